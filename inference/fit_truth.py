@@ -1,0 +1,53 @@
+"""FitTruth: the same program, trained on the true states. What bearings are measured against; no robot has it.
+
+The guide's sites are Deltas at the true states and the channel noise that explains them, so that the same loop becomes
+supervised learning. It still stops on held-out log p(y), as every other recipe does.
+"""
+
+from steady_ppl import Fit, Optimization, Trajectories, TruthGuide, Validation, for_program, seeded, train
+
+
+def fit(
+    program,
+    table: Trajectories,
+    valid: Trajectories | None = None,
+    *,
+    known_start: bool = False,
+    steps: int = 1000,
+    learning_rate: float = 1e-2,
+    weight_decay: float = 1.0,
+    averaging: float = 0.98,
+    validate_every: int = 50,
+    validation_particles: int = 2000,
+    patience: int = 10,
+    seed: int = 0,
+    **run,
+) -> Fit:
+    """Fit `program` to the true states of `table`.
+
+    Args:
+        program: the state-space model, changed in place.
+        table: the training drives, every x. column filled.
+        valid: held-out drives.
+        known_start: the first row's true state is given to the filter of the validation.
+        steps: gradient steps, each on all drives.
+        run: checkpoint, resume and progress of `train`.
+    """
+    settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
+    data = for_program(program, table)
+    with seeded(seed, "prepare"):
+        program.prepare(data, known_start)
+    optimization = Optimization(
+        steps=steps,
+        learning_rate=learning_rate,
+        weight_decay=weight_decay,
+        averaging=averaging,
+        validate_every=validate_every,
+        patience=patience,
+    )
+    held_out = for_program(program, valid) if valid is not None else None
+    validation = Validation(held_out, particles=validation_particles, known_start=known_start)
+    trained = train(
+        program, TruthGuide(program), data, validation, optimization, known_start=known_start, seed=seed, **run
+    )
+    return Fit(program, "fit-truth", settings, seed=seed, known_start=known_start, trained=trained)

@@ -1,0 +1,81 @@
+"""STEADY: learn a program's dynamics from measurements alone, by tempered particle filtering (IROS 2022).
+
+Each step runs the program as a particle filter on every drive (the E step), draws paths from the surviving lineages,
+and moves the parameters along the gradient of the paths' joint log-density (the M step). The observations' weight grows
+from FIRST_WEIGHT to 1. The parameters with the best held-out log p(y) are kept.
+
+The paper's own settings, hours on two cores, are
+    particles=20_000, draws=10, steps=40_000, learning_rate=1e-4, weight_decay=1.0, batch=1, ramp=1.0,
+    averaging=0.0, final_rate=1.0, validate_every=500, validation_particles=100_000
+"""
+
+from steady_ppl import (
+    Fit,
+    LinearRamp,
+    Optimization,
+    SMCGuide,
+    Trajectories,
+    Validation,
+    for_program,
+    seeded,
+    train,
+)
+
+FIRST_WEIGHT = 0.001
+
+
+def fit(
+    program,
+    table: Trajectories,
+    valid: Trajectories | None = None,
+    *,
+    known_start: bool = False,
+    particles: int = 300,
+    draws: int = 10,
+    steps: int = 400,
+    learning_rate: float = 1e-2,
+    final_rate: float = 0.05,
+    weight_decay: float = 1.0,
+    averaging: float = 0.98,
+    batch: int | None = None,
+    ramp: float = 0.3,
+    validate_every: int = 25,
+    validation_particles: int = 2000,
+    patience: int = 30,
+    seed: int = 0,
+    **run,
+) -> Fit:
+    """Fit `program` to the measurements of `table`; `valid` decides when to stop.
+
+    Args:
+        program: the state-space model, changed in place.
+        table: the training drives; true states, where there are any, are used for a known start only.
+        valid: held-out drives.
+        known_start: the first row's true state is given.
+        particles: N of the E step, for each drive.
+        draws: M, paths for each drive in the M step.
+        steps: number of E steps.
+        ramp: share of the training over which the observation weight grows to 1.
+        run: checkpoint, resume and progress of `train`.
+    """
+    settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
+    data = for_program(program, table)
+    with seeded(seed, "prepare"):
+        program.prepare(data, known_start)
+    guide = SMCGuide(
+        program, particles=particles, draws=draws, tempering=LinearRamp(FIRST_WEIGHT, ramp), known_start=known_start
+    )
+    optimization = Optimization(
+        steps=steps,
+        learning_rate=learning_rate,
+        final_rate=final_rate,
+        weight_decay=weight_decay,
+        averaging=averaging,
+        batch=batch,
+        validate_every=validate_every,
+        patience=patience,
+    )
+    held_out = for_program(program, valid) if valid is not None else None
+    validation = Validation(held_out, particles=validation_particles, known_start=known_start)
+    trained = train(program, guide, data, validation, optimization, known_start=known_start, seed=seed, **run)
+    return Fit(program, "steady", settings, seed=seed, known_start=known_start, trained=trained)

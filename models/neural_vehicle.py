@@ -1,0 +1,107 @@
+"""Planar vehicles whose dynamics are a network: what STEADY learns when no equation is known."""
+
+import math
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import nn, tensor
+
+from steady_ppl import PlanarVehicle, bearings_to, smoothed_states, stack
+
+
+class NeuralVehicle(PlanarVehicle):
+    """Body-frame accelerations from body-frame velocities and controls, by a network with a linear skip.
+
+    z = (v, w, yaw_rate, controls), normalised
+    mean = scale · (skip z + head(hidden z)),   sd = scale · max(softplus(noise z), 0.001)
+
+    One hidden layer of 64 as in the paper; its code has a second, residual one and the absolute heading among the
+    inputs (`layers=2, absolute_heading=True`). The heads start at zero: constant velocity and large noise.
+
+    Args:
+        layers: 1 or 2 hidden layers of 64.
+        absolute_heading: add cos and sin of the heading to the inputs.
+        normalise: "smoothed" takes the moments of the velocities from a smoother run before learning; "truth" from the
+            true training states, a mild leak that the authors' code has.
+    """
+
+    acceleration_scale = (1.0, 1.0, 1.0)
+    rates = {"noise": 3.0}
+    decays = {"hidden": 10.0, "skip": 0.1, "noise": 0.1}
+
+    def __init__(self, *, layers=1, absolute_heading=False, normalise="smoothed"):
+        super().__init__()
+        self.absolute_heading, self.normalise = absolute_heading, normalise
+        inputs = 3 + len(self.controls) + 2 * absolute_heading
+        self.skip = nn.Linear(inputs, 3)
+        self.hidden_in = nn.Linear(inputs, 64)
+        self.hidden_residual = nn.Linear(64, 64) if layers == 2 else None
+        self.hidden_out = nn.Linear(64, 3)
+        self.noise = nn.Linear(inputs, 3)
+        for head in (self.skip, self.hidden_out, self.noise):
+            nn.init.zeros_(head.weight)
+            nn.init.zeros_(head.bias)
+        self.register_buffer("scale", tensor(self.acceleration_scale))
+        self.register_buffer("input_mean", torch.zeros(3 + len(self.controls)))
+        self.register_buffer("input_sd", torch.ones(3 + len(self.controls)))
+
+    def prepare(self, data, known_start):
+        """Normalise by the moments of the controls and of smoothed (or, if asked, true) body velocities.
+
+        The scale of the accelerations is the root mean square change of these velocities over a second (a step).
+        """
+        leaking = self.normalise == "truth"
+        states = data.states if leaking else smoothed_states(self, data, known_start=known_start)
+        velocities = stack(*self.body_velocity(states))
+        inputs = torch.cat([velocities, data.controls], -1)[data.rows]
+        self.input_mean.copy_(inputs.mean(0))
+        self.input_sd.copy_(inputs.std(0).clamp(min=1e-3))
+        apart = 1 if leaking else max(1, round(1 / float(data.steps.median())))
+        seconds = (data.elapsed[apart:] - data.elapsed[:-apart]).unsqueeze(-1)
+        change = ((velocities[apart:] - velocities[:-apart]) / seconds)[data.rows[apart:]]
+        self.scale.copy_(change.square().mean(0).sqrt().clamp(min=1e-3))
+
+    def initial(self):
+        mean = torch.zeros(6).to(self.scale)
+        sd = tensor([3.0, 3.0, math.pi, 1.0, 1.0, 0.5]).to(self.scale)
+        return pyro.sample("start", dist.Normal(mean, sd).to_event(1))
+
+    def transition(self, state, control, time, step):
+        inputs = stack(*self.body_velocity(state), *control.unbind(-1))
+        inputs = (inputs - self.input_mean) / self.input_sd
+        if self.absolute_heading:
+            heading = state[..., 2:3]
+            inputs = torch.cat([inputs, heading.cos(), heading.sin()], -1)
+        hidden = self.hidden_in(inputs).relu()
+        if self.hidden_residual is not None:
+            hidden = hidden + self.hidden_residual(hidden).relu()
+        mean = self.scale * (self.skip(inputs) + self.hidden_out(hidden))
+        sd = self.scale * nn.functional.softplus(self.noise(inputs)).clamp(min=1e-3)
+        acceleration = pyro.sample("acceleration", dist.Normal(mean, sd).to_event(1))
+        return self.integrate(state, acceleration, step)
+
+    def observe(self, state):
+        pyro.sample("bearing", bearings_to(self.landmarks, state, sd=math.radians(5)))
+
+
+class NeuralHovercraft(NeuralVehicle):
+    """The hovercraft, nothing known of its dynamics but the order of magnitude of its accelerations."""
+
+    controls = ("left [N]", "right [N]")
+    landmarks = ((12.0, -8.0), (-6.0, -4.0), (-4.0, 10.0), (6.0, 7.0))
+    acceleration_scale = (0.3, 0.3, 0.3)
+
+    def initial(self):
+        mean = tensor([0.5, 1.0, math.pi / 5, 0.25, 0.1, math.pi / 50]).to(self.scale)
+        sd = tensor([2.0, 2.0, math.pi, 0.3, 0.2, 0.1 * math.pi]).to(self.scale)
+        return pyro.sample("start", dist.Normal(mean, sd).to_event(1))
+
+
+class NeuralTruck(NeuralVehicle):
+    """The AlphaTruck, likewise."""
+
+    controls = ("speed [m/s]", "turn [rad/s]")
+    landmarks = ((-1.230314, -0.606814), (0.797073, 0.889471), (-3.496525, 0.207874), (0.0, 6.0))
+    acceleration_scale = (2.0, 2.0, 2.0)
+    decays = {"hidden": 3.0, "skip": 0.1, "noise": 0.1}

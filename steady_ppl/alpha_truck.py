@@ -1,0 +1,142 @@
+"""The AlphaTruck drives: a 1:10 truck under motion capture, with bearings simulated from its pose.
+
+The logs are published as `datasets/alpha_truck` of the repository MrVPlusOne/STEADY on GitHub (the code of STEADY,
+IROS 2022). No licence is stated there, hence they are not part of this package. Each of the folders `train`, `valid`
+and `test` holds `vrpn-pose.csv` (poses at 100 Hz) and `vesc_drive.csv` (commands at 20 Hz).
+
+Known flaws, kept so that results compare with the published ones: motion capture drops out for 2.12 s in the middle
+of the 12th training trajectory, and the motion interpolated there is not the truck's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import DataError, UsageError
+from steady_ppl.planar_vehicle import bearings_to, wrap
+
+LANDMARKS = ((-1.230314, -0.606814), (0.797073, 0.889471), (-3.496525, 0.207874), (0.0, 6.0))
+"""The landmarks of the published experiments, m."""
+
+FRAMES = 100
+"""Rows a trajectory, which spans a little more than 10 s."""
+
+STAMP = ("header.stamp.secs", "header.stamp.nsecs")
+POSE = ("pose.position.x", "pose.position.y", "pose.orientation.z", "pose.orientation.w")
+COMMAND = ("twist.linear.x", "twist.angular.z")
+
+
+def read_alpha_truck(
+    folder: str | Path,
+    *,
+    sigma_degrees: float = 5.0,
+    seed: int = 0,
+    landmarks: Sequence[Sequence[float]] = LANDMARKS,
+) -> Trajectories:
+    """Read one split, resampled as the authors of STEADY do.
+
+    The window in which both logs run is cut into n = ⌊window in s⌋ // 10 trajectories. Position, cos and sin of the
+    heading and both commands are interpolated linearly at 100 n evenly spaced times over the whole window; velocities
+    are forward differences there, the last one repeated. Nothing is filtered. Times are the messages' header stamps;
+    a log whose stamps are out of order is sorted by them, equal stamps staying in the order of the file.
+
+    Args:
+        folder: holds `vrpn-pose.csv` and `vesc_drive.csv`.
+        sigma_degrees: standard deviation of the bearings, degrees; larger within 0.1 m of a landmark, see
+            `bearings_to`.
+        seed: of the bearings' noise, drawn once. Torch's global random state is left alone.
+        landmarks: `(K, 2)` m.
+
+    Returns:
+        n trajectories of 100 rows, float64, each starting at time 0, with controls speed (m/s) and turn (rad/s),
+        measurements bearing_0, … (rad) and states x, y (m), heading (rad, in [−π, π]), vx, vy (m/s, world frame) and
+        yaw_rate (rad/s).
+
+    Raises:
+        DataError: for a missing file or column, a cell that is not a finite number, or logs that overlap by less
+            than 10 s.
+        UsageError: for a sigma that is not positive.
+    """
+    if not (sigma_degrees > 0 and math.isfinite(sigma_degrees)):
+        raise UsageError(f"the bearings' standard deviation must be positive and finite, got {sigma_degrees} degrees")
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise DataError(f"{folder.name}: no such folder; expected one with vrpn-pose.csv and vesc_drive.csv")
+    pose_stamps, pose = _read_log(folder / "vrpn-pose.csv", POSE)
+    command_stamps, command = _read_log(folder / "vesc_drive.csv", COMMAND)
+    begin, end = max(pose_stamps[0], command_stamps[0]), min(pose_stamps[-1], command_stamps[-1])
+    window = (end - begin) * 1e-9
+    count = int(window) // 10
+    if count < 1:
+        overlap = f"overlap by {window:.3g} s" if window > 0 else f"do not overlap (they are {-window:.3g} s apart)"
+        raise DataError(f"{folder.name}: vrpn-pose.csv and vesc_drive.csv {overlap}, expected 10 s or more")
+
+    grid = np.linspace(0.0, window, FRAMES * count)
+    step = window / (FRAMES * count - 1)
+
+    def resample(stamps: np.ndarray, values: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.interp(grid, (stamps - begin) * 1e-9, values))
+
+    x, y, qz, qw = pose.T
+    angle = 2 * np.arctan2(qz, qw)
+    x, y, cos, sin = (resample(pose_stamps, values) for values in (x, y, np.cos(angle), np.sin(angle)))
+    position_and_heading = torch.stack([x, y, torch.atan2(sin, cos)], -1)
+    change = position_and_heading.diff(dim=0)
+    change[:, 2] = wrap(change[:, 2])
+    velocity = torch.cat([change, change[-1:]]) / step
+    states = torch.cat([position_and_heading, velocity], -1)
+    controls = torch.stack([resample(command_stamps, values) for values in command.T], -1)
+    states, controls = (block.unflatten(0, (count, FRAMES)).transpose(0, 1) for block in (states, controls))
+
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(seed)
+        bearings = bearings_to(landmarks, states, sd=math.radians(sigma_degrees)).sample()
+    return Trajectories(
+        time=(torch.arange(FRAMES, dtype=torch.float64) * step)[:, None].repeat(1, count),
+        controls=controls,
+        measurements=bearings,
+        observed=torch.ones_like(bearings, dtype=torch.bool),
+        lengths=torch.full((count,), FRAMES),
+        states=states,
+        labels=tuple(str(i + 1) for i in range(count)),
+        control_names=("speed", "turn"),
+        measurement_names=tuple(f"bearing_{i}" for i in range(len(landmarks))),
+        state_names=("x", "y", "heading", "vx", "vy", "yaw_rate"),
+    )
+
+
+def _read_log(path: Path, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """The header stamps `(N,)` in ns, in order, and the named columns `(N, ·)`."""
+    where = f"{path.parent.name}/{path.name}"
+    try:
+        log = pd.read_csv(path, low_memory=False)
+    except FileNotFoundError as error:
+        raise DataError(f"{where}: there is no such file") from error
+    except pd.errors.EmptyDataError as error:
+        raise DataError(f"{where}: the log is empty") from error
+    except (OSError, ValueError) as error:
+        raise DataError(f"{where}: cannot be read as csv: {str(error).partition(chr(10))[0]}") from error
+    for column in (*STAMP, *columns):
+        if column not in log.columns:
+            raise DataError(f"{where}: column {column} is missing", column=column)
+        numbers = pd.to_numeric(log[column], errors="coerce")
+        bad = ~np.isfinite(numbers.to_numpy(dtype=np.float64))
+        if bad.any():
+            row = int(bad.argmax())
+            cell = log[column].iloc[row]
+            came = "an empty cell" if pd.isna(cell) else f"{str(cell)[:40]!r}"
+            problem = f"{where}: column {column}, row {row + 1}: got {came}, expected a finite number"
+            raise DataError(problem, column=column, row=row + 1)
+        log[column] = numbers
+    if len(log) == 0:
+        raise DataError(f"{where}: the log has no rows")
+    stamps = log[STAMP[0]].to_numpy(np.int64) * 10**9 + log[STAMP[1]].to_numpy(np.int64)
+    order = stamps.argsort(kind="stable")
+    return stamps[order], log[list(columns)].to_numpy(np.float64)[order]

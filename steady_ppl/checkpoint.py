@@ -1,0 +1,96 @@
+"""Checkpoints: tensors and a little text in one safetensors file, written beside and renamed. Never pickle."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from steady_ppl.errors import RunError
+
+
+@dataclass
+class Checkpoint:
+    """The state of a training run besides its optimiser.
+
+    Attributes:
+        step: E steps done.
+        history: one entry a validation.
+        parameters: the live parameters of program and guide.
+        averaged: the running mean of the program's parameters.
+        best: the averaged parameters with the best held-out log p(y) so far, empty before the first validation.
+    """
+
+    step: int
+    history: list[dict[str, float]]
+    parameters: Mapping[str, Tensor]
+    averaged: dict[str, Tensor]
+    best: dict[str, Tensor]
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: Mapping[str, str] | None = None) -> None:
+    """Write tensors and text to a safetensors file, whole or not at all."""
+    beside = path.with_name(path.name + ".partial")
+    save_file(
+        {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}, beside, dict(text or {})
+    )
+    os.replace(beside, path)
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Read a file of `write_tensors`.
+
+    Raises:
+        RunError: the file is missing or damaged.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
+    except FileNotFoundError:
+        raise RunError(f"no file {path.name} in {path.parent}") from None
+    except SafetensorError as error:
+        raise RunError(f"{path.name} in {path.parent} is damaged ({error})") from error
+
+
+def write_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimizer) -> None:
+    """Write everything that `read_checkpoint` needs to go on as if nothing had happened."""
+    tensors = {f"parameters/{name}": value for name, value in state.parameters.items()}
+    tensors |= {f"averaged/{name}": value for name, value in state.averaged.items()}
+    tensors |= {f"best/{name}": value for name, value in state.best.items()}
+    for index, slots in optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer/{index}/{slot}": value for slot, value in slots.items()}
+    write_tensors(path, tensors, {"step": str(state.step), "history": json.dumps(state.history)})
+
+
+def read_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimizer) -> None:
+    """Bring `state` and `optimizer`, made for the same program and guide, to where the checkpoint was written.
+
+    Raises:
+        RunError: the file is missing, damaged, or of another program.
+    """
+    tensors, text = read_tensors(path)
+    groups: dict[str, dict[str, Tensor]] = {"parameters": {}, "averaged": {}, "best": {}, "optimizer": {}}
+    for key, value in tensors.items():
+        group, _, name = key.partition("/")
+        groups[group][name] = value
+    if {n: v.shape for n, v in groups["parameters"].items()} != {n: v.shape for n, v in state.parameters.items()}:
+        raise RunError(f"{path.name} in {path.parent} was written by a program with other parameters")
+    with torch.no_grad():
+        for name, value in groups["parameters"].items():
+            state.parameters[name].copy_(value)
+    for name, value in groups["averaged"].items():
+        state.averaged[name].copy_(value)
+    state.best = {name: value.to(state.averaged[name].device) for name, value in groups["best"].items()}
+    state.step, state.history = int(text["step"]), json.loads(text["history"])
+    slots: dict[int, dict[str, Tensor]] = {}
+    for key, value in groups["optimizer"].items():
+        index, _, slot = key.partition("/")
+        slots.setdefault(int(index), {})[slot] = value
+    optimizer.load_state_dict({"state": slots, "param_groups": optimizer.state_dict()["param_groups"]})

@@ -1,0 +1,226 @@
+"""The `steady` command. Each command reads its input, calls one function of the library, and writes whole files.
+
+Exit codes: 0 done, 1 the computation failed or was interrupted, 2 bad usage or bad input.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import traceback
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from steady_ppl.errors import SteadyError, UsageError
+
+if TYPE_CHECKING:
+    pass
+
+app = typer.Typer(
+    help="Learn how a vehicle moves from noisy, indirect measurements.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+data_app = typer.Typer(help="Published logs to tables.", no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(data_app, name="data")
+
+
+class Device(StrEnum):
+    """Where tensors live."""
+
+    cpu = "cpu"
+    cuda = "cuda"
+
+
+class GuideName(StrEnum):
+    """The E step."""
+
+    bootstrap = "bootstrap"
+
+
+Seed = Annotated[int, typer.Option(help="Random seed.", min=0)]
+Out = Annotated[Path, typer.Option("--out", help="Table to write, .csv or .parquet.")]
+
+
+@app.callback()
+def options(debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False) -> None:
+    """Learn how a vehicle moves from noisy, indirect measurements, with its model written as a Pyro program."""
+
+
+@app.command()
+def simulate(
+    model: Annotated[str, typer.Argument(help="Program: models/hovercraft.py, or mine.py:Boat.")],
+    out: Out,
+    trajectories: Annotated[int, typer.Option(help="How many drives.", min=1)] = 16,
+    seed: Seed = 0,
+    controls: Annotated[Path | None, typer.Option(help="Take time, controls and gaps from this table.")] = None,
+) -> None:
+    """Simulate drives of a program, with measurements and true states."""
+    from steady_ppl.simulation import simulate as run
+    from steady_ppl.table import read_table, write_table
+
+    program = _program(model, seed)
+    like = read_table(controls) if controls else None
+    write_table(run(program, trajectories, seed=seed, like=like), out)
+
+
+@data_app.command("alpha-truck")
+def alpha_truck(
+    folder: Annotated[Path, typer.Argument(help="One split: holds vrpn-pose.csv and vesc_drive.csv.")],
+    out: Out,
+    sigma_deg: Annotated[float, typer.Option(help="Standard deviation of the simulated bearings, degrees.")] = 5.0,
+    seed: Seed = 0,
+) -> None:
+    """One split of the AlphaTruck logs to a table, resampled as the authors do.
+
+    The logs are published in datasets/alpha_truck of the repository MrVPlusOne/STEADY on GitHub. They are real motion
+    capture and commands; the bearings are simulated from the true poses. True states are kept in the x. columns.
+    """
+    from steady_ppl.alpha_truck import read_alpha_truck
+    from steady_ppl.table import write_table
+
+    write_table(read_alpha_truck(folder, sigma_degrees=sigma_deg, seed=seed), out)
+
+
+@app.command()
+def fit(
+    context: typer.Context,
+    model: Annotated[str, typer.Argument(help="Program: models/hovercraft.py, or mine.py:Boat.")],
+    table: Annotated[Path, typer.Argument(help="Training drives, .csv or .parquet.")],
+    out: Annotated[Path, typer.Option("--out", help="Run folder to write.")],
+    valid: Annotated[Path | None, typer.Option(help="Held-out drives that decide when to stop.")] = None,
+    recipe: Annotated[str, typer.Option(help="steady, hand, fit-truth, or a recipe of your own: PATH.py.")] = "steady",
+    guide: Annotated[GuideName | None, typer.Option(help="The E step.")] = None,
+    known_start: Annotated[bool, typer.Option(help="Give the first row's x. columns as the exact start.")] = False,
+    particles: Annotated[int | None, typer.Option(help="Particles for each drive.", min=1)] = None,
+    draws: Annotated[int | None, typer.Option(help="Paths for each drive in the M step.", min=1)] = None,
+    steps: Annotated[int | None, typer.Option(help="E steps.", min=1)] = None,
+    seed: Seed = 0,
+    device: Annotated[Device, typer.Option(help="Where to compute.")] = Device.cpu,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite an existing run.")] = False,
+) -> None:
+    """Learn a program's parameters from measurements."""
+    from steady_ppl.run_recipe import run_recipe
+    from steady_ppl.table import read_table
+
+    given: dict[str, Any] = {"particles": particles, "draws": draws, "steps": steps, "guide": guide and guide.value}
+    result = run_recipe(
+        recipe,
+        _program(model, seed),
+        read_table(table),
+        read_table(valid) if valid else None,
+        out,
+        options={name: value for name, value in given.items() if value is not None},
+        known_start=known_start,
+        seed=seed,
+        device=device.value,
+        resume=resume,
+        force=force,
+        progress=sys.stderr.isatty(),
+    )
+    for note in result.notes:
+        _say(note)
+    print(f"{out}: {result.program}")
+    if result.trained is not None:
+        judged = [entry["log_likelihood"] for entry in result.trained.history if "log_likelihood" in entry]
+        if judged:
+            print(f"held-out log p(y) {judged[0]:.2f} → {max(judged):.2f}, best at step {result.trained.best}")
+        if result.trained.interrupted:
+            _say(f"interrupted; the run so far is usable, `--resume` goes on with {out}")
+            raise typer.Exit(1)
+
+
+@app.command()
+def evaluate(
+    arguments: Annotated[list[Path], typer.Argument(metavar="RUN... TABLE", help="Run folders, then the table.")],
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
+    particles: Annotated[int, typer.Option(help="Particles of the filters.", min=2)] = 5000,
+    rollouts: Annotated[int, typer.Option(help="Noisy roll-outs from each true state.", min=1)] = 1000,
+    seed: Seed = 0,
+    program: Annotated[str | None, typer.Option(help="The program, if its file moved or changed.")] = None,
+) -> None:
+    """The paper's errors where true states exist; errors in measurement space always."""
+    from steady_ppl.evaluation import evaluate as judge
+    from steady_ppl.evaluation import table_of
+    from steady_ppl.fit import Fit
+    from steady_ppl.table import read_table
+
+    if len(arguments) < 2:
+        raise UsageError("evaluate needs at least one RUN and then a TABLE")
+    *runs, table = arguments
+    fits = [Fit.load(run, program) for run in runs]
+    drives = read_table(table)
+    results = [judge(fit, drives, particles=particles, rollouts=rollouts, seed=seed) for fit in fits]
+    print(table_of(results, [f"{run.name} ({result['recipe']})" for run, result in zip(runs, results, strict=True)]))
+    if json_file is not None:
+        rows = [{"run": str(run), **result} for run, result in zip(runs, results, strict=True)]
+        _write_json(json_file, {"runs": rows})
+
+
+def _program(model: str, seed: int) -> Any:
+    """Load a program, its random initial weights keyed by the seed, and try it once on a probe."""
+    from steady_ppl.probe import probe
+    from steady_ppl.program import load_program
+    from steady_ppl.seeding import seeded
+
+    with seeded(seed, "program"):
+        program = load_program(model)
+    probe(program)
+    return program
+
+
+def _write_json(path: Path, content: Any) -> None:
+    """Write a file whole or not at all."""
+    beside = path.with_name(path.name + ".partial")
+    try:
+        beside.write_text(json.dumps(content, indent=1) + "\n")
+        os.replace(beside, path)
+    except OSError as error:
+        raise UsageError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _say(line: str) -> None:
+    print(f"steady: {line}", file=sys.stderr)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    debug = "--debug" in arguments
+    arguments = [argument for argument in arguments if argument != "--debug"]
+    command = typer.main.get_command(app)
+    try:
+        return command.main(arguments, prog_name="steady", standalone_mode=False) or 0
+    except SteadyError as error:
+        if debug:
+            traceback.print_exc()
+        _say(str(error))
+        return error.exit_code
+    except KeyboardInterrupt:
+        _say("interrupted")
+        return 1
+    except Exception as error:
+        if hasattr(error, "format_message"):
+            _say(f"{error.format_message()} (steady --help shows the usage)")
+            return 2
+        if debug:
+            traceback.print_exc()
+        _say(f"{type(error).__name__}: {error} (--debug shows where)")
+        return 1
+
+
+def run() -> None:
+    """The console script."""
+    sys.exit(main())
+
+
+if __name__ == "__main__":
+    run()

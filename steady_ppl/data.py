@@ -1,0 +1,200 @@
+"""Trajectories: measurements, controls and, where known, the true states, padded and time-first.
+
+Tensors are `(rows, trajectories, components)`. Lengths differ, so every tensor is padded to the longest trajectory:
+time goes on at the last step, controls and measurements are zero, nothing is observed, states are NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from steady_ppl.errors import DataError
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """`B` trajectories of at most `T + 1` rows, with `U` controls, `K` measurements and `D` state components.
+
+    Attributes:
+        time: `(T + 1, B)`, s, strictly increasing.
+        controls: `(T + 1, B, U)`; row t acts from t to t + 1, so a trajectory's last row acts on nothing.
+        measurements: `(T + 1, B, K)`, zero where missing.
+        observed: `(T + 1, B, K)` bool, where a measurement exists.
+        lengths: `(B,)` number of rows of each trajectory.
+        states: `(T + 1, B, D)` the true states, NaN where unknown; None when nothing is known.
+        labels: the trajectories' names.
+        control_names, measurement_names, state_names: the components' names, without units.
+    """
+
+    time: Tensor
+    controls: Tensor
+    measurements: Tensor
+    observed: Tensor
+    lengths: Tensor
+    states: Tensor | None = None
+    labels: tuple[str, ...] = ()
+    control_names: tuple[str, ...] = ()
+    measurement_names: tuple[str, ...] = ()
+    state_names: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return self.time.shape[1]
+
+    def __repr__(self) -> str:
+        return (
+            f"Trajectories({len(self)} of {int(self.lengths.min())}–{int(self.lengths.max())} rows, "
+            f"controls {list(self.control_names)}, measurements {list(self.measurement_names)} "
+            f"({int((~self.observed[self.rows]).sum())} missing), "
+            f"states {list(self.state_names) if self.states is not None else 'unknown'})"
+        )
+
+    @property
+    def rows(self) -> Tensor:
+        """`(T + 1, B)` bool: the rows that belong to a trajectory, not to its padding."""
+        return torch.arange(self.time.shape[0], device=self.time.device)[:, None] < self.lengths
+
+    @property
+    def transitions(self) -> Tensor:
+        """`(T, B)` bool: the intervals that belong to a trajectory."""
+        return self.rows[1:]
+
+    @property
+    def steps(self) -> Tensor:
+        """`(T, B)` the length of each interval, s."""
+        return self.time[1:] - self.time[:-1]
+
+    @property
+    def elapsed(self) -> Tensor:
+        """`(T + 1, B)` seconds since each trajectory's first row."""
+        return self.time - self.time[0]
+
+    @property
+    def known_start(self) -> Tensor:
+        """`(B, D)` the true first states.
+
+        Raises:
+            DataError: where the first row's states are not all known.
+        """
+        if self.states is None:
+            raise DataError(
+                "a known start needs the true states of every trajectory's first row: the table has no x. columns"
+            )
+        unknown = ~torch.isfinite(self.states[0])
+        if bool(unknown.any()):
+            trajectory, component = (int(i) for i in unknown.nonzero()[0])
+            raise DataError(
+                f"a known start needs every trajectory's first state: x.{self.state_names[component]} "
+                f"of trajectory {self.labels[trajectory]} is empty",
+                column=f"x.{self.state_names[component]}",
+                trajectory=self.labels[trajectory],
+                row=1,
+            )
+        return self.states[0]
+
+    def subset(self, index: Sequence[int] | Tensor) -> Trajectories:
+        """The trajectories at `index`, still padded to the same number of rows."""
+        index = torch.as_tensor(index, dtype=torch.long, device=self.time.device)
+        return replace(
+            self,
+            time=self.time[:, index],
+            controls=self.controls[:, index],
+            measurements=self.measurements[:, index],
+            observed=self.observed[:, index],
+            lengths=self.lengths[index],
+            states=None if self.states is None else self.states[:, index],
+            labels=tuple(self.labels[int(i)] for i in index),
+        )
+
+    def observed_every(self, stride: int) -> Trajectories:
+        """Keep the measurements of rows 1, 1 + stride, … only; every row stays (10 turns 10 Hz into 1 Hz)."""
+        keep = (torch.arange(self.time.shape[0], device=self.time.device) % stride == 0)[:, None, None]
+        return replace(self, observed=self.observed & keep)
+
+    def without_truth(self, *, keep_start: bool = False) -> Trajectories:
+        """Forget the true states, or all but each trajectory's first."""
+        if not keep_start or self.states is None:
+            return replace(self, states=None)
+        states = torch.full_like(self.states, torch.nan)
+        states[0] = self.states[0]
+        return replace(self, states=states)
+
+    def to(self, like: torch.dtype | None = None, device: Any = None) -> Trajectories:
+        """Cast to a floating dtype and move to a device.
+
+        `time` becomes seconds since the first row, so that clock stamps of 10⁹ s survive single precision.
+        """
+
+        def cast(tensor: Tensor) -> Tensor:
+            return tensor.to(device=device, dtype=like if tensor.is_floating_point() else None)
+
+        return replace(
+            self,
+            time=cast(self.elapsed),
+            controls=cast(self.controls),
+            measurements=cast(self.measurements),
+            observed=cast(self.observed),
+            lengths=cast(self.lengths),
+            states=None if self.states is None else cast(self.states),
+        )
+
+    def select(self, controls: Sequence[str], measurements: Sequence[str], states: Sequence[str]) -> Trajectories:
+        """The named columns in the named order; what a program reads.
+
+        Unknown state components become NaN; a control or a measurement that the table lacks is an error.
+
+        Raises:
+            DataError: naming the missing column and those that the table has.
+        """
+
+        def pick(prefix: str, wanted: Sequence[str], have: tuple[str, ...]) -> list[int]:
+            for name in wanted:
+                if name not in have:
+                    raise DataError(
+                        f"the table has no column {prefix}.{name}; it has "
+                        f"{', '.join(f'{prefix}.{n}' for n in have) or f'no {prefix}. column'}",
+                        column=f"{prefix}.{name}",
+                    )
+            return [have.index(name) for name in wanted]
+
+        chosen_controls = pick("u", controls, self.control_names)
+        chosen = pick("y", measurements, self.measurement_names)
+        truth = None
+        if self.states is not None and any(name in self.state_names for name in states):
+            truth = self.states.new_full((*self.time.shape, len(states)), torch.nan)
+            for i, name in enumerate(states):
+                if name in self.state_names:
+                    truth[..., i] = self.states[..., self.state_names.index(name)]
+        return replace(
+            self,
+            controls=self.controls[..., chosen_controls],
+            measurements=self.measurements[..., chosen],
+            observed=self.observed[..., chosen],
+            states=truth,
+            control_names=tuple(controls),
+            measurement_names=tuple(measurements),
+            state_names=tuple(states),
+        )
+
+
+def pad(columns: Sequence[Tensor], fill: float = 0.0) -> Tensor:
+    """Stack `B` tensors of shapes `(rows_b, ·)` into `(T + 1, B, ·)`, filled up with `fill`."""
+    longest = max(len(column) for column in columns)
+    out = columns[0].new_full((longest, len(columns), *columns[0].shape[1:]), fill)
+    for i, column in enumerate(columns):
+        out[: len(column), i] = column
+    return out
+
+
+def pad_time(times: Sequence[Tensor]) -> Tensor:
+    """Stack `B` vectors of times into `(T + 1, B)`, going on at each one's last step."""
+    longest = max(len(time) for time in times)
+    out = times[0].new_empty((longest, len(times)))
+    for i, time in enumerate(times):
+        extra = torch.arange(1, longest - len(time) + 1, dtype=time.dtype)
+        out[:, i] = torch.cat([time, time[-1] + extra * (time[-1] - time[-2])])
+    return out

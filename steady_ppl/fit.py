@@ -1,0 +1,233 @@
+"""A fitted program, the same for every recipe: what was learned, how, and how to keep it."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import os
+import platform
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from steady_ppl.checkpoint import read_tensors, write_tensors
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import RunError
+from steady_ppl.program import Program, load_program
+from steady_ppl.training import Trained
+
+if TYPE_CHECKING:
+    import arviz
+
+PARAMETERS, RECORD, POSTERIOR, CHECKPOINT = (
+    "parameters.safetensors",
+    "run.json",
+    "posterior.nc",
+    "checkpoint.safetensors",
+)
+
+
+@dataclass
+class Fit:
+    """A program with fitted parameters.
+
+    Attributes:
+        program: the program, its parameters the fitted ones.
+        recipe: the name of the recipe.
+        settings: what the recipe was called with.
+        seed: of the fit.
+        known_start: whether the true first state was given.
+        trained: the history; None for a recipe that does not train.
+        notes: anything that was rescued, replaced or left out on the way.
+    """
+
+    program: Program
+    recipe: str
+    settings: dict[str, Any] = field(default_factory=dict)
+    seed: int = 0
+    known_start: bool = False
+    trained: Trained | None = None
+    notes: list[str] = field(default_factory=list)
+
+    def posterior(
+        self, data: Trajectories, *, draws: int = 100, particles: int = 5000, every: int = 1, seed: int = 0
+    ) -> arviz.InferenceData:
+        """Posterior draws of states and channel noise as ArviZ `InferenceData`; see `steady_ppl.posterior`."""
+        from steady_ppl.posterior import posterior
+
+        return posterior(
+            self.program,
+            data,
+            draws=draws,
+            particles=particles,
+            every=every,
+            known_start=self.known_start,
+            seed=seed,
+        )
+
+    def save(self, folder: str | Path, *, train: Trajectories | None = None, force: bool = False) -> None:
+        """Write parameters, record and, with the training drives, posterior draws to a run folder.
+
+        Raises:
+            RunError: the folder exists (and is not `force`d) or cannot be written.
+        """
+        self.save_into(open_run(folder, force=force), train)
+
+    def save_into(
+        self, folder: Path, train: Trajectories | None = None, begun: Mapping[str, Any] | None = None
+    ) -> None:
+        """Write into an open run folder; `begun` is what its record already says."""
+        write_tensors(folder / PARAMETERS, self.program.state_dict())
+        if train is not None:
+            beside = folder / (POSTERIOR + ".partial")
+            self.posterior(train, draws=50, particles=2000, seed=self.seed).to_netcdf(str(beside), engine="h5netcdf")
+            os.replace(beside, folder / POSTERIOR)
+        write_record(folder, {**(begun or {}), **self.record(folder)})
+
+    def record(self, folder: Path) -> dict[str, Any]:
+        """What `run.json` holds."""
+        trained = self.trained
+        return {
+            "program": program_source(self.program, folder),
+            "recipe": self.recipe,
+            "status": "interrupted" if trained is not None and trained.interrupted else "finished",
+            "known_start": self.known_start,
+            "seed": self.seed,
+            "settings": self.settings,
+            "best_step": trained.best if trained else None,
+            "history": trained.history if trained else [],
+            "notes": self.notes,
+            "versions": versions(),
+        }
+
+    @classmethod
+    def load(cls, folder: str | Path, program: str | Path | Program | None = None) -> Fit:
+        """Read a run folder.
+
+        Args:
+            folder: written by `save`.
+            program: the program, or where its file is now; the recorded place when not given.
+
+        Raises:
+            RunError: the folder is no finished run, its program moved, changed, or has other parameters.
+        """
+        folder = Path(folder)
+        record = read_record(folder)
+        if not isinstance(program, Program):
+            program = _load_recorded(folder, record["program"], program)
+        tensors, _ = read_tensors(folder / PARAMETERS)
+        have = {name: tuple(value.shape) for name, value in program.state_dict().items()}
+        found = {name: tuple(value.shape) for name, value in tensors.items()}
+        if have != found:
+            differing = sorted(name for name in have.keys() | found.keys() if have.get(name) != found.get(name))
+            raise RunError(
+                f"{folder}: the parameters do not fit program {type(program).__name__}: {', '.join(differing)}"
+            )
+        program.load_state_dict(tensors)
+        trained = Trained(
+            history=record["history"], best=record["best_step"] or 0, interrupted=record["status"] == "interrupted"
+        )
+        return cls(
+            program=program,
+            recipe=record["recipe"],
+            settings=record["settings"],
+            seed=record["seed"],
+            known_start=record["known_start"],
+            trained=trained if record["history"] else None,
+            notes=record["notes"],
+        )
+
+
+def open_run(folder: str | Path, *, force: bool = False, resume: bool = False) -> Path:
+    """Make a run folder.
+
+    Raises:
+        RunError: it exists and neither `force` nor `resume` is given, or it cannot be made.
+    """
+    folder = Path(folder)
+    if folder.exists() and not (force or resume):
+        raise RunError(f"{folder} exists: choose another folder, or --force to overwrite, or --resume to go on")
+    if resume and not (folder / CHECKPOINT).is_file():
+        raise RunError(f"{folder} has no {CHECKPOINT} to resume from")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not resume:
+            for name in (PARAMETERS, RECORD, POSTERIOR, CHECKPOINT):
+                (folder / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise RunError(f"{folder} cannot be written: {error.strerror}") from error
+    return folder
+
+
+def write_record(folder: Path, record: dict[str, Any]) -> None:
+    """Write `run.json`, whole or not at all."""
+    beside = folder / (RECORD + ".partial")
+    beside.write_text(json.dumps(record, indent=1) + "\n")
+    os.replace(beside, folder / RECORD)
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """Read `run.json`.
+
+    Raises:
+        RunError: there is none, or it is damaged.
+    """
+    try:
+        return json.loads((folder / RECORD).read_text())
+    except FileNotFoundError:
+        raise RunError(f"{folder} is not a run: it has no {RECORD}") from None
+    except (OSError, ValueError) as error:
+        raise RunError(f"{folder / RECORD} is damaged: {error}") from error
+
+
+def program_source(program: Program, folder: Path) -> dict[str, str] | None:
+    """Class, file relative to the run, and the file's sha256; None for a class that has no file."""
+    program_class = type(program)
+    try:
+        file = inspect.getsourcefile(program_class)
+    except (TypeError, OSError):
+        file = None
+    if file is None or not Path(file).is_file():
+        return None
+    return {
+        "class": program_class.__qualname__,
+        "file": os.path.relpath(file, folder.resolve()),
+        "sha256": sha256(Path(file)),
+    }
+
+
+def sha256(file: Path) -> str:
+    """The hash of a file, in hexadecimal."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def _load_recorded(folder: Path, source: dict[str, str] | None, moved: str | Path | None) -> Program:
+    if moved is not None:
+        return load_program(moved)
+    if source is None:
+        raise RunError(f"{folder}: its program came from no file: name it with --program PATH (or pass `program=`)")
+    file = folder.resolve() / source["file"]
+    if not file.is_file():
+        raise RunError(f"{folder}: its program {source['file']} is gone: name it with --program PATH")
+    if sha256(file) != source["sha256"]:
+        raise RunError(
+            f"{folder}: its program {source['file']} changed since the fit: fit again, or accept it with --program PATH"
+        )
+    return load_program(f"{file}:{source['class']}")
+
+
+def versions() -> dict[str, str]:
+    """Versions that a result may depend on."""
+    found = {"python": platform.python_version(), "torch_threads": str(torch.get_num_threads())}
+    for package in ("steady-ppl", "torch", "pyro-ppl", "numpy"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            print(f"{package} is not installed as a package: its version is not recorded", file=sys.stderr)
+    return found

@@ -1,0 +1,46 @@
+"""The joint density of one program over whole trajectories: what the M step and SVI differentiate."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+
+import pyro
+import pyro.distributions as dist
+from pyro.distributions import constraints
+
+from steady_ppl.data import Trajectories
+from steady_ppl.particle_filter import KnownStart
+from steady_ppl.program import Program
+from steady_ppl.sites import Observing, masked
+
+
+class Joint:
+    """The program as a Pyro model of whole trajectories, every step evaluated at once.
+
+    The site `states` carries what a guide knows about the states, at density one; with the channel noise that goes with
+    them the transitions need no loop over time. Draws, if any, are at dimension −3, rows at −2, trajectories at −1.
+
+    Args:
+        program: the state-space model.
+        known_start: the first state is certain and not scored.
+    """
+
+    def __init__(self, program: Program, *, known_start: bool = False) -> None:
+        self.program, self.known_start = program, known_start
+
+    def __call__(self, data: Trajectories) -> None:
+        """The model. `data` is as returned by `for_program`."""
+        rows, trajectories = data.time.shape
+        dimension = len(self.program.states)
+        with pyro.plate("trajectory", trajectories, dim=-1):
+            with pyro.plate("row", rows, dim=-2), masked(data.rows):
+                states = pyro.sample("states", dist.ImproperUniform(constraints.real_vector, (), (dimension,)))
+            with ExitStack() as stack:
+                stack.enter_context(pyro.plate("first_row", 1, dim=-2))
+                if self.known_start:
+                    stack.enter_context(KnownStart(data.known_start))
+                self.program.initial()
+            with pyro.plate("interval", rows - 1, dim=-2), masked(data.transitions):
+                self.program.transition(states[..., :-1, :, :], data.controls[:-1], data.elapsed[:-1], data.steps)
+            with pyro.plate("observed_row", rows, dim=-2), Observing(data.measurements, data.observed):
+                self.program.observe(states)

@@ -1,0 +1,118 @@
+"""Errors in measurement space: what was measured against what the filtered program predicted. No truth is needed."""
+
+from __future__ import annotations
+
+import math
+from contextlib import ExitStack
+
+import pyro
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.filtering import in_parts
+from steady_ppl.particle_filter import particle_filter, roll_out
+from steady_ppl.program import Program
+from steady_ppl.resampling import systematic, take
+from steady_ppl.sites import AtMean, Recording, as_vector, residual
+
+OPEN_LOOP = {"open_loop_1s": 1.0, "open_loop_3s": 3.0}
+OPEN_LOOP_DRAWS = 64
+
+
+@torch.no_grad()
+def measurement_errors(program: Program, data: Trajectories, *, particles: int, known_start: bool) -> dict[str, float]:
+    """Root mean square of measured minus predicted over all measured cells, and the coverage of 90 % intervals.
+
+    `one_step` and `coverage_90` judge the prediction of each row from the rows before it. `open_loop_1s` (and `_3s`)
+    starts 64 filtered particles at each row and runs them without noise over the rows that make up that time.
+    Measurement noise is part of every one of these errors.
+
+    Args:
+        program: the state-space model.
+        data: as returned by `for_program`; all its rows are used.
+        particles: N, for each trajectory.
+        known_start: start at the true first state.
+
+    Returns:
+        `one_step`, `open_loop_1s`, `open_loop_3s` in the measurements' unit, and `coverage_90` between 0 and 1; an
+        open loop that is longer than every trajectory is left out.
+    """
+    totals: dict[str, list[float]] = {}
+    for part in in_parts(data, particles):
+        for name, (total, count) in _totals(program, part, particles, known_start).items():
+            have = totals.setdefault(name, [0.0, 0.0])
+            have[0] += total
+            have[1] += count
+    means = {name: total / count for name, (total, count) in totals.items() if count}
+    return {name: mean if name == "coverage_90" else math.sqrt(mean) for name, mean in means.items()}
+
+
+def _totals(program: Program, data: Trajectories, particles: int, known_start: bool) -> dict[str, tuple[float, float]]:
+    squares, covered, count = 0.0, 0.0, 0.0
+    draws: list[Tensor] = []
+
+    def on_frame(row: int, states: Tensor, before: Tensor, after: Tensor) -> None:
+        nonlocal squares, covered, count
+        draws.append(take(states, systematic(after, OPEN_LOOP_DRAWS)))
+        observed = data.observed[row]
+        if row == 0 or not bool(observed.any()):
+            return
+        weights = before.exp().unsqueeze(-1)
+        error, noise = _residuals(program, states.unsqueeze(1), data.measurements[row, None])
+        mean = (weights * error.squeeze(1)).sum(0)
+        below = (weights * (noise < error).squeeze(1)).sum(0)
+        squares += float(mean[observed].square().sum())
+        covered += float(((below > 0.05) & (below < 0.95))[observed].sum())
+        count += float(observed.sum())
+
+    particle_filter(program, data, particles=particles, known_start=known_start, keep_history=False, on_frame=on_frame)
+    totals = {"one_step": (squares, count), "coverage_90": (covered, count)}
+    return totals | _open_loop(program, data, torch.stack(draws, 1))
+
+
+def _open_loop(program: Program, data: Trajectories, draws: Tensor) -> dict[str, tuple[float, float]]:
+    rows = data.time.shape[0]
+    step = float(data.steps[data.transitions].median())
+    wanted = {name: round(seconds / step) for name, seconds in OPEN_LOOP.items() if round(seconds / step) < rows}
+    totals: dict[str, tuple[float, float]] = {}
+    for name, horizon in wanted.items():
+        starts = rows - horizon
+
+        def windows(values: Tensor, horizon: int = horizon, starts: int = starts) -> Tensor:
+            return torch.stack([values[k : k + starts] for k in range(horizon)])
+
+        *_, state = roll_out(
+            program,
+            draws[:, :starts],
+            windows(data.controls),
+            windows(data.elapsed),
+            windows(data.steps),
+            handler=AtMean(),
+        )
+        error, _ = _residuals(program, state, data.measurements[horizon:])
+        observed = data.observed[horizon:]
+        totals[name] = (float(error.mean(0)[observed].double().square().sum()), float(observed.sum()))
+    return totals
+
+
+def _residuals(program: Program, states: Tensor, measurements: Tensor) -> tuple[Tensor, Tensor]:
+    """Measured minus predicted, and one draw of the measurement noise, both `(..., K)`."""
+    recording = Recording()
+    with ExitStack() as stack:
+        stack.enter_context(poutine.block())
+        stack.enter_context(pyro.validation_enabled(False))
+        for dim, size in enumerate(reversed(states.shape[:-1]), start=1):
+            stack.enter_context(pyro.plate(f"dim_{dim}", size, dim=-dim))
+        stack.enter_context(recording)
+        program.observe(states)
+    errors, noises, column = [], [], 0
+    for site, fn in recording.distributions.items():
+        drawn = recording.values[site]
+        width = fn.event_shape.numel()
+        measured = measurements[..., column : column + width]
+        column += width
+        errors.append(as_vector(residual(fn, measured if fn.event_dim else measured[..., 0]), fn.event_dim))
+        noises.append(as_vector(residual(fn, drawn), fn.event_dim))
+    return torch.cat(errors, -1), torch.cat(noises, -1)

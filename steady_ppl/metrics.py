@@ -1,0 +1,108 @@
+"""The errors of the paper, and errors in measurement space that need no truth.
+
+Definitions: STEADY (IROS 2022), section V, as its authors' code computes them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.filtering import in_parts
+from steady_ppl.particle_filter import particle_filter, roll_out
+from steady_ppl.planar_vehicle import wrap
+from steady_ppl.program import Program, error_groups, names
+from steady_ppl.sites import AtMean
+
+Errors = dict[str, float]
+
+
+def squared_errors(program: Program, states: Tensor, truth: Tensor) -> dict[str, Tensor]:
+    """Squared errors `(...)` of each of the program's error groups, angles on the circle; NaN where unknown."""
+    difference = states - truth
+    order = names(program.states)
+    for name in program.angles:
+        index = order.index(name)
+        difference[..., index] = wrap(difference[..., index])
+    return {group: difference[..., list(members)].square().sum(-1) for group, members in error_groups(program).items()}
+
+
+@torch.no_grad()
+def state_estimation(
+    program: Program, data: Trajectories, *, particles: int, known_start: bool, every: int = 10, lineages: int = 1000
+) -> Errors:
+    """Errors of smoothed lineages, measured at every n-th row and judged at all rows.
+
+    The squared error is averaged over lineages and rows; its root is averaged over trajectories.
+
+    Args:
+        program: the state-space model.
+        data: as returned by `for_program`, with the true states.
+        particles: N, for each trajectory.
+        known_start: start at the true first state.
+        every: use the measurements of every n-th row only.
+        lineages: paths for each trajectory.
+
+    Returns:
+        Error group → error, groups without truth left out.
+    """
+    assert data.states is not None
+    roots: dict[str, list[Tensor]] = {}
+    for part in in_parts(data.observed_every(every), particles):
+        assert part.states is not None
+        filtered = particle_filter(program, part, particles=particles, known_start=known_start)
+        paths = filtered.paths(lineages)
+        rows = part.rows
+        for group, squared in squared_errors(program, paths.states, part.states).items():
+            mean = torch.where(rows, squared.mean(0), 0.0).sum(0) / rows.sum(0)
+            roots.setdefault(group, []).append(mean.sqrt())
+    errors = {group: float(torch.cat(values).mean()) for group, values in roots.items()}
+    return {group: error for group, error in errors.items() if not math.isnan(error)}
+
+
+@torch.no_grad()
+def forward(program: Program, data: Trajectories, *, horizon: int = 10, rollouts: int = 1000) -> Errors:
+    """End-point errors of noisy roll-outs from every true state, with the recorded controls.
+
+    One root of the squared error averaged over roll-outs, starts and trajectories: the process noise counts in it.
+    """
+    return _forward(program, data, horizon, rollouts, mean=False)
+
+
+@torch.no_grad()
+def forward_mean(program: Program, data: Trajectories, *, horizon: int = 10) -> Errors:
+    """The same for one roll-out without channel noise."""
+    return _forward(program, data, horizon, 1, mean=True)
+
+
+def _forward(program: Program, data: Trajectories, horizon: int, rollouts: int, mean: bool) -> Errors:
+    assert data.states is not None
+    starts = data.time.shape[0] - horizon
+    counted = data.rows[horizon:] & torch.isfinite(data.states[:-horizon]).all(-1)
+    origin = torch.where(counted[..., None], data.states[:-horizon], 0.0)
+    sums: dict[str, float] = {}
+    at_once = max(1, 500_000 // counted.numel())
+    for first in range(0, rollouts, at_once):
+        draws = min(at_once, rollouts - first)
+        end = _end_of_roll_out(program, data, origin.expand(draws, *origin.shape), horizon, starts, mean)
+        for group, squared in squared_errors(program, end, data.states[horizon:]).items():
+            sums[group] = sums.get(group, 0.0) + float(squared[:, counted].double().sum())
+    errors = {group: math.sqrt(total / (rollouts * int(counted.sum()))) for group, total in sums.items()}
+    return {group: error for group, error in errors.items() if not math.isnan(error)}
+
+
+def _end_of_roll_out(
+    program: Program, data: Trajectories, state: Tensor, horizon: int, starts: int, mean: bool
+) -> Tensor:
+    def windows(values: Tensor) -> Tensor:
+        return torch.stack([values[k : k + starts] for k in range(horizon)])
+
+    handler = AtMean() if mean else None
+    for state in roll_out(  # noqa: B007, B020
+        program, state, windows(data.controls), windows(data.elapsed), windows(data.steps), handler=handler
+    ):
+        pass
+    return state

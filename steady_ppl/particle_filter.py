@@ -1,0 +1,269 @@
+"""The bootstrap particle filter: the Pyro program itself, forward in time, for many particles and trajectories.
+
+Gordon, Salmond and Smith (1993); Chopin and Papaspiliopoulos (2020), algorithms 10.1 and 10.3 (adaptive resampling).
+Densities live in the channels: a particle is a start and its channel noise, its states follow.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import pyro
+import pyro.distributions as dist
+import torch
+from pyro import poutine
+from pyro.poutine.messenger import Messenger
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import FilterError, ProgramError
+from steady_ppl.program import Program
+from steady_ppl.resampling import effective_sample_size, normalise, systematic, take
+from steady_ppl.sites import Observing, Recording, broadcast_event
+
+OnFrame = Callable[[int, Tensor, Tensor, Tensor], None]
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Equally weighted draws of whole trajectories, with everything that the joint density needs.
+
+    Attributes:
+        states: `(M, T + 1, B, D)`.
+        start: value of each site of `initial`, `(M, 1, B, ...)`.
+        noise: value of each site of `transition`, `(M, T, B, ...)`.
+        event_dims: event dimension of each of these sites.
+    """
+
+    states: Tensor
+    start: dict[str, Tensor]
+    noise: dict[str, Tensor]
+    event_dims: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """What a filter leaves behind.
+
+    Attributes:
+        log_likelihood: `(B,)` the estimate of log p(y), whose exponential is unbiased at observation weight 1.
+        log_weights: `(N, B)` normalised weights of the last row's particles.
+        effective_sizes: `(T + 1, B)` effective sample size after each observed row; N elsewhere.
+        roots: `(B,)` how many of the first row's particles still have descendants at the end.
+        states, start, noise, ancestors: the particles' history, a tensor a row; empty when it was not kept.
+    """
+
+    log_likelihood: Tensor
+    log_weights: Tensor
+    effective_sizes: Tensor
+    roots: Tensor
+    states: list[Tensor]
+    start: dict[str, Tensor]
+    noise: dict[str, list[Tensor]]
+    ancestors: list[Tensor | None]
+    event_dims: dict[str, int]
+
+    def paths(self, draws: int) -> Paths:
+        """Equally weighted paths, resampled systematically from all surviving lineages and traced back."""
+        index = systematic(self.log_weights, draws)
+        states, noise = [take(self.states[-1], index)], {site: list[Tensor]() for site in self.noise}
+        for row in range(len(self.states) - 2, -1, -1):
+            for site, values in self.noise.items():
+                noise[site].append(take(values[row], index))
+            ancestors = self.ancestors[row]
+            if ancestors is not None:
+                index = take(ancestors, index)
+            states.append(take(self.states[row], index))
+        return Paths(
+            states=torch.stack(states[::-1], 1),
+            start={site: take(value, index).unsqueeze(1) for site, value in self.start.items()},
+            noise={site: torch.stack(values[::-1], 1) for site, values in noise.items()},
+            event_dims=self.event_dims,
+        )
+
+
+class KnownStart(Messenger):
+    """Replace the prior of `initial` by certainty about the first state.
+
+    Args:
+        state: `(B, D)`.
+    """
+
+    def __init__(self, state: Tensor) -> None:
+        super().__init__()
+        self.state = state
+
+    def _pyro_sample(self, message: Any) -> None:
+        if tuple(message["fn"].event_shape) != (self.state.shape[-1],):
+            raise ProgramError(
+                f"a known start needs initial() to sample the whole state as one site of event shape "
+                f"({self.state.shape[-1]},); site {message['name']!r} has {tuple(message['fn'].event_shape)}",
+                site=message["name"],
+            )
+        message["fn"] = dist.Delta(self.state, event_dim=1)
+
+
+@contextmanager
+def _particle_plates(particles: int, trajectories: int) -> Iterator[None]:
+    """Plates of the sequential run, hidden from any handler outside."""
+    with ExitStack() as stack:
+        stack.enter_context(poutine.block())
+        stack.enter_context(pyro.validation_enabled(False))
+        stack.enter_context(pyro.plate("particle", particles, dim=-3))
+        stack.enter_context(pyro.plate("row", 1, dim=-2))
+        stack.enter_context(pyro.plate("trajectory", trajectories, dim=-1))
+        yield
+
+
+@torch.no_grad()
+def particle_filter(
+    program: Program,
+    data: Trajectories,
+    *,
+    particles: int,
+    observation_weight: float = 1.0,
+    known_start: bool = False,
+    resample_below: float = 0.5,
+    keep_history: bool = True,
+    on_frame: OnFrame | None = None,
+) -> Filtered:
+    """Run the program as a bootstrap filter on every trajectory at once.
+
+    Args:
+        program: the state-space model.
+        data: as returned by `for_program`.
+        particles: N, for each trajectory.
+        observation_weight: tempers the observations' log-density (w_obs in STEADY).
+        known_start: start every particle at the true first state instead of drawing it from the prior.
+        resample_below: resample a trajectory when its effective sample size falls below this share of N;
+            checked at its observed rows, never at the last one.
+        keep_history: keep what `Filtered.paths` needs.
+        on_frame: called at every row with (row, states `(N, B, D)`, log-weights before, log-weights after), `(N, B)`.
+
+    Returns:
+        The estimate of log p(y) and, with `keep_history`, the genealogy.
+
+    Raises:
+        FilterError: every weight is zero or a particle is not finite; names trajectory and time.
+    """
+    rows, trajectories = data.time.shape
+    steps, elapsed, last = data.steps, data.elapsed, rows - 1
+    observed_rows = data.observed.any(-1).any(-1).tolist()
+    start = Recording()
+    with _particle_plates(particles, trajectories):
+        with ExitStack() as stack:
+            if known_start:
+                stack.enter_context(KnownStart(data.known_start))
+            stack.enter_context(start)
+            state = program.initial()
+        left = torch.Size((particles, 1, trajectories))
+        state = broadcast_event(state, left, 1)
+        event_dims = {"states": 1} | {site: fn.event_dim for site, fn in start.distributions.items()}
+        log_weights = state.new_full((particles, trajectories), -math.log(particles), dtype=torch.float64)
+        log_likelihood = log_weights.new_zeros((rows, trajectories))
+        effective_sizes = log_weights.new_full((rows, trajectories), float(particles))
+        roots = torch.arange(particles, device=state.device)[:, None].expand(-1, trajectories)
+        history: list[Tensor] = []
+        noise: dict[str, list[Tensor]] = {}
+        all_ancestors: list[Tensor | None] = []
+
+        for row in range(rows):
+            if keep_history:
+                history.append(state.squeeze(1))
+            predicted = log_weights
+            ancestors = None
+            if observed_rows[row]:
+                recording = Recording()
+                measured = Observing(data.measurements[row, None], data.observed[row, None], observation_weight)
+                with recording, measured:
+                    program.observe(state)
+                log_weights, log_likelihood[row] = normalise(log_weights + recording.total().squeeze(-2))
+                size = effective_sample_size(log_weights)
+                effective_sizes[row] = size
+                if row < last and resample_below > 0:
+                    exhausted = size < resample_below * particles
+                    if state.device.type != "cpu" or bool(exhausted.any()):
+                        ancestors = systematic(log_weights, particles)
+                        unmoved = torch.arange(particles, device=state.device)[:, None]
+                        ancestors = torch.where(exhausted, ancestors, unmoved)
+            if on_frame is not None:
+                on_frame(row, state.squeeze(1), predicted, log_weights)
+            if keep_history:
+                all_ancestors.append(ancestors)
+            if row == last:
+                break
+            if ancestors is not None:
+                log_weights = torch.where(exhausted, -math.log(particles), log_weights)
+                state, roots = take(state.squeeze(1), ancestors).unsqueeze(1), take(roots, ancestors)
+            recording = Recording()
+            with recording:
+                state = program.transition(state, data.controls[row, None], elapsed[row, None], steps[row, None])
+            if row == 0:
+                event_dims |= {site: fn.event_dim for site, fn in recording.distributions.items()}
+            if keep_history:
+                for site, value in recording.values.items():
+                    noise.setdefault(site, []).append(value.squeeze(1))
+
+    _raise_if_broken(log_likelihood, data)
+    survivors = torch.zeros_like(log_weights).scatter_(0, roots, 1.0).sum(0)
+    return Filtered(
+        log_likelihood=log_likelihood.sum(0),
+        log_weights=log_weights,
+        effective_sizes=effective_sizes,
+        roots=survivors,
+        states=history,
+        start={site: broadcast_event(value, left, event_dims[site]).squeeze(1) for site, value in start.values.items()},
+        noise=noise,
+        ancestors=all_ancestors,
+        event_dims=event_dims,
+    )
+
+
+def _raise_if_broken(log_likelihood: Tensor, data: Trajectories) -> None:
+    """Find the first row whose evidence is not finite."""
+    broken = ~torch.isfinite(log_likelihood)
+    if not bool(broken.any()):
+        return
+    row, trajectory = (int(i) for i in broken.nonzero()[0])
+    label, time = data.labels[trajectory], float(data.elapsed[row, trajectory])
+    impossible = bool(log_likelihood[row, trajectory] == -math.inf)
+    what = (
+        "every particle's weight is zero: the measurement is impossible under the program"
+        if impossible
+        else "a particle is not a number: the program's parameters or states have blown up"
+    )
+    raise FilterError(f"trajectory {label} at {time:.3g} s: {what}", trajectory=label, time=time)
+
+
+@torch.no_grad()
+def roll_out(
+    program: Program,
+    state: Tensor,
+    controls: Tensor,
+    elapsed: Tensor,
+    steps: Tensor,
+    *,
+    handler: Messenger | None = None,
+) -> Iterator[Tensor]:
+    """Run the program forward from given states; yields the state after each step.
+
+    Args:
+        state: `(draws, 1 or R, B, D)`; rows R are starts of a roll-out of their own.
+        controls: `(H, 1 or R, B, U)`.
+        elapsed, steps: `(H, 1 or R, B)` s.
+        handler: acts on the channel noise, for example `AtMean()` for a roll-out without noise.
+    """
+    for control, time, step in zip(controls, elapsed, steps, strict=True):
+        with ExitStack() as stack:
+            stack.enter_context(poutine.block())
+            stack.enter_context(pyro.validation_enabled(False))
+            for dim, size in enumerate(reversed(state.shape[:-1]), start=1):
+                stack.enter_context(pyro.plate(f"dim_{dim}", size, dim=-dim))
+            if handler is not None:
+                stack.enter_context(handler)
+            state = program.transition(state, control, time, step)
+        yield state

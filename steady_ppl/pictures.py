@@ -1,0 +1,53 @@
+"""Pictures for notebooks and papers; each function draws on matplotlib axes and returns them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import arviz
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+
+POSTERIOR, TRUTH, LANDMARK = "#0072b2", "black", "#d55e00"
+
+
+def posterior_trajectories(
+    posterior: arviz.InferenceData,
+    trajectory: str,
+    *,
+    landmarks: Sequence[Sequence[float]] = (),
+    axes: Axes | None = None,
+    color: str = POSTERIOR,
+    label: str = "posterior draws",
+    shown: int = 50,
+) -> Axes:
+    """Draws of one trajectory in the plane, with the truth where it is known, and the landmarks.
+
+    Args:
+        posterior: of `Fit.posterior`, of a program with the state components x and y.
+        trajectory: its label.
+        landmarks: `(K, 2)` m.
+        axes: drawn on; new ones when not given.
+        shown: draw at most so many paths.
+    """
+    axes = axes if axes is not None else plt.subplots(figsize=(5, 5))[1]
+    draws = posterior["posterior"].sel(trajectory=trajectory, chain=0)
+    for index in range(min(shown, draws.sizes["draw"])):
+        draw = draws.isel(draw=index)
+        axes.plot(draw["x"], draw["y"], color=color, alpha=0.15, lw=0.8, label=label if index == 0 else None)
+    constants = posterior["constant_data"].sel(trajectory=trajectory)
+    if "true_x" in constants and bool(constants["true_x"].notnull().sum() > 1):
+        axes.plot(constants["true_x"], constants["true_y"], color=TRUTH, lw=1.4, ls="--", label="truth")
+    if len(landmarks):
+        xs, ys = zip(*landmarks, strict=True)
+        axes.plot(xs, ys, "^", color=LANDMARK, ms=8, label="landmark", clip_on=True)
+    unit: Any = draws["x"].attrs.get("units", "")
+    axes.set_xlabel(f"x [{unit}]")
+    axes.set_ylabel(f"y [{unit}]")
+    axes.set_aspect("equal", "datalim")
+    axes.set_title(f"trajectory {trajectory}")
+    for line in axes.get_lines():
+        if line.get_label() == label:
+            line.set_rasterized(True)
+    return axes

@@ -1,0 +1,124 @@
+"""Vehicles in the plane that see bearings to landmarks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import pyro.distributions as dist
+import torch
+from pyro.distributions import constraints
+from torch import Tensor
+
+from steady_ppl.program import Program
+
+
+class PlanarVehicle(Program):
+    """A vehicle with state (x, y, heading, vx, vy, yaw_rate): pose and velocity in the world frame.
+
+    A subclass samples the body-frame accelerations and returns `self.integrate(state, acceleration, step)`.
+
+    Attributes:
+        landmarks: positions that bearings are measured to, m.
+    """
+
+    states = ("x [m]", "y [m]", "heading [rad]", "vx [m/s]", "vy [m/s]", "yaw_rate [rad/s]")
+    channels = ("forward [m/s²]", "lateral [m/s²]", "yaw [rad/s²]")
+    angles: ClassVar = ("heading",)
+    error_groups: ClassVar = {
+        "location": ("x", "y"),
+        "angle": ("heading",),
+        "velocity": ("vx", "vy"),
+        "yaw_rate": ("yaw_rate",),
+    }
+    landmarks: Sequence[Sequence[float]] = ()
+
+    @property
+    def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
+        """One bearing a landmark."""
+        return tuple(f"bearing_{i} [rad]" for i in range(len(self.landmarks)))
+
+    def integrate(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
+        """Explicit Euler with the old pose and velocity.
+
+        Args:
+            state: `(..., 6)`.
+            acceleration: `(..., 3)` forward, lateral (m/s²) and yaw (rad/s²), in the body frame.
+            step: `(...)` s.
+
+        Returns:
+            The next state, `(..., 6)`.
+        """
+        x, y, heading, vx, vy, yaw_rate = state.unbind(-1)
+        forward, lateral, yaw = acceleration.unbind(-1)
+        cos, sin = heading.cos(), heading.sin()
+        return stack(
+            x + vx * step,
+            y + vy * step,
+            heading + yaw_rate * step,
+            vx + (cos * forward - sin * lateral) * step,
+            vy + (sin * forward + cos * lateral) * step,
+            yaw_rate + yaw * step,
+        )
+
+    def body_velocity(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Forward and lateral velocity (m/s) and yaw rate (rad/s), each `(...)`."""
+        _, _, heading, vx, vy, yaw_rate = state.unbind(-1)
+        cos, sin = heading.cos(), heading.sin()
+        return cos * vx + sin * vy, cos * vy - sin * vx, yaw_rate
+
+
+def stack(*components: Tensor) -> Tensor:
+    """Stack components along the last dimension, laid out component by component so that each stays contiguous."""
+    return torch.stack(torch.broadcast_tensors(*components)).movedim(0, -1)
+
+
+def wrap(angle: Tensor) -> Tensor:
+    """The same angle in [−π, π]."""
+    return angle - 2 * math.pi * (angle / (2 * math.pi)).round()
+
+
+class WrappedNormal(dist.Normal):
+    """Normal(0, scale) on the difference of two angles, wrapped to [−π, π].
+
+    For scale ≪ π (.35 rad at 20°) the neglected windings hold less than 10⁻¹⁸ of the mass.
+    """
+
+    support = constraints.real
+
+    def residual(self, value: Tensor) -> Tensor:
+        """`value − loc`, wrapped."""
+        return wrap(value - self.loc)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return -0.5 * (self.residual(value) / self.scale) ** 2 - self.scale.log() - 0.5 * math.log(2 * math.pi)
+
+    def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:
+        return wrap(super().rsample(torch.Size(sample_shape)))
+
+    def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
+        with torch.no_grad():
+            return self.rsample(sample_shape)
+
+
+def bearings_to(landmarks: Sequence[Sequence[float]] | Tensor, state: Tensor, sd: float | Tensor) -> dist.Independent:
+    """Bearings to landmarks relative to the heading, with independent noise.
+
+    Nearer than 0.1 m the noise grows as 0.1/distance, at most tenfold.
+
+    Args:
+        landmarks: `(K, 2)` m.
+        state: `(..., 6)`, x, y and heading first.
+        sd: rad.
+
+    Returns:
+        A distribution over `(..., K)` rad.
+    """
+    places = torch.as_tensor(landmarks, dtype=state.dtype, device=state.device)
+    x, y, heading = state[..., 0], state[..., 1], state[..., 2]
+    to_x = places[:, 0] - x.unsqueeze(-1)
+    to_y = places[:, 1] - y.unsqueeze(-1)
+    nearness = (to_x * to_x + to_y * to_y).clamp(1e-4, 1e-2).rsqrt() * 0.1
+    bearing = torch.atan2(to_y, to_x) - heading.unsqueeze(-1)
+    return WrappedNormal(bearing, sd * nearness).to_event(1)

@@ -1,0 +1,124 @@
+"""Posterior trajectories as ArviZ InferenceData, with named coordinates and units."""
+
+from __future__ import annotations
+
+import arviz
+import numpy as np
+import torch
+import xarray
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.filtering import in_parts
+from steady_ppl.particle_filter import particle_filter
+from steady_ppl.program import Program, for_program, names, units
+from steady_ppl.seeding import seeded
+from steady_ppl.sites import as_vector
+
+DIMENSIONS = ("chain", "draw", "trajectory", "row")
+
+
+def posterior(
+    program: Program,
+    data: Trajectories,
+    *,
+    draws: int = 100,
+    particles: int = 5000,
+    every: int = 1,
+    known_start: bool = False,
+    seed: int = 0,
+) -> arviz.InferenceData:
+    """Draw whole trajectories given all of their measurements.
+
+    Args:
+        program: the state-space model.
+        data: drives with the program's columns.
+        draws: equally weighted paths for each trajectory, resampled from all surviving lineages.
+        particles: N of the filter, for each trajectory.
+        every: use the measurements of every n-th row only.
+        known_start: start at the true first state.
+        seed: the same seed gives the same draws.
+
+    Returns:
+        `posterior`: one variable a state component and one a noise site, over (chain, draw, trajectory, row), NaN past
+        a trajectory's end (the noise of row t acts from t to t + 1); `observed_data`: the measurements used;
+        `constant_data`: time, controls and, where known, the true states. Units are in each variable's attributes.
+    """
+    run = for_program(program, data).observed_every(every)
+    states: list[Tensor] = []
+    noise: dict[str, list[Tensor]] = {}
+    evidence: list[Tensor] = []
+    with seeded(seed, "posterior"):
+        for part in in_parts(run, particles):
+            filtered = particle_filter(program, part, particles=particles, known_start=known_start)
+            paths = filtered.paths(draws)
+            states.append(paths.states)
+            evidence.append(filtered.log_likelihood)
+            for site, value in paths.noise.items():
+                noise.setdefault(site, []).append(as_vector(value, paths.event_dims[site]))
+    coordinates = {
+        "chain": [0],
+        "draw": np.arange(draws),
+        "trajectory": list(run.labels),
+        "row": np.arange(run.time.shape[0]),
+    }
+    inside = run.rows.t().numpy(force=True)
+    variables: dict[str, tuple] = {}
+    path = _draws(torch.cat(states, 2))
+    for index, (name, unit) in enumerate(zip(names(program.states), units(program.states), strict=True)):
+        values = np.where(inside, path[..., index], np.nan)
+        variables[name] = (DIMENSIONS, values, {"units": unit})
+    for site, parts in noise.items():
+        values = _draws(torch.cat(parts, 2))
+        missing = np.full((*values.shape[:3], 1, values.shape[-1]), np.nan, values.dtype)
+        values = np.concatenate([values, missing], 3)
+        values[:, :, ~np.roll(inside, -1, 1) | ~inside] = np.nan
+        dimension = f"{site}_channel"
+        labels = names(program.channels)
+        known = len(labels) == values.shape[-1]
+        coordinates[dimension] = list(labels) if known else [f"{site}_{i}" for i in range(values.shape[-1])]
+        attributes = {"units": list(units(program.channels))} if known else {}
+        variables[site if site not in variables else f"{site}_noise"] = ((*DIMENSIONS, dimension), values, attributes)
+    return arviz.InferenceData(
+        posterior=xarray.Dataset(variables, coordinates, {"program": type(program).__name__, "particles": particles}),
+        observed_data=_observed(program, run, coordinates),
+        constant_data=_constants(program, run, coordinates, torch.cat(evidence)),
+    )
+
+
+def _draws(values: Tensor) -> np.ndarray:
+    """`(M, rows, B, ·)` to `(1, M, B, rows, ·)`."""
+    return values.transpose(1, 2).unsqueeze(0).numpy(force=True).copy()
+
+
+def _by_trajectory(values: Tensor) -> np.ndarray:
+    return values.t().double().numpy(force=True).copy()
+
+
+def _observed(program: Program, data: Trajectories, coordinates: dict) -> xarray.Dataset:
+    shown = {name: coordinates[name] for name in ("trajectory", "row")}
+    measured = torch.where(data.observed, data.measurements, torch.nan)
+    return xarray.Dataset(
+        {
+            f"measured_{name}": (("trajectory", "row"), _by_trajectory(measured[..., index]), {"units": unit})
+            for index, (name, unit) in enumerate(
+                zip(names(program.measurements), units(program.measurements), strict=True)
+            )
+        },
+        shown,
+    )
+
+
+def _constants(program: Program, data: Trajectories, coordinates: dict, evidence: Tensor) -> xarray.Dataset:
+    shown = {name: coordinates[name] for name in ("trajectory", "row")}
+    both = ("trajectory", "row")
+    variables = {
+        "time": (both, _by_trajectory(data.elapsed), {"units": "s"}),
+        "log_likelihood": (("trajectory",), evidence.numpy(force=True), {"units": "nat"}),
+    }
+    for index, (name, unit) in enumerate(zip(names(program.controls), units(program.controls), strict=True)):
+        variables[f"control_{name}"] = (both, _by_trajectory(data.controls[..., index]), {"units": unit})
+    if data.states is not None:
+        for index, (name, unit) in enumerate(zip(names(program.states), units(program.states), strict=True)):
+            variables[f"true_{name}"] = (both, _by_trajectory(data.states[..., index]), {"units": unit})
+    return xarray.Dataset(variables, shown)

@@ -1,0 +1,183 @@
+"""The form of a program: `initial`, `transition` and `observe` on a PyroModule, written for any shape on the left.
+
+The latent variables are the start and the channel noise; the states follow from them, so no density over poses, which
+would be singular, is ever needed. The engine runs the same three methods forward in time, for many particles, and for
+all times at once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import inspect
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import torch
+from pyro.nn import PyroModule
+from torch import Tensor
+
+from steady_ppl.errors import ProgramError
+
+if TYPE_CHECKING:
+    from steady_ppl.data import Trajectories
+
+
+class Program(PyroModule):
+    """A state-space model as a Pyro program.
+
+    A subclass declares its components as "name [unit]" and writes three methods. `...` is any shape, the same for all
+    arguments: times and steps are `(...)`, states `(..., D)`, controls `(..., U)`.
+
+    Attributes:
+        states: names and units of the state's components.
+        controls: names and units of the controls.
+        measurements: names and units of the measurement's components, in the order of the observed sites.
+        channels: names and units of the noise channels.
+        angles: the state components that live on a circle.
+        error_groups: what an error is reported for: name → components whose Euclidean norm it is.
+        rates: learning rates relative to the recipe's, by the beginning of a parameter's name.
+        decays: weight decay relative to the recipe's, by the beginning of a parameter's name (matrices 1, others 0).
+        duration, step: of a simulated trajectory, s.
+    """
+
+    states: Sequence[str] = ()
+    controls: Sequence[str] = ()
+    measurements: Sequence[str] = ()
+    channels: Sequence[str] = ()
+    angles: ClassVar[Sequence[str]] = ()
+    error_groups: ClassVar[Mapping[str, Sequence[str]]] = {}
+    rates: ClassVar[Mapping[str, float]] = {}
+    decays: ClassVar[Mapping[str, float]] = {}
+    duration: float = 10.0
+    step: float = 0.1
+
+    def initial(self) -> Tensor:
+        """Sample the start; returns the first state, `(..., D)`."""
+        raise ProgramError(f"program {type(self).__name__} lacks the method initial(self)", site="initial")
+
+    def transition(self, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
+        """Sample the channel noise and move on by `step`; returns the next state, `(..., D)`."""
+        raise ProgramError(
+            f"program {type(self).__name__} lacks the method transition(self, state, control, time, step)",
+            site="transition",
+        )
+
+    def observe(self, state: Tensor) -> None:
+        """Sample the measurement of `state`, without `obs=`: the engine conditions and masks."""
+        raise ProgramError(f"program {type(self).__name__} lacks the method observe(self, state)", site="observe")
+
+    def example_controls(self, time: Tensor) -> Tensor:
+        """Controls of simulated drives, `(rows, trajectories, U)` at `time` of `(rows, trajectories)`; zero unless
+        a program knows better."""
+        return time.new_zeros((*time.shape, len(self.controls)))
+
+    def prepare(self, data: Trajectories, known_start: bool) -> None:
+        """Called once before learning, with the training table; a network sets its normalisation here."""
+
+    def extra_repr(self) -> str:
+        """The values of the program's own parameters."""
+        own = {
+            name.removesuffix("_unconstrained"): getattr(self, name.removesuffix("_unconstrained"))
+            for name, _ in self.named_parameters(recurse=False)
+        }
+        return ", ".join(f"{name}={_rounded(value)}" for name, value in own.items())
+
+
+def _rounded(value: Tensor) -> Any:
+    values = [float(f"{v:.4g}") for v in value.detach().flatten().tolist()]
+    return values[0] if value.dim() == 0 else values
+
+
+def names(declared: Sequence[str]) -> tuple[str, ...]:
+    """The names in a declaration such as `("left [N]", "right [N]")`."""
+    return tuple(component.split("[")[0].strip() for component in declared)
+
+
+def units(declared: Sequence[str]) -> tuple[str, ...]:
+    """The units in a declaration, empty where none is given."""
+    return tuple(component.partition("[")[2].rstrip("] ") for component in declared)
+
+
+def error_groups(program: Program) -> dict[str, tuple[int, ...]]:
+    """What errors are reported for: name → indices of the state components; each component alone by default."""
+    order = names(program.states)
+    groups = program.error_groups or {name: (name,) for name in order}
+    return {group: tuple(order.index(name) for name in members) for group, members in groups.items()}
+
+
+def for_program(program: Program, data: Trajectories) -> Trajectories:
+    """The columns that the program reads, in its order, its precision and on its device."""
+    chosen = data.select(names(program.controls), names(program.measurements), names(program.states))
+    parameter = next(program.parameters(), None)
+    if parameter is None:
+        return chosen.to(torch.get_default_dtype())
+    return chosen.to(parameter.dtype, parameter.device)
+
+
+def load_program(source: str | Path) -> Program:
+    """Load a program by path: `models/hovercraft.py` (the class named after the file) or `mine.py:Boat`.
+
+    The file is run afresh under a private module name; `from .sibling import …` finds files of its own folder.
+
+    Raises:
+        ProgramError: the file does not exist or does not import, or has no such class.
+    """
+    path, _, class_name = str(source).partition(":")
+    file = Path(path)
+    class_name = class_name or "".join(word.capitalize() for word in file.stem.split("_"))
+    module = run_file(file)
+    program_class = getattr(module, class_name, None)
+    if not (inspect.isclass(program_class) and issubclass(program_class, Program)):
+        have = [n for n, c in vars(module).items() if inspect.isclass(c) and c.__module__ == module.__name__]
+        raise ProgramError(
+            f"{file.name} has no program {class_name}; it has {', '.join(have) or 'no class'} (name one as {path}:NAME)"
+        )
+    try:
+        return program_class()
+    except ProgramError:
+        raise
+    except Exception as error:
+        raise ProgramError(f"{class_name}() of {file.name} failed: {type(error).__name__}: {error}") from error
+
+
+def run_file(file: Path) -> ModuleType:
+    """Run a Python file as a module of a private package that stands for its folder.
+
+    Raises:
+        ProgramError: the file does not exist or raises while it is imported.
+    """
+    if not file.is_file():
+        raise ProgramError(f"no file {file}")
+    folder = file.resolve().parent
+    package = "_steady_folder_" + hashlib.sha256(str(folder).encode()).hexdigest()[:12]
+    for name in [n for n in sys.modules if n == package or n.startswith(package + ".")]:
+        del sys.modules[name]
+    parent = ModuleType(package)
+    parent.__path__ = [str(folder)]
+    sys.modules[package] = parent
+    spec = importlib.util.spec_from_file_location(f"{package}.{file.stem}", file)
+    if spec is None or spec.loader is None:
+        raise ProgramError(f"{file} is not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        line = error.lineno if isinstance(error, SyntaxError) else _line_in(file, error)
+        raise ProgramError(f"{file} does not import: line {line}: {type(error).__name__}: {error}") from error
+    return module
+
+
+def _line_in(file: Path, error: BaseException) -> int | str:
+    """The last line of `file` on the way to an error."""
+    line: int | str = "?"
+    trace = error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == str(file.resolve()) or trace.tb_frame.f_code.co_filename == str(file):
+            line = trace.tb_lineno
+        trace = trace.tb_next
+    return line

@@ -1,0 +1,133 @@
+"""Find a recipe, hand it a program and tables, and keep what it learned in a run folder."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import sysconfig
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import RunError, UsageError
+from steady_ppl.fit import CHECKPOINT, RECORD, Fit, open_run, program_source, read_record, versions, write_record
+from steady_ppl.program import Program, for_program, run_file
+
+Recipe = Callable[..., Fit]
+
+
+def recipe_folder() -> Path:
+    """`inference/` of the checkout, else the copy that the wheel carries."""
+    here = Path(__file__).resolve().parent
+    for folder in (here.parent / "inference", here / "workbench" / "inference"):
+        if (folder / "steady.py").is_file():
+            return folder
+    raise UsageError(f"the recipes are missing from this installation ({sysconfig.get_path('purelib')})")
+
+
+def find_recipe(name: str) -> Recipe:
+    """The `fit` function of a recipe: a name (`fit-truth` is `inference/fit_truth.py`) or a path.
+
+    Raises:
+        UsageError: there is no such recipe, or its file has no function `fit`.
+    """
+    if name.endswith(".py"):
+        file = Path(name)
+        if not file.is_file():
+            raise UsageError(f"no recipe file {name}")
+    else:
+        folder = recipe_folder()
+        file = folder / f"{name.replace('-', '_')}.py"
+        known = sorted(path.stem.replace("_", "-") for path in folder.glob("[!_]*.py"))
+        if name not in known:
+            raise UsageError(f"no recipe {name!r}; there are {', '.join(known)}, or a PATH.py of your own")
+    found = getattr(run_file(file), "fit", None)
+    if not callable(found):
+        raise UsageError(f"recipe {file.name} has no function fit(program, table, valid, ...)")
+    return found
+
+
+def run_recipe(
+    name: str,
+    program: Program,
+    table: Trajectories,
+    valid: Trajectories | None,
+    folder: Path,
+    *,
+    options: Mapping[str, Any],
+    known_start: bool = False,
+    seed: int = 0,
+    device: str = "cpu",
+    resume: bool = False,
+    force: bool = False,
+    progress: bool = False,
+) -> Fit:
+    """Fit and save. Every input is checked before the run folder is made.
+
+    Args:
+        name: the recipe.
+        options: its own keyword arguments; one that it does not take is an error.
+        folder: the run.
+        device: "cpu" or "cuda".
+        resume: go on from the run's checkpoint; program, table, options and seed must be those of the run.
+
+    Raises:
+        UsageError: unknown recipe or option, or no such device.
+        RunError: the folder exists, or does not match on `resume`.
+    """
+    recipe = find_recipe(name)
+    takes = inspect.signature(recipe).parameters
+    for option in options:
+        if option not in takes:
+            raise UsageError(f"recipe {name} takes no --{option.replace('_', '-')}")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise UsageError("--device cuda: this machine has no CUDA device")
+    program.to(device)
+    for part in (table, valid):
+        if part is not None:
+            columns = for_program(program, part)
+            if known_start:
+                _ = columns.known_start
+    begun = {
+        "program": program_source(program, folder),
+        "recipe": name,
+        "status": "training",
+        "known_start": known_start,
+        "seed": seed,
+        "options": dict(options),
+        "table_sha256": fingerprint(table),
+        "valid_sha256": fingerprint(valid) if valid is not None else None,
+        "versions": versions(),
+    }
+    if resume:
+        _require_same(folder, begun)
+    folder = open_run(folder, force=force, resume=resume)
+    write_record(folder, begun)
+    trains = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in takes.values())
+    run = {"checkpoint": folder / CHECKPOINT, "resume": resume, "progress": progress} if trains else {}
+    fitted = recipe(program, table, valid, known_start=known_start, seed=seed, **options, **run)
+    if valid is None and trains:
+        fitted.notes.append("no --valid table: trained to the last step, nothing held out decides when to stop")
+    fitted.save_into(folder, table, begun)
+    return fitted
+
+
+def fingerprint(table: Trajectories) -> str:
+    """A hash of the times, controls and measurements."""
+    digest = hashlib.sha256()
+    for values in (table.time, table.controls, table.measurements, table.observed):
+        digest.update(values.numpy(force=True).tobytes())
+    return digest.hexdigest()
+
+
+def _require_same(folder: Path, begun: Mapping[str, Any]) -> None:
+    before = read_record(folder)
+    for key in ("program", "recipe", "known_start", "seed", "options", "table_sha256", "valid_sha256"):
+        if before.get(key) != begun[key]:
+            raise RunError(
+                f"{folder}: --resume needs the same {key.replace('_sha256', '')}: "
+                f"{before.get(key)!r} then, {begun[key]!r} now ({RECORD})"
+            )

@@ -1,0 +1,23 @@
+"""Random streams keyed by what they are for, so that a resumed run draws what the uninterrupted one would have."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+
+
+@contextmanager
+def seeded(*key: int | str) -> Iterator[None]:
+    """Run a block under a torch generator keyed by `key`; the caller's generators are left as they were.
+
+    Args:
+        key: for example `(seed, "estep", 17)`; equal keys give equal draws.
+    """
+    words = [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in key]
+    with torch.random.fork_rng():
+        torch.manual_seed(int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> 1))
+        yield

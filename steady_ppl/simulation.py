@@ -1,0 +1,77 @@
+"""Run a program forward in time without measurements."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+
+import pyro
+import torch
+from pyro import poutine
+
+from steady_ppl.data import Trajectories
+from steady_ppl.particle_filter import roll_out
+from steady_ppl.program import Program, for_program, names
+from steady_ppl.seeding import seeded
+from steady_ppl.sites import Recording, as_vector, broadcast_event
+
+
+@torch.no_grad()
+def simulate(
+    program: Program, trajectories: int | None = None, *, seed: int = 0, like: Trajectories | None = None
+) -> Trajectories:
+    """Drives of a program, with measurements and the true states.
+
+    Args:
+        program: what moves and what is measured.
+        trajectories: how many; the program's `duration`, `step` and `example_controls` apply.
+        seed: the same seed gives the same table.
+        like: take time, controls and gaps in the measurements from these drives instead.
+    """
+    with seeded(seed, "simulate"), ExitStack() as stack:
+        if like is None:
+            rows = round(program.duration / program.step) + 1
+            time = (torch.arange(rows, dtype=torch.float64) * program.step)[:, None].repeat(1, trajectories or 1)
+            controls = program.example_controls(time)
+            data = Trajectories(
+                time=time,
+                controls=controls,
+                measurements=time.new_zeros((*time.shape, len(program.measurements))),
+                observed=torch.ones((*time.shape, len(program.measurements)), dtype=torch.bool),
+                lengths=torch.full((time.shape[1],), rows),
+                labels=tuple(str(i + 1) for i in range(time.shape[1])),
+                control_names=names(program.controls),
+                measurement_names=names(program.measurements),
+                state_names=names(program.states),
+            )
+        else:
+            data = like
+        run = for_program(program, data)
+        rows, drives = run.time.shape
+        stack.enter_context(poutine.block())
+        with pyro.plate("row", 1, dim=-2), pyro.plate("trajectory", drives, dim=-1):
+            start = broadcast_event(program.initial(), torch.Size((1, drives)), 1)
+        states = [start]
+        controls_over_time = run.controls[:-1].unsqueeze(1)
+        for state in roll_out(
+            program, start, controls_over_time, run.elapsed[:-1].unsqueeze(1), run.steps.unsqueeze(1)
+        ):
+            states.append(state)
+        path = torch.cat(states)
+        seen = Recording()
+        with pyro.plate("row", rows, dim=-2), pyro.plate("trajectory", drives, dim=-1), seen:
+            program.observe(path)
+        parts = [as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()]
+        measurements = torch.cat(parts, -1)
+    nothing = path.new_full((), torch.nan)
+    return Trajectories(
+        time=data.time,
+        controls=run.controls.double(),
+        measurements=torch.where(run.observed, measurements, 0.0).double(),
+        observed=run.observed,
+        lengths=run.lengths,
+        states=torch.where(run.rows[..., None], path, nothing).double(),
+        labels=run.labels,
+        control_names=run.control_names,
+        measurement_names=run.measurement_names,
+        state_names=names(program.states),
+    )

@@ -1,0 +1,157 @@
+"""Effect handlers that run a program's sites: condition, temper, replay, record."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, cast
+
+import pyro.distributions as dist
+import torch
+from pyro.poutine.mask_messenger import MaskMessenger
+from pyro.poutine.messenger import Messenger
+from torch import Tensor
+
+from steady_ppl.errors import ProgramError
+
+
+class Observing(Messenger):
+    """Condition the sites of `observe` on measurements, cell by cell, and temper them.
+
+    The sites take the measurement's columns in the order in which they are met. A missing cell contributes nothing.
+
+    Args:
+        measurements: `(..., K)`, finite also where missing.
+        observed: `(..., K)` bool.
+        weight: multiplies the observations' log-density (w_obs in STEADY); 1 is the model as written.
+    """
+
+    def __init__(self, measurements: Tensor, observed: Tensor, weight: float = 1.0) -> None:
+        super().__init__()
+        self.measurements, self.observed, self.weight = measurements, observed, weight
+        self.column = 0
+
+    def __enter__(self) -> Observing:
+        self.column = 0
+        super().__enter__()
+        return self
+
+    def __exit__(self, *exception: Any) -> None:
+        super().__exit__(*exception)
+        if exception[0] is None and self.column != self.measurements.shape[-1]:
+            raise ProgramError(
+                f"observe sampled {self.column} measurement components, the program declares "
+                f"{self.measurements.shape[-1]}",
+                site="observe",
+            )
+
+    def _pyro_sample(self, message: Any) -> None:
+        fn, name = message["fn"], message["name"]
+        width = fn.event_shape.numel()
+        columns = slice(self.column, self.column + width)
+        self.column += width
+        if fn.event_dim > 1 or self.column > self.measurements.shape[-1]:
+            raise ProgramError(
+                f"site {name!r} of observe has event shape {tuple(fn.event_shape)}; expected a scalar or a vector, and "
+                f"{self.measurements.shape[-1]} declared measurement components in all",
+                site=name,
+            )
+        value, observed = self.measurements[..., columns], self.observed[..., columns]
+        if fn.event_dim == 0:
+            fn, value = fn.mask(observed[..., 0]), value[..., 0]
+        elif isinstance(fn, dist.Independent) and fn.base_dist.event_dim == 0:
+            fn = fn.base_dist.mask(observed).to_event(1)
+        else:
+            whole = observed.all(-1)
+            if bool((observed.any(-1) & ~whole).any()):
+                raise ProgramError(
+                    f"site {name!r} has correlated components ({type(fn).__name__}), of which some are missing: "
+                    "independent components (to_event(1)) can be masked one by one, these cannot",
+                    site=name,
+                )
+            fn = fn.mask(whole)
+        message["fn"], message["value"], message["is_observed"] = fn, value, True
+        message["scale"] = message["scale"] * self.weight
+
+
+class Replaying(Messenger):
+    """Give latent sites the values that are already known.
+
+    Args:
+        values: site name → value.
+        known: score the value as a certainty (log-density 0), as a known start is.
+    """
+
+    def __init__(self, values: Mapping[str, Tensor], *, known: bool = False) -> None:
+        super().__init__()
+        self.values, self.known = values, known
+
+    def _pyro_sample(self, message: Any) -> None:
+        name = message["name"]
+        if name not in self.values:
+            return
+        message["value"] = self.values[name]
+        if self.known:
+            message["fn"] = dist.Delta(message["value"], event_dim=message["fn"].event_dim)
+
+
+class AtMean(Messenger):
+    """Give every latent site its mean: a roll-out without noise."""
+
+    def _pyro_sample(self, message: Any) -> None:
+        if not message["is_observed"]:
+            message["value"] = message["fn"].mean
+
+
+class Recording(Messenger):
+    """Keep the values of latent sites, every site's distribution, and the observed sites' tempered log-densities.
+
+    Attributes:
+        values: latent site → value.
+        distributions: site → distribution.
+        log_likelihood: one `(...)` an observed site.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.values: dict[str, Tensor] = {}
+        self.distributions: dict[str, Any] = {}
+        self.log_likelihood: list[Tensor] = []
+
+    def total(self) -> Tensor:
+        """The sum of the observed sites' log-densities, `(...)`."""
+        total = self.log_likelihood[0]
+        for other in self.log_likelihood[1:]:
+            total = total + other
+        return total
+
+    def _pyro_post_sample(self, message: Any) -> None:
+        self.distributions[message["name"]] = message["fn"]
+        if message["is_observed"]:
+            self.log_likelihood.append(message["scale"] * message["fn"].log_prob(message["value"]))
+        else:
+            self.values[message["name"]] = message["value"]
+
+
+def masked(mask: Tensor) -> MaskMessenger:
+    """Count only the sites' elements where `mask` holds."""
+    return MaskMessenger(cast(torch.BoolTensor, mask))
+
+
+def residual(fn: Any, value: Tensor) -> Tensor:
+    """`value − mean` of a measurement site, on the circle where the site's distribution lives there."""
+    base = fn
+    while isinstance(base, dist.Independent | dist.MaskedDistribution | dist.ExpandedDistribution):
+        base = base.base_dist
+    if hasattr(base, "residual"):
+        return base.residual(value)
+    return value - fn.mean
+
+
+def as_vector(value: Tensor, event_dim: int) -> Tensor:
+    """A site's value with its event as the last dimension, scalars as vectors of one."""
+    return value.unsqueeze(-1) if event_dim == 0 else value
+
+
+def broadcast_event(value: Tensor, left: torch.Size, event_dim: int) -> Tensor:
+    """Expand a site's value to the batch shape `left`."""
+    return value.expand(*left, *value.shape[value.dim() - event_dim :])

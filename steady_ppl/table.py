@@ -1,0 +1,250 @@
+"""The table: one row a trajectory and time step, as CSV, Parquet or a pandas frame.
+
+Columns: `trajectory`, `time` (s), `u.<control>`, `y.<measurement>` and, where known, `x.<state component>`.
+
+- An empty `y.` cell is a missing measurement, an empty `x.` cell an unknown state; NaN counts as empty.
+- A control acts from its row to the next, so it may be empty in a trajectory's last row, and only there.
+- The rows of a trajectory follow one another, two at least, with strictly increasing time.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import uuid
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import pandas as pd
+import pyarrow
+import pyarrow.parquet
+import torch
+from torch import Tensor
+
+from steady_ppl.data import Trajectories, pad, pad_time
+from steady_ppl.errors import DataError
+
+
+def read_table(path: str | Path) -> Trajectories:
+    """Read a table from a `.csv` or `.parquet` file.
+
+    Returns:
+        The trajectories in order of first appearance, float64; `states` is None when no `x.` cell is filled.
+
+    Raises:
+        DataError: naming the file and, where they apply, the column, the trajectory and the row.
+    """
+    path = Path(path)
+    read = _read_csv if _suffix(path) == ".csv" else _read_parquet
+    try:
+        frame = read(path)
+    except FileNotFoundError as error:
+        raise DataError(f"{path.name}: there is no such file") from error
+    except (OSError, ValueError, csv.Error, pyarrow.ArrowException) as error:
+        reason = getattr(error, "strerror", None) or str(error).partition("\n")[0]
+        raise DataError(f"{path.name}: cannot be read as {_suffix(path)[1:]}: {reason}") from error
+    return from_frame(frame, name=path.name)
+
+
+def write_table(data: Trajectories, path: str | Path) -> None:
+    """Write a table to a `.csv` or `.parquet` file; `read_table` gives the same numbers back, bit for bit in float64.
+
+    The file appears whole or not at all, and a table that `read_table` would refuse is not written.
+
+    Raises:
+        DataError: for another suffix, a missing folder, or data that makes no valid table.
+    """
+    path = Path(path)
+    suffix = _suffix(path)
+    if not path.parent.is_dir():
+        raise DataError(f"{path.name}: cannot be written: there is no folder {path.parent.name}, create it first")
+    frame = to_frame(data)
+    from_frame(frame, name=path.name)
+    part = path.with_name(f".{uuid.uuid4().hex}{suffix}")
+    try:
+        if suffix == ".csv":
+            frame.to_csv(part, index=False)
+        else:
+            frame.to_parquet(part, index=False)
+        os.replace(part, path)
+    except OSError as error:
+        raise DataError(f"{path.name}: cannot be written: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def to_frame(data: Trajectories) -> pd.DataFrame:
+    """The table as a pandas frame, trajectory after trajectory; missing cells are NaN.
+
+    Trajectories without labels are numbered from 1.
+
+    Raises:
+        DataError: where two trajectories have the same label, or a measurement that was made is NaN: as rows of a
+            table they would be one trajectory, or a missing measurement.
+    """
+    labels = data.labels or tuple(str(i + 1) for i in range(len(data)))
+    for i, label in enumerate(labels):
+        if label in labels[:i]:
+            _fail("table", "two trajectories have this label", column="trajectory", trajectory=label)
+    for t, b, k in (data.measurements.isnan() & data.observed & data.rows[..., None]).nonzero()[:1].tolist():
+        row, column = int(data.lengths[:b].sum()) + t + 1, f"y.{data.measurement_names[k]}"
+        _fail("table", "a measurement is NaN", column=column, trajectory=labels[b], row=row)
+    blocks = [data.time[..., None], data.controls, data.measurements.masked_fill(~data.observed, torch.nan)]
+    names = ["time", *(f"u.{n}" for n in data.control_names), *(f"y.{n}" for n in data.measurement_names)]
+    if data.states is not None:
+        blocks.append(data.states)
+        names += [f"x.{n}" for n in data.state_names]
+    values = torch.cat([block.detach().double() for block in blocks], -1).transpose(0, 1)[data.rows.T]
+    frame = pd.DataFrame(values.cpu().numpy(), columns=names)
+    frame.insert(0, "trajectory", np.repeat(np.array(labels, dtype=object), data.lengths.cpu().numpy()))
+    return frame
+
+
+def from_frame(frame: pd.DataFrame, name: str = "table") -> Trajectories:
+    """The trajectories of a pandas frame; its index is ignored.
+
+    Args:
+        frame: the table's columns; cells are numbers or text that spells numbers.
+        name: what error messages call the table.
+
+    Raises:
+        DataError: naming the column, the trajectory and the row.
+    """
+    controls, measurements, states = _columns(frame, name)
+    labels, lengths = _trajectories(frame["trajectory"], name)
+    row_labels, ends = np.repeat(labels, lengths), lengths.cumsum()
+    inner = np.ones(len(frame), dtype=bool)
+    inner[ends - 1] = False
+    every, none = np.ones_like(inner), np.zeros_like(inner)
+
+    def numbers(column: str, required: np.ndarray) -> np.ndarray:
+        values, bad = _parse(frame[column])
+        bad = bad | np.isinf(values) | (np.isnan(values) & required)
+        if bad.any():
+            row = int(bad.argmax())
+            cell = frame[column].iloc[row]
+            came = "an empty cell" if pd.isna(cell) or not str(cell).strip() else f"{str(cell)[:40]!r}"
+            wanted = "a finite number" if required[row] else "a finite number or an empty cell"
+            _fail(name, f"got {came}, expected {wanted}", column=column, trajectory=row_labels[row], row=row + 1)
+        return values
+
+    def split(columns: list[str], required: np.ndarray) -> tuple[Tensor, ...]:
+        block = np.stack([np.empty(len(frame)), *(numbers(column, required) for column in columns)], -1)[:, 1:]
+        return torch.from_numpy(block).split(lengths.tolist())
+
+    time = numbers("time", every)
+    back = np.append(False, np.diff(time) <= 0)
+    back[ends[:-1]] = False
+    if back.any():
+        row = int(back.argmax())
+        problem = f"time must strictly increase, got {time[row]} after {time[row - 1]}"
+        _fail(name, problem, column="time", trajectory=row_labels[row], row=row + 1)
+    acting, measured, truth = split(controls, inner), split(measurements, none), split(states, none)
+    known = any(bool((~values.isnan()).any()) for values in truth)
+    return Trajectories(
+        time=pad_time(torch.from_numpy(time).split(lengths.tolist())),
+        controls=pad([values.nan_to_num(0.0) for values in acting]),
+        measurements=pad([values.nan_to_num(0.0) for values in measured]),
+        observed=pad([~values.isnan() for values in measured], False),
+        lengths=torch.from_numpy(lengths),
+        states=pad(truth, torch.nan) if known else None,
+        labels=tuple(labels),
+        control_names=tuple(column[2:] for column in controls),
+        measurement_names=tuple(column[2:] for column in measurements),
+        state_names=tuple(column[2:] for column in states) if known else (),
+    )
+
+
+def _columns(frame: pd.DataFrame, name: str) -> tuple[list[str], list[str], list[str]]:
+    """The control, measurement and state columns, in the table's order."""
+    columns: list[Any] = list(frame.columns)
+    groups: dict[str, list[str]] = {"u.": [], "y.": [], "x.": []}
+    for i, column in enumerate(columns):
+        if column in columns[:i]:
+            _fail(name, "this column appears twice", column=column)
+        if column in ("trajectory", "time"):
+            continue
+        if str(column)[:2] not in groups or len(column) < 3:
+            _fail(name, "unknown column, expected trajectory, time, u.…, y.… or x.…; is it misnamed?", column=column)
+        groups[column[:2]].append(column)
+    for required in ("trajectory", "time"):
+        if required not in columns:
+            _fail(name, "this column is missing", column=required)
+    if not groups["y."]:
+        _fail(name, "there is no measurement, expected at least one column y.…")
+    return groups["u."], groups["y."], groups["x."]
+
+
+def _trajectories(cells: pd.Series, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """The labels in order of first appearance and the trajectories' numbers of rows."""
+    if len(cells) == 0:
+        _fail(name, "the table has no rows")
+    labels = np.array([str(cell) for cell in cells], dtype=object)
+    empty = cells.isna().to_numpy() | np.array([not label.strip() for label in labels])
+    if empty.any():
+        _fail(name, "got an empty cell, expected a label", column="trajectory", row=int(empty.argmax()) + 1)
+    starts = np.flatnonzero(np.append(True, labels[1:] != labels[:-1]))
+    lengths, labels = np.diff(starts, append=len(labels)), labels[starts]
+    again = pd.Series(labels).duplicated().to_numpy()
+    for bad, problem in (
+        (again, "this trajectory goes on after another one; keep its rows together"),
+        (lengths < 2, "a trajectory needs at least two rows, got one"),
+    ):
+        if bad.any():
+            i = int(bad.argmax())
+            _fail(name, problem, column="trajectory", trajectory=labels[i], row=int(starts[i]) + 1)
+    return labels, lengths
+
+
+def _parse(cells: pd.Series) -> tuple[np.ndarray, np.ndarray]:
+    """The cells as float64, NaN where empty, and where they are not numbers."""
+    bad = np.zeros(len(cells), dtype=bool)
+    if pd.api.types.is_float_dtype(cells.dtype) or pd.api.types.is_integer_dtype(cells.dtype):
+        return cells.to_numpy(dtype=np.float64, na_value=np.nan, copy=True), bad
+    values = np.full(len(cells), np.nan)
+    for i, cell in enumerate(cells.where(cells.notna(), "")):
+        text = str(cell).strip()
+        try:
+            values[i] = float(text or "nan")
+        except ValueError:
+            bad[i] = True
+        bad[i] |= "_" in text  # which float() takes for a digit separator
+    return values, bad
+
+
+def _read_csv(path: Path) -> pd.DataFrame:
+    # not pandas' reader: it fills up a row that was cut short and renames a column that appears twice
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        lines = [line for line in csv.reader(file, strict=True) if line]
+    if not lines:
+        _fail(path.name, "the table is empty")
+    header, *rows = lines
+    for i, row in enumerate(rows):
+        if len(row) != len(header):
+            _fail(path.name, f"got {len(row)} cells, expected {len(header)} as in the header", row=i + 1)
+    return pd.DataFrame(rows, columns=header, dtype=object)
+
+
+def _read_parquet(path: Path) -> pd.DataFrame:
+    # not pandas' reader: it turns a folder named seed=3 on the way into a column
+    with path.open("rb") as file:
+        frame = pyarrow.parquet.ParquetFile(file).read().to_pandas(ignore_metadata=True)
+    return frame.drop(columns=[column for column in frame if column.startswith("__index_level_")])
+
+
+def _suffix(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in (".csv", ".parquet"):
+        raise DataError(f"{path.name}: a table is a .csv or .parquet file")
+    return suffix
+
+
+def _fail(
+    name: str, problem: str, *, column: str | None = None, trajectory: str | None = None, row: int | None = None
+) -> NoReturn:
+    """Raise a DataError whose one line says where."""
+    places = (("column", column), ("trajectory", trajectory), ("row", row))
+    where = ", ".join(f"{kind} {place}" for kind, place in places if place is not None)
+    message = " ".join(f"{name}: {where}{': ' if where else ''}{problem}".split())
+    raise DataError(message, column=column, trajectory=trajectory, row=row)

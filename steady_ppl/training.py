@@ -1,0 +1,268 @@
+"""One training loop for every guide."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import pyro
+import torch
+from pyro.infer import Trace_ELBO
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from steady_ppl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import TrainingError
+from steady_ppl.filtering import log_likelihood
+from steady_ppl.joint import Joint
+from steady_ppl.program import Program
+from steady_ppl.seeding import seeded
+
+
+class Guide(Protocol):
+    """What the loop asks of a guide; parameters, if it is a torch module, are trained with the program's."""
+
+    draws: int
+
+    def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
+        """The E step, outside the gradient; returns figures for the log."""
+        ...
+
+    def __call__(self, data: Trajectories) -> None:
+        """Sample the sites of `Joint`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Optimization:
+    """How parameters are moved. The defaults suit a network on some twenty trajectories.
+
+    Attributes:
+        steps: number of E steps.
+        gradient_steps: Adam steps on each E step's draws.
+        learning_rate: Adam's; falls to `final_rate` of it along half a cosine.
+        betas: Adam's.
+        final_rate: share of the learning rate at the end.
+        weight_decay: of matrices, decoupled; each step shrinks them by learning rate × decay (the paper's code: 1).
+        averaging: weight of the past in the running mean of the parameters; that mean is validated and returned.
+        batch: trajectories an E step, all when None.
+        validate_every: E steps between two validations.
+        patience: stop after so many validations without a better log p(y).
+    """
+
+    steps: int = 600
+    gradient_steps: int = 1
+    learning_rate: float = 1e-2
+    betas: tuple[float, float] = (0.9, 0.99)
+    final_rate: float = 0.05
+    weight_decay: float = 1.0
+    averaging: float = 0.98
+    batch: int | None = None
+    validate_every: int = 25
+    patience: int = 30
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Held-out log p(y): the stopping rule of every method.
+
+    Attributes:
+        data: the validation table, as returned by `for_program`; None trains to the last step.
+        particles: N of the filter; the same random numbers are used at every validation.
+        known_start: start at the true first state.
+        every: use every n-th row's measurements (10 Hz to 1 Hz).
+    """
+
+    data: Trajectories | None = None
+    particles: int = 2000
+    known_start: bool = False
+    every: int = 10
+
+    def __call__(self, program: Program, seed: int) -> float:
+        assert self.data is not None
+        with seeded(seed, "validate"):
+            values = log_likelihood(
+                program, self.data, particles=self.particles, known_start=self.known_start, every=self.every
+            )
+        return float(values.mean())
+
+
+@dataclass
+class Trained:
+    """What training leaves behind.
+
+    Attributes:
+        history: one entry a validation: step, loss, log p(y) and the guide's figures.
+        best: the step whose parameters were kept.
+        interrupted: whether it was stopped by the user.
+    """
+
+    history: list[dict[str, float]]
+    best: int
+    interrupted: bool = False
+
+
+def train(
+    program: Program,
+    guide: Guide,
+    data: Trajectories,
+    validation: Validation,
+    optimization: Optimization,
+    *,
+    known_start: bool = False,
+    seed: int = 0,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    progress: bool = True,
+) -> Trained:
+    """Fit the program's (and the guide's) parameters; the program ends with the best averaged ones.
+
+    Alternates the guide's E step with gradient steps on Pyro's ELBO. For a `PathGuide` that ELBO is STEADY's M-step
+    objective (IROS 2022, equation 6); for a guide with parameters it is SVI.
+
+    Args:
+        program: the state-space model, trained in place.
+        guide: proposes the latent variables.
+        data: as returned by `for_program`.
+        validation: the stopping rule.
+        optimization: step sizes and numbers of steps.
+        known_start: the first state is certain and not scored.
+        seed: with the step it keys every draw, so that a resumed run repeats an uninterrupted one.
+        checkpoint: file that is written at every validation.
+        resume: continue from `checkpoint`.
+        progress: show a bar on stderr.
+
+    Raises:
+        TrainingError: the loss is not finite.
+        FilterError: the E step broke down.
+    """
+    joint = Joint(program, known_start=known_start)
+    elbo = Trace_ELBO(num_particles=guide.draws, vectorize_particles=guide.draws > 1, max_plate_nesting=2)
+    parameters: dict[str, Tensor] = dict(program.named_parameters())
+    optimizer = torch.optim.AdamW(_groups(program, guide, optimization), betas=optimization.betas)
+    full_rates = [group["lr"] for group in optimizer.param_groups]
+    state = Checkpoint(
+        step=0,
+        history=[],
+        parameters={**parameters, **_guide_parameters(guide)},
+        averaged={name: value.detach().clone() for name, value in parameters.items()},
+        best={},
+    )
+    if resume and checkpoint is not None:
+        read_checkpoint(checkpoint, state, optimizer)
+    batch = optimization.batch or len(data)
+    bar = tqdm(total=optimization.steps, initial=state.step, disable=not progress, file=sys.stderr, unit="step")
+    figures: dict[str, float] = {}
+    interrupted = False
+    with bar, pyro.settings.context(module_local_params=True), pyro.validation_enabled(False):
+        try:
+            while state.step < optimization.steps and not _out_of_patience(state.history, optimization.patience):
+                with seeded(seed, "step", state.step):
+                    part = data if batch >= len(data) else data.subset(torch.randperm(len(data))[:batch])
+                    figures = guide.refresh(part, state.step / optimization.steps)
+                    _set_rates(optimizer, full_rates, state.step / optimization.steps, optimization.final_rate)
+                    for _ in range(optimization.gradient_steps):
+                        loss = elbo.differentiable_loss(joint, guide, part) / int(part.transitions.sum())
+                        _require_finite(loss, state.step)
+                        optimizer.zero_grad()
+                        loss.backward()
+                        optimizer.step()
+                state.step += 1
+                keep = min(optimization.averaging, (state.step - 1) / (state.step + 9))
+                for name, value in parameters.items():
+                    state.averaged[name].lerp_(value.detach(), 1 - keep)
+                bar.update()
+                if state.step % optimization.validate_every == 0 or state.step == optimization.steps:
+                    entry = {"step": float(state.step), "loss": loss.item(), **figures}
+                    if validation.data is not None:
+                        with using(parameters, state.averaged):
+                            entry["log_likelihood"] = validation(program, seed)
+                    state.history.append(entry)
+                    if _is_best(state.history):
+                        state.best = {name: value.clone() for name, value in state.averaged.items()}
+                    if checkpoint is not None:
+                        write_checkpoint(checkpoint, state, optimizer)
+                shown = {"loss": loss.item(), **figures}
+                if state.history and "log_likelihood" in state.history[-1]:
+                    shown["log_p(y)"] = state.history[-1]["log_likelihood"]
+                bar.set_postfix({name: f"{value:.3g}" for name, value in shown.items()}, refresh=False)
+        except KeyboardInterrupt:
+            interrupted = True
+    with torch.no_grad():
+        for name, value in (state.best or state.averaged).items():
+            parameters[name].copy_(value)
+    return Trained(history=state.history, best=_best_step(state.history), interrupted=interrupted)
+
+
+@contextmanager
+def using(parameters: Mapping[str, Tensor], values: dict[str, Tensor]) -> Iterator[None]:
+    """Run a block with other parameter values, and put the present ones back."""
+    present = {name: value.detach().clone() for name, value in parameters.items()}
+    with torch.no_grad():
+        for name, value in values.items():
+            parameters[name].copy_(value)
+    try:
+        yield
+    finally:
+        with torch.no_grad():
+            for name, value in present.items():
+                parameters[name].copy_(value)
+
+
+def _guide_parameters(guide: Guide) -> dict[str, nn.Parameter]:
+    if not isinstance(guide, nn.Module):
+        return {}
+    return {f"guide.{name}": value for name, value in guide.named_parameters()}
+
+
+def _groups(program: Program, guide: Guide, optimization: Optimization) -> list[dict[str, Any]]:
+    """One parameter group each, with the program's own relative rates and decays."""
+
+    def relative(table: Any, name: str) -> float:
+        return next((factor for start, factor in table.items() if name.startswith(start)), 1.0)
+
+    groups = []
+    for name, value in program.named_parameters():
+        decay = optimization.weight_decay * relative(program.decays, name) if value.dim() > 1 else 0.0
+        rate = optimization.learning_rate * relative(program.rates, name)
+        groups.append({"params": [value], "lr": rate, "weight_decay": decay})
+    for value in _guide_parameters(guide).values():
+        groups.append({"params": [value], "lr": optimization.learning_rate, "weight_decay": 0.0})
+    return groups
+
+
+def _set_rates(optimizer: torch.optim.Optimizer, full: list[float], progress: float, final: float) -> None:
+    share = final + (1 - final) * 0.5 * (1 + math.cos(math.pi * progress))
+    for group, rate in zip(optimizer.param_groups, full, strict=True):
+        group["lr"] = rate * share
+
+
+def _require_finite(loss: Tensor, step: int) -> None:
+    if not bool(torch.isfinite(loss)):
+        raise TrainingError(
+            f"the loss is {loss.item()} at step {step + 1}: lower the learning rate, or look at the program's "
+            "densities (a standard deviation of zero?)"
+        )
+
+
+def _best_step(history: list[dict[str, float]]) -> int:
+    judged = [entry for entry in history if "log_likelihood" in entry]
+    if judged:
+        return int(max(judged, key=lambda entry: entry["log_likelihood"])["step"])
+    return int(history[-1]["step"]) if history else 0
+
+
+def _is_best(history: list[dict[str, float]]) -> bool:
+    return _best_step(history) == int(history[-1]["step"])
+
+
+def _out_of_patience(history: list[dict[str, float]], patience: int) -> bool:
+    if not history or "log_likelihood" not in history[-1]:
+        return False
+    return sum(entry["step"] > _best_step(history) for entry in history) >= patience

@@ -1,0 +1,77 @@
+"""The channel noise that explains given states, for supervised learning."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+
+import pyro
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import DataError
+from steady_ppl.particle_filter import Paths
+from steady_ppl.program import Program
+from steady_ppl.sites import Recording, Replaying
+
+
+@torch.no_grad()
+def true_paths(program: Program, data: Trajectories) -> Paths:
+    """The true states with the channel noise that leads from one to the next.
+
+    The program is run at zero noise and at a unit of each channel; where the next state is affine in the noise, as in
+    every program whose noise enters once, least squares on these runs gives the noise exactly.
+
+    Args:
+        program: the state-space model.
+        data: as returned by `for_program`, all states known.
+
+    Raises:
+        DataError: a state is unknown.
+    """
+    states = data.states
+    if states is None or not bool(torch.isfinite(states[data.rows]).all()):
+        raise DataError("supervised learning needs the true state of every row: the table's x. columns are incomplete")
+    states = torch.where(data.rows[..., None], states, states[:1])
+    before, after = states[:-1], states[1:]
+
+    def run(noise: dict[str, Tensor]) -> tuple[Tensor, Recording]:
+        recording = Recording()
+        with ExitStack() as stack:
+            stack.enter_context(poutine.block())
+            stack.enter_context(pyro.validation_enabled(False))
+            stack.enter_context(pyro.plate("interval", before.shape[0], dim=-2))
+            stack.enter_context(pyro.plate("trajectory", before.shape[1], dim=-1))
+            stack.enter_context(recording)
+            stack.enter_context(Replaying(noise))
+            after = program.transition(before, data.controls[:-1], data.elapsed[:-1], data.steps)
+        return after, recording
+
+    _, probe = run({})
+    zero = {site: value.new_zeros(value.shape) for site, value in probe.values.items()}
+    base, _ = run(zero)
+    columns, places = [], []
+    for site, value in zero.items():
+        for channel in range(value[0, 0].numel()):
+            unit = zero | {site: value.clone()}
+            unit[site].reshape(*value.shape[:2], -1)[..., channel] = 1.0
+            columns.append(run(unit)[0] - base)
+            places.append((site, channel))
+    effect = torch.stack(columns, -1).double()
+    solution = torch.linalg.lstsq(effect, (after - base).double().unsqueeze(-1)).solution.squeeze(-1).to(states.dtype)
+    noise = {site: value.clone() for site, value in zero.items()}
+    for index, (site, channel) in enumerate(places):
+        noise[site].reshape(*noise[site].shape[:2], -1)[..., channel] = solution[..., index]
+
+    start = Recording()
+    with poutine.block(), start:
+        program.initial()
+    (site,) = start.values
+    event_dims = {s: fn.event_dim for s, fn in (start.distributions | probe.distributions).items()} | {"states": 1}
+    return Paths(
+        states=states[None],
+        start={site: states[None, :1]},
+        noise={s: value[None] for s, value in noise.items()},
+        event_dims=event_dims,
+    )
