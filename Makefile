@@ -18,11 +18,11 @@ $(INSTALLED): pyproject.toml constraints.txt
 	touch $@
 
 learn: $(INSTALLED)
-	$(BIN)/python benchmarks/learn.py --out $(OUT)/learn
+	$(BIN)/python benchmarks/learn.py hov --out $(OUT)/learn
 
 learn-truck: $(INSTALLED)
 	@test -n "$(DATA)" || { echo "make learn-truck DATA=FOLDER: the folder with train/, valid/ and test/ of the AlphaTruck logs" >&2; exit 2; }
-	$(BIN)/python benchmarks/learn_truck.py "$(DATA)" --out $(OUT)/learn-truck
+	$(BIN)/python benchmarks/learn.py truck --data "$(DATA)" --out $(OUT)/learn-truck
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest

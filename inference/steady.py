@@ -2,11 +2,7 @@
 
 Each step runs the program as a particle filter on every drive (the E step), draws paths from the surviving lineages,
 and moves the parameters along the gradient of the paths' joint log-density (the M step). The observations' weight grows
-from FIRST_WEIGHT to 1. The parameters with the best held-out log p(y) are kept.
-
-The paper's own settings, hours on two cores, are
-    particles=20_000, draws=10, steps=40_000, learning_rate=1e-4, weight_decay=1.0, batch=1, ramp=1.0,
-    averaging=0.0, final_rate=1.0, validate_every=500, validation_particles=100_000
+from `first_weight` to 1. Held-out log p(y) decides which parameters are kept.
 """
 
 from steady_ppl import (
@@ -21,7 +17,22 @@ from steady_ppl import (
     train,
 )
 
-FIRST_WEIGHT = 0.001
+# What the paper and its authors' code use; hours on two cores. steady.fit(program, table, valid, **PAPER)
+PAPER = {
+    "particles": 20_000,
+    "draws": 10,
+    "steps": 40_000,
+    "gradient_steps": 1,
+    "learning_rate": 1e-4,
+    "final_rate": 1.0,
+    "weight_decay": 1.0,
+    "averaging": 0.0,
+    "batch": 1,
+    "first_weight": 0.001,
+    "ramp": 1.0,
+    "validate_every": 500,
+    "validation_particles": 100_000,
+}
 
 
 def fit(
@@ -30,15 +41,17 @@ def fit(
     valid: Trajectories | None = None,
     *,
     known_start: bool = False,
-    particles: int = 300,
-    draws: int = 10,
-    steps: int = 400,
+    particles: int = 400,
+    draws: int = 30,
+    steps: int = 250,
+    gradient_steps: int = 2,
     learning_rate: float = 1e-2,
     final_rate: float = 0.05,
     weight_decay: float = 1.0,
     averaging: float = 0.98,
     batch: int | None = None,
-    ramp: float = 0.3,
+    first_weight: float = 0.02,
+    ramp: float = 1.0,
     validate_every: int = 25,
     validation_particles: int = 2000,
     patience: int = 30,
@@ -55,7 +68,9 @@ def fit(
         particles: N of the E step, for each drive.
         draws: M, paths for each drive in the M step.
         steps: number of E steps.
-        ramp: share of the training over which the observation weight grows to 1.
+        gradient_steps: Adam steps on the draws of each E step.
+        first_weight: the observation weight at the first step.
+        ramp: share of the training over which it grows to 1.
         run: checkpoint, resume and progress of `train`.
     """
     settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
@@ -63,10 +78,11 @@ def fit(
     with seeded(seed, "prepare"):
         program.prepare(data, known_start)
     guide = SMCGuide(
-        program, particles=particles, draws=draws, tempering=LinearRamp(FIRST_WEIGHT, ramp), known_start=known_start
+        program, particles=particles, draws=draws, tempering=LinearRamp(first_weight, ramp), known_start=known_start
     )
     optimization = Optimization(
         steps=steps,
+        gradient_steps=gradient_steps,
         learning_rate=learning_rate,
         final_rate=final_rate,
         weight_decay=weight_decay,

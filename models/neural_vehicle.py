@@ -27,11 +27,13 @@ class NeuralVehicle(PlanarVehicle):
     """
 
     acceleration_scale = (1.0, 1.0, 1.0)
-    rates = {"noise": 3.0}
+    rates = {"noise": 4.0}
     decays = {"hidden": 10.0, "skip": 0.1, "noise": 0.1}
 
     def __init__(self, *, layers=1, absolute_heading=False, normalise="smoothed"):
         super().__init__()
+        if layers not in (1, 2) or normalise not in ("smoothed", "truth"):
+            raise ValueError(f"layers is 1 or 2 and normalise 'smoothed' or 'truth', got {layers} and {normalise!r}")
         self.absolute_heading, self.normalise = absolute_heading, normalise
         inputs = 3 + len(self.controls) + 2 * absolute_heading
         self.skip = nn.Linear(inputs, 3)
@@ -47,20 +49,11 @@ class NeuralVehicle(PlanarVehicle):
         self.register_buffer("input_sd", torch.ones(3 + len(self.controls)))
 
     def prepare(self, data, known_start):
-        """Normalise by the moments of the controls and of smoothed (or, if asked, true) body velocities.
-
-        The scale of the accelerations is the root mean square change of these velocities over a second (a step).
-        """
-        leaking = self.normalise == "truth"
-        states = data.states if leaking else smoothed_states(self, data, known_start=known_start)
-        velocities = stack(*self.body_velocity(states))
-        inputs = torch.cat([velocities, data.controls], -1)[data.rows]
+        """Normalise by the moments of the controls and of smoothed (or, if asked, true) body velocities."""
+        states = data.states if self.normalise == "truth" else smoothed_states(self, data, known_start=known_start)
+        inputs = stack(*self.body_velocity(states), *data.controls.unbind(-1))[data.rows]
         self.input_mean.copy_(inputs.mean(0))
         self.input_sd.copy_(inputs.std(0).clamp(min=1e-3))
-        apart = 1 if leaking else max(1, round(1 / float(data.steps.median())))
-        seconds = (data.elapsed[apart:] - data.elapsed[:-apart]).unsqueeze(-1)
-        change = ((velocities[apart:] - velocities[:-apart]) / seconds)[data.rows[apart:]]
-        self.scale.copy_(change.square().mean(0).sqrt().clamp(min=1e-3))
 
     def initial(self):
         mean = torch.zeros(6).to(self.scale)
@@ -86,11 +79,11 @@ class NeuralVehicle(PlanarVehicle):
 
 
 class NeuralHovercraft(NeuralVehicle):
-    """The hovercraft, nothing known of its dynamics but the order of magnitude of its accelerations."""
+    """The hovercraft, nothing known of its dynamics but that its accelerations are at most some 1 m/s², 1 rad/s²."""
 
     controls = ("left [N]", "right [N]")
     landmarks = ((12.0, -8.0), (-6.0, -4.0), (-4.0, 10.0), (6.0, 7.0))
-    acceleration_scale = (0.3, 0.3, 0.3)
+    acceleration_scale = (1.0, 1.0, 1.0)
 
     def initial(self):
         mean = tensor([0.5, 1.0, math.pi / 5, 0.25, 0.1, math.pi / 50]).to(self.scale)
@@ -99,9 +92,23 @@ class NeuralHovercraft(NeuralVehicle):
 
 
 class NeuralTruck(NeuralVehicle):
-    """The AlphaTruck, likewise."""
+    """The AlphaTruck, likewise, with 3 m/s² and 3 rad/s²."""
 
     controls = ("speed [m/s]", "turn [rad/s]")
     landmarks = ((-1.230314, -0.606814), (0.797073, 0.889471), (-3.496525, 0.207874), (0.0, 6.0))
-    acceleration_scale = (2.0, 2.0, 2.0)
+    acceleration_scale = (3.0, 3.0, 3.0)
     decays = {"hidden": 3.0, "skip": 0.1, "noise": 0.1}
+
+
+class AuthorsHovercraft(NeuralHovercraft):
+    """The variant of the authors' code: two layers, absolute heading, normalised by true states (a leak)."""
+
+    def __init__(self):
+        super().__init__(layers=2, absolute_heading=True, normalise="truth")
+
+
+class AuthorsTruck(NeuralTruck):
+    """The same for the AlphaTruck."""
+
+    def __init__(self):
+        super().__init__(layers=2, absolute_heading=True, normalise="truth")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -25,14 +25,18 @@ class Checkpoint:
         history: one entry a validation.
         parameters: the live parameters of program and guide.
         averaged: the running mean of the program's parameters.
-        best: the averaged parameters with the best held-out log p(y) so far, empty before the first validation.
+        kept: the averaged parameters that would be returned now, empty before the first validation.
+        kept_step: the step that they are from.
+        best_held_out: the best held-out log p(y) so far, one a trajectory.
     """
 
     step: int
     history: list[dict[str, float]]
     parameters: Mapping[str, Tensor]
     averaged: dict[str, Tensor]
-    best: dict[str, Tensor]
+    kept: dict[str, Tensor]
+    kept_step: int = 0
+    best_held_out: list[float] = field(default_factory=list)
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: Mapping[str, str] | None = None) -> None:
@@ -63,10 +67,11 @@ def write_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optim
     """Write everything that `read_checkpoint` needs to go on as if nothing had happened."""
     tensors = {f"parameters/{name}": value for name, value in state.parameters.items()}
     tensors |= {f"averaged/{name}": value for name, value in state.averaged.items()}
-    tensors |= {f"best/{name}": value for name, value in state.best.items()}
+    tensors |= {f"kept/{name}": value for name, value in state.kept.items()}
     for index, slots in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer/{index}/{slot}": value for slot, value in slots.items()}
-    write_tensors(path, tensors, {"step": str(state.step), "history": json.dumps(state.history)})
+    numbers = {name: getattr(state, name) for name in ("step", "history", "kept_step", "best_held_out")}
+    write_tensors(path, tensors, {name: json.dumps(value) for name, value in numbers.items()})
 
 
 def read_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimizer) -> None:
@@ -76,7 +81,7 @@ def read_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimi
         RunError: the file is missing, damaged, or of another program.
     """
     tensors, text = read_tensors(path)
-    groups: dict[str, dict[str, Tensor]] = {"parameters": {}, "averaged": {}, "best": {}, "optimizer": {}}
+    groups: dict[str, dict[str, Tensor]] = {"parameters": {}, "averaged": {}, "kept": {}, "optimizer": {}}
     for key, value in tensors.items():
         group, _, name = key.partition("/")
         groups[group][name] = value
@@ -87,8 +92,9 @@ def read_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimi
             state.parameters[name].copy_(value)
     for name, value in groups["averaged"].items():
         state.averaged[name].copy_(value)
-    state.best = {name: value.to(state.averaged[name].device) for name, value in groups["best"].items()}
-    state.step, state.history = int(text["step"]), json.loads(text["history"])
+    state.kept = {name: value.to(state.averaged[name].device) for name, value in groups["kept"].items()}
+    for name in ("step", "history", "kept_step", "best_held_out"):
+        setattr(state, name, json.loads(text[name]))
     slots: dict[int, dict[str, Tensor]] = {}
     for key, value in groups["optimizer"].items():
         index, _, slot = key.partition("/")

@@ -132,7 +132,7 @@ def fit(
     if result.trained is not None:
         judged = [entry["log_likelihood"] for entry in result.trained.history if "log_likelihood" in entry]
         if judged:
-            print(f"held-out log p(y) {judged[0]:.2f} → {max(judged):.2f}, best at step {result.trained.best}")
+            print(f"held-out log p(y) {judged[0]:.2f} → {max(judged):.2f}, kept step {result.trained.kept}")
         if result.trained.interrupted:
             _say(f"interrupted; the run so far is usable, `--resume` goes on with {out}")
             raise typer.Exit(1)

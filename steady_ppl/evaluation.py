@@ -60,10 +60,10 @@ def has_truth(data: Trajectories) -> bool:
 def table_of(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> str:
     """The results as one table of text, a line a program.
 
-    Columns: log p(y); for each error group the forward error with noisy roll-outs, of the mean roll-out, and the
-    state-estimation error; then the errors in measurement space.
+    Columns: log p(y); for the first two error groups the forward error with noisy roll-outs, of the mean roll-out, and
+    the state-estimation error; then the errors in measurement space.
     """
-    groups = list(next((r["forward"] for r in results if r["forward"]), {}))
+    groups = list(next((r["forward"] for r in results if r["forward"]), {}))[:2]
     header = ["", "log p(y)"]
     for name in ("forward", "mean", "state"):
         header += [f"{name} {group}" for group in groups]

@@ -100,7 +100,7 @@ class Fit:
             "known_start": self.known_start,
             "seed": self.seed,
             "settings": self.settings,
-            "best_step": trained.best if trained else None,
+            "kept_step": trained.kept if trained else None,
             "history": trained.history if trained else [],
             "notes": self.notes,
             "versions": versions(),
@@ -131,7 +131,7 @@ class Fit:
             )
         program.load_state_dict(tensors)
         trained = Trained(
-            history=record["history"], best=record["best_step"] or 0, interrupted=record["status"] == "interrupted"
+            history=record["history"], kept=record["kept_step"] or 0, interrupted=record["status"] == "interrupted"
         )
         return cls(
             program=program,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import nullcontext
 
 import pyro
 import pyro.distributions as dist
@@ -35,10 +35,8 @@ class Joint:
         with pyro.plate("trajectory", trajectories, dim=-1):
             with pyro.plate("row", rows, dim=-2), masked(data.rows):
                 states = pyro.sample("states", dist.ImproperUniform(constraints.real_vector, (), (dimension,)))
-            with ExitStack() as stack:
-                stack.enter_context(pyro.plate("first_row", 1, dim=-2))
-                if self.known_start:
-                    stack.enter_context(KnownStart(data.known_start))
+            certain = KnownStart(data.known_start) if self.known_start else nullcontext()
+            with pyro.plate("first_row", 1, dim=-2), certain:
                 self.program.initial()
             with pyro.plate("interval", rows - 1, dim=-2), masked(data.transitions):
                 self.program.transition(states[..., :-1, :, :], data.controls[:-1], data.elapsed[:-1], data.steps)

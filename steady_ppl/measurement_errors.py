@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import math
-from contextlib import ExitStack
 
-import pyro
 import torch
-from pyro import poutine
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
@@ -15,7 +12,7 @@ from steady_ppl.filtering import in_parts
 from steady_ppl.particle_filter import particle_filter, roll_out
 from steady_ppl.program import Program
 from steady_ppl.resampling import systematic, take
-from steady_ppl.sites import AtMean, Recording, as_vector, residual
+from steady_ppl.sites import AtMean, Recording, as_vector, residual, running
 
 OPEN_LOOP = {"open_loop_1s": 1.0, "open_loop_3s": 3.0}
 OPEN_LOOP_DRAWS = 64
@@ -100,12 +97,7 @@ def _open_loop(program: Program, data: Trajectories, draws: Tensor) -> dict[str,
 def _residuals(program: Program, states: Tensor, measurements: Tensor) -> tuple[Tensor, Tensor]:
     """Measured minus predicted, and one draw of the measurement noise, both `(..., K)`."""
     recording = Recording()
-    with ExitStack() as stack:
-        stack.enter_context(poutine.block())
-        stack.enter_context(pyro.validation_enabled(False))
-        for dim, size in enumerate(reversed(states.shape[:-1]), start=1):
-            stack.enter_context(pyro.plate(f"dim_{dim}", size, dim=-dim))
-        stack.enter_context(recording)
+    with running(*states.shape[:-1]), recording:
         program.observe(states)
     errors, noises, column = [], [], 0
     for site, fn in recording.distributions.items():

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
-import pyro
 import pyro.distributions as dist
 import torch
-from pyro import poutine
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
@@ -23,7 +21,7 @@ from steady_ppl.data import Trajectories
 from steady_ppl.errors import FilterError, ProgramError
 from steady_ppl.program import Program
 from steady_ppl.resampling import effective_sample_size, normalise, systematic, take
-from steady_ppl.sites import Observing, Recording, broadcast_event
+from steady_ppl.sites import Observing, Recording, broadcast_event, running
 
 OnFrame = Callable[[int, Tensor, Tensor, Tensor], None]
 
@@ -107,18 +105,6 @@ class KnownStart(Messenger):
         message["fn"] = dist.Delta(self.state, event_dim=1)
 
 
-@contextmanager
-def _particle_plates(particles: int, trajectories: int) -> Iterator[None]:
-    """Plates of the sequential run, hidden from any handler outside."""
-    with ExitStack() as stack:
-        stack.enter_context(poutine.block())
-        stack.enter_context(pyro.validation_enabled(False))
-        stack.enter_context(pyro.plate("particle", particles, dim=-3))
-        stack.enter_context(pyro.plate("row", 1, dim=-2))
-        stack.enter_context(pyro.plate("trajectory", trajectories, dim=-1))
-        yield
-
-
 @torch.no_grad()
 def particle_filter(
     program: Program,
@@ -154,11 +140,8 @@ def particle_filter(
     steps, elapsed, last = data.steps, data.elapsed, rows - 1
     observed_rows = data.observed.any(-1).any(-1).tolist()
     start = Recording()
-    with _particle_plates(particles, trajectories):
-        with ExitStack() as stack:
-            if known_start:
-                stack.enter_context(KnownStart(data.known_start))
-            stack.enter_context(start)
+    with running(particles, 1, trajectories):
+        with start, KnownStart(data.known_start) if known_start else nullcontext():
             state = program.initial()
         left = torch.Size((particles, 1, trajectories))
         state = broadcast_event(state, left, 1)
@@ -258,12 +241,6 @@ def roll_out(
         handler: acts on the channel noise, for example `AtMean()` for a roll-out without noise.
     """
     for control, time, step in zip(controls, elapsed, steps, strict=True):
-        with ExitStack() as stack:
-            stack.enter_context(poutine.block())
-            stack.enter_context(pyro.validation_enabled(False))
-            for dim, size in enumerate(reversed(state.shape[:-1]), start=1):
-                stack.enter_context(pyro.plate(f"dim_{dim}", size, dim=-dim))
-            if handler is not None:
-                stack.enter_context(handler)
+        with running(*state.shape[:-1]), handler or nullcontext():
             state = program.transition(state, control, time, step)
         yield state

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 
-import pyro
 import torch
 from pyro import poutine
 from torch import Tensor
 
 from steady_ppl.errors import ProgramError, SteadyError
 from steady_ppl.program import Program, error_groups
-from steady_ppl.sites import Observing, Recording, as_vector
+from steady_ppl.sites import Broadcasting, Observing, Recording, as_vector
 
 DRAWS, ROWS, TRAJECTORIES = 3, 4, 5
 
@@ -73,11 +72,10 @@ def probe(program: Program) -> None:
 
 def _call(name: str, method: str, run: Callable[[], Tensor | None], *handlers: Observing) -> tuple[Tensor, Recording]:
     recording = Recording()
+    left = (DRAWS, 1, TRAJECTORIES) if method == "initial" else (DRAWS, ROWS, TRAJECTORIES)
     with ExitStack() as stack:
         stack.enter_context(poutine.block())
-        sizes = (DRAWS, 1, TRAJECTORIES) if method == "initial" else (DRAWS, ROWS, TRAJECTORIES)
-        for dim, size in enumerate(reversed(sizes), start=1):
-            stack.enter_context(pyro.plate(f"dim_{dim}", size, dim=-dim))
+        stack.enter_context(Broadcasting(left))
         for handler in (recording, *handlers):
             stack.enter_context(handler)
         try:

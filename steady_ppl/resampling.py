@@ -46,6 +46,17 @@ def systematic(log_weights: Tensor, draws: int, uniform: Tensor | None = None) -
 
 
 def take(values: Tensor, index: Tensor) -> Tensor:
-    """`values` of shape `(N, B, ...)` at the particles `index` of shape `(M, B)`: `(M, B, ...)`."""
-    trajectories = torch.arange(index.shape[1], device=index.device)
-    return values[index, trajectories]
+    """The particles `index` of each trajectory, component by component: states from `stack` are laid out that way.
+
+    Args:
+        values: `(N, B)` or `(N, B, D)`.
+        index: `(M, B)` in 0 … N − 1.
+
+    Returns:
+        `(M, B)` or `(M, B, D)`.
+    """
+    particles, trajectories = values.shape[:2]
+    flat = (index * trajectories + torch.arange(trajectories, device=index.device)).flatten()
+    components = values.reshape(particles, trajectories, -1).movedim(-1, 0)
+    taken = components.reshape(-1, particles * trajectories).index_select(1, flat)
+    return taken.view(-1, *index.shape).movedim(0, -1).reshape(*index.shape, *values.shape[2:])

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
-
-import pyro
 import torch
-from pyro import poutine
 
 from steady_ppl.data import Trajectories
 from steady_ppl.particle_filter import roll_out
 from steady_ppl.program import Program, for_program, names
 from steady_ppl.seeding import seeded
-from steady_ppl.sites import Recording, as_vector, broadcast_event
+from steady_ppl.sites import Recording, as_vector, broadcast_event, running
 
 
 @torch.no_grad()
@@ -27,7 +23,7 @@ def simulate(
         seed: the same seed gives the same table.
         like: take time, controls and gaps in the measurements from these drives instead.
     """
-    with seeded(seed, "simulate"), ExitStack() as stack:
+    with seeded(seed, "simulate"):
         if like is None:
             rows = round(program.duration / program.step) + 1
             time = (torch.arange(rows, dtype=torch.float64) * program.step)[:, None].repeat(1, trajectories or 1)
@@ -47,8 +43,7 @@ def simulate(
             data = like
         run = for_program(program, data)
         rows, drives = run.time.shape
-        stack.enter_context(poutine.block())
-        with pyro.plate("row", 1, dim=-2), pyro.plate("trajectory", drives, dim=-1):
+        with running(1, drives):
             start = broadcast_event(program.initial(), torch.Size((1, drives)), 1)
         states = [start]
         controls_over_time = run.controls[:-1].unsqueeze(1)
@@ -58,7 +53,7 @@ def simulate(
             states.append(state)
         path = torch.cat(states)
         seen = Recording()
-        with pyro.plate("row", rows, dim=-2), pyro.plate("trajectory", drives, dim=-1), seen:
+        with running(rows, drives), seen:
             program.observe(path)
         parts = [as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()]
         measurements = torch.cat(parts, -1)

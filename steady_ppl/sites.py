@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, cast
 
+import pyro
 import pyro.distributions as dist
 import torch
+from pyro import poutine
 from pyro.poutine.mask_messenger import MaskMessenger
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
@@ -71,6 +74,27 @@ class Observing(Messenger):
             fn = fn.mask(whole)
         message["fn"], message["value"], message["is_observed"] = fn, value, True
         message["scale"] = message["scale"] * self.weight
+
+
+class Broadcasting(Messenger):
+    """Give every site the batch shape `left`, as plates would, without claiming any plate's dimension."""
+
+    def __init__(self, left: tuple[int, ...]) -> None:
+        super().__init__()
+        self.left = torch.Size(left)
+
+    def _pyro_sample(self, message: Any) -> None:
+        fn = message["fn"]
+        if fn.batch_shape != self.left:
+            message["fn"] = fn.expand(torch.broadcast_shapes(fn.batch_shape, self.left))
+
+
+@contextmanager
+def running(*left: int) -> Iterator[None]:
+    """Run the program's methods on states of batch shape `left`, hidden from any handler outside, without checks of
+    the distributions' arguments (`probe` has made them)."""
+    with poutine.block(), pyro.validation_enabled(False), Broadcasting(left):
+        yield
 
 
 class Replaying(Messenger):

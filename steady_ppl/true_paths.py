@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
-
-import pyro
 import torch
-from pyro import poutine
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError
 from steady_ppl.particle_filter import Paths
 from steady_ppl.program import Program
-from steady_ppl.sites import Recording, Replaying
+from steady_ppl.sites import Recording, Replaying, running
 
 
 @torch.no_grad()
@@ -38,13 +34,7 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
 
     def run(noise: dict[str, Tensor]) -> tuple[Tensor, Recording]:
         recording = Recording()
-        with ExitStack() as stack:
-            stack.enter_context(poutine.block())
-            stack.enter_context(pyro.validation_enabled(False))
-            stack.enter_context(pyro.plate("interval", before.shape[0], dim=-2))
-            stack.enter_context(pyro.plate("trajectory", before.shape[1], dim=-1))
-            stack.enter_context(recording)
-            stack.enter_context(Replaying(noise))
+        with running(*before.shape[:-1]), recording, Replaying(noise):
             after = program.transition(before, data.controls[:-1], data.elapsed[:-1], data.steps)
         return after, recording
 
@@ -65,7 +55,7 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
         noise[site].reshape(*noise[site].shape[:2], -1)[..., channel] = solution[..., index]
 
     start = Recording()
-    with poutine.block(), start:
+    with running(1, before.shape[1]), start:
         program.initial()
     (site,) = start.values
     event_dims = {s: fn.event_dim for s, fn in (start.distributions | probe.distributions).items()} | {"states": 1}

@@ -1,0 +1,65 @@
+"""The paper's experiments in pieces: data, the four programs, what was published."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from inference import fit_truth, hand, steady  # noqa: E402
+from models.hovercraft import Hovercraft, HovercraftTruth  # noqa: E402
+from models.neural_vehicle import NeuralHovercraft, NeuralTruck  # noqa: E402
+from models.truck import Truck  # noqa: E402
+from steady_ppl import Fit, Trajectories, seeded, simulate  # noqa: E402
+from steady_ppl.alpha_truck import read_alpha_truck  # noqa: E402
+from steady_ppl.evaluation import evaluate  # noqa: E402
+
+LOGS = ROOT.parent / "shared" / "data" / "alpha_truck"
+Split = tuple[Trajectories, Trajectories, Trajectories]
+
+
+def hov(seed: int, train: int = 16, valid: int = 16, test: int = 32) -> Split:
+    """Hov (train 16) or Hov+ (train 160, valid 32): train, valid and test drives of one data seed."""
+    truth = HovercraftTruth()
+    return (
+        simulate(truth, train, seed=10 * seed + 1),
+        simulate(truth, valid, seed=10 * seed + 2),
+        simulate(truth, test, seed=10 * seed + 3),
+    )
+
+
+def truck(folder: Path, seed: int) -> Split:
+    """The AlphaTruck logs with one draw of the bearings."""
+    return tuple(read_alpha_truck(folder / split, seed=seed) for split in ("train", "valid", "test"))  # type: ignore
+
+
+def learn(method: str, vehicle: str, data: Split, seed: int, progress: bool = False) -> Fit:
+    """Fit one method to the train and valid drives, known start, as the paper does."""
+    torch.set_num_threads(1)
+    train, valid, _ = data
+    network = NeuralHovercraft if vehicle == "hov" else NeuralTruck
+    own = Hovercraft if vehicle == "hov" else Truck
+    with seeded(seed, "program"):
+        program = {"steady": network, "fit-truth": network, "hand": own, "truth": HovercraftTruth}[method]()
+    if method == "steady":
+        bearings_only = tuple(part.without_truth(keep_start=True) for part in (train, valid))
+        particles = 400 if vehicle == "hov" else 1000  # so that some ten first-row particles keep descendants
+        return steady.fit(program, *bearings_only, known_start=True, particles=particles, seed=seed, progress=progress)
+    if method == "fit-truth":
+        return fit_truth.fit(program, train, valid, known_start=True, seed=seed, progress=progress)
+    return hand.fit(program, train, valid, known_start=True, seed=seed)
+
+
+def learn_and_judge(job: tuple[str, str, Path | None, int, int]) -> dict:
+    """One method on one data seed, for a process pool: the evaluation with the seconds that learning took."""
+    method, vehicle, folder, seed, particles = job
+    data = hov(seed) if folder is None else truck(folder, seed)
+    began = time.perf_counter()
+    fit = learn(method, vehicle, data, seed)
+    seconds = time.perf_counter() - began
+    return {"method": method, "seed": seed, "seconds": seconds, **evaluate(fit, data[2], particles=particles)}

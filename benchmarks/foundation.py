@@ -1,0 +1,130 @@
+"""The figures of the first slice beside the published ones: known start, forward error with noisy roll-outs.
+
+    python benchmarks/foundation.py hov                      true model and Hand, 12 data seeds
+    python benchmarks/foundation.py learn-hov                STEADY and FitTruth on Hov, 3 data seeds
+    python benchmarks/foundation.py learn-truck --data FOLDER    Hand, STEADY and FitTruth, 3 draws of the bearings
+
+Prints mean ± sd over seeds, the best, and the published figure; exits with 1 when a figure misses its bound. Two
+processes of one thread each. `--particles` sets those of the evaluation (the paper: 100 000).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from experiments import LOGS, learn_and_judge
+
+
+@dataclass(frozen=True)
+class Bound:
+    """What a figure must be: at most `high`, and at least `low` where it has to reproduce a known value."""
+
+    high: float
+    low: float = 0.0
+    published: str = "–"
+
+
+BOUNDS = {
+    ("hov", "truth", "location"): Bound(0.0272, 0.0262, ".0267 (re-simulated)"),
+    ("hov", "truth", "angle"): Bound(0.0121, 0.0115, ".0118 (re-simulated)"),
+    ("hov", "hand", "location"): Bound(0.0608, 0.0588, ".0585"),
+    ("hov", "hand", "angle"): Bound(0.0247, 0.0237, ".0249"),
+    ("learn-hov", "steady", "location"): Bound(0.045, published=".0428"),
+    ("learn-hov", "steady", "angle"): Bound(0.0140, published=".0140"),
+    ("learn-hov", "fit-truth", "location"): Bound(0.0343, published=".0343"),
+    ("learn-truck", "hand", "location"): Bound(0.480, 0.468, ".474"),
+    ("learn-truck", "hand", "angle"): Bound(0.157, 0.151, ".154"),
+    ("learn-truck", "steady", "location"): Bound(0.23, published=".200"),
+    ("learn-truck", "steady", "angle"): Bound(0.085, published=".081"),
+    ("learn-truck", "fit-truth", "location"): Bound(0.181, published=".181"),
+}
+METHODS = {
+    "hov": ["truth", "hand"],
+    "learn-hov": ["steady", "fit-truth"],
+    "learn-truck": ["hand", "steady", "fit-truth"],
+}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("experiment", choices=list(METHODS))
+    parser.add_argument("--data", type=Path, default=LOGS, help="the AlphaTruck logs: train/, valid/ and test/")
+    parser.add_argument("--seeds", type=int, help="how many (12 for hov, 3 to learn)")
+    parser.add_argument("--particles", type=int, default=20_000)
+    parser.add_argument("--methods", nargs="*", help="some of the experiment's methods only")
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    experiment = arguments.experiment
+    folder = arguments.data if experiment == "learn-truck" else None
+    if folder is not None and not folder.is_dir():
+        print(f"skipped: no AlphaTruck logs at {folder}")
+        return 0
+    vehicle = "truck" if folder else "hov"
+    seeds = range(1, 1 + (arguments.seeds or (12 if experiment == "hov" else 3)))
+    methods = arguments.methods or METHODS[experiment]
+    jobs = [(method, vehicle, folder, seed, arguments.particles) for method in methods for seed in seeds]
+    with ProcessPoolExecutor(2) as pool:
+        results = []
+        for result in pool.map(learn_and_judge, jobs):
+            results.append(result)
+            forward, mean = result["forward"], result["forward_mean"]
+            print(
+                f"{result['method']} seed {result['seed']}: forward {forward['location']:.4f} m {forward['angle']:.4f} "
+                f"rad, mean {mean['location']:.4f} m {mean['angle']:.4f} rad, log p(y) {result['log_likelihood']:.2f}, "
+                f"learnt in {result['seconds']:.0f} s",
+                flush=True,
+            )
+    if arguments.json:
+        arguments.json.write_text(json.dumps(results, indent=1) + "\n")
+    return report(experiment, methods, results)
+
+
+def report(experiment: str, methods: list[str], results: list[dict]) -> int:
+    """Print the table; 1 if a bound is missed."""
+    missed = 0
+    print(f"\n{'':10} {'error':18} {'mean ± sd':>18} {'best':>8}  {'must':18} published")
+    for method in methods:
+        runs = [result for result in results if result["method"] == method]
+        for name, group in (
+            ("forward", "location"),
+            ("forward", "angle"),
+            ("forward_mean", "location"),
+            ("forward_mean", "angle"),
+            ("state_estimation", "location"),
+            ("state_estimation", "angle"),
+        ):
+            values = [run[name][group] for run in runs]
+            bound = BOUNDS.get((experiment, method, group)) if name == "forward" else None
+            missed |= line(method, f"{name} {group}", values, bound)
+        line(method, "log p(y) at 1 Hz", [run["log_likelihood"] for run in runs], None)
+        line(method, "seconds to learn", [run["seconds"] for run in runs], None)
+    return missed
+
+
+def line(method: str, name: str, values: list[float], bound: Bound | None) -> int:
+    """Print one figure; 1 if it misses its bound."""
+    mean = statistics.fmean(values)
+    sd = statistics.stdev(values) if len(values) > 1 else 0.0
+    best = max(values) if name.startswith("log p") else min(values)
+    digits = 4 if abs(mean) < 5 else 1
+    verdict, must, published = "", "", ""
+    if bound:
+        must = f"≤ {bound.high:g}" if not bound.low else f"{bound.low:g} – {bound.high:g}"
+        verdict = "  ok" if bound.low <= mean <= bound.high else "  MISSED"
+        published = bound.published
+    figure = f"{mean:.{digits}f} ± {sd:.{digits}f}"
+    print(f"{method:10} {name:26} {figure:>18} {best:8.{digits}f}  {must:16} {published}{verdict}".rstrip())
+    return int(verdict.strip() == "MISSED")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,55 @@
+"""The example programs and small drives of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from steady_ppl import Trajectories, load_program, seeded, simulate
+from steady_ppl.program import Program, for_program
+
+MODELS = Path(__file__).parent.parent / "models"
+
+
+def example(name: str, dtype: torch.dtype = torch.float64) -> Program:
+    """A program of `models/`, for example "hovercraft" or "hovercraft.py:HovercraftTruth"."""
+    file, _, program = name.partition(":")
+    source = MODELS / f"{file.removesuffix('.py')}.py"
+    return load_program(f"{source}:{program}" if program else source).to(dtype)
+
+
+def drives(program: Program, trajectories: int, rows: int, *, gaps: bool = False, seed: int = 0) -> Trajectories:
+    """Simulated drives for `program`, read by it: all cells measured on an even clock, or, with `gaps`, every other
+    trajectory two rows shorter, a fifth of the cells missing and every interval of another length."""
+    program.duration = (rows - 1) * program.step
+    table = simulate(program, trajectories, seed=seed)
+    if gaps:
+        with seeded(seed, "gaps"):
+            time = program.step * (0.5 + torch.rand(table.time.shape, dtype=torch.float64)).cumsum(0)
+            lengths = torch.where(torch.arange(trajectories) % 2 == 1, rows - 2, rows)
+            inside = torch.arange(rows)[:, None] < lengths
+            observed = (torch.rand(table.observed.shape) < 0.8) & inside[..., None]
+        controls = torch.where(inside[..., None], table.controls, 0.0)
+        table = replace(table, time=time, controls=controls, lengths=lengths, observed=observed)
+        table = simulate(program, seed=seed, like=table)
+    return for_program(program, table)
+
+
+def copies(data: Trajectories, count: int) -> Trajectories:
+    """Each trajectory `count` times: `count` independent runs of a filter in one."""
+    return data.subset(torch.arange(len(data)).repeat_interleave(count))
+
+
+def cut(data: Trajectories, rows: int) -> Trajectories:
+    """The first `rows` rows only."""
+    return replace(
+        data,
+        time=data.time[:rows],
+        controls=data.controls[:rows],
+        measurements=data.measurements[:rows],
+        observed=data.observed[:rows],
+        lengths=data.lengths.clamp(max=rows),
+        states=None if data.states is None else data.states[:rows],
+    )

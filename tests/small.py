@@ -1,0 +1,54 @@
+"""Small tables and programs on disk, and the `steady` command in this process."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from examples import MODELS, example
+
+from steady_ppl import Trajectories, simulate, write_table
+from steady_ppl.command_line import main
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", FutureWarning)  # arviz announces its next version whenever it is imported
+    import arviz  # noqa: F401
+
+HOVERCRAFT, TRUTH = MODELS / "hovercraft.py", f"{MODELS / 'hovercraft.py'}:HovercraftTruth"
+
+
+def steady(*arguments: object) -> int:
+    """The exit code of `steady ARGUMENTS`."""
+    return main([str(argument) for argument in arguments])
+
+
+def simulated(name: str = "hovercraft.py:HovercraftTruth", trajectories: int = 3, rows: int = 13, seed: int = 0):
+    """Drives of an example program, as a table holds them."""
+    program = example(name, torch.float32)
+    program.duration = (rows - 1) * program.step
+    return simulate(program, trajectories, seed=seed)
+
+
+def written(path: Path, data: Trajectories | None = None) -> Path:
+    """A table on disk."""
+    write_table(simulated() if data is None else data, path)
+    return path
+
+
+def only_start(data: Trajectories) -> Trajectories:
+    """The same drives, of whose true states only the first is known."""
+    return data.without_truth(keep_start=True)
+
+
+def impossible(data: Trajectories, trajectory: int, row: int) -> Trajectories:
+    """The same drives with a measurement that no program explains."""
+    measurements = data.measurements.clone()
+    measurements[row, trajectory] = 1e30
+    return replace(data, measurements=measurements)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder; to see that nothing was written, changed or left over."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}

@@ -1,0 +1,421 @@
+"""The bootstrap filter against exact answers, its genealogy, its errors, and its invariances."""
+
+from __future__ import annotations
+
+import math
+from contextlib import ExitStack
+from dataclasses import replace
+
+import pyro
+import pytest
+import torch
+from examples import copies, cut, drives, example
+from oracles import CartPosterior, assert_mean, cart_parameters, kalman
+
+from steady_ppl import DataError, FilterError, ProgramError, particle_filter, roll_out, seeded
+from steady_ppl.program import Program
+from steady_ppl.sites import AtMean, Replaying
+
+PROGRAMS = ("linear_gaussian", "hovercraft", "hovercraft:HovercraftTruth", "truck", "pendulum")
+
+
+@pytest.fixture(scope="module")
+def cart():
+    return example("linear_gaussian").requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def even(cart):
+    """Three complete trajectories."""
+    return drives(cart, 3, 12)
+
+
+@pytest.fixture(scope="module")
+def uneven(cart):
+    """Lengths 12 and 10, gaps in the measurements, irregular steps."""
+    return drives(cart, 3, 12, gaps=True)
+
+
+def estimates(program, data, runs: int, particles: int, **settings) -> torch.Tensor:
+    """log p(y) of each trajectory by `runs` independent filters, `(runs, B)`."""
+    with seeded("estimates"):
+        filtered = particle_filter(program, copies(data, runs), particles=particles, keep_history=False, **settings)
+    return filtered.log_likelihood.view(len(data), runs).T
+
+
+# --- log p(y) -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_log_likelihood_agrees_with_kalman(cart, uneven, dtype):
+    runs = estimates(example("linear_gaussian", dtype), uneven.to(dtype), 60, 2000)
+    bias = -runs.var(0) / 2  # of the logarithm of an unbiased, nearly log-normal estimate
+    assert_mean(runs - bias, kalman(uneven, cart_parameters(cart)).log_likelihood)
+
+
+@pytest.mark.parametrize("resample_below", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("drive", ["even", "uneven"])
+def test_evidence_is_unbiased(cart, drive, resample_below, request):
+    data = request.getfixturevalue(drive)
+    runs = estimates(cart, data, 1000, 50, resample_below=resample_below)
+    exact = kalman(data, cart_parameters(cart)).log_likelihood
+    assert_mean((runs - exact).exp(), torch.ones(3))
+
+
+@pytest.mark.parametrize("known_start", [False, True])
+@pytest.mark.parametrize("weight", [0.1, 0.6])
+def test_tempered_evidence_is_that_of_the_power_posterior(cart, uneven, weight, known_start):
+    runs = estimates(cart, uneven, 500, 100, observation_weight=weight, known_start=known_start)
+    exact = kalman(uneven, cart_parameters(cart), weight=weight, known_start=known_start).log_likelihood
+    assert_mean((runs - exact).exp(), torch.ones(3))
+
+
+def test_evidence_from_a_known_start_is_unbiased(cart, uneven):
+    runs = estimates(cart, uneven, 1000, 50, known_start=True)
+    exact = kalman(uneven, cart_parameters(cart), known_start=True).log_likelihood
+    assert_mean((runs - exact).exp(), torch.ones(3))
+
+
+def test_variance_falls_as_one_over_the_number_of_particles(cart, even):
+    sizes = (64, 256, 1024)
+    variances = [estimates(cart, even, 300, size).var(0).mean().log() for size in sizes]
+    x = torch.tensor(sizes, dtype=torch.float64).log()
+    x, y = x - x.mean(), torch.stack(variances)
+    slope = float((x * (y - y.mean())).sum() / x.square().sum())
+    # a log-variance of 900 runs has standard error √(2 / 900), the slope .017; the rest is the next order in 1/N
+    assert slope == pytest.approx(-1, abs=0.15)
+
+
+def test_the_first_row_counts_at_a_known_start_exactly(cart, even):
+    only_first = replace(even, observed=even.observed & (torch.arange(12) == 0)[:, None, None])
+    filtered = particle_filter(cart, only_first, particles=7, known_start=True)
+    density = torch.distributions.Normal(even.states[0, :, 0], cart.measurement_sd)
+    torch.testing.assert_close(filtered.log_likelihood, density.log_prob(even.measurements[0, :, 0]))
+
+
+def test_the_first_row_is_worth_what_kalman_says(cart, even):
+    without = replace(even, observed=even.observed & (torch.arange(12) > 0)[:, None, None])
+    parameters = cart_parameters(cart)
+    worth = kalman(even, parameters).log_likelihood - kalman(without, parameters).log_likelihood
+    assert worth.abs().min() > 0.1
+    with_it, without_it = estimates(cart, even, 60, 2000), estimates(cart, without, 60, 2000)
+    assert_mean(with_it + with_it.var(0) / 2 - without_it - without_it.var(0) / 2, worth)
+
+
+def test_effective_sizes_and_weights_of_the_last_row(cart, even):
+    with seeded("weights"):
+        filtered = particle_filter(cart, even, particles=100, resample_below=0.0)
+    torch.testing.assert_close(filtered.log_weights.exp().sum(0), torch.ones(3, dtype=torch.float64))
+    torch.testing.assert_close(filtered.effective_sizes[-1], 1 / filtered.log_weights.exp().square().sum(0))
+    assert torch.equal(filtered.roots, torch.full((3,), 100.0, dtype=torch.float64))
+
+
+def test_nothing_observed_leaves_prior_weights_and_no_evidence(cart, even):
+    filtered = particle_filter(cart, replace(even, observed=torch.zeros_like(even.observed)), particles=10)
+    assert torch.equal(filtered.log_likelihood, torch.zeros(3, dtype=torch.float64))
+    assert torch.equal(filtered.effective_sizes, torch.full((12, 3), 10.0, dtype=torch.float64))
+
+
+# --- filtered and smoothed states -----------------------------------------------------------------------------------
+
+
+def test_filtered_means_and_covariances_agree_with_kalman(cart, uneven):
+    runs, rows = 60, uneven.time.shape[0]
+    before, after = [], []
+
+    def on_frame(row, states, log_before, log_after):
+        for log_weights, moments in ((log_before, before), (log_after, after)):
+            weights = log_weights.exp()[..., None]
+            mean = (weights * states).sum(0)
+            square = (weights[..., None] * states[..., :, None] * states[..., None, :]).sum(0)
+            moments.append(torch.cat([mean, square.flatten(-2)[:, [0, 1, 3]]], -1))
+
+    with seeded("moments"):
+        particle_filter(cart, copies(uneven, runs), particles=2000, keep_history=False, on_frame=on_frame)
+    exact = kalman(uneven, cart_parameters(cart))
+    for moments, means, covariances in (
+        (before, exact.predicted_means, exact.predicted_covariances),
+        (after, exact.means, exact.covariances),
+    ):
+        squares = covariances + means[..., :, None] * means[..., None, :]
+        expected = torch.cat([means, squares.flatten(-2)[..., [0, 1, 3]]], -1)
+        found = torch.stack(moments).view(rows, 3, runs, 5).movedim(2, 0)
+        inside = uneven.rows
+        assert_mean(found[:, inside], expected[inside])
+
+
+@pytest.mark.parametrize("resample_below", [0.5, 1.0])
+def test_paths_have_the_moments_of_the_exact_smoother(cart, uneven, resample_below):
+    runs = 60
+    with seeded("smoother"):
+        filtered = particle_filter(cart, copies(uneven, runs), particles=2000, resample_below=resample_below)
+        paths = filtered.paths(500)
+    for trajectory, rows in enumerate(uneven.lengths.tolist()):
+        states = paths.states.view(500, -1, 3, runs, 2)[:, :rows, trajectory]
+        exact = CartPosterior(uneven, trajectory, cart_parameters(cart))
+        assert_mean(states.mean(0).transpose(0, 1), exact.states_mean)
+        centred = states - exact.states_mean[:, None]
+        within = (centred[..., :, None] * centred[..., None, :]).mean(0).transpose(0, 1)
+        assert_mean(within, torch.stack([exact.states_covariance[t, :, t] for t in range(rows)]))
+        lagged = (centred[:, 1:, ..., :, None] * centred[:, :-1, ..., None, :]).mean(0).transpose(0, 1)
+        assert_mean(lagged, torch.stack([exact.states_covariance[t + 1, :, t] for t in range(rows - 1)]))
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_paths_obey_the_transition_given_their_noise(name):
+    program = example(name).requires_grad_(False)
+    data = drives(program, 3, 12, gaps=True)
+    with seeded("ancestry"):
+        filtered = particle_filter(program, data, particles=300, resample_below=1.0)
+        paths = filtered.paths(40)
+    assert sum(ancestors is not None for ancestors in filtered.ancestors) >= 9
+    assert len(paths.states[:, 0].unique(dim=0)) < 40  # lineages have coalesced: the ancestors did something
+    with ExitStack() as stack:
+        for dim, size in enumerate((3, 11, 40), start=1):
+            stack.enter_context(pyro.plate(f"dim_{dim}", size, dim=-dim))
+        stack.enter_context(Replaying(paths.noise))
+        after = program.transition(paths.states[:, :-1], data.controls[:-1], data.elapsed[:-1], data.steps)
+    torch.testing.assert_close(after, paths.states[:, 1:], rtol=1e-12, atol=1e-12)
+    assert torch.equal(paths.start["start"], paths.states[:, :1])
+
+
+def test_draws_need_not_be_as_many_as_particles(cart, even):
+    filtered = particle_filter(cart, even, particles=20)
+    for draws in (1, 7, 20, 90):
+        paths = filtered.paths(draws)
+        assert paths.states.shape == (draws, 12, 3, 2)
+        assert paths.start["start"].shape == (draws, 1, 3, 2)
+        assert paths.noise["acceleration"].shape == (draws, 11, 3)
+    assert paths.event_dims == {"states": 1, "start": 1, "acceleration": 0}
+
+
+def test_roots_count_the_first_rows_particles_with_descendants(cart, even):
+    with seeded("roots"):
+        filtered = particle_filter(cart, even, particles=200, resample_below=1.0)
+    index = torch.arange(200)[:, None].expand(-1, 3)
+    for ancestors in filtered.ancestors[::-1]:
+        index = index if ancestors is None else ancestors.gather(0, index)
+    alive = [len(index[:, b].unique()) for b in range(3)]
+    assert all(1 <= count < 100 for count in alive)
+    assert filtered.roots.tolist() == alive
+
+
+def test_a_known_start_holds_for_every_path(cart, uneven):
+    paths = particle_filter(cart, uneven, particles=50, known_start=True).paths(10)
+    assert torch.equal(paths.states[:, 0], uneven.states[0].expand(10, 3, 2))
+    assert torch.equal(paths.start["start"][:, 0], uneven.states[0].expand(10, 3, 2))
+
+
+def test_no_history_without_keep_history_and_the_same_estimate(cart, even):
+    with seeded("history"):
+        with_it = particle_filter(cart, even, particles=50)
+    with seeded("history"):
+        without = particle_filter(cart, even, particles=50, keep_history=False)
+    assert torch.equal(with_it.log_likelihood, without.log_likelihood)
+    assert without.states == [] and without.noise == {}
+
+
+# --- errors ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_impossible_measurement_names_trajectory_and_time(even, dtype):
+    program = example("linear_gaussian", dtype)
+    data = replace(even, time=even.time + 100.0, labels=("a", "b", "c"))
+    data.measurements[7, 1] = 1e300
+    with pytest.raises(FilterError, match=r"trajectory b at 0.7 s: every particle's weight is zero") as error:
+        particle_filter(program, data.to(dtype), particles=20)
+    assert error.value.trajectory == "b"
+    assert error.value.time == pytest.approx(0.7)
+    data.measurements[7, 1] = 0.0
+
+
+def test_a_state_that_is_not_a_number_names_trajectory_and_time(cart, even):
+    controls = even.controls.clone()
+    controls[2, 2] = math.nan  # the velocity of row 3, the position of row 4
+    with pytest.raises(FilterError, match=r"trajectory 3 at 0.4 s: a particle is not a number") as error:
+        particle_filter(cart, replace(even, controls=controls), particles=20)
+    assert error.value.trajectory == "3"
+    assert error.value.time == pytest.approx(0.4)
+
+
+def test_a_single_particle_that_is_not_a_number_is_found(cart, even):
+    class Broken(type(cart)):
+        def transition(self, state, control, time, step):
+            after = super().transition(state, control, time, step)
+            after[5, :, 1] = torch.where(time[:, 1] > 0.55, math.nan, 1.0)[..., None] * after[5, :, 1]
+            return after
+
+    with pytest.raises(FilterError, match="trajectory 2 at 0.7 s"):
+        particle_filter(Broken().double().requires_grad_(False), even, particles=20)
+
+
+def test_a_parameter_that_is_not_a_number_is_an_error(even):
+    program = example("linear_gaussian")
+    with torch.no_grad():
+        program.damping_unconstrained.fill_(math.nan)
+    with pytest.raises(FilterError, match="trajectory 1 at 0.2 s"):
+        particle_filter(program, even, particles=20)
+
+
+def test_a_known_start_without_truth_is_an_error(cart, even):
+    with pytest.raises(DataError, match="true states"):
+        particle_filter(cart, even.without_truth(), particles=20, known_start=True)
+
+
+def test_a_known_start_needs_the_whole_state_as_one_site(even):
+    class Split(Program):
+        states, controls, measurements = ("position", "velocity"), ("push",), ("position",)
+
+        def initial(self):
+            parts = [pyro.sample(name, pyro.distributions.Normal(0.0, 1.0)) for name in ("p", "v")]
+            return torch.stack(parts, -1)
+
+    with pytest.raises(ProgramError, match="whole state as one site") as error:
+        particle_filter(Split(), even, particles=20, known_start=True)
+    assert error.value.site == "p"
+
+
+def test_200_000_float32_particles_never_throw():
+    program = example("hovercraft", torch.float32).requires_grad_(False)
+    data = drives(program, 1, 16)
+    assert data.time.dtype == torch.float32
+    with seeded("large"):
+        filtered = particle_filter(program, data, particles=200_000, resample_below=1.0, keep_history=False)
+    assert filtered.log_likelihood.isfinite().all()
+    assert filtered.roots.min() >= 1 and filtered.roots.max() <= 200_000
+    assert filtered.effective_sizes.min() > 0.999 and filtered.effective_sizes.max() < 200_000.1
+
+
+# --- invariances ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("resample_below", [0.0, 1.0])
+def test_trajectories_do_not_touch_each_other(cart, uneven, resample_below):
+    def run(data):
+        with seeded("alone"):
+            return particle_filter(cart, data, particles=100, resample_below=resample_below)
+
+    other = replace(uneven, measurements=uneven.measurements * torch.tensor([1.0, 5.0, 1.0])[:, None])
+    a, b = run(uneven), run(other)
+    same = torch.tensor([0, 2])
+    assert a.log_likelihood[1] != b.log_likelihood[1]
+    assert torch.equal(a.log_likelihood[same], b.log_likelihood[same])
+    assert torch.equal(a.states[-1][:, same], b.states[-1][:, same])
+
+
+def test_labels_and_the_clock_change_nothing(cart, uneven):
+    with seeded("labels"):
+        a = particle_filter(cart, uneven, particles=50)
+    with seeded("labels"):
+        b = particle_filter(cart, replace(uneven, labels=("x", "y", "z"), time=uneven.time + 2.0**20), particles=50)
+    torch.testing.assert_close(a.log_likelihood, b.log_likelihood, rtol=0, atol=1e-6)  # 2²⁰ s leave 2⁻³³ s
+
+
+def test_what_stands_in_a_missing_cell_changes_nothing(cart, uneven):
+    rubbish = torch.where(uneven.observed, uneven.measurements, 1e6)
+    with seeded("missing"):
+        a = particle_filter(cart, uneven, particles=50)
+    with seeded("missing"):
+        b = particle_filter(cart, replace(uneven, measurements=rubbish), particles=50)
+    assert torch.equal(a.log_likelihood, b.log_likelihood)
+
+
+def test_a_trajectory_scores_the_same_alone_as_padded(cart, uneven):
+    short = uneven.subset([1])
+    with seeded("padded"):
+        a = particle_filter(cart, short, particles=100, resample_below=1.0)
+    with seeded("padded"):
+        b = particle_filter(cart, cut(short, 10), particles=100, resample_below=1.0)
+    torch.testing.assert_close(a.log_likelihood, b.log_likelihood, rtol=1e-12, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def hovercraft():
+    return example("hovercraft:HovercraftTruth").requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def bearings(hovercraft):
+    return drives(hovercraft, 3, 21, gaps=True)
+
+
+def hovercraft_evidence(program, data, **settings) -> torch.Tensor:
+    with seeded("world"):
+        return particle_filter(program, data, particles=500, known_start=True, **settings).log_likelihood
+
+
+@pytest.mark.parametrize("turn", [0.5, math.pi, 4.0])
+def test_turning_and_moving_the_world_changes_nothing(hovercraft, bearings, turn):
+    cos, sin, away = math.cos(turn), math.sin(turn), torch.tensor([3.0, -8.0], dtype=torch.float64)
+    rotation = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
+
+    class Elsewhere(type(hovercraft)):
+        landmarks = (torch.tensor(hovercraft.landmarks, dtype=torch.float64) @ rotation.T + away).tolist()
+
+    states = bearings.states
+    place, velocity = states[..., :2] @ rotation.T + away, states[..., 3:5] @ rotation.T
+    moved = replace(bearings, states=torch.cat([place, states[..., 2:3] + turn, velocity, states[..., 5:]], -1))
+    here, there = hovercraft_evidence(hovercraft, bearings), hovercraft_evidence(Elsewhere().double(), moved)
+    torch.testing.assert_close(here, there.detach(), rtol=1e-9, atol=1e-9)
+
+
+def test_whole_turns_of_the_heading_change_nothing(hovercraft, bearings):
+    turned = bearings.states.clone()
+    turned[..., 2] += math.pi * torch.tensor([2, -4, 6], dtype=torch.float64)
+    here, there = (hovercraft_evidence(hovercraft, d) for d in (bearings, replace(bearings, states=turned)))
+    torch.testing.assert_close(here, there, rtol=1e-9, atol=1e-9)
+
+
+def test_whole_turns_of_a_bearing_change_nothing(hovercraft, bearings):
+    turned = bearings.measurements + 2 * math.pi * torch.tensor([1, -2, 0, 3], dtype=torch.float64)
+    here, there = (hovercraft_evidence(hovercraft, d) for d in (bearings, replace(bearings, measurements=turned)))
+    torch.testing.assert_close(here, there, rtol=1e-9, atol=1e-9)
+
+
+def test_the_order_of_the_landmarks_changes_nothing(hovercraft, bearings):
+    order = [2, 0, 3, 1]
+
+    class Shuffled(type(hovercraft)):
+        landmarks = [hovercraft.landmarks[i] for i in order]
+
+    shuffled = replace(bearings, measurements=bearings.measurements[..., order], observed=bearings.observed[..., order])
+    here, there = hovercraft_evidence(hovercraft, bearings), hovercraft_evidence(Shuffled().double(), shuffled)
+    torch.testing.assert_close(here, there.detach(), rtol=1e-9, atol=1e-9)
+
+
+def test_a_wrong_landmark_costs_many_nats(hovercraft, bearings):
+    class Wrong(type(hovercraft)):
+        landmarks = ((12.0, -3.0), *hovercraft.landmarks[1:])
+
+    assert (hovercraft_evidence(hovercraft, bearings) - hovercraft_evidence(Wrong().double(), bearings)).min() > 20
+
+
+def test_reversed_time_costs_many_nats(hovercraft, bearings):
+    whole = bearings.subset([0, 2])
+    reversed_ = replace(whole, measurements=whole.measurements.flip(0), observed=whole.observed.flip(0))
+    assert (hovercraft_evidence(hovercraft, whole) - hovercraft_evidence(hovercraft, reversed_)).sum() > 100
+
+
+# --- roll-outs --------------------------------------------------------------------------------------------------------
+
+
+def test_roll_out_without_noise_is_the_mean_recursion(cart, uneven):
+    state = uneven.states[:1]
+    found = torch.cat(
+        list(
+            roll_out(
+                cart,
+                state,
+                uneven.controls[:-1, None],
+                uneven.elapsed[:-1, None],
+                uneven.steps[:, None],
+                handler=AtMean(),
+            )
+        )
+    )
+    position, velocity = state[0].unbind(-1)
+    for row, step in enumerate(uneven.steps):
+        acceleration = cart.gain * uneven.controls[row, :, 0] - cart.damping * velocity
+        position, velocity = position + velocity * step, velocity + acceleration * step
+        torch.testing.assert_close(found[row], torch.stack([position, velocity], -1), rtol=1e-12, atol=1e-12)
