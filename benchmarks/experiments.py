@@ -48,7 +48,7 @@ def learn(method: str, vehicle: str, data: Split, seed: int, progress: bool = Fa
         program = {"steady": network, "fit-truth": network, "hand": own, "truth": HovercraftTruth}[method]()
     if method == "steady":
         bearings_only = tuple(part.without_truth(keep_start=True) for part in (train, valid))
-        particles = 400 if vehicle == "hov" else 1000  # so that some ten first-row particles keep descendants
+        particles = 300 if vehicle == "hov" else 1000  # so that some ten first-row particles keep descendants
         return steady.fit(program, *bearings_only, known_start=True, particles=particles, seed=seed, progress=progress)
     if method == "fit-truth":
         return fit_truth.fit(program, train, valid, known_start=True, seed=seed, progress=progress)

@@ -58,7 +58,7 @@ def run(vehicle: str, folder: Path | None, out: Path, seed: int) -> None:
         fits[method] = learn(method, vehicle, data, seed, progress=True)
         train = data[0] if method == "steady" else None
         fits[method].save(out / method, train=train, force=True)
-    results = [evaluate(fits[method], data[2]) for method in methods]
+    results = [evaluate(fits[method], data[2], rollouts=200) for method in methods]
     print(table_of(results, [NAMES[method] for method in methods]))
     print(
         "log p(y): per drive at 1 Hz; location m, angle rad, velocity m/s, yaw rate rad/s. forward: noisy roll-outs of"

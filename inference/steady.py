@@ -32,7 +32,10 @@ PAPER = {
     "ramp": 1.0,
     "validate_every": 500,
     "validation_particles": 100_000,
+    "patience": 30,
 }
+
+GUIDES = {"bootstrap": SMCGuide}
 
 
 def fit(
@@ -41,7 +44,8 @@ def fit(
     valid: Trajectories | None = None,
     *,
     known_start: bool = False,
-    particles: int = 400,
+    guide: str = "bootstrap",
+    particles: int = 300,
     draws: int = 30,
     steps: int = 250,
     gradient_steps: int = 2,
@@ -54,7 +58,7 @@ def fit(
     ramp: float = 1.0,
     validate_every: int = 25,
     validation_particles: int = 2000,
-    patience: int = 30,
+    patience: int = 5,
     seed: int = 0,
     **run,
 ) -> Fit:
@@ -65,6 +69,7 @@ def fit(
         table: the training drives; true states, where there are any, are used for a known start only.
         valid: held-out drives.
         known_start: the first row's true state is given.
+        guide: the E step, one of GUIDES.
         particles: N of the E step, for each drive.
         draws: M, paths for each drive in the M step.
         steps: number of E steps.
@@ -77,7 +82,7 @@ def fit(
     data = for_program(program, table)
     with seeded(seed, "prepare"):
         program.prepare(data, known_start)
-    guide = SMCGuide(
+    e_step = GUIDES[guide](
         program, particles=particles, draws=draws, tempering=LinearRamp(first_weight, ramp), known_start=known_start
     )
     optimization = Optimization(
@@ -93,5 +98,5 @@ def fit(
     )
     held_out = for_program(program, valid) if valid is not None else None
     validation = Validation(held_out, particles=validation_particles, known_start=known_start)
-    trained = train(program, guide, data, validation, optimization, known_start=known_start, seed=seed, **run)
+    trained = train(program, e_step, data, validation, optimization, known_start=known_start, seed=seed, **run)
     return Fit(program, "steady", settings, seed=seed, known_start=known_start, trained=trained)

@@ -20,7 +20,8 @@ from steady_ppl.program import Program, for_program, load_program
 from steady_ppl.seeding import seeded
 from steady_ppl.simulation import simulate
 from steady_ppl.table import read_table, write_table
-from steady_ppl.training import Optimization, Trained, Validation, train
+from steady_ppl.training import Optimization, Trained, train
+from steady_ppl.validation import Validation
 
 __all__ = [
     "Constant",

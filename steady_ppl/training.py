@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,10 +19,10 @@ from tqdm import tqdm
 from steady_ppl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import TrainingError
-from steady_ppl.filtering import log_likelihood
 from steady_ppl.joint import Joint
 from steady_ppl.program import Program
 from steady_ppl.seeding import seeded
+from steady_ppl.validation import Validation, as_good
 
 
 class Guide(Protocol):
@@ -68,32 +68,6 @@ class Optimization:
     patience: int = 30
 
 
-@dataclass(frozen=True)
-class Validation:
-    """Held-out log p(y): the stopping rule of every method.
-
-    Attributes:
-        data: the validation table, as returned by `for_program`; None trains to the last step.
-        particles: N of the filter; the same random numbers are used at every validation.
-        known_start: start at the true first state.
-        every: use every n-th row's measurements (10 Hz to 1 Hz).
-    """
-
-    data: Trajectories | None = None
-    particles: int = 2000
-    known_start: bool = False
-    every: int = 10
-
-    def __call__(self, program: Program, seed: int) -> list[float]:
-        """Log p(y) of each held-out trajectory."""
-        assert self.data is not None
-        with seeded(seed, "validate"):
-            values = log_likelihood(
-                program, self.data, particles=self.particles, known_start=self.known_start, every=self.every
-            )
-        return values.tolist()
-
-
 @dataclass
 class Trained:
     """What training leaves behind.
@@ -136,7 +110,7 @@ def train(
         optimization: step sizes and numbers of steps.
         known_start: the first state is certain and not scored.
         seed: with the step it keys every draw, so that a resumed run repeats an uninterrupted one.
-        checkpoint: file that is written at every validation.
+        checkpoint: file that is written at the start and at every validation.
         resume: continue from `checkpoint`.
         progress: show a bar on stderr.
 
@@ -158,6 +132,8 @@ def train(
     )
     if resume and checkpoint is not None:
         read_checkpoint(checkpoint, state, optimizer)
+    elif checkpoint is not None:
+        write_checkpoint(checkpoint, state, optimizer)
     batch = optimization.batch or len(data)
     bar = tqdm(total=optimization.steps, initial=state.step, disable=not progress, file=sys.stderr, unit="step")
     figures: dict[str, float] = {}
@@ -183,19 +159,11 @@ def train(
                     state.averaged[name].lerp_(value.detach(), 1 - keep)
                 bar.update()
                 if state.step % optimization.validate_every == 0 or state.step == optimization.steps:
-                    entry = {"step": float(state.step), "loss": loss.item(), **figures}
+                    held_out = []
                     if validation.data is not None:
                         with using(parameters, state.averaged):
                             held_out = validation(program, seed)
-                        entry["log_likelihood"] = sum(held_out) / len(held_out)
-                    else:
-                        held_out = []
-                    state.history.append(entry)
-                    if as_good(held_out, state.best_held_out):
-                        state.kept = {name: value.clone() for name, value in state.averaged.items()}
-                        state.kept_step = state.step
-                    if not state.best_held_out or sum(held_out) > sum(state.best_held_out):
-                        state.best_held_out = held_out
+                    _judge(state, held_out, {"loss": loss.item(), **figures})
                     if checkpoint is not None:
                         write_checkpoint(checkpoint, state, optimizer)
                 shown = {"loss": loss.item(), **figures}
@@ -208,6 +176,19 @@ def train(
         for name, value in (state.kept or state.averaged).items():
             parameters[name].copy_(value)
     return Trained(history=state.history, kept=state.kept_step, interrupted=interrupted)
+
+
+def _judge(state: Checkpoint, held_out: list[float], figures: dict[str, float]) -> None:
+    """Note a validation, and keep the averaged parameters if they are as good as the best."""
+    entry = {"step": float(state.step), **figures}
+    if held_out:
+        entry["log_likelihood"] = sum(held_out) / len(held_out)
+    state.history.append(entry)
+    if as_good(held_out, state.best_held_out):
+        state.kept = {name: value.clone() for name, value in state.averaged.items()}
+        state.kept_step = state.step
+    if not state.best_held_out or sum(held_out) > sum(state.best_held_out):
+        state.best_held_out = held_out
 
 
 @contextmanager
@@ -259,21 +240,3 @@ def _require_finite(loss: Tensor, step: int) -> None:
             f"the loss is {loss.item()} at step {step + 1}: lower the learning rate, or look at the program's "
             "densities (a standard deviation of zero?)"
         )
-
-
-def as_good(candidate: Sequence[float], best: Sequence[float]) -> bool:
-    """Whether held-out log p(y) is no worse than the best, up to one standard error of the paired difference.
-
-    Log p(y) at 1 Hz hardly feels how wide the process noise is; its differences late in a training are smaller than
-    what the choice of held-out drives moves. Among equals the later parameters have seen more of the full observation
-    weight (the one-standard-error rule of Breiman et al. 1984, towards the later instead of the smaller model).
-
-    Args:
-        candidate, best: log p(y) of each held-out trajectory; empty when nothing is held out.
-    """
-    if not candidate or not best:
-        return True
-    loss = torch.tensor(best, dtype=torch.float64) - torch.tensor(candidate, dtype=torch.float64)
-    if len(loss) < 2:
-        return bool(loss.mean() <= 0)
-    return bool(loss.mean() <= loss.std() / math.sqrt(len(loss)))

@@ -196,6 +196,17 @@ def test_a_path_that_blows_up_after_the_last_measurement_is_an_error(measured):
     assert error.value.trajectory == "2" and error.value.time == pytest.approx(0.4)
 
 
+def test_a_path_that_blows_up_in_its_padding_is_none():
+    program = example("linear_gaussian").requires_grad_(False)
+    data = drives(program, 2, 6, gaps=True)
+    assert data.lengths.tolist() == [6, 4]
+    data.controls[3, 1] = math.inf
+    guide = SMCGuide(program, particles=20)
+    guide.refresh(data, 1.0)
+    finite = guide.paths.states.isfinite()
+    assert finite[:, :4].all() and not finite[:, 4, 1].all(-1).any()
+
+
 # --- the true paths ---------------------------------------------------------------------------------------------------
 
 
@@ -207,9 +218,9 @@ def test_the_truth_guides_noise_leads_from_each_true_state_to_the_next(name):
     program = example(name).requires_grad_(False)
     data = drives(program, 3, 12, gaps=True)
     paths = true_paths(program, data)
-    with pyro.plate("interval", 11, dim=-2), pyro.plate("trajectory", 3, dim=-1):
-        with Replaying({site: value[0] for site, value in paths.noise.items()}):
-            after = program.transition(paths.states[0, :-1], data.controls[:-1], data.elapsed[:-1], data.steps)
+    replaying = Replaying({site: value[0] for site, value in paths.noise.items()})
+    with pyro.plate("interval", 11, dim=-2), pyro.plate("trajectory", 3, dim=-1), replaying:
+        after = program.transition(paths.states[0, :-1], data.controls[:-1], data.elapsed[:-1], data.steps)
     inside = data.transitions
     torch.testing.assert_close(after[inside], data.states[1:][inside], rtol=1e-9, atol=1e-9)
     assert torch.equal(paths.start["start"][0, 0], data.states[0])

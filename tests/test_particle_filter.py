@@ -234,7 +234,7 @@ def test_a_state_that_is_not_a_number_names_trajectory_and_time(cart, even):
     controls = even.controls.clone()
     controls[2, 2] = math.nan  # the velocity of row 3, the position of row 4
     with pytest.raises(FilterError, match=r"trajectory 3 at 0.4 s: a particle is not a number") as error:
-        particle_filter(cart, replace(even, controls=controls), particles=20)
+        particle_filter(cart, replace(even, controls=controls, time=even.time + 100.0), particles=20)
     assert error.value.trajectory == "3"
     assert error.value.time == pytest.approx(0.4)
 

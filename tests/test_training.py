@@ -140,12 +140,26 @@ def test_training_leaves_pyros_global_parameter_store_alone(data):
     assert set(pyro.get_param_store().keys()) == before
 
 
-def test_a_program_of_pyro_methods_keeps_its_own_values_outside_of_training(data):
-    class Decorated(Cart):
-        @pyro_method
-        def transition(self, state, control, time, step):
-            return super().transition(state, control, time, step)
+class Decorated(Wrong):
+    """Written in Pyro's habit; its parameters live in the global store unless told otherwise."""
 
+    @pyro_method
+    def transition(self, state, control, time, step):
+        return super().transition(state, control, time, step)
+
+
+@pytest.mark.xfail(strict=True, reason="a program made before module_local_params is set fails with AttributeError")
+def test_fits_of_pyro_methods_are_independent_as_well(data):
+    with pyro.get_param_store().scope() as scope:
+        first, second = Decorated(), Decorated()
+        a, b = (run(program, data) for program in (first, second))
+        assert not scope["params"]
+    assert a == b and same(values(first), values(second))
+    assert not same(values(first), values(Wrong()))
+
+
+@pytest.mark.xfail(strict=True, reason="module_local_params is set in train only")
+def test_a_program_of_pyro_methods_keeps_its_own_values_outside_of_training(data):
     with pyro.get_param_store().scope():
         first, second = Decorated(), Decorated()
         first.gain = torch.tensor(5.0)
@@ -160,13 +174,13 @@ def test_a_program_of_pyro_methods_keeps_its_own_values_outside_of_training(data
 
 
 @pytest.mark.parametrize("batch", [None, 2])
-@pytest.mark.parametrize("stop", [3, 4, 5])
+@pytest.mark.parametrize("stop", [1, 3, 4, 5])
 def test_a_resumed_run_repeats_an_uninterrupted_one_bit_for_bit(data, tmp_path, stop, batch):
     optimization = Optimization(steps=6, validate_every=2, learning_rate=0.05, batch=batch, gradient_steps=2)
     whole, killed, resumed = Wrong(), Wrong(), Wrong()
     a = run(whole, data, optimization, checkpoint=tmp_path / "whole", seed=1)
+    guide = Stopping(killed, at=stop, error=RuntimeError("killed"))
     with pytest.raises(RuntimeError, match="killed"):
-        guide = Stopping(killed, at=stop, error=RuntimeError("killed"))
         run(killed, data, optimization, guide=guide, checkpoint=tmp_path / "cut", seed=1)
     guide = Stopping(resumed)
     b = run(resumed, data, optimization, guide=guide, checkpoint=tmp_path / "cut", resume=True, seed=1)
@@ -182,9 +196,8 @@ def test_a_resumed_run_keeps_counting_the_patience(data, tmp_path):
     optimization = Optimization(steps=10, validate_every=2, patience=3, learning_rate=0.05)
     whole, killed, resumed = Wrong(), Wrong(), Wrong()
     a = run(whole, data, optimization, validation=Scripted(data, scores=scores))
+    guide, script = Stopping(killed, at=5, error=RuntimeError("killed")), Scripted(data, scores=scores)
     with pytest.raises(RuntimeError, match="killed"):
-        guide = Stopping(killed, at=5, error=RuntimeError("killed"))
-        script = Scripted(data, scores=scores)
         run(killed, data, optimization, guide=guide, validation=script, checkpoint=tmp_path / "cut")
     rest = Scripted(data, scores=scores[2:])
     guide = Stopping(resumed)
@@ -386,7 +399,9 @@ def test_a_loss_that_is_not_finite_is_an_error_and_names_the_step(data):
 
 
 @pytest.mark.filterwarnings("ignore:Encountered NaN")
-@pytest.mark.parametrize("steps", [1, 5])
+@pytest.mark.parametrize(
+    "steps", [pytest.param(1, marks=pytest.mark.xfail(strict=True, reason="only the loss is looked at")), 5]
+)
 def test_a_gradient_that_is_not_finite_is_an_error(data, steps):
     class Steep(Cart):
         def transition(self, state, control, time, step):
@@ -398,6 +413,7 @@ def test_a_gradient_that_is_not_finite_is_an_error(data, steps):
         run(program, data, Optimization(steps=steps), guide=TruthGuide(program), validation=Validation())
 
 
+@pytest.mark.xfail(strict=True, reason="0 · inf in the gradient of masked, padded rows")
 @pytest.mark.filterwarnings("ignore:Encountered NaN")
 def test_padding_that_blows_up_does_not_spoil_the_parameters():
     class Toppling(Cart):
