@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -165,6 +166,16 @@ def test_force_overwrites_a_run_and_leaves_nothing_of_the_old_one(tmp_path: Path
     assert steady("fit", HOVERCRAFT, work / "train.csv", "--recipe", "hand", "--force", "--out", run) == 0
     assert set(contents(run)) == {"parameters.safetensors", "posterior.nc", "run.json"}
     assert json.loads((run / "run.json").read_text())["recipe"] == "hand"
+
+
+@defect("arviz announces its next version on stderr in the day's first fit")
+def test_a_fit_in_a_shell_says_its_result_and_nothing_else(tmp_path: Path, work: Path) -> None:
+    command = ("fit", HOVERCRAFT, work / "train.csv", "--recipe", "hand", "--out", tmp_path / "run")
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}  # where arviz notes that it has announced itself
+    program = (sys.executable, "-m", "steady_ppl.command_line")
+    done = subprocess.run([*program, *command], capture_output=True, text=True, check=False, env=environment)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == f"{tmp_path / 'run'}: Hovercraft(mass=1.5, inertia=1.5, noise=[0.2, 0.2, 0.1])\n"
 
 
 # --- evaluate ---------------------------------------------------------------------------------------------------------
@@ -563,7 +574,8 @@ def test_a_run_interrupted_twice_stays_usable(tmp_path: Path, capsys, ctrl_c) ->
     assert steady(*command) == 1
     ctrl_c(0)
     assert steady(*command, "--resume") == 1
-    assert Fit.load(tmp_path / "run").trained.interrupted
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "interrupted"
+    Fit.load(tmp_path / "run")
 
 
 def test_a_run_interrupted_before_its_first_checkpoint_can_be_resumed(tmp_path: Path, capsys, ctrl_c) -> None:

@@ -85,6 +85,12 @@ def test_a_hand_written_program_has_no_history(tmp_path: Path) -> None:
     assert Fit.load(tmp_path / "run").trained is None
 
 
+@defect("a fit without history comes back as one that was never trained")
+def test_a_fit_interrupted_before_its_first_validation_comes_back_as_interrupted(tmp_path: Path) -> None:
+    Fit(load_program(HOVERCRAFT), "steady", trained=Trained([], kept=0, interrupted=True)).save(tmp_path / "run")
+    assert Fit.load(tmp_path / "run").trained == Trained([], kept=0, interrupted=True)
+
+
 # --- what is written --------------------------------------------------------------------------------------------------
 
 

@@ -106,6 +106,15 @@ def test_two_files_of_one_name_in_two_folders_are_two_programs(tmp_path: Path) -
     assert [program.color for program in programs] == ["black", "white"]
 
 
+def test_an_import_that_waits_for_its_call_finds_its_own_sibling_too(tmp_path: Path) -> None:
+    programs = []
+    for color in ("black", "white"):
+        boat(tmp_path / color / "parts.py", f"color = '{color}'\n")
+        text = BOAT + "\n    def paint(self):\n        from .parts import color\n        return color\n"
+        programs.append(load_program(f"{boat(tmp_path / color / 'boat.py', text)}:SmallBoat"))
+    assert [program.paint() for program in programs] == ["black", "white"]
+
+
 def test_a_file_that_changed_is_read_again(tmp_path: Path) -> None:
     assert load_program(boat(tmp_path / "boat.py")).color == "red"
     assert load_program(boat(tmp_path / "boat.py", BOAT.replace("red", "yellow"))).color == "yellow"
