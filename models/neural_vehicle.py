@@ -7,7 +7,7 @@ import pyro.distributions as dist
 import torch
 from torch import nn, tensor
 
-from steady_ppl import PlanarVehicle, bearings_to, smoothed_states, stack
+from steady_ppl import DataError, PlanarVehicle, bearings_to, smoothed_states, stack
 
 
 class NeuralVehicle(PlanarVehicle):
@@ -50,6 +50,8 @@ class NeuralVehicle(PlanarVehicle):
 
     def prepare(self, data, known_start):
         """Normalise by the moments of the controls and of smoothed (or, if asked, true) body velocities."""
+        if self.normalise == "truth" and (data.states is None or not bool(data.states[data.rows].isfinite().all())):
+            raise DataError('normalise="truth" needs the true state of every row: the x. columns are incomplete')
         states = data.states if self.normalise == "truth" else smoothed_states(self, data, known_start=known_start)
         inputs = stack(*self.body_velocity(states), *data.controls.unbind(-1))[data.rows]
         self.input_mean.copy_(inputs.mean(0))
@@ -97,7 +99,7 @@ class NeuralTruck(NeuralVehicle):
     controls = ("speed [m/s]", "turn [rad/s]")
     landmarks = ((-1.230314, -0.606814), (0.797073, 0.889471), (-3.496525, 0.207874), (0.0, 6.0))
     acceleration_scale = (3.0, 3.0, 3.0)
-    decays = {"hidden": 3.0, "skip": 0.1, "noise": 0.1}
+    decays = {"hidden": 1.0, "skip": 0.1, "noise": 3.0}
 
 
 class AuthorsHovercraft(NeuralHovercraft):

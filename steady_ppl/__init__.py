@@ -1,64 +1,64 @@
-"""Learn how a vehicle moves from noisy, indirect measurements, with its state-space model written as a Pyro program."""
+"""Learn how a vehicle moves from noisy, indirect measurements, with its state-space model written as a Pyro program.
 
-from steady_ppl.data import Trajectories
-from steady_ppl.errors import (
-    DataError,
-    FilterError,
-    ProgramError,
-    RunError,
-    SteadyError,
-    TrainingError,
-    UsageError,
-)
-from steady_ppl.filtering import log_likelihood, smoothed_states
-from steady_ppl.fit import Fit
-from steady_ppl.guides import Constant, LinearRamp, PathGuide, SMCGuide, TruthGuide
-from steady_ppl.joint import Joint
-from steady_ppl.particle_filter import Filtered, Paths, particle_filter, roll_out
-from steady_ppl.planar_vehicle import PlanarVehicle, WrappedNormal, bearings_to, stack, wrap
-from steady_ppl.program import Program, for_program, load_program
-from steady_ppl.seeding import seeded
-from steady_ppl.simulation import simulate
-from steady_ppl.table import read_table, write_table
-from steady_ppl.training import Optimization, Trained, train
-from steady_ppl.validation import Validation
+Names are imported when they are first used, so that the command line answers `--help` without loading torch.
+"""
 
-__all__ = [
-    "Constant",
-    "DataError",
-    "FilterError",
-    "Filtered",
-    "Fit",
-    "Joint",
-    "LinearRamp",
-    "Optimization",
-    "PathGuide",
-    "Paths",
-    "PlanarVehicle",
-    "Program",
-    "ProgramError",
-    "RunError",
-    "SMCGuide",
-    "SteadyError",
-    "Trained",
-    "TrainingError",
-    "Trajectories",
-    "TruthGuide",
-    "UsageError",
-    "Validation",
-    "WrappedNormal",
-    "bearings_to",
-    "for_program",
-    "load_program",
-    "log_likelihood",
-    "particle_filter",
-    "read_table",
-    "roll_out",
-    "seeded",
-    "simulate",
-    "smoothed_states",
-    "stack",
-    "train",
-    "wrap",
-    "write_table",
-]
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from steady_ppl.data import Trajectories
+    from steady_ppl.errors import (
+        DataError,
+        FilterError,
+        ProgramError,
+        RunError,
+        SteadyError,
+        TrainingError,
+        UsageError,
+    )
+    from steady_ppl.filtering import log_likelihood, smoothed_states
+    from steady_ppl.fit import Fit
+    from steady_ppl.guides import Constant, LinearRamp, PathGuide, SMCGuide, TruthGuide
+    from steady_ppl.joint import Joint
+    from steady_ppl.particles import Filtered, Paths, particle_filter, roll_out
+    from steady_ppl.planar_vehicle import PlanarVehicle, WrappedNormal, bearings_to, stack, wrap
+    from steady_ppl.program import Program, for_program, load_program
+    from steady_ppl.seeding import seeded
+    from steady_ppl.simulation import simulate
+    from steady_ppl.table import read_table, write_table
+    from steady_ppl.training import Optimization, Trained, train
+    from steady_ppl.validation import Validation
+
+_HOMES = {
+    "data": ("Trajectories",),
+    "errors": ("DataError", "FilterError", "ProgramError", "RunError", "SteadyError", "TrainingError", "UsageError"),
+    "filtering": ("log_likelihood", "smoothed_states"),
+    "fit": ("Fit",),
+    "guides": ("Constant", "LinearRamp", "PathGuide", "SMCGuide", "TruthGuide"),
+    "joint": ("Joint",),
+    "particles": ("Filtered", "Paths", "particle_filter", "roll_out"),
+    "planar_vehicle": ("PlanarVehicle", "WrappedNormal", "bearings_to", "stack", "wrap"),
+    "program": ("Program", "for_program", "load_program"),
+    "seeding": ("seeded",),
+    "simulation": ("simulate",),
+    "table": ("read_table", "write_table"),
+    "training": ("Optimization", "Trained", "train"),
+    "validation": ("Validation",),
+}
+_HOME = {name: module for module, names in _HOMES.items() for name in names}
+__all__ = sorted(_HOME)  # pyright: ignore
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"steady_ppl.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -20,6 +20,8 @@ from steady_ppl.errors import SteadyError, UsageError
 if TYPE_CHECKING:
     pass
 
+INTERRUPTED = 130  # what typer returns for Ctrl-C
+
 app = typer.Typer(
     help="Learn how a vehicle moves from noisy, indirect measurements.",
     no_args_is_help=True,
@@ -58,7 +60,7 @@ def options(debug: Annotated[bool, typer.Option("--debug", help="Show the traceb
 def simulate(
     model: Annotated[str, typer.Argument(help="Program: models/hovercraft.py, or mine.py:Boat.")],
     out: Out,
-    trajectories: Annotated[int, typer.Option(help="How many drives.", min=1)] = 16,
+    trajectories: Annotated[int | None, typer.Option(help="How many drives, 16 when not given.", min=1)] = None,
     seed: Seed = 0,
     controls: Annotated[Path | None, typer.Option(help="Take time, controls and gaps from this table.")] = None,
 ) -> None:
@@ -66,9 +68,11 @@ def simulate(
     from steady_ppl.simulation import simulate as run
     from steady_ppl.table import read_table, write_table
 
+    if controls and trajectories:
+        raise UsageError("--controls has as many drives as its table: leave --trajectories out")
     program = _program(model, seed)
     like = read_table(controls) if controls else None
-    write_table(run(program, trajectories, seed=seed, like=like), out)
+    write_table(run(program, trajectories or 16, seed=seed, like=like), out)
 
 
 @data_app.command("alpha-truck")
@@ -184,6 +188,7 @@ def _write_json(path: Path, content: Any) -> None:
         beside.write_text(json.dumps(content, indent=1) + "\n")
         os.replace(beside, path)
     except OSError as error:
+        beside.unlink(missing_ok=True)
         raise UsageError(f"{path} cannot be written: {error.strerror}") from error
 
 
@@ -198,7 +203,11 @@ def main(arguments: list[str] | None = None) -> int:
     arguments = [argument for argument in arguments if argument != "--debug"]
     command = typer.main.get_command(app)
     try:
-        return command.main(arguments, prog_name="steady", standalone_mode=False) or 0
+        code = command.main(arguments, prog_name="steady", standalone_mode=False) or 0
+        if code == INTERRUPTED:
+            _say("interrupted")
+            return 1
+        return code
     except SteadyError as error:
         if debug:
             traceback.print_exc()
@@ -209,11 +218,13 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
     except Exception as error:
         if hasattr(error, "format_message"):
-            _say(f"{error.format_message()} (steady --help shows the usage)")
+            if error.format_message():
+                _say(f"{error.format_message()} (steady --help shows the usage)")
             return 2
         if debug:
             traceback.print_exc()
-        _say(f"{type(error).__name__}: {error} (--debug shows where)")
+        lines = str(error).strip().splitlines() or [""]
+        _say(f"{type(error).__name__}: {lines[0]} (--debug shows where)")
         return 1
 
 

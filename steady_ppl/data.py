@@ -27,7 +27,7 @@ class Trajectories:
         observed: `(T + 1, B, K)` bool, where a measurement exists.
         lengths: `(B,)` number of rows of each trajectory.
         states: `(T + 1, B, D)` the true states, NaN where unknown; None when nothing is known.
-        labels: the trajectories' names.
+        labels: the trajectories' names, 1, 2, … where none are given.
         control_names, measurement_names, state_names: the components' names, without units.
     """
 
@@ -41,6 +41,10 @@ class Trajectories:
     control_names: tuple[str, ...] = ()
     measurement_names: tuple[str, ...] = ()
     state_names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.labels:
+            object.__setattr__(self, "labels", tuple(str(i + 1) for i in range(self.time.shape[1])))
 
     def __len__(self) -> int:
         return self.time.shape[1]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
-from steady_ppl.particle_filter import particle_filter
+from steady_ppl.particles import particle_filter
 from steady_ppl.program import Program
 
 

@@ -119,6 +119,8 @@ class Fit:
         """
         folder = Path(folder)
         record = read_record(folder)
+        if record.get("status") not in ("finished", "interrupted"):
+            raise RunError(f"{folder}: its fit has not finished: go on with it by `steady fit … --resume`")
         if not isinstance(program, Program):
             program = _load_recorded(folder, record["program"], program)
         tensors, _ = read_tensors(folder / PARAMETERS)
@@ -129,17 +131,20 @@ class Fit:
             raise RunError(
                 f"{folder}: the parameters do not fit program {type(program).__name__}: {', '.join(differing)}"
             )
+        kinds = {value.dtype for value in tensors.values() if value.is_floating_point()}
+        if len(kinds) == 1:
+            program.to(kinds.pop())
         program.load_state_dict(tensors)
-        trained = Trained(
-            history=record["history"], kept=record["kept_step"] or 0, interrupted=record["status"] == "interrupted"
-        )
+        trained = None
+        if record["kept_step"] is not None:
+            trained = Trained(record["history"], record["kept_step"], record["status"] == "interrupted")
         return cls(
             program=program,
             recipe=record["recipe"],
             settings=record["settings"],
             seed=record["seed"],
             known_start=record["known_start"],
-            trained=trained if record["history"] else None,
+            trained=trained,
             notes=record["notes"],
         )
 
@@ -179,21 +184,24 @@ def read_record(folder: Path) -> dict[str, Any]:
         RunError: there is none, or it is damaged.
     """
     try:
-        return json.loads((folder / RECORD).read_text())
-    except FileNotFoundError:
+        record = json.loads((folder / RECORD).read_text())
+    except (FileNotFoundError, NotADirectoryError):
         raise RunError(f"{folder} is not a run: it has no {RECORD}") from None
     except (OSError, ValueError) as error:
         raise RunError(f"{folder / RECORD} is damaged: {error}") from error
+    if not (isinstance(record, dict) and {"program", "recipe", "status"} <= record.keys()):
+        raise RunError(f"{folder / RECORD} is damaged: it says neither program nor recipe")
+    return record
 
 
 def program_source(program: Program, folder: Path) -> dict[str, str] | None:
-    """Class, file relative to the run, and the file's sha256; None for a class that has no file."""
+    """Class, file relative to the run, and the file's sha256; None where there is no file to load it from."""
     program_class = type(program)
     try:
         file = inspect.getsourcefile(program_class)
     except (TypeError, OSError):
         file = None
-    if file is None or not Path(file).is_file():
+    if file is None or not Path(file).is_file() or "." in program_class.__qualname__:
         return None
     return {
         "class": program_class.__qualname__,

@@ -11,7 +11,7 @@ import torch
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import FilterError
-from steady_ppl.particle_filter import Paths, particle_filter
+from steady_ppl.particles import Paths, particle_filter
 from steady_ppl.program import Program
 from steady_ppl.sites import masked
 from steady_ppl.true_paths import true_paths
@@ -125,7 +125,7 @@ class SMCGuide(PathGuide):
             known_start=self.known_start,
             resample_below=self.resample_below,
         )
-        self.paths = filtered.paths(self.draws)
+        self.paths = filtered.paths(self.draws).within(data)
         _require_finite(self.paths, data)
         observed = data.observed.any(-1)
         return {
@@ -141,10 +141,12 @@ class TruthGuide(PathGuide):
     def __init__(self, program: Program) -> None:
         super().__init__(draws=1)
         self.program = program
+        self._of: Trajectories | None = None
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
         """Look the true paths up; nothing is drawn."""
-        self.paths = true_paths(self.program, data)
+        if data is not self._of:
+            self.paths, self._of = true_paths(self.program, data), data
         return {}
 
 

@@ -9,7 +9,7 @@ import pyro.distributions as dist
 from pyro.distributions import constraints
 
 from steady_ppl.data import Trajectories
-from steady_ppl.particle_filter import KnownStart
+from steady_ppl.particles import KnownStart
 from steady_ppl.program import Program
 from steady_ppl.sites import Observing, masked
 

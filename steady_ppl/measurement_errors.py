@@ -9,7 +9,7 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.filtering import in_parts
-from steady_ppl.particle_filter import particle_filter, roll_out
+from steady_ppl.particles import particle_filter, roll_out
 from steady_ppl.program import Program
 from steady_ppl.resampling import systematic, take
 from steady_ppl.sites import AtMean, Recording, as_vector, residual, running
@@ -34,11 +34,14 @@ def measurement_errors(program: Program, data: Trajectories, *, particles: int, 
 
     Returns:
         `one_step`, `open_loop_1s`, `open_loop_3s` in the measurements' unit, and `coverage_90` between 0 and 1; an
-        open loop that is longer than every trajectory is left out.
+        open loop shorter than a step or longer than every trajectory is left out.
     """
     totals: dict[str, list[float]] = {}
+    step = float(data.steps[data.transitions].median())
+    rows = {name: round(seconds / step) for name, seconds in OPEN_LOOP.items()}
+    horizons = {name: count for name, count in rows.items() if 1 <= count < data.time.shape[0]}
     for part in in_parts(data, particles):
-        for name, (total, count) in _totals(program, part, particles, known_start).items():
+        for name, (total, count) in _totals(program, part, particles, known_start, horizons).items():
             have = totals.setdefault(name, [0.0, 0.0])
             have[0] += total
             have[1] += count
@@ -46,7 +49,9 @@ def measurement_errors(program: Program, data: Trajectories, *, particles: int, 
     return {name: mean if name == "coverage_90" else math.sqrt(mean) for name, mean in means.items()}
 
 
-def _totals(program: Program, data: Trajectories, particles: int, known_start: bool) -> dict[str, tuple[float, float]]:
+def _totals(
+    program: Program, data: Trajectories, particles: int, known_start: bool, horizons: dict[str, int]
+) -> dict[str, tuple[float, float]]:
     squares, covered, count = 0.0, 0.0, 0.0
     draws: list[Tensor] = []
 
@@ -66,16 +71,15 @@ def _totals(program: Program, data: Trajectories, particles: int, known_start: b
 
     particle_filter(program, data, particles=particles, known_start=known_start, keep_history=False, on_frame=on_frame)
     totals = {"one_step": (squares, count), "coverage_90": (covered, count)}
-    return totals | _open_loop(program, data, torch.stack(draws, 1))
+    return totals | _open_loop(program, data, torch.stack(draws, 1), horizons)
 
 
-def _open_loop(program: Program, data: Trajectories, draws: Tensor) -> dict[str, tuple[float, float]]:
-    rows = data.time.shape[0]
-    step = float(data.steps[data.transitions].median())
-    wanted = {name: round(seconds / step) for name, seconds in OPEN_LOOP.items() if round(seconds / step) < rows}
+def _open_loop(
+    program: Program, data: Trajectories, draws: Tensor, horizons: dict[str, int]
+) -> dict[str, tuple[float, float]]:
     totals: dict[str, tuple[float, float]] = {}
-    for name, horizon in wanted.items():
-        starts = rows - horizon
+    for name, horizon in horizons.items():
+        starts = data.time.shape[0] - horizon
 
         def windows(values: Tensor, horizon: int = horizon, starts: int = starts) -> Tensor:
             return torch.stack([values[k : k + starts] for k in range(horizon)])

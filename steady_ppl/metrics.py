@@ -12,7 +12,7 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.filtering import in_parts
-from steady_ppl.particle_filter import particle_filter, roll_out
+from steady_ppl.particles import particle_filter, roll_out
 from steady_ppl.planar_vehicle import wrap
 from steady_ppl.program import Program, error_groups, names
 from steady_ppl.sites import AtMean
@@ -55,12 +55,13 @@ def state_estimation(
         assert part.states is not None
         filtered = particle_filter(program, part, particles=particles, known_start=known_start)
         paths = filtered.paths(lineages)
-        rows = part.rows
         for group, squared in squared_errors(program, paths.states, part.states).items():
-            mean = torch.where(rows, squared.mean(0), 0.0).sum(0) / rows.sum(0)
-            roots.setdefault(group, []).append(mean.sqrt())
-    errors = {group: float(torch.cat(values).mean()) for group, values in roots.items()}
-    return {group: error for group, error in errors.items() if not math.isnan(error)}
+            mean = squared.mean(0)
+            known = torch.isfinite(mean) & part.rows
+            judged = known.any(0)
+            total = torch.where(known, mean, 0.0).sum(0)[judged]
+            roots.setdefault(group, []).append((total / known.sum(0)[judged]).sqrt())
+    return {group: float(torch.cat(values).mean()) for group, values in roots.items() if any(map(len, values))}
 
 
 @torch.no_grad()
@@ -81,17 +82,22 @@ def forward_mean(program: Program, data: Trajectories, *, horizon: int = 10) -> 
 def _forward(program: Program, data: Trajectories, horizon: int, rollouts: int, mean: bool) -> Errors:
     assert data.states is not None
     starts = data.time.shape[0] - horizon
+    if starts < 1:
+        return {}
     counted = data.rows[horizon:] & torch.isfinite(data.states[:-horizon]).all(-1)
     origin = torch.where(counted[..., None], data.states[:-horizon], 0.0)
     sums: dict[str, float] = {}
+    counts: dict[str, int] = {}
     at_once = max(1, 500_000 // counted.numel())
     for first in range(0, rollouts, at_once):
         draws = min(at_once, rollouts - first)
         end = _end_of_roll_out(program, data, origin.expand(draws, *origin.shape), horizon, starts, mean)
         for group, squared in squared_errors(program, end, data.states[horizon:]).items():
-            sums[group] = sums.get(group, 0.0) + float(squared[:, counted].double().sum())
-    errors = {group: math.sqrt(total / (rollouts * int(counted.sum()))) for group, total in sums.items()}
-    return {group: error for group, error in errors.items() if not math.isnan(error)}
+            members = list(error_groups(program)[group])
+            known = counted & torch.isfinite(data.states[horizon:, :, members]).all(-1)
+            sums[group] = sums.get(group, 0.0) + float(squared[:, known].double().sum())
+            counts[group] = counts.get(group, 0) + draws * int(known.sum())
+    return {group: math.sqrt(total / counts[group]) for group, total in sums.items() if counts[group]}
 
 
 def _end_of_roll_out(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import arviz
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
+
+if TYPE_CHECKING:
+    import arviz
 
 POSTERIOR, TRUTH, LANDMARK = "#0072b2", "black", "#d55e00"
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import arviz
+import warnings
+
 import numpy as np
 import torch
 import xarray
@@ -10,10 +11,14 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.filtering import in_parts
-from steady_ppl.particle_filter import particle_filter
+from steady_ppl.particles import particle_filter
 from steady_ppl.program import Program, for_program, names, units
 from steady_ppl.seeding import seeded
 from steady_ppl.sites import as_vector
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", FutureWarning)  # an advertisement of arviz 1, once a day
+    import arviz
 
 DIMENSIONS = ("chain", "draw", "trajectory", "row")
 

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from typing import Any
 
+import pyro
 import torch
 from pyro import poutine
+from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.errors import ProgramError, SteadyError
-from steady_ppl.program import Program, error_groups
-from steady_ppl.sites import Broadcasting, Observing, Recording, as_vector
+from steady_ppl.program import Program, names, one_line
+from steady_ppl.sites import Broadcasting, Observing, Recording, Replaying
 
-DRAWS, ROWS, TRAJECTORIES = 3, 4, 5
+DRAWS, ROWS, TRAJECTORIES = 7, 11, 13
+LEFT = (DRAWS, ROWS, TRAJECTORIES)
 
 
 def probe(program: Program) -> None:
@@ -23,72 +27,144 @@ def probe(program: Program) -> None:
         ProgramError: naming the method or site, what came and what was expected.
     """
     name = type(program).__name__
+    _check_declarations(program, name)
+    size, width = len(program.states), len(program.measurements)
+    parameter = next(program.parameters(), torch.zeros(()))
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        state = torch.randn(*LEFT, size).to(parameter)
+        control = torch.randn(ROWS, TRAJECTORIES, len(program.controls)).to(parameter)
+        step = (program.step * (1 + torch.rand(ROWS, TRAJECTORIES))).to(parameter)
+        time = step.cumsum(0)
+
+        start, started = _call(name, "initial", program.initial, (DRAWS, 1, TRAJECTORIES))
+        _check_state("initial", start, size)
+        after, noise = _call(name, "transition", lambda: program.transition(state, control, time, step), LEFT)
+        _check_state("transition", after, size)
+        _check_noise(name, noise)
+
+        measurements = torch.zeros(ROWS, TRAJECTORIES, width).to(parameter)
+        observing = Observing(measurements, torch.ones_like(measurements, dtype=torch.bool))
+        _, seen = _call(name, "observe", lambda: program.observe(state), LEFT, observing)
+        density = seen.total()
+        if tuple(density.shape) != LEFT:
+            raise ProgramError(
+                f"program {name}: the density of observe has shape {tuple(density.shape)}; expected {LEFT} "
+                "(is .to_event(1) missing?)",
+                site="observe",
+            )
+        _check_sites(name, started, noise, seen)
+
+        # one element alone must come out as it did among the others
+        draw, row, drive = slice(2, 3), slice(4, 5), slice(8, 9)
+        alone = {site: value.expand(*LEFT, *value.shape[3:])[draw, row, drive] for site, value in noise.values.items()}
+        single = state[draw, row, drive], control[row, drive], time[row, drive], step[row, drive]
+        one, moved = _call(name, "transition", lambda: program.transition(*single), (1, 1, 1), Replaying(alone))
+        observing = Observing(measurements[row, drive], observing.observed[row, drive])
+        _, again = _call(name, "observe", lambda: program.observe(single[0]), (1, 1, 1), observing)
+        for method, among, by_itself in (
+            ("transition", after[draw, row, drive], one),
+            *(
+                ("transition", _density(noise, site).expand(LEFT)[draw, row, drive], _density(moved, site))
+                for site in noise.values
+            ),
+            ("observe", density[draw, row, drive], again.total()),
+        ):
+            if not torch.allclose(among, by_itself, rtol=1e-3, atol=1e-4, equal_nan=True):
+                raise ProgramError(
+                    f"program {name}: {method} mixes draws, rows or trajectories: one alone gives another result than "
+                    "among others; work on the last dimension only (no sum or mean over the others)",
+                    site=method,
+                )
+
+
+def _check_declarations(program: Program, name: str) -> None:
+    for what in ("states", "controls", "measurements", "channels"):
+        declared = getattr(program, what)
+        if isinstance(declared, str):
+            raise ProgramError(f"program {name}: {what} is the text {declared!r}; one component is ({declared!r},)")
+        if len(set(names(declared))) != len(declared):
+            raise ProgramError(f"program {name}: {what} names a component twice: {', '.join(names(declared))}")
     if not program.states or not program.measurements:
         missing = "states" if not program.states else "measurements (for a planar vehicle: landmarks)"
         raise ProgramError(f"program {name} declares no {missing}; name another class of the file as FILE.py:NAME")
-    size, left = len(program.states), (DRAWS, ROWS, TRAJECTORIES)
-    try:
-        error_groups(program)
-    except ValueError as error:
-        raise ProgramError(f"program {name}: error_groups names an unknown state component: {error}") from None
-    parameter = next(program.parameters(), torch.zeros(()))
-    state = torch.randn(*left, size).to(parameter)
-    control = torch.randn(ROWS, TRAJECTORIES, len(program.controls)).to(parameter)
-    step = torch.full((ROWS, TRAJECTORIES), program.step).to(parameter)
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        _check_state("initial", _call(name, "initial", program.initial)[0], size)
-        after, noise = _call(name, "transition", lambda: program.transition(state, control, step.cumsum(0), step))
-        _check_state("transition", after, size)
-        if tuple(after.shape[:-1]) != left:
+    known = names(program.states)
+    for what, members in (("angles", program.angles), *(("error_groups", g) for g in program.error_groups.values())):
+        for member in members:
+            if member not in known:
+                raise ProgramError(f"program {name}: {what} names {member!r}, no state component ({', '.join(known)})")
+    if not (program.step > 0 and program.duration >= program.step):
+        raise ProgramError(
+            f"program {name}: step is {program.step} s and duration {program.duration} s; expected 0 < step ≤ duration"
+        )
+
+
+def _check_noise(name: str, noise: Recording) -> None:
+    if not noise.values:
+        raise ProgramError(
+            f"program {name}: transition samples nothing: at least one channel must be noisy", site="transition"
+        )
+    for site, value in noise.values.items():
+        fn = noise.distributions[site]
+        if fn.event_dim > 1 or tuple(value.shape[: value.dim() - fn.event_dim]) != LEFT:
             raise ProgramError(
-                f"program {name}: transition returned shape {tuple(after.shape)} for states of shape "
-                f"{tuple(state.shape)}: write it for any shape on the left, with the component last",
-                site="transition",
+                f"program {name}: site {site!r} of transition has shape {tuple(value.shape)} with event shape "
+                f"{tuple(fn.event_shape)}; expected {LEFT} and at most one event dimension (is .to_event(1) missing?)",
+                site=site,
             )
-        if not noise.values:
-            raise ProgramError(
-                f"program {name}: transition samples nothing: at least one channel must be noisy", site="transition"
-            )
-        for site, value in noise.values.items():
-            channel = as_vector(value, noise.distributions[site].event_dim)
-            if tuple(channel.shape[:-1]) != left or noise.distributions[site].event_dim > 1:
+
+
+def _check_sites(name: str, *recordings: Recording) -> None:
+    """The joint density needs every site to have a name of its own."""
+    taken = {"states": "the engine"}
+    for method, recording in zip(("initial", "transition", "observe"), recordings, strict=True):
+        for site in recording.distributions:
+            if site in taken:
                 raise ProgramError(
-                    f"program {name}: site {site!r} of transition has shape {tuple(value.shape)} with event shape "
-                    f"{tuple(noise.distributions[site].event_shape)}; expected {left} and at most one event dimension "
-                    "(is .to_event(1) missing?)",
-                    site=site,
+                    f"program {name}: site {site!r} of {method} has a name that {taken[site]} uses too", site=site
                 )
-        measurements = torch.zeros(ROWS, TRAJECTORIES, len(program.measurements)).to(parameter)
-        observing = Observing(measurements, torch.ones_like(measurements, dtype=torch.bool))
-        _, seen = _call(name, "observe", lambda: program.observe(state), observing)
-        shape = tuple(seen.total().shape)
-        if shape != left:
+            taken[site] = method
+
+
+class _RecordingOnce(Recording):
+    """Refuses a second site of the same name, and names the site that cannot be scored."""
+
+    def _pyro_post_sample(self, message: Any) -> None:
+        name = message["name"]
+        if name in self.distributions:
+            raise ProgramError(f"two sites are named {name!r}: give each its own name", site=name)
+        try:
+            super()._pyro_post_sample(message)
+        except (ValueError, RuntimeError) as error:
             raise ProgramError(
-                f"program {name}: the density of observe has shape {shape}; expected {left} (is .to_event(1) missing?)",
-                site="observe",
-            )
+                f"site {name!r}, of batch shape {tuple(message['fn'].batch_shape)} and event shape "
+                f"{tuple(message['fn'].event_shape)}, cannot be scored: {one_line(error)} (is .to_event(1) missing?)",
+                site=name,
+            ) from error
 
 
-def _call(name: str, method: str, run: Callable[[], Tensor | None], *handlers: Observing) -> tuple[Tensor, Recording]:
-    recording = Recording()
-    left = (DRAWS, 1, TRAJECTORIES) if method == "initial" else (DRAWS, ROWS, TRAJECTORIES)
+def _call(
+    name: str, method: str, run: Callable[[], Tensor | None], left: tuple[int, ...], *handlers: Messenger
+) -> tuple[Tensor, Recording]:
+    recording = _RecordingOnce()
     with ExitStack() as stack:
-        stack.enter_context(poutine.block())
-        stack.enter_context(Broadcasting(left))
-        for handler in (recording, *handlers):
+        for handler in (poutine.block(), Broadcasting(left), recording, *handlers):
             stack.enter_context(handler)
+        stack.enter_context(pyro.settings.context(module_local_params=True))
         try:
             return run(), recording  # type: ignore[return-value]
-        except SteadyError:
+        except SteadyError as error:
+            if isinstance(error, ProgramError) and name not in str(error):
+                raise ProgramError(f"program {name}: {method}: {error}", site=error.site) from error
             raise
         except Exception as error:
-            first = str(error).strip().splitlines()[0] if str(error).strip() else ""
-            raise ProgramError(
-                f"program {name}: {method} failed on states of shape ({DRAWS}, {ROWS}, {TRAJECTORIES}, …): "
-                f"{type(error).__name__}: {first}",
-                site=method,
-            ) from error
+            on = "" if method == "initial" else f" on states of shape {LEFT} + (D,)"
+            hint = " (is .to_event(1) missing?)" if "broadcast" in str(error) else ""
+            raise ProgramError(f"program {name}: {method} failed{on}: {one_line(error)}{hint}", site=method) from error
+
+
+def _density(recording: Recording, site: str) -> Tensor:
+    return recording.distributions[site].log_prob(recording.values[site])
 
 
 def _check_state(method: str, state: object, size: int) -> None:
@@ -97,5 +173,11 @@ def _check_state(method: str, state: object, size: int) -> None:
         raise ProgramError(
             f"{method} must return a state whose last dimension holds the {size} declared components; "
             f"it returned {came}",
+            site=method,
+        )
+    if method == "transition" and tuple(state.shape[:-1]) != LEFT:
+        raise ProgramError(
+            f"transition returned shape {tuple(state.shape)} for states of shape {(*LEFT, size)}: write it for any "
+            "shape on the left, with the component last",
             site=method,
         )

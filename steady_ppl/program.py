@@ -7,23 +7,26 @@ all times at once.
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import inspect
+import itertools
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import pyro
 import torch
 from pyro.nn import PyroModule
 from torch import Tensor
 
-from steady_ppl.errors import ProgramError
+from steady_ppl.errors import ProgramError, SteadyError
 
 if TYPE_CHECKING:
     from steady_ppl.data import Trajectories
+
+_LOADS = itertools.count()
 
 
 class Program(PyroModule):
@@ -54,6 +57,11 @@ class Program(PyroModule):
     decays: ClassVar[Mapping[str, float]] = {}
     duration: float = 10.0
     step: float = 0.1
+
+    def __init__(self) -> None:
+        # parameters belong to this object, not to Pyro's global store, where a second program would find them
+        with pyro.settings.context(module_local_params=True):
+            super().__init__()
 
     def initial(self) -> Tensor:
         """Sample the start; returns the first state, `(..., D)`."""
@@ -126,22 +134,25 @@ def load_program(source: str | Path) -> Program:
     Raises:
         ProgramError: the file does not exist or does not import, or has no such class.
     """
-    path, _, class_name = str(source).partition(":")
+    path, _, class_name = str(source).rpartition(":")
+    if not class_name.isidentifier() or not path:
+        path, class_name = str(source), ""
     file = Path(path)
     class_name = class_name or "".join(word.capitalize() for word in file.stem.split("_"))
     module = run_file(file)
     program_class = getattr(module, class_name, None)
     if not (inspect.isclass(program_class) and issubclass(program_class, Program)):
-        have = [n for n, c in vars(module).items() if inspect.isclass(c) and c.__module__ == module.__name__]
-        raise ProgramError(
-            f"{file.name} has no program {class_name}; it has {', '.join(have) or 'no class'} (name one as {path}:NAME)"
-        )
+        own = [c for c in vars(module).values() if inspect.isclass(c) and c.__module__ == module.__name__]
+        have = ", ".join(c.__name__ for c in own if issubclass(c, Program)) or "none"
+        if inspect.isclass(program_class):
+            have += f"; its class {class_name} derives from no steady_ppl.Program"
+        raise ProgramError(f"{file.name} has no program {class_name}; its programs: {have} (choose with {path}:NAME)")
     try:
         return program_class()
-    except ProgramError:
+    except SteadyError:
         raise
-    except Exception as error:
-        raise ProgramError(f"{class_name}() of {file.name} failed: {type(error).__name__}: {error}") from error
+    except (Exception, SystemExit) as error:
+        raise ProgramError(f"{class_name}() of {file.name} failed: {one_line(error)}") from error
 
 
 def run_file(file: Path) -> ModuleType:
@@ -153,9 +164,7 @@ def run_file(file: Path) -> ModuleType:
     if not file.is_file():
         raise ProgramError(f"no file {file}")
     folder = file.resolve().parent
-    package = "_steady_folder_" + hashlib.sha256(str(folder).encode()).hexdigest()[:12]
-    for name in [n for n in sys.modules if n == package or n.startswith(package + ".")]:
-        del sys.modules[name]
+    package = f"_steady_folder_{next(_LOADS)}"
     parent = ModuleType(package)
     parent.__path__ = [str(folder)]
     sys.modules[package] = parent
@@ -166,18 +175,26 @@ def run_file(file: Path) -> ModuleType:
     sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
-        line = error.lineno if isinstance(error, SyntaxError) else _line_in(file, error)
-        raise ProgramError(f"{file} does not import: line {line}: {type(error).__name__}: {error}") from error
+    except (Exception, SystemExit) as error:
+        message = one_line(error).replace(f"{package}.", ".")
+        raise ProgramError(f"{file} does not import: {_place(folder, file, error)}: {message}") from error
     return module
 
 
-def _line_in(file: Path, error: BaseException) -> int | str:
-    """The last line of `file` on the way to an error."""
-    line: int | str = "?"
-    trace = error.__traceback__
+def one_line(error: BaseException) -> str:
+    """An error's type and the first line of its message."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
+def _place(folder: Path, file: Path, error: BaseException) -> str:
+    """The last line in one of the folder's files on the way to an error."""
+    if isinstance(error, SyntaxError) and error.lineno is not None:
+        return f"line {error.lineno} of {Path(error.filename or file).name}"
+    place, trace = file.name, error.__traceback__
     while trace is not None:
-        if trace.tb_frame.f_code.co_filename == str(file.resolve()) or trace.tb_frame.f_code.co_filename == str(file):
-            line = trace.tb_lineno
+        passed = Path(trace.tb_frame.f_code.co_filename)
+        if passed.resolve().parent == folder:
+            place = f"line {trace.tb_lineno} of {passed.name}"
         trace = trace.tb_next
-    return line
+    return place

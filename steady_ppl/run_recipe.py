@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import json
 import sysconfig
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -11,9 +12,20 @@ from typing import Any
 
 import torch
 
+from steady_ppl.checkpoint import read_tensors
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import RunError, UsageError
-from steady_ppl.fit import CHECKPOINT, RECORD, Fit, open_run, program_source, read_record, versions, write_record
+from steady_ppl.fit import (
+    CHECKPOINT,
+    PARAMETERS,
+    RECORD,
+    Fit,
+    open_run,
+    program_source,
+    read_record,
+    versions,
+    write_record,
+)
 from steady_ppl.program import Program, for_program, run_file
 
 Recipe = Callable[..., Fit]
@@ -102,14 +114,28 @@ def run_recipe(
         "valid_sha256": fingerprint(valid) if valid is not None else None,
         "versions": versions(),
     }
+    trains = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in takes.values())
+    arguments = {"known_start": known_start, "seed": seed, **options}
+    if trains:
+        arguments |= {"checkpoint": folder / CHECKPOINT, "resume": resume, "progress": progress}
+    try:
+        call = inspect.signature(recipe).bind(program, table, valid, **arguments)
+    except TypeError as error:
+        raise UsageError(f"recipe {name}: its fit does not take what a recipe is called with: {error}") from error
     if resume:
         _require_same(folder, begun)
+        read_tensors(folder / CHECKPOINT)
     folder = open_run(folder, force=force, resume=resume)
-    write_record(folder, begun)
-    trains = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in takes.values())
-    run = {"checkpoint": folder / CHECKPOINT, "resume": resume, "progress": progress} if trains else {}
-    fitted = recipe(program, table, valid, known_start=known_start, seed=seed, **options, **run)
-    if valid is None and trains:
+    try:
+        if not resume:
+            write_record(folder, begun)
+        fitted = recipe(*call.args, **call.kwargs)
+        if not isinstance(fitted, Fit):
+            raise UsageError(f"recipe {name} returned {type(fitted).__name__}, not a Fit")
+    except BaseException:
+        _remove_unless_begun(folder)
+        raise
+    if valid is None and trains and not (fitted.trained and fitted.trained.interrupted):
         fitted.notes.append("no --valid table: trained to the last step, nothing held out decides when to stop")
     fitted.save_into(folder, table, begun)
     return fitted
@@ -125,9 +151,21 @@ def fingerprint(table: Trajectories) -> str:
 
 def _require_same(folder: Path, begun: Mapping[str, Any]) -> None:
     before = read_record(folder)
-    for key in ("program", "recipe", "known_start", "seed", "options", "table_sha256", "valid_sha256"):
+    for key in ("program", "table_sha256", "valid_sha256"):
         if before.get(key) != begun[key]:
-            raise RunError(
-                f"{folder}: --resume needs the same {key.replace('_sha256', '')}: "
-                f"{before.get(key)!r} then, {begun[key]!r} now ({RECORD})"
-            )
+            what = {"program": "program", "table_sha256": "training table", "valid_sha256": "--valid table"}[key]
+            raise RunError(f"{folder}: --resume goes on with the same {what}, but it is another or has changed since")
+    for key in ("recipe", "known_start", "seed", "options"):
+        if before.get(key) != begun[key]:
+            raise RunError(f"{folder}: --resume needs the same {key}: {before.get(key)} then, {begun[key]} now")
+
+
+def _remove_unless_begun(folder: Path) -> None:
+    """Leave nothing of a fit that failed before its first validation; later its checkpoint is worth resuming."""
+    checkpoint = folder / CHECKPOINT
+    if checkpoint.is_file() and json.loads(read_tensors(checkpoint)[1]["step"]) > 0:
+        return
+    for name in (RECORD, CHECKPOINT, PARAMETERS):
+        (folder / name).unlink(missing_ok=True)
+    if not any(folder.iterdir()):
+        folder.rmdir()

@@ -15,7 +15,8 @@ def seeded(*key: int | str) -> Iterator[None]:
     """Run a block under a torch generator keyed by `key`; the caller's generators are left as they were.
 
     Args:
-        key: for example `(seed, "estep", 17)`; equal keys give equal draws.
+        key: for example `(seed, "step", 17)`; equal keys give equal draws. Zeros at the end do not tell keys apart:
+            give every purpose its own name.
     """
     words = [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in key]
     with torch.random.fork_rng():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from steady_ppl.data import Trajectories
-from steady_ppl.particle_filter import roll_out
+from steady_ppl.particles import roll_out
 from steady_ppl.program import Program, for_program, names
 from steady_ppl.seeding import seeded
 from steady_ppl.sites import Recording, as_vector, broadcast_event, running

@@ -49,6 +49,8 @@ class Observing(Messenger):
 
     def _pyro_sample(self, message: Any) -> None:
         fn, name = message["fn"], message["name"]
+        if message["is_observed"]:
+            raise ProgramError(f"site {name!r} of observe has obs=: leave it out, the engine conditions", site=name)
         width = fn.event_shape.numel()
         columns = slice(self.column, self.column + width)
         self.column += width
@@ -85,15 +87,24 @@ class Broadcasting(Messenger):
 
     def _pyro_sample(self, message: Any) -> None:
         fn = message["fn"]
-        if fn.batch_shape != self.left:
+        if fn.batch_shape == self.left:
+            return
+        try:
             message["fn"] = fn.expand(torch.broadcast_shapes(fn.batch_shape, self.left))
+        except RuntimeError:
+            raise ProgramError(
+                f"site {message['name']!r} has batch shape {tuple(fn.batch_shape)} and event shape "
+                f"{tuple(fn.event_shape)} on states of batch shape {tuple(self.left)} (is .to_event(1) missing?)",
+                site=message["name"],
+            ) from None
 
 
 @contextmanager
 def running(*left: int) -> Iterator[None]:
     """Run the program's methods on states of batch shape `left`, hidden from any handler outside, without checks of
     the distributions' arguments (`probe` has made them)."""
-    with poutine.block(), pyro.validation_enabled(False), Broadcasting(left):
+    local = pyro.settings.context(module_local_params=True)
+    with local, poutine.block(), pyro.validation_enabled(False), Broadcasting(left):
         yield
 
 
@@ -149,11 +160,12 @@ class Recording(Messenger):
         return total
 
     def _pyro_post_sample(self, message: Any) -> None:
-        self.distributions[message["name"]] = message["fn"]
+        name = message["name"]
+        self.distributions[name] = message["fn"]
         if message["is_observed"]:
             self.log_likelihood.append(message["scale"] * message["fn"].log_prob(message["value"]))
         else:
-            self.values[message["name"]] = message["value"]
+            self.values[name] = message["value"]
 
 
 def masked(mask: Tensor) -> MaskMessenger:

@@ -152,6 +152,7 @@ def train(
                         _require_finite(loss, state.step)
                         optimizer.zero_grad()
                         loss.backward()
+                        _require_finite_gradients(state.parameters, state.step)
                         optimizer.step()
                 state.step += 1
                 keep = min(optimization.averaging, (state.step - 1) / (state.step + 9))
@@ -176,6 +177,15 @@ def train(
         for name, value in (state.kept or state.averaged).items():
             parameters[name].copy_(value)
     return Trained(history=state.history, kept=state.kept_step, interrupted=interrupted)
+
+
+def _require_finite_gradients(parameters: Mapping[str, Tensor], step: int) -> None:
+    for name, value in parameters.items():
+        if value.grad is not None and not bool(torch.isfinite(value.grad).all()):
+            raise TrainingError(
+                f"the gradient of {name.removesuffix('_unconstrained')} is not finite at step {step + 1}: look for a "
+                "square root, a division or a norm at zero in the program"
+            )
 
 
 def _judge(state: Checkpoint, held_out: list[float], figures: dict[str, float]) -> None:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError
-from steady_ppl.particle_filter import Paths
+from steady_ppl.particles import Paths
 from steady_ppl.program import Program
 from steady_ppl.sites import Recording, Replaying, running
 

@@ -6,7 +6,6 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
 import torch
 from examples import MODELS, example
 
@@ -53,8 +52,3 @@ def impossible(data: Trajectories, trajectory: int, row: int) -> Trajectories:
 def contents(folder: Path) -> dict[str, bytes]:
     """Every file below a folder; to see that nothing was written, changed or left over."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
-def defect(reason: str) -> pytest.MarkDecorator:
-    """A test of what the library does not do yet; it fails as soon as the library does it."""
-    return pytest.mark.xfail(strict=True, reason=reason)

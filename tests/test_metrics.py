@@ -116,7 +116,6 @@ def test_a_start_whose_state_is_unknown_counts_nothing(cart, data):
     assert found["position"] == pytest.approx(float(expected[0]), rel=1e-10)
 
 
-@pytest.mark.xfail(strict=True, reason="only a start's state is looked at: the whole group is left out")
 def test_an_end_whose_state_is_unknown_counts_nothing(cart, data):
     states = data.states.clone()
     states[23, 0] = math.nan
@@ -128,15 +127,12 @@ def test_an_end_whose_state_is_unknown_counts_nothing(cart, data):
     assert found["position"] == pytest.approx(float(expected[0]), rel=1e-10)
 
 
-@pytest.mark.parametrize(
-    "rows", [pytest.param(10, marks=pytest.mark.xfail(strict=True, reason="division by zero")), 11]
-)
+@pytest.mark.parametrize("rows", [10, 11])
 def test_drives_shorter_than_the_horizon_have_no_forward_error(cart, data, rows):
     short = cut(data, rows)
     assert bool(forward_mean(cart, short)) == bool(forward(cart, short, rollouts=2)) == (rows > HORIZON)
 
 
-@pytest.mark.xfail(strict=True, reason="division by zero")
 def test_forward_errors_need_whole_states():
     program = example("hovercraft").requires_grad_(False)
     data = drives(program, 2, 13)

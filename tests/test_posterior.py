@@ -9,7 +9,7 @@ import pytest
 import torch
 from examples import drives, example
 from oracles import CartPosterior, assert_mean, cart_parameters
-from small import defect, simulated
+from small import simulated
 
 from steady_ppl import Fit, Trajectories
 from steady_ppl.posterior import posterior
@@ -144,7 +144,6 @@ def test_without_truth_no_true_state_is_shown() -> None:
     assert not [name for name in constants if str(name).startswith("true_")]
 
 
-@defect("IndexError in Trajectories.subset")
 def test_drives_without_labels_are_numbered() -> None:
     program = example("linear_gaussian")
     data = replace(uneven("linear_gaussian"), labels=())

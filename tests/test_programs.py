@@ -14,7 +14,7 @@ import pytest
 import torch
 from examples import MODELS, drives, example
 from pyro.infer import Trace_ELBO
-from small import HOVERCRAFT, TRUTH, defect, only_start, simulated, steady, written
+from small import HOVERCRAFT, TRUTH, only_start, simulated, steady, written
 
 from steady_ppl import Joint, SteadyError, TruthGuide, for_program, load_program, simulate
 from steady_ppl.probe import probe
@@ -408,7 +408,6 @@ def test_an_input_that_never_changes_is_not_blown_up() -> None:
     assert (program.input_sd[3:] == 1e-3).all()
 
 
-@defect("AttributeError without states, silent NaN weights with a start alone")
 @pytest.mark.parametrize("known", ["nothing", "the start"])
 def test_normalising_by_a_truth_that_is_not_there_is_an_error(known: str) -> None:
     data = drives(load_program(TRUTH).double(), 2, 10)

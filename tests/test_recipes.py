@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from examples import MODELS
-from small import HOVERCRAFT, TRUTH, contents, defect, only_start, simulated, steady, written
+from small import HOVERCRAFT, TRUTH, contents, only_start, simulated, steady, written
 
 from steady_ppl import UsageError, for_program, load_program, log_likelihood, seeded, simulate
 from steady_ppl.run_recipe import find_recipe, recipe_folder
@@ -205,7 +205,6 @@ def test_a_recipe_of_ones_own_is_named_by_its_path(tmp_path: Path, mine: Path, c
     assert steady("evaluate", tmp_path / "run", table, "--particles", 20, "--rollouts", 2) == 0
 
 
-@defect("the record of the program is null: run_file forgets the folder's modules")
 def test_a_recipe_beside_its_program_is_no_obstacle(tmp_path: Path, mine: Path) -> None:
     program = mine.with_name("hovercraft.py")
     program.write_text(HOVERCRAFT.read_text())
@@ -214,7 +213,6 @@ def test_a_recipe_beside_its_program_is_no_obstacle(tmp_path: Path, mine: Path) 
     assert steady("evaluate", tmp_path / "run", table, "--particles", 20, "--rollouts", 2) == 0
 
 
-@defect("TypeError or AttributeError, code 1, and a folder with run.json alone")
 @pytest.mark.parametrize(
     ("old", "new"),
     [

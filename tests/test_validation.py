@@ -2,8 +2,8 @@
 
 import pytest
 import torch
+from examples import example
 
-from models.linear_gaussian import LinearGaussian
 from steady_ppl import Validation, for_program, log_likelihood, seeded, simulate
 from steady_ppl.validation import as_good
 
@@ -32,7 +32,7 @@ def test_without_held_out_drives_the_last_is_kept() -> None:
 
 
 def test_validation_repeats_its_random_numbers_and_averages_at_the_stated_rate() -> None:
-    program = LinearGaussian()
+    program = example("linear_gaussian")
     data = for_program(program, simulate(program, 3, seed=4))
     validation = Validation(data, particles=50, every=5)
     first = validation(program, seed=7)

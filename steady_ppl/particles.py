@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pyro.distributions as dist
@@ -41,6 +41,17 @@ class Paths:
     start: dict[str, Tensor]
     noise: dict[str, Tensor]
     event_dims: dict[str, int]
+
+    def within(self, data: Trajectories) -> Paths:
+        """Fill the rows past each trajectory's end with its first row, where the program is known to be finite: what
+        is masked there would still spoil a gradient if it blew up."""
+
+        def fill(value: Tensor, inside: Tensor) -> Tensor:
+            mask = inside.reshape(*inside.shape, *[1] * (value.dim() - 3))
+            return torch.where(mask, value, value[:, :1])
+
+        noise = {site: fill(value, data.transitions) for site, value in self.noise.items()}
+        return replace(self, states=fill(self.states, data.rows), noise=noise)
 
 
 @dataclass(frozen=True)

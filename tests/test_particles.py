@@ -76,12 +76,13 @@ def test_evidence_from_a_known_start_is_unbiased(cart, uneven):
     assert_mean((runs - exact).exp(), torch.ones(3))
 
 
-def test_variance_falls_as_one_over_the_number_of_particles(cart, even):
-    sizes = (64, 256, 1024)
-    variances = [estimates(cart, even, 300, size).var(0).mean().log() for size in sizes]
+def test_variance_falls_as_one_over_the_number_of_particles():
+    vague = example("linear_gaussian").requires_grad_(False)
+    vague.measurement_sd = torch.tensor(0.6, dtype=torch.float64)  # far from degenerate at 64 particles
+    data, sizes = drives(vague, 3, 12), (64, 256, 1024)
+    y = torch.stack([estimates(vague, data, 300, size).var(0).log().mean() for size in sizes])
     x = torch.tensor(sizes, dtype=torch.float64).log()
-    x, y = x - x.mean(), torch.stack(variances)
-    slope = float((x * (y - y.mean())).sum() / x.square().sum())
+    slope = float(((x - x.mean()) * y).sum() / (x - x.mean()).square().sum())
     # a log-variance of 900 runs has standard error √(2 / 900), the slope .017; the rest is the next order in 1/N
     assert slope == pytest.approx(-1, abs=0.15)
 
@@ -97,7 +98,7 @@ def test_the_first_row_is_worth_what_kalman_says(cart, even):
     without = replace(even, observed=even.observed & (torch.arange(12) > 0)[:, None, None])
     parameters = cart_parameters(cart)
     worth = kalman(even, parameters).log_likelihood - kalman(without, parameters).log_likelihood
-    assert worth.abs().min() > 0.1
+    assert worth.abs().max() > 0.5
     with_it, without_it = estimates(cart, even, 60, 2000), estimates(cart, without, 60, 2000)
     assert_mean(with_it + with_it.var(0) / 2 - without_it - without_it.var(0) / 2, worth)
 
