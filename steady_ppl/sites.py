@@ -62,7 +62,15 @@ class Observing(Messenger):
             )
         value, observed = self.measurements[..., columns], self.observed[..., columns]
         if fn.event_dim == 0:
-            fn, value = fn.mask(observed[..., 0]), value[..., 0]
+            value, observed = value[..., 0], observed[..., 0]
+            try:
+                fn = fn.mask(observed)
+            except ValueError:
+                raise ProgramError(
+                    f"site {name!r} of observe has batch shape {tuple(fn.batch_shape)}, which does not fit rows and "
+                    f"trajectories {tuple(observed.shape)} (is .to_event(1) missing?)",
+                    site=name,
+                ) from None
         elif isinstance(fn, dist.Independent) and fn.base_dist.event_dim == 0:
             fn = fn.base_dist.mask(observed).to_event(1)
         else:
