@@ -20,9 +20,9 @@ from steady_ppl.alpha_truck import read_alpha_truck  # noqa: E402
 from steady_ppl.evaluation import evaluate  # noqa: E402
 
 # For the truck chosen by held-out log p(y) on the valid split, draw 11 of the bearings: the ramp among 1, 3 and 8
-# trainings long, 300 or 1000 particles, the network's decays (hidden .3, 1, 3; noise .1, 3). White noise cannot
-# hold what the controls do with a lag; at full weight it grows to cover that (the paper's best parameters, too, come from
-# observation weights near .1).
+# trainings long, 300 or 1000 particles, and the network's decays (hidden .3, 1, 3; noise .1, 3). White noise cannot
+# hold what the controls do with a lag; at full weight it grows to cover that (the paper's best parameters, too, come
+# from observation weights near .1).
 STEADY_SETTINGS: dict[str, dict] = {"hov": {}, "truck": {"particles": 1000, "steps": 160, "ramp": 3.0}}
 LOGS = ROOT.parent / "shared" / "data" / "alpha_truck"
 Split = tuple[Trajectories, Trajectories, Trajectories]
