@@ -24,6 +24,7 @@ from steady_ppl.evaluation import evaluate  # noqa: E402
 # hold what the controls do with a lag; at full weight it grows to cover that (the paper's best parameters, too, come
 # from observation weights near .1).
 STEADY_SETTINGS: dict[str, dict] = {"hov": {}, "truck": {"particles": 1000, "steps": 160, "ramp": 3.0}}
+FIT_TRUTH_SETTINGS: dict[str, dict] = {"hov": {}, "truck": {"weight_decay": 0.3}}  # likewise, .3 or 1
 LOGS = ROOT.parent / "shared" / "data" / "alpha_truck"
 Split = tuple[Trajectories, Trajectories, Trajectories]
 
@@ -57,7 +58,9 @@ def learn(method: str, vehicle: str, data: Split, seed: int, progress: bool = Fa
             program, *bearings_only, known_start=True, seed=seed, progress=progress, **STEADY_SETTINGS[vehicle]
         )
     if method == "fit-truth":
-        return fit_truth.fit(program, train, valid, known_start=True, seed=seed, progress=progress)
+        return fit_truth.fit(
+            program, train, valid, known_start=True, seed=seed, progress=progress, **FIT_TRUTH_SETTINGS[vehicle]
+        )
     return hand.fit(program, train, valid, known_start=True, seed=seed)
 
 

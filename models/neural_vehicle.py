@@ -105,12 +105,18 @@ class NeuralTruck(NeuralVehicle):
 class AuthorsHovercraft(NeuralHovercraft):
     """The variant of the authors' code: two layers, absolute heading, normalised by true states (a leak)."""
 
+    rates = {}
+    decays = {}
+
     def __init__(self):
         super().__init__(layers=2, absolute_heading=True, normalise="truth")
 
 
 class AuthorsTruck(NeuralTruck):
     """The same for the AlphaTruck."""
+
+    rates = {}
+    decays = {}
 
     def __init__(self):
         super().__init__(layers=2, absolute_heading=True, normalise="truth")

@@ -134,9 +134,12 @@ def fit(
         _say(note)
     print(f"{out}: {result.program}")
     if result.trained is not None:
-        judged = [entry["log_likelihood"] for entry in result.trained.history if "log_likelihood" in entry]
+        judged = {e["step"]: e["log_likelihood"] for e in result.trained.history if "log_likelihood" in e}
         if judged:
-            print(f"held-out log p(y) {judged[0]:.2f} → {max(judged):.2f}, kept step {result.trained.kept}")
+            first, kept = next(iter(judged.values())), judged[result.trained.kept]
+            print(
+                f"held-out log p(y) {first:.2f} → {kept:.2f} at step {result.trained.kept}, whose parameters were kept"
+            )
         if result.trained.interrupted:
             _say(f"interrupted; the run so far is usable, `--resume` goes on with {out}")
             raise typer.Exit(1)

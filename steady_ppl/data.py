@@ -69,13 +69,13 @@ class Trajectories:
 
     @property
     def steps(self) -> Tensor:
-        """`(T, B)` the length of each interval, s."""
-        return self.time[1:] - self.time[:-1]
+        """`(T, B)` the length of each interval, s; the difference is taken in double precision."""
+        return (self.time[1:] - self.time[:-1]).to(self.controls.dtype)
 
     @property
     def elapsed(self) -> Tensor:
         """`(T + 1, B)` seconds since each trajectory's first row."""
-        return self.time - self.time[0]
+        return (self.time - self.time[0]).to(self.controls.dtype)
 
     @property
     def known_start(self) -> Tensor:
@@ -128,17 +128,14 @@ class Trajectories:
         return replace(self, states=states)
 
     def to(self, like: torch.dtype | None = None, device: Any = None) -> Trajectories:
-        """Cast to a floating dtype and move to a device.
-
-        `time` becomes seconds since the first row, so that clock stamps of 10⁹ s survive single precision.
-        """
+        """Cast to a floating dtype and move to a device; `time`, from zero, stays in double precision."""
 
         def cast(tensor: Tensor) -> Tensor:
             return tensor.to(device=device, dtype=like if tensor.is_floating_point() else None)
 
         return replace(
             self,
-            time=cast(self.elapsed),
+            time=(self.time - self.time[0]).to(device=device),
             controls=cast(self.controls),
             measurements=cast(self.measurements),
             observed=cast(self.observed),

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
+from steady_ppl.errors import DataError
 from steady_ppl.particles import particle_filter
 from steady_ppl.program import Program
 
@@ -26,10 +27,22 @@ def log_likelihood(
 
     Returns:
         `(B,)`.
+
+    Raises:
+        DataError: a trajectory has measurements, but none at these rows.
     """
+    thinned = data.observed_every(every)
+    unseen = data.observed.any(-1).any(0) & ~thinned.observed.any(-1).any(0)
+    if bool(unseen.any()):
+        label = data.labels[int(unseen.nonzero()[0])]
+        raise DataError(
+            f"trajectory {label} is measured at none of the rows 1, {1 + every}, {1 + 2 * every}, … of log p(y): "
+            "let it begin at a measured row",
+            trajectory=label,
+        )
     parts = [
         particle_filter(program, part, particles=particles, known_start=known_start, keep_history=False).log_likelihood
-        for part in in_parts(data.observed_every(every), particles)
+        for part in in_parts(thinned, particles)
     ]
     return torch.cat(parts)
 

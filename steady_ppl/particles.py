@@ -137,7 +137,7 @@ def particle_filter(
         observation_weight: tempers the observations' log-density (w_obs in STEADY).
         known_start: start every particle at the true first state instead of drawing it from the prior.
         resample_below: resample a trajectory when its effective sample size falls below this share of N;
-            checked at its observed rows, never at the last one.
+            checked at its observed rows, never at the table's last one.
         keep_history: keep what `Filtered.paths` needs.
         on_frame: called at every row with (row, states `(N, B, D)`, log-weights before, log-weights after), `(N, B)`.
 
@@ -156,6 +156,10 @@ def particle_filter(
             state = program.initial()
         left = torch.Size((particles, 1, trajectories))
         state = broadcast_event(state, left, 1)
+        if known_start and not bool((state == data.known_start).all()):
+            raise ProgramError(
+                "a known start needs initial() to return the sampled state as it is; it returns another", site="initial"
+            )
         event_dims = {"states": 1} | {site: fn.event_dim for site, fn in start.distributions.items()}
         log_weights = state.new_full((particles, trajectories), -math.log(particles), dtype=torch.float64)
         log_likelihood = log_weights.new_zeros((rows, trajectories))

@@ -47,7 +47,7 @@ def posterior_trajectories(
     unit: Any = draws["x"].attrs.get("units", "")
     axes.set_xlabel(f"x [{unit}]")
     axes.set_ylabel(f"y [{unit}]")
-    axes.set_aspect("equal", "datalim")
+    axes.set_aspect("equal", "box")
     axes.set_title(f"trajectory {trajectory}")
     for line in axes.get_lines():
         if line.get_label() == label:

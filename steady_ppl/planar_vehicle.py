@@ -82,7 +82,7 @@ def wrap(angle: Tensor) -> Tensor:
 class WrappedNormal(dist.Normal):
     """Normal(0, scale) on the difference of two angles, wrapped to [−π, π].
 
-    For scale ≪ π (.35 rad at 20°) the neglected windings hold less than 10⁻¹⁸ of the mass.
+    The neglected windings hold less than 10⁻¹⁸ of the mass at a scale of 20°, 3 · 10⁻⁴ at 50°.
     """
 
     support = constraints.real

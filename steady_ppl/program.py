@@ -43,7 +43,8 @@ class Program(PyroModule):
         angles: the state components that live on a circle.
         error_groups: what an error is reported for: name → components whose Euclidean norm it is.
         rates: learning rates relative to the recipe's, by the beginning of a parameter's name.
-        decays: weight decay relative to the recipe's, by the beginning of a parameter's name (matrices 1, others 0).
+        decays: weight decay relative to the recipe's, by the beginning of a parameter's name; only the matrices of
+            `torch.nn.Linear` decay.
         duration, step: of a simulated trajectory, s.
     """
 

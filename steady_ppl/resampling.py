@@ -38,7 +38,7 @@ def systematic(log_weights: Tensor, draws: int, uniform: Tensor | None = None) -
     cumulative = log_weights.t().to(torch.float64).exp().cumsum(1)
     cumulative = cumulative / cumulative[:, -1:]
     born = (cumulative * draws - uniform[:, None]).ceil().long().clamp(0, draws)
-    born[:, -1] = draws
+    born[:, -1] = draws  # also where a weight is not a number: the filter says so at its end
     offspring = torch.diff(born, dim=1, prepend=born.new_zeros((trajectories, 1)))
     index = torch.arange(particles, device=device).repeat(trajectories)
     chosen = torch.repeat_interleave(index, offspring.flatten(), output_size=trajectories * draws)

@@ -49,11 +49,12 @@ class Optimization:
         learning_rate: Adam's; falls to `final_rate` of it along half a cosine.
         betas: Adam's.
         final_rate: share of the learning rate at the end.
-        weight_decay: of matrices, decoupled; each step shrinks them by learning rate × decay (the paper's code: 1).
+        weight_decay: of the matrices of `torch.nn.Linear`, decoupled; each step shrinks them by learning rate × decay
+            (the authors' code: 1).
         averaging: weight of the past in the running mean of the parameters; that mean is validated and returned.
         batch: trajectories an E step, all when None.
         validate_every: E steps between two validations.
-        patience: stop after so many validations in a row that are worse than the best.
+        patience: stop after so many validations in a row that are worse than the best by more than a standard error.
     """
 
     steps: int = 600
@@ -228,9 +229,10 @@ def _groups(program: Program, guide: Guide, optimization: Optimization) -> list[
     def relative(table: Any, name: str) -> float:
         return next((factor for start, factor in table.items() if name.startswith(start)), 1.0)
 
+    linear = {id(module.weight) for module in program.modules() if isinstance(module, nn.Linear)}
     groups = []
     for name, value in program.named_parameters():
-        decay = optimization.weight_decay * relative(program.decays, name) if value.dim() > 1 else 0.0
+        decay = optimization.weight_decay * relative(program.decays, name) if id(value) in linear else 0.0
         rate = optimization.learning_rate * relative(program.rates, name)
         groups.append({"params": [value], "lr": rate, "weight_decay": decay})
     for value in _guide_parameters(guide).values():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 from examples import copies, drives, example
 from oracles import CartPosterior, assert_mean, cart_parameters, kalman
 
-from steady_ppl import log_likelihood, smoothed_states
+from steady_ppl import DataError, log_likelihood, smoothed_states
 from steady_ppl.filtering import in_parts
 
 
@@ -65,3 +66,9 @@ def test_log_likelihood_in_parts_is_that_of_each_trajectory(data, monkeypatch):
     exact = kalman(data, cart_parameters(still), known_start=True).log_likelihood
     found = log_likelihood(still, data, particles=10, known_start=True, every=1)
     torch.testing.assert_close(found, exact, rtol=1e-6, atol=1e-6)
+
+
+def test_a_drive_without_a_measurement_at_the_counted_rows_is_an_error(cart, data):
+    seen = data.observed & (torch.arange(data.time.shape[0]) % 10 == 5)[:, None, None]
+    with pytest.raises(DataError, match=r"trajectory 1 is measured at none of the rows 1, 11, 21"):
+        log_likelihood(cart, replace(data, observed=seen), particles=10, known_start=False)

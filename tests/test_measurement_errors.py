@@ -77,19 +77,24 @@ def test_ninety_percent_intervals_of_the_true_program_cover_ninety_percent(cart)
     assert measurement_errors(narrow, data, particles=500, known_start=False)["coverage_90"] < 0.9 - margin
 
 
+def second(data) -> int:
+    """The rows that make up 1 s."""
+    return round(1 / float(data.steps[data.transitions].median()))
+
+
 def test_open_loop_errors_of_a_still_cart_are_those_of_its_recursion(still, data):
     error = data.measurements[..., 0] - kalman(data, cart_parameters(still), known_start=True).means[..., 0]
     found = measurement_errors(still, data, particles=20, known_start=True)
     seen = data.observed[..., 0]
-    second = round(1 / float(data.steps[data.transitions].median()))
     assert set(found) == {"one_step", "open_loop_1s", "coverage_90"}  # 3 s are longer than the 24 rows
-    for name, horizon in (("one_step", 1), ("open_loop_1s", second)):
+    for name, horizon in (("one_step", 1), ("open_loop_1s", second(data))):
         expected = error[horizon:][seen[horizon:]].square().mean().sqrt()
         assert found[name] == pytest.approx(float(expected), rel=1e-5)
 
 
 def test_open_loops_start_from_the_filtered_states(cart, data):
-    exact, system, horizon = kalman(data, cart_parameters(cart)), cart_system(data, cart_parameters(cart)), 10
+    exact, system = kalman(data, cart_parameters(cart)), cart_system(data, cart_parameters(cart))
+    horizon = second(data)
     starts = 24 - horizon
     mean, covariance = exact.means[:starts], exact.covariances[:starts]
     for k in range(horizon):

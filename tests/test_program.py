@@ -258,9 +258,10 @@ def test_columns_come_in_the_programs_precision_with_time_from_zero(dtype: torch
     program = example("hovercraft")
     data = drives(program, 2, 5)
     chosen = for_program(program.to(dtype), replace(data, time=data.time + 1.7e9))
-    tensors = (chosen.time, chosen.controls, chosen.measurements, chosen.states)
+    tensors = (chosen.steps, chosen.elapsed, chosen.controls, chosen.measurements, chosen.states)
     assert {tensor.dtype for tensor in tensors} == {dtype} and chosen.observed.dtype == torch.bool
-    assert torch.allclose(chosen.time.double(), data.time, atol=1e-6)  # a clock stamp of 1.7e9 s has steps of 2.4e-7
+    assert chosen.time.dtype == torch.float64
+    assert torch.allclose(chosen.time, data.time, atol=1e-6)  # a clock stamp of 1.7e9 s has steps of 2.4e-7
 
 
 def test_a_program_without_parameters_reads_the_default_precision() -> None:
@@ -285,3 +286,12 @@ def test_unknown_state_components_are_nan_and_foreign_ones_are_left_out() -> Non
     assert torch.equal(chosen.states[..., 1], data.states[..., 0])
     assert chosen.states[..., [0, 2, 3, 4, 5]].isnan().all()
     assert for_program(program, replace(data, states=data.states[..., :1], state_names=("battery",))).states is None
+
+
+def test_steps_late_in_a_long_log_keep_their_length() -> None:
+    program = example("hovercraft").to(torch.float32)
+    data = drives(example("hovercraft"), 1, 3)
+    time = torch.tensor([[0.0], [3600.0], [3600.01]], dtype=torch.float64)
+    steps = for_program(program, replace(data, time=time)).steps
+    assert steps.dtype == torch.float32
+    assert float(steps[1, 0]) == pytest.approx(0.01, rel=1e-6)
