@@ -78,7 +78,10 @@ def draw(before: Fit, after: Fit, data: Split, file: Path, drives: int = 4) -> N
         for column, label in enumerate(shown.labels):
             one = posterior_trajectories(posterior, label, landmarks=after.program.landmarks, axes=axes[row, column])
             one.set_title(f"test drive {label}, {name}", fontsize=9)
-            one.label_outer()
+            if row == 0:
+                one.set_xlabel("")
+            if column > 0:
+                one.set_ylabel("")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     for handle in handles:
         handle.set_alpha(1)

@@ -280,7 +280,7 @@ def test_a_known_start_needs_the_whole_state_as_one_site(even):
 def test_200_000_float32_particles_never_throw():
     program = example("hovercraft", torch.float32).requires_grad_(False)
     data = drives(program, 1, 16)
-    assert data.time.dtype == torch.float32
+    assert data.controls.dtype == torch.float32
     with seeded("large"):
         filtered = particle_filter(program, data, particles=200_000, resample_below=1.0, keep_history=False)
     assert filtered.log_likelihood.isfinite().all()
