@@ -66,8 +66,8 @@ def main() -> int:
     experiment = arguments.experiment
     folder = arguments.data if experiment == "learn-truck" else None
     if folder is not None and not folder.is_dir():
-        print(f"skipped: no AlphaTruck logs at {folder}")
-        return 0
+        print(f"no AlphaTruck logs at {folder}", file=sys.stderr)
+        return 2 if arguments.data != LOGS else 0  # skipped where the default place does not exist
     vehicle = "truck" if folder else "hov"
     seeds = range(1, 1 + (arguments.seeds or (12 if experiment == "hov" else 3)))
     methods = arguments.methods or METHODS[experiment]

@@ -11,14 +11,11 @@ import sys
 import traceback
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from steady_ppl.errors import SteadyError, UsageError
-
-if TYPE_CHECKING:
-    pass
+from steady_ppl.errors import ComputationError, SteadyError, UsageError
 
 INTERRUPTED = 130  # what typer returns for Ctrl-C
 
@@ -185,11 +182,13 @@ def _program(model: str, seed: int) -> Any:
 
 
 def _write_json(path: Path, content: Any) -> None:
-    """Write a file whole or not at all."""
+    """Write a file whole or not at all; a figure that is not finite is an error, JSON has no word for it."""
     beside = path.with_name(path.name + ".partial")
     try:
-        beside.write_text(json.dumps(content, indent=1) + "\n")
+        beside.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
         os.replace(beside, path)
+    except ValueError as error:
+        raise ComputationError(f"{path} is not written: a figure is not finite, the program has blown up") from error
     except OSError as error:
         beside.unlink(missing_ok=True)
         raise UsageError(f"{path} cannot be written: {error.strerror}") from error

@@ -52,7 +52,13 @@ class UsageError(SteadyError):
     """An option or a name that does not exist or does not apply."""
 
 
-class FilterError(SteadyError):
+class ComputationError(SteadyError):
+    """A computation whose result cannot be used."""
+
+    exit_code = 1
+
+
+class FilterError(ComputationError):
     """The particle filter broke down: every weight is zero, or a particle is not finite.
 
     Attributes:
@@ -60,14 +66,10 @@ class FilterError(SteadyError):
         time: seconds since its first row.
     """
 
-    exit_code = 1
-
     def __init__(self, message: str, *, trajectory: str | None = None, time: float | None = None) -> None:
         super().__init__(message)
         self.trajectory, self.time = trajectory, time
 
 
-class TrainingError(SteadyError):
+class TrainingError(ComputationError):
     """Training failed, for example on a loss that is not finite."""
-
-    exit_code = 1

@@ -142,10 +142,10 @@ def run_recipe(
 
 
 def fingerprint(table: Trajectories) -> str:
-    """A hash of the times, controls and measurements."""
-    digest = hashlib.sha256()
-    for values in (table.time, table.controls, table.measurements, table.observed):
-        digest.update(values.numpy(force=True).tobytes())
+    """A hash of everything that a fit can depend on."""
+    digest = hashlib.sha256(repr((table.labels, table.control_names, table.measurement_names)).encode())
+    for values in (table.time, table.controls, table.measurements, table.observed, table.lengths, table.states):
+        digest.update(b"-" if values is None else values.numpy(force=True).tobytes())
     return digest.hexdigest()
 
 
