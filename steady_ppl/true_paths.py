@@ -6,9 +6,10 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
-from steady_ppl.errors import DataError
+from steady_ppl.errors import DataError, ProgramError
 from steady_ppl.particles import Paths
-from steady_ppl.program import Program
+from steady_ppl.planar_vehicle import wrap
+from steady_ppl.program import Program, names
 from steady_ppl.sites import Recording, Replaying, running
 
 
@@ -16,8 +17,9 @@ from steady_ppl.sites import Recording, Replaying, running
 def true_paths(program: Program, data: Trajectories) -> Paths:
     """The true states with the channel noise that leads from one to the next.
 
-    The program is run at zero noise and at a unit of each channel; where the next state is affine in the noise, as in
-    every program whose noise enters once, least squares on these runs gives the noise exactly.
+    The program is run at zero noise and at a unit of each channel; where the next state is affine in the noise, least
+    squares on these runs gives the noise exactly. What noise cannot explain (a position that does not follow from the
+    velocity) is left over. Angles are compared on the circle.
 
     Args:
         program: the state-space model.
@@ -25,6 +27,7 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
 
     Raises:
         DataError: a state is unknown.
+        ProgramError: the next state is not affine in the channel noise, or the start is not one site.
     """
     states = data.states
     if states is None or not bool(torch.isfinite(states[data.rows]).all()):
@@ -49,7 +52,10 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
             columns.append(run(unit)[0] - base)
             places.append((site, channel))
     effect = torch.stack(columns, -1).double()
-    solution = torch.linalg.lstsq(effect, (after - base).double().unsqueeze(-1)).solution.squeeze(-1).to(states.dtype)
+    difference = after - base
+    for index in (names(program.states).index(angle) for angle in program.angles):
+        difference[..., index] = wrap(difference[..., index])
+    solution = torch.linalg.lstsq(effect, difference.double().unsqueeze(-1)).solution.squeeze(-1).to(states.dtype)
     noise = {site: value.clone() for site, value in zero.items()}
     for index, (site, channel) in enumerate(places):
         noise[site].reshape(*noise[site].shape[:2], -1)[..., channel] = solution[..., index]
@@ -57,6 +63,16 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
     start = Recording()
     with running(1, before.shape[1]), start:
         program.initial()
+    replayed = run(noise)[0] - base
+    predicted = (effect @ solution.double().unsqueeze(-1)).squeeze(-1).to(states.dtype)
+    if not torch.allclose(replayed, predicted, rtol=1e-2, atol=1e-3):
+        raise ProgramError(
+            f"program {type(program).__name__}: the next state is not affine in the channel noise: supervised learning "
+            "cannot tell which noise led from one true state to the next",
+            site="transition",
+        )
+    if len(start.values) != 1:
+        raise ProgramError("supervised learning needs initial() to sample the whole state as one site", site="initial")
     (site,) = start.values
     event_dims = {s: fn.event_dim for s, fn in (start.distributions | probe.distributions).items()} | {"states": 1}
     return Paths(

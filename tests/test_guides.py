@@ -24,9 +24,11 @@ from steady_ppl import (
     PathGuide,
     Paths,
     Program,
+    ProgramError,
     SMCGuide,
     TruthGuide,
     seeded,
+    stack,
 )
 from steady_ppl.sites import Replaying
 from steady_ppl.true_paths import true_paths
@@ -311,3 +313,15 @@ def test_true_paths_need_every_state():
     for incomplete in (data, data.without_truth()):
         with pytest.raises(DataError, match="true state of every row"):
             TruthGuide(program).refresh(incomplete, 0.0)
+
+
+def test_noise_that_does_not_enter_affinely_is_refused():
+    class Squared(type(example("linear_gaussian"))):
+        def transition(self, state, control, time, step):
+            position, velocity = state.unbind(-1)
+            acceleration = pyro.sample("acceleration", pyro.distributions.Normal(0 * velocity, self.noise))
+            return stack(position + velocity * step, velocity + acceleration**2 * step)
+
+    program = Squared().double().requires_grad_(False)
+    with pytest.raises(ProgramError, match="not affine in the channel noise"):
+        true_paths(program, drives(program, 2, 12))
