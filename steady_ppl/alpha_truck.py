@@ -21,6 +21,7 @@ import torch
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.planar_vehicle import bearings_to, wrap
+from steady_ppl.seeding import seeded
 
 LANDMARKS = ((-1.230314, -0.606814), (0.797073, 0.889471), (-3.496525, 0.207874), (0.0, 6.0))
 """The landmarks of the published experiments, m."""
@@ -51,7 +52,8 @@ def read_alpha_truck(
         folder: holds `vrpn-pose.csv` and `vesc_drive.csv`.
         sigma_degrees: standard deviation of the bearings, degrees; larger within 0.1 m of a landmark, see
             `bearings_to`.
-        seed: of the bearings' noise, drawn once. Torch's global random state is left alone.
+        seed: of the bearings' noise, drawn once; with the folder's name it keys the draw, so that the splits of one
+            seed share no noise. Torch's global random state is left alone.
         landmarks: `(K, 2)` m.
 
     Returns:
@@ -95,8 +97,7 @@ def read_alpha_truck(
     controls = torch.stack([resample(command_stamps, values) for values in command.T], -1)
     states, controls = (block.unflatten(0, (count, FRAMES)).transpose(0, 1) for block in (states, controls))
 
-    with torch.random.fork_rng(devices=[]):
-        torch.default_generator.manual_seed(seed)
+    with seeded(seed, "bearings", folder.resolve().name):
         bearings = bearings_to(landmarks, states, sd=math.radians(sigma_degrees)).sample()
     return Trajectories(
         time=(torch.arange(FRAMES, dtype=torch.float64) * step)[:, None].repeat(1, count),

@@ -38,7 +38,10 @@ def systematic(log_weights: Tensor, draws: int, uniform: Tensor | None = None) -
     cumulative = log_weights.t().to(torch.float64).exp().cumsum(1)
     cumulative = cumulative / cumulative[:, -1:]
     born = (cumulative * draws - uniform[:, None]).ceil().long().clamp(0, draws)
+    born.masked_fill_(cumulative >= 1, draws)  # a uniform within rounding of 1 leaves nothing to weights of zero
     born[:, -1] = draws  # also where a weight is not a number: the filter says so at its end
+    if device.type != "cpu":
+        born = born.cummax(1).values  # a parallel sum may round one of its terms below the one before
     offspring = torch.diff(born, dim=1, prepend=born.new_zeros((trajectories, 1)))
     index = torch.arange(particles, device=device).repeat(trajectories)
     chosen = torch.repeat_interleave(index, offspring.flatten(), output_size=trajectories * draws)

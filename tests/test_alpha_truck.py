@@ -141,6 +141,19 @@ def test_other_landmarks(circle: Path) -> None:
     assert float(error.abs().max()) < 1e-6
 
 
+def test_splits_of_one_seed_share_no_noise(circle: Path) -> None:
+    folders = [circle / "train", circle / "valid"]
+    noises = []
+    for folder in folders:
+        folder.mkdir()
+        for log in circle.glob("*.csv"):
+            (folder / log.name).write_bytes(log.read_bytes())
+        data = read_alpha_truck(folder, seed=1)
+        noises.append(wrap(data.measurements - true_bearings(data, torch.tensor(LANDMARKS, dtype=torch.float64))))
+    one, other = (noise.flatten() for noise in noises)
+    assert abs(float(torch.corrcoef(torch.stack([one, other]))[0, 1])) < 4 / math.sqrt(len(one))
+
+
 def test_the_seed_decides_the_bearings_and_nothing_else(circle: Path) -> None:
     torch.manual_seed(11)
     before = torch.get_rng_state()
