@@ -5,6 +5,7 @@ Exit codes: 0 done, 1 the computation failed or was interrupted, 2 bad usage or 
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import sys
@@ -103,6 +104,10 @@ def fit(
     particles: Annotated[int | None, typer.Option(help="Particles for each drive.", min=1)] = None,
     draws: Annotated[int | None, typer.Option(help="Paths for each drive in the M step.", min=1)] = None,
     steps: Annotated[int | None, typer.Option(help="E steps.", min=1)] = None,
+    setting: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Any other setting of the recipe, for example ramp=0.7."),
+    ] = None,
     seed: Seed = 0,
     device: Annotated[Device, typer.Option(help="Where to compute.")] = Device.cpu,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
@@ -119,13 +124,13 @@ def fit(
         read_table(table),
         read_table(valid) if valid else None,
         out,
-        options={name: value for name, value in given.items() if value is not None},
+        options=_settings(setting or [], {name: value for name, value in given.items() if value is not None}),
         known_start=known_start,
         seed=seed,
         device=device.value,
         resume=resume,
         force=force,
-        progress=sys.stderr.isatty(),
+        progress=True,
     )
     for note in result.notes:
         _say(note)
@@ -149,7 +154,12 @@ def evaluate(
     particles: Annotated[int, typer.Option(help="Particles of the filters.", min=2)] = 5000,
     rollouts: Annotated[int, typer.Option(help="Noisy roll-outs from each true state.", min=1)] = 1000,
     seed: Seed = 0,
-    program: Annotated[str | None, typer.Option(help="The program, if its file moved or changed.")] = None,
+    program: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="The program, if its file moved or changed; with several RUNs once for each, in their order."
+        ),
+    ] = None,
 ) -> None:
     """The paper's errors where true states exist; errors in measurement space always."""
     from steady_ppl.evaluation import evaluate as judge
@@ -160,7 +170,10 @@ def evaluate(
     if len(arguments) < 2:
         raise UsageError("evaluate needs at least one RUN and then a TABLE")
     *runs, table = arguments
-    fits = [Fit.load(run, program) for run in runs]
+    if program and len(program) != len(runs):
+        raise UsageError(f"--program is given {len(program)} times for {len(runs)} runs: name one for each, in order")
+    sources: list[str | None] = [*program] if program else [None] * len(runs)
+    fits = [Fit.load(run, source) for run, source in zip(runs, sources, strict=True)]
     drives = read_table(table)
     results = [judge(fit, drives, particles=particles, rollouts=rollouts, seed=seed) for fit in fits]
     print(table_of(results, [f"{run.name} ({result['recipe']})" for run, result in zip(runs, results, strict=True)]))
@@ -179,6 +192,22 @@ def _program(model: str, seed: int) -> Any:
         program = load_program(model)
     probe(program)
     return program
+
+
+def _settings(pairs: list[str], options: dict[str, Any]) -> dict[str, Any]:
+    """Add `NAME=VALUE` settings to the named options; a value is a Python literal, or else a word."""
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        name = name.strip().replace("-", "_")
+        if not (equals and name):
+            raise UsageError(f"--set {pair}: expected NAME=VALUE")
+        if name in options:
+            raise UsageError(f"--set {pair}: {name} is given twice")
+        try:
+            options[name] = ast.literal_eval(text.strip())
+        except (ValueError, SyntaxError):
+            options[name] = text.strip()
+    return options
 
 
 def _write_json(path: Path, content: Any) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import json
 import os
 import platform
 import sys
@@ -20,17 +19,11 @@ from steady_ppl.checkpoint import read_tensors, write_tensors
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import RunError
 from steady_ppl.program import Program, load_program
+from steady_ppl.run_folder import PARAMETERS, POSTERIOR, read_record, run_folder, write_record
 from steady_ppl.training import Trained
 
 if TYPE_CHECKING:
     import arviz
-
-PARAMETERS, RECORD, POSTERIOR, CHECKPOINT = (
-    "parameters.safetensors",
-    "run.json",
-    "posterior.nc",
-    "checkpoint.safetensors",
-)
 
 
 @dataclass
@@ -77,7 +70,8 @@ class Fit:
         Raises:
             RunError: the folder exists (and is not `force`d) or cannot be written.
         """
-        self.save_into(open_run(folder, force=force), train)
+        with run_folder(folder, force=force) as opened:
+            self.save_into(opened, train)
 
     def save_into(
         self, folder: Path, train: Trajectories | None = None, begun: Mapping[str, Any] | None = None
@@ -147,51 +141,6 @@ class Fit:
             trained=trained,
             notes=record["notes"],
         )
-
-
-def open_run(folder: str | Path, *, force: bool = False, resume: bool = False) -> Path:
-    """Make a run folder.
-
-    Raises:
-        RunError: it exists and neither `force` nor `resume` is given, or it cannot be made.
-    """
-    folder = Path(folder)
-    if folder.exists() and not (force or resume):
-        raise RunError(f"{folder} exists: choose another folder, or --force to overwrite, or --resume to go on")
-    if resume and not (folder / CHECKPOINT).is_file():
-        raise RunError(f"{folder} has no {CHECKPOINT} to resume from")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if not resume:
-            for name in (PARAMETERS, RECORD, POSTERIOR, CHECKPOINT):
-                (folder / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise RunError(f"{folder} cannot be written: {error.strerror}") from error
-    return folder
-
-
-def write_record(folder: Path, record: dict[str, Any]) -> None:
-    """Write `run.json`, whole or not at all."""
-    beside = folder / (RECORD + ".partial")
-    beside.write_text(json.dumps(record, indent=1) + "\n")
-    os.replace(beside, folder / RECORD)
-
-
-def read_record(folder: Path) -> dict[str, Any]:
-    """Read `run.json`.
-
-    Raises:
-        RunError: there is none, or it is damaged.
-    """
-    try:
-        record = json.loads((folder / RECORD).read_text())
-    except (FileNotFoundError, NotADirectoryError):
-        raise RunError(f"{folder} is not a run: it has no {RECORD}") from None
-    except (OSError, ValueError) as error:
-        raise RunError(f"{folder / RECORD} is damaged: {error}") from error
-    if not (isinstance(record, dict) and {"program", "recipe", "status"} <= record.keys()):
-        raise RunError(f"{folder / RECORD} is damaged: it says neither program nor recipe")
-    return record
 
 
 def program_source(program: Program, folder: Path) -> dict[str, str] | None:

@@ -15,18 +15,9 @@ import torch
 from steady_ppl.checkpoint import read_tensors
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import RunError, UsageError
-from steady_ppl.fit import (
-    CHECKPOINT,
-    PARAMETERS,
-    RECORD,
-    Fit,
-    open_run,
-    program_source,
-    read_record,
-    versions,
-    write_record,
-)
+from steady_ppl.fit import Fit, program_source, versions
 from steady_ppl.program import Program, for_program, run_file
+from steady_ppl.run_folder import CHECKPOINT, read_record, run_folder, write_record
 
 Recipe = Callable[..., Fit]
 
@@ -92,9 +83,14 @@ def run_recipe(
     """
     recipe = find_recipe(name)
     takes = inspect.signature(recipe).parameters
+    settings = [
+        setting
+        for setting, parameter in list(takes.items())[3:]
+        if parameter.kind is not parameter.VAR_KEYWORD and setting not in ("known_start", "seed")
+    ]
     for option in options:
-        if option not in takes:
-            raise UsageError(f"recipe {name} takes no --{option.replace('_', '-')}")
+        if option not in settings:
+            raise UsageError(f"recipe {name} has no setting {option}; it has {', '.join(settings) or 'none'}")
     if device == "cuda" and not torch.cuda.is_available():
         raise UsageError("--device cuda: this machine has no CUDA device")
     program.to(device)
@@ -109,7 +105,7 @@ def run_recipe(
         "status": "training",
         "known_start": known_start,
         "seed": seed,
-        "options": dict(options),
+        "options": json.loads(json.dumps(dict(options))),  # as the record will say them
         "table_sha256": fingerprint(table),
         "valid_sha256": fingerprint(valid) if valid is not None else None,
         "versions": versions(),
@@ -125,19 +121,15 @@ def run_recipe(
     if resume:
         _require_same(folder, begun)
         read_tensors(folder / CHECKPOINT)
-    folder = open_run(folder, force=force, resume=resume)
-    try:
+    with run_folder(folder, force=force, resume=resume):
         if not resume:
             write_record(folder, begun)
         fitted = recipe(*call.args, **call.kwargs)
         if not isinstance(fitted, Fit):
             raise UsageError(f"recipe {name} returned {type(fitted).__name__}, not a Fit")
-    except BaseException:
-        _remove_unless_begun(folder)
-        raise
-    if valid is None and trains and not (fitted.trained and fitted.trained.interrupted):
-        fitted.notes.append("no --valid table: trained to the last step, nothing held out decides when to stop")
-    fitted.save_into(folder, table, begun)
+        if valid is None and trains and not (fitted.trained and fitted.trained.interrupted):
+            fitted.notes.append("no --valid table: trained to the last step, nothing held out decides when to stop")
+        fitted.save_into(folder, table, begun)
     return fitted
 
 
@@ -158,14 +150,3 @@ def _require_same(folder: Path, begun: Mapping[str, Any]) -> None:
     for key in ("recipe", "known_start", "seed", "options"):
         if before.get(key) != begun[key]:
             raise RunError(f"{folder}: --resume needs the same {key}: {before.get(key)} then, {begun[key]} now")
-
-
-def _remove_unless_begun(folder: Path) -> None:
-    """Leave nothing of a fit that failed before its first validation; later its checkpoint is worth resuming."""
-    checkpoint = folder / CHECKPOINT
-    if checkpoint.is_file() and json.loads(read_tensors(checkpoint)[1]["step"]) > 0:
-        return
-    for name in (RECORD, CHECKPOINT, PARAMETERS):
-        (folder / name).unlink(missing_ok=True)
-    if not any(folder.iterdir()):
-        folder.rmdir()

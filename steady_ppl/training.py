@@ -113,7 +113,7 @@ def train(
         seed: with the step it keys every draw, so that a resumed run repeats an uninterrupted one.
         checkpoint: file that is written at the start and at every validation.
         resume: continue from `checkpoint`.
-        progress: show a bar on stderr.
+        progress: show a bar on stderr, or a line a validation where stderr is no terminal.
 
     Raises:
         TrainingError: the loss is not finite.
@@ -136,7 +136,8 @@ def train(
     elif checkpoint is not None:
         write_checkpoint(checkpoint, state, optimizer)
     batch = optimization.batch or len(data)
-    bar = tqdm(total=optimization.steps, initial=state.step, disable=not progress, file=sys.stderr, unit="step")
+    shows_bar = progress and sys.stderr.isatty()
+    bar = tqdm(total=optimization.steps, initial=state.step, disable=not shows_bar, file=sys.stderr, unit="step")
     figures: dict[str, float] = {}
     interrupted = False
     with bar, pyro.settings.context(module_local_params=True), pyro.validation_enabled(False):
@@ -166,18 +167,26 @@ def train(
                         with using(parameters, state.averaged):
                             held_out = validation(program, seed)
                     _judge(state, held_out, {"loss": loss.item(), **figures})
+                    if progress and not shows_bar:
+                        print(_in_words(state.history[-1], optimization.steps), file=sys.stderr, flush=True)
                     if checkpoint is not None:
                         write_checkpoint(checkpoint, state, optimizer)
-                shown = {"loss": loss.item(), **figures}
-                if state.history and "log_likelihood" in state.history[-1]:
-                    shown["log_p(y)"] = state.history[-1]["log_likelihood"]
-                bar.set_postfix({name: f"{value:.3g}" for name, value in shown.items()}, refresh=False)
+                held = {k: v for k, v in (state.history or [{}])[-1].items() if k == "log_likelihood"}
+                bar.set_postfix_str(_in_words({"loss": loss.item(), **figures, **held}), refresh=False)
         except KeyboardInterrupt:
             interrupted = True
     with torch.no_grad():
         for name, value in (state.kept or state.averaged).items():
             parameters[name].copy_(value)
     return Trained(history=state.history, kept=state.kept_step, interrupted=interrupted)
+
+
+def _in_words(figures: Mapping[str, float], steps: int = 0) -> str:
+    """Figures of the log in one line."""
+    shown = {name.replace("log_likelihood", "log p(y)").replace("_", " "): value for name, value in figures.items()}
+    step = shown.pop("step", None)
+    begin = f"step {step:.0f} of {steps}: " if step is not None else ""
+    return begin + ", ".join(f"{name} {value:.4g}" for name, value in shown.items())
 
 
 def _require_finite_gradients(parameters: Mapping[str, Tensor], step: int) -> None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import pytest
 import torch
+from small import FEW, HOVERCRAFT, contents, simulated, steady, written
 
 
 @pytest.fixture(autouse=True)
@@ -11,3 +15,31 @@ def _same_random_numbers():
     with torch.random.fork_rng():
         torch.manual_seed(0)
         yield
+
+
+@pytest.fixture(scope="session")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Tables, and a run of each of two recipes."""
+    folder = tmp_path_factory.mktemp("work")
+    written(folder / "train.csv")
+    written(folder / "valid.parquet", simulated(trajectories=2, rows=33, seed=1))
+    assert steady("fit", HOVERCRAFT, folder / "train.csv", "--recipe", "hand", "--out", folder / "hand") == 0
+    assert steady("fit", HOVERCRAFT, folder / "train.csv", "--out", folder / "steady", *FEW) == 0
+    return folder
+
+
+@pytest.fixture
+def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., None]:
+    """Asserts that a command ends with a code and one line that says something, and that no file is touched."""
+
+    def check(code: int, says: str, *arguments: object, folder: Path = tmp_path) -> None:
+        capsys.readouterr()
+        before = contents(folder), sorted(folder.rglob("*"))
+        assert steady(*arguments) == code
+        out, error = capsys.readouterr()
+        assert error.startswith("steady: ") and 1 <= len(error.splitlines()) <= 2, error
+        assert says in error
+        assert out == ""
+        assert (contents(folder), sorted(folder.rglob("*"))) == before
+
+    return check

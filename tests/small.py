@@ -18,6 +18,9 @@ with warnings.catch_warnings():
 
 HOVERCRAFT, TRUTH = MODELS / "hovercraft.py", f"{MODELS / 'hovercraft.py'}:HovercraftTruth"
 
+FEW = ("--particles", 20, "--draws", 3, "--steps", 3)
+QUICK = ("--particles", 50, "--rollouts", 5)
+
 
 def steady(*arguments: object) -> int:
     """The exit code of `steady ARGUMENTS`."""
@@ -52,3 +55,11 @@ def impossible(data: Trajectories, trajectory: int, row: int) -> Trajectories:
 def contents(folder: Path) -> dict[str, bytes]:
     """Every file below a folder; to see that nothing was written, changed or left over."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def rewritten(path: Path, old: str, new: str, count: int = 1) -> Path:
+    """A table with some text replaced."""
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, count))
+    return path

@@ -197,7 +197,7 @@ def test_a_recipe_of_ones_own_is_named_by_its_path(tmp_path: Path, mine: Path, c
     table = written(tmp_path / "t.csv")
     command = ("fit", HOVERCRAFT, table, "--recipe", mine, "--out", tmp_path / "run")
     assert steady(*command, "--particles", 3) == 2
-    assert "takes no --particles" in capsys.readouterr().err
+    assert "has no setting particles" in capsys.readouterr().err
     assert steady(*command, "--steps", 2) == 0
     assert "Hovercraft(mass=6.0" in capsys.readouterr().out
     record = json.loads((tmp_path / "run" / "run.json").read_text())

@@ -1,0 +1,119 @@
+"""The folder of a run: its files, its record, and how one is overwritten without losing it to a failed fit."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from steady_ppl.checkpoint import read_tensors
+from steady_ppl.errors import RunError
+
+PARAMETERS, RECORD, POSTERIOR, CHECKPOINT = (
+    "parameters.safetensors",
+    "run.json",
+    "posterior.nc",
+    "checkpoint.safetensors",
+)
+FILES = (PARAMETERS, RECORD, POSTERIOR, CHECKPOINT)
+ASIDE = "previous"
+
+
+@contextmanager
+def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False) -> Iterator[Path]:
+    """Make a run folder for the block that fills it.
+
+    With `force` the files of the old run are put aside in the folder `previous` of the run; a block that fails gets
+    them back, one that succeeds removes them. Without an old run a failure leaves nothing but a checkpoint that is
+    worth resuming.
+
+    Raises:
+        RunError: it exists and neither `force` nor `resume` is given, it cannot be made, or has nothing to resume.
+    """
+    folder = Path(folder)
+    if folder.exists() and not (force or resume):
+        raise RunError(f"{folder} exists: choose another folder, or --force to overwrite, or --resume to go on")
+    if resume and not (folder / CHECKPOINT).is_file():
+        raise RunError(f"{folder} has no {CHECKPOINT} to resume from")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not resume:
+            _put_aside(folder)
+    except OSError as error:
+        raise RunError(f"{folder} cannot be written: {error.strerror}") from error
+    try:
+        yield folder
+    except BaseException:
+        if not resume:
+            _clean_up(folder)
+        raise
+    _remove_aside(folder)
+
+
+def _put_aside(folder: Path) -> None:
+    aside = folder / ASIDE
+    if aside.is_dir():  # of an overwriting fit that was killed: it, not what that fit left, is the finished run
+        _remove(folder)
+        return
+    present = [name for name in FILES if (folder / name).exists()]
+    if present:
+        aside.mkdir()
+    for name in present:
+        os.replace(folder / name, aside / name)
+
+
+def _clean_up(folder: Path) -> None:
+    """Undo what a failed block wrote."""
+    aside = folder / ASIDE
+    if aside.is_dir():
+        _remove(folder)
+        for name in FILES:
+            if (aside / name).exists():
+                os.replace(aside / name, folder / name)
+        aside.rmdir()
+        return
+    checkpoint = folder / CHECKPOINT
+    if checkpoint.is_file() and json.loads(read_tensors(checkpoint)[1]["step"]) > 0:
+        return
+    _remove(folder)
+    if not any(folder.iterdir()):
+        folder.rmdir()
+
+
+def _remove_aside(folder: Path) -> None:
+    aside = folder / ASIDE
+    if aside.is_dir():
+        _remove(aside)
+        aside.rmdir()
+
+
+def _remove(folder: Path) -> None:
+    for name in FILES:
+        (folder / name).unlink(missing_ok=True)
+
+
+def write_record(folder: Path, record: dict[str, Any]) -> None:
+    """Write `run.json`, whole or not at all."""
+    beside = folder / (RECORD + ".partial")
+    beside.write_text(json.dumps(record, indent=1) + "\n")
+    os.replace(beside, folder / RECORD)
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """Read `run.json`.
+
+    Raises:
+        RunError: there is none, or it is damaged.
+    """
+    try:
+        record = json.loads((folder / RECORD).read_text())
+    except (FileNotFoundError, NotADirectoryError):
+        raise RunError(f"{folder} is not a run: it has no {RECORD}") from None
+    except (OSError, ValueError) as error:
+        raise RunError(f"{folder / RECORD} is damaged: {error}") from error
+    if not (isinstance(record, dict) and {"program", "recipe", "status"} <= record.keys()):
+        raise RunError(f"{folder / RECORD} is damaged: it says neither program nor recipe")
+    return record

@@ -1,0 +1,122 @@
+"""`steady evaluate` end to end."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from small import HOVERCRAFT, QUICK, contents, impossible, only_start, simulated, steady, written
+
+from steady_ppl import Fit, read_table
+from steady_ppl.evaluation import evaluate
+
+ERRORS = {"location", "angle", "velocity", "yaw_rate"}
+
+
+def test_evaluate_writes_the_figures_of_every_run_as_json(tmp_path: Path, work: Path, capsys) -> None:
+    runs, file = (work / "hand", work / "steady"), tmp_path / "figures.json"
+    assert steady("evaluate", *runs, work / "valid.parquet", "--json", file, *QUICK) == 0
+    content = json.loads(file.read_text())
+    assert list(content) == ["runs"]
+    assert [(row["run"], row["recipe"]) for row in content["runs"]] == [
+        (str(runs[0]), "hand"),
+        (str(runs[1]), "steady"),
+    ]
+    for row in content["runs"]:
+        groups = {"forward", "forward_mean", "state_estimation"}
+        assert row.keys() == {"run", "recipe", "log_likelihood", "measurement"} | groups
+        assert all(row[group].keys() == ERRORS for group in groups)
+        assert row["measurement"].keys() == {"one_step", "open_loop_1s", "open_loop_3s", "coverage_90"}
+        figures = [
+            row["log_likelihood"],
+            *(value for group in (*groups, "measurement") for value in row[group].values()),
+        ]
+        assert all(math.isfinite(figure) for figure in figures)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3 and "log p(y)" in lines[0] and "open_loop_3s" in lines[0]
+    assert [line.split("  ")[0] for line in lines[1:]] == ["hand (hand)", "steady (steady)"]
+    assert f"{content['runs'][0]['forward']['location']:.4f}" in lines[1]
+
+
+def test_evaluate_gives_what_the_library_gives(tmp_path: Path, work: Path) -> None:
+    options = ("--particles", 40, "--rollouts", 3, "--seed", 7)
+    assert steady("evaluate", work / "hand", work / "train.csv", "--json", tmp_path / "e.json", *options) == 0
+    (row,) = json.loads((tmp_path / "e.json").read_text())["runs"]
+    drives = read_table(work / "train.csv")
+    assert row == {
+        "run": str(work / "hand"),
+        **evaluate(Fit.load(work / "hand"), drives, particles=40, rollouts=3, seed=7),
+    }
+
+
+def test_evaluate_without_true_states_judges_the_measurements_only(tmp_path: Path, work: Path, capsys) -> None:
+    table = written(tmp_path / "blind.csv", only_start(simulated(rows=33)))
+    assert steady("evaluate", work / "hand", table, "--json", tmp_path / "e.json", *QUICK) == 0
+    (row,) = json.loads((tmp_path / "e.json").read_text())["runs"]
+    assert row["forward"] == row["forward_mean"] == row["state_estimation"] == {}
+    assert len(row["measurement"]) == 4 and "forward" not in capsys.readouterr().out
+
+
+def test_evaluate_of_drives_shorter_than_the_horizon_leaves_those_figures_out(tmp_path: Path, work: Path) -> None:
+    table = written(tmp_path / "short.csv", simulated(rows=8))
+    assert steady("evaluate", work / "hand", table, "--json", tmp_path / "e.json", *QUICK) == 0
+    (row,) = json.loads((tmp_path / "e.json").read_text())["runs"]
+    assert row["forward"] == row["forward_mean"] == {} and row["state_estimation"].keys() == ERRORS
+    assert row["measurement"].keys() == {"one_step", "coverage_90"}
+
+
+def test_evaluate_with_some_state_columns_only_does_without_the_others(tmp_path: Path, work: Path) -> None:
+    data = simulated()
+    positions = replace(data, states=data.states[..., :2], state_names=("x", "y"))
+    table = written(tmp_path / "positions.csv", positions)
+    assert steady("evaluate", work / "hand", table, "--json", tmp_path / "e.json", *QUICK) == 0
+    (row,) = json.loads((tmp_path / "e.json").read_text())["runs"]
+    assert row["forward"] == {} and row["state_estimation"].keys() == {"location"}
+
+
+def test_figures_are_written_whole_or_not_at_all(tmp_path: Path, work: Path, capsys) -> None:
+    file = tmp_path / "e.json"
+    file.write_text("the old one")
+    table = written(tmp_path / "bad.csv", impossible(simulated(), trajectory=1, row=10))
+    before = contents(tmp_path)
+    assert steady("evaluate", work / "hand", table, "--json", file, *QUICK) == 1
+    assert capsys.readouterr().err.startswith("steady: trajectory 2 at 1 s: every particle's weight is zero")
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("target", ["nowhere/e.json", "."])
+def test_figures_that_cannot_be_written_leave_nothing_behind(tmp_path: Path, work: Path, capsys, target: str) -> None:
+    (tmp_path / "in").mkdir()
+    assert steady("evaluate", work / "hand", work / "train.csv", "--json", tmp_path / "in" / target, *QUICK) == 2
+    assert "cannot be written" in capsys.readouterr().err
+    assert contents(tmp_path) == {}
+
+
+def test_a_program_that_moved_is_named(tmp_path: Path, work: Path, refused) -> None:
+    program, run = tmp_path / "hovercraft.py", tmp_path / "run"
+    program.write_text(HOVERCRAFT.read_text())
+    assert steady("fit", program, work / "train.csv", "--recipe", "hand", "--out", run) == 0
+    program = program.rename(tmp_path / "boat.py")
+    refused(2, "hovercraft.py is gone: name it with --program", "evaluate", run, work / "train.csv", *QUICK)
+    named = ("--program", f"{program}:Hovercraft")
+    assert steady("evaluate", run, work / "train.csv", *named, *QUICK) == 0
+
+
+def test_several_runs_name_a_program_each(tmp_path: Path, work: Path, refused) -> None:
+    runs, table, copy = (work / "hand", work / "steady"), work / "train.csv", tmp_path / "copy.py"
+    copy.write_text(HOVERCRAFT.read_text())
+    named = ("--program", f"{copy}:Hovercraft")
+    refused(2, "--program is given 1 times for 2 runs", "evaluate", *runs, table, *named, *QUICK)
+    assert steady("evaluate", *runs, table, *named, *named, *QUICK) == 0
+
+
+def test_evaluate_refuses_what_is_no_run_and_no_table(tmp_path: Path, work: Path, refused) -> None:
+    (tmp_path / "empty").mkdir()
+    written(tmp_path / "truck.csv", simulated("truck"))
+    refused(2, "it has no run.json", "evaluate", tmp_path / "empty", work / "train.csv")
+    refused(2, "there is no such file", "evaluate", work / "hand", tmp_path / "nothing.csv")
+    refused(2, "at least one RUN and then a TABLE", "evaluate", work / "hand")
+    refused(2, "the table has no column u.left", "evaluate", work / "hand", tmp_path / "truck.csv")
