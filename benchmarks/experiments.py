@@ -24,7 +24,9 @@ from steady_ppl.evaluation import evaluate  # noqa: E402
 # hold what the controls do with a lag; at full weight it grows to cover that (the paper's best parameters, too, come
 # from observation weights near .1).
 STEADY_SETTINGS: dict[str, dict] = {"hov": {}, "truck": {"particles": 1000, "steps": 160, "ramp": 3.0}}
-FIT_TRUTH_SETTINGS: dict[str, dict] = {"hov": {}, "truck": {"weight_decay": 0.3}}  # likewise, .3 or 1
+# Likewise: a decay of .3 or 1, 500 or 1500 steps. The longer training has the same log p(y) on the valid split (34.1
+# against 33.9, 34.5 against 34.7, draws 11 and 12) and the smaller error of its true states (.142 m against .152).
+FIT_TRUTH_SETTINGS: dict[str, dict] = {"hov": {}, "truck": {"weight_decay": 0.3, "steps": 1500, "validate_every": 150}}
 LOGS = ROOT.parent / "shared" / "data" / "alpha_truck"
 Split = tuple[Trajectories, Trajectories, Trajectories]
 
