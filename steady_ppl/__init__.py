@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from steady_ppl.fit import Fit
     from steady_ppl.guides import Constant, LinearRamp, PathGuide, SMCGuide, TruthGuide
     from steady_ppl.joint import Joint
-    from steady_ppl.particles import Filtered, Paths, particle_filter, roll_out
+    from steady_ppl.particles import particle_filter, roll_out
+    from steady_ppl.paths import Filtered, Paths
     from steady_ppl.planar_vehicle import PlanarVehicle, WrappedNormal, bearings_to, stack, wrap
     from steady_ppl.program import Program, for_program, load_program
     from steady_ppl.seeding import seeded
@@ -39,7 +40,8 @@ _HOMES = {
     "fit": ("Fit",),
     "guides": ("Constant", "LinearRamp", "PathGuide", "SMCGuide", "TruthGuide"),
     "joint": ("Joint",),
-    "particles": ("Filtered", "Paths", "particle_filter", "roll_out"),
+    "particles": ("particle_filter", "roll_out"),
+    "paths": ("Filtered", "Paths"),
     "planar_vehicle": ("PlanarVehicle", "WrappedNormal", "bearings_to", "stack", "wrap"),
     "program": ("Program", "for_program", "load_program"),
     "seeding": ("seeded",),

@@ -11,7 +11,8 @@ import torch
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import FilterError
-from steady_ppl.particles import Paths, particle_filter
+from steady_ppl.particles import particle_filter
+from steady_ppl.paths import Paths
 from steady_ppl.program import Program
 from steady_ppl.sites import masked
 from steady_ppl.true_paths import true_paths

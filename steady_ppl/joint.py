@@ -9,9 +9,8 @@ import pyro.distributions as dist
 from pyro.distributions import constraints
 
 from steady_ppl.data import Trajectories
-from steady_ppl.particles import KnownStart
 from steady_ppl.program import Program
-from steady_ppl.sites import Observing, masked
+from steady_ppl.sites import KnownStart, Observing, masked
 
 
 class Joint:

@@ -116,6 +116,27 @@ def running(*left: int) -> Iterator[None]:
         yield
 
 
+class KnownStart(Messenger):
+    """Replace the prior of `initial` by certainty about the first state.
+
+    Args:
+        state: `(B, D)`.
+    """
+
+    def __init__(self, state: Tensor) -> None:
+        super().__init__()
+        self.state = state
+
+    def _pyro_sample(self, message: Any) -> None:
+        if tuple(message["fn"].event_shape) != (self.state.shape[-1],):
+            raise ProgramError(
+                f"a known start needs initial() to sample the whole state as one site of event shape "
+                f"({self.state.shape[-1]},); site {message['name']!r} has {tuple(message['fn'].event_shape)}",
+                site=message["name"],
+            )
+        message["fn"] = dist.Delta(self.state, event_dim=1)
+
+
 class Replaying(Messenger):
     """Give latent sites the values that are already known.
 
@@ -145,11 +166,44 @@ class AtMean(Messenger):
             message["value"] = message["fn"].mean
 
 
+class Standardised(Messenger):
+    """Give latent sites `mean + sd · noise`: the program as a function of standard normal noise.
+
+    The sites take the columns of the noise in the order in which they are met.
+
+    Args:
+        noise: `(..., C)`.
+    """
+
+    def __init__(self, noise: Tensor) -> None:
+        super().__init__()
+        self.noise = noise
+        self.column = 0
+
+    def __enter__(self) -> Standardised:
+        self.column = 0
+        super().__enter__()
+        return self
+
+    def _pyro_sample(self, message: Any) -> None:
+        if message["is_observed"]:
+            return
+        mean, sd = normal_moments(message["fn"], message["name"])
+        if message["fn"].event_dim == 0:
+            noise = self.noise[..., self.column]
+            self.column += 1
+        else:
+            noise = self.noise[..., self.column : self.column + mean.shape[-1]]
+            self.column += mean.shape[-1]
+        message["value"] = mean + sd * noise
+
+
 class Recording(Messenger):
     """Keep the values of latent sites, every site's distribution, and the observed sites' tempered log-densities.
 
     Attributes:
         values: latent site → value.
+        observed: observed site → value.
         distributions: site → distribution.
         log_likelihood: one `(...)` an observed site.
     """
@@ -157,6 +211,7 @@ class Recording(Messenger):
     def __init__(self) -> None:
         super().__init__()
         self.values: dict[str, Tensor] = {}
+        self.observed: dict[str, Tensor] = {}
         self.distributions: dict[str, Any] = {}
         self.log_likelihood: list[Tensor] = []
 
@@ -171,6 +226,7 @@ class Recording(Messenger):
         name = message["name"]
         self.distributions[name] = message["fn"]
         if message["is_observed"]:
+            self.observed[name] = message["value"]
             self.log_likelihood.append(message["scale"] * message["fn"].log_prob(message["value"]))
         else:
             self.values[name] = message["value"]
@@ -189,6 +245,24 @@ def residual(fn: Any, value: Tensor) -> Tensor:
     if hasattr(base, "residual"):
         return base.residual(value)
     return value - fn.mean
+
+
+def normal_moments(fn: Any, site: str) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of a site with independent normal components, each `(...)` or `(..., C)`.
+
+    Raises:
+        ProgramError: the site has another distribution.
+    """
+    base = fn
+    while isinstance(base, dist.Independent | dist.MaskedDistribution | dist.ExpandedDistribution):
+        base = base.base_dist
+    if not isinstance(base, dist.Normal) or fn.event_dim > 1:
+        raise ProgramError(
+            f"site {site!r} is {type(base).__name__} with event shape {tuple(fn.event_shape)}: looking ahead needs "
+            "normal noise with independent components (a scalar or a vector); --guide bootstrap takes any",
+            site=site,
+        )
+    return base.loc, base.scale
 
 
 def as_vector(value: Tensor, event_dim: int) -> Tensor:

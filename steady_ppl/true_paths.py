@@ -7,7 +7,7 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError, ProgramError
-from steady_ppl.particles import Paths
+from steady_ppl.paths import Paths
 from steady_ppl.planar_vehicle import wrap
 from steady_ppl.program import Program, names
 from steady_ppl.sites import Recording, Replaying, running

@@ -1,0 +1,157 @@
+"""The iterated smoother: linearise, look ahead, move the path to the posterior mean, again.
+
+This is Gauss–Newton on the start and the standard normal noise of the program (Bell 1994). It finds the path along
+which the lookahead filter is steered; its draws are an E step of their own (Briegel and Tresp 1998; Ghahramani and
+Roweis 1999).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.linearization import Path, linearize
+from steady_ppl.lookahead import Lookahead, look_ahead
+from steady_ppl.particles import particle_filter
+from steady_ppl.paths import Paths
+from steady_ppl.program import Program
+from steady_ppl.sites import (
+    KnownStart,
+    Recording,
+    Replaying,
+    Standardised,
+    as_vector,
+    broadcast_event,
+    normal_moments,
+    running,
+)
+
+
+def smooth(
+    program: Program,
+    data: Trajectories,
+    path: Path,
+    *,
+    known_start: bool = False,
+    observation_weight: float = 1.0,
+    passes: int = 10,
+    tolerance: float = 0.01,
+) -> Lookahead:
+    """Move a path to the mode of the posterior and look ahead along it.
+
+    Args:
+        program: with normal noise; see `linearize`.
+        data: as returned by `for_program`.
+        path: where to begin; the better, the fewer passes.
+        known_start: the first state is certain.
+        observation_weight: tempers the observations.
+        passes: linearisations at most.
+        tolerance: stop when no noise moves by more, in standard deviations of its channel.
+
+    Returns:
+        The lookahead along the last path but one, so that its linearization and its means agree.
+    """
+    for index in range(passes):
+        ahead = look_ahead(
+            linearize(program, data, path, known_start=known_start, observation_weight=observation_weight)
+        )
+        if index == passes - 1:
+            break
+        moved = means_as_path(ahead, data)
+        change = (moved.noise - path.noise).abs().max()
+        path = moved
+        if not bool(change > tolerance):
+            break
+    return ahead
+
+
+def means_as_path(ahead: Lookahead, data: Trajectories) -> Path:
+    """The posterior mean as a path to linearise along, the padding filled with the first row."""
+    _, states, noise = ahead.means()
+    kind = data.controls.dtype
+    return Path(
+        states=torch.where(data.rows[..., None], states, states[:1]).to(kind),
+        noise=torch.where(data.transitions[..., None], noise, 0.0).to(kind),
+    )
+
+
+def find_path(
+    program: Program,
+    data: Trajectories,
+    *,
+    known_start: bool = False,
+    observation_weight: float = 1.0,
+    particles: int = 1000,
+    candidates: int = 4,
+    passes: int = 3,
+) -> Path:
+    """A path near the posterior's best mode, from the measurements alone.
+
+    Smooths from several paths of a bootstrap filter, whose start comes from the program's prior and the first
+    measurements, and takes the one under which the measurements are most likely.
+
+    Raises:
+        FilterError: the bootstrap filter broke down.
+    """
+    filtered = particle_filter(
+        program, data, particles=particles, observation_weight=observation_weight, known_start=known_start
+    )
+    found = filtered.paths(candidates).within(data)
+    copies = data.subset(torch.arange(len(data)).repeat(candidates))
+    ahead = smooth(
+        program,
+        copies,
+        Path(_side_by_side(found.states), _side_by_side(standard_noise(program, data, found))),
+        known_start=known_start,
+        observation_weight=observation_weight,
+        passes=passes,
+    )
+    likely = torch.nan_to_num(ahead.log_likelihood, nan=-torch.inf).view(candidates, len(data))
+    chosen = likely.argmax(0) * len(data) + torch.arange(len(data), device=likely.device)
+    best = means_as_path(ahead, copies)
+    return Path(best.states[:, chosen], best.noise[:, chosen])
+
+
+def standard_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor:
+    """The channel noise of paths in its standard deviations, `(M, T, B, C)`."""
+    seen, states = Recording(), paths.states[:, :-1]
+    with running(*states.shape[:-1]), seen, Replaying(paths.noise):
+        program.transition(states, data.controls[:-1], data.elapsed[:-1], data.steps)
+    parts = []
+    for site, fn in seen.distributions.items():
+        mean, sd = normal_moments(fn, site)
+        parts.append(as_vector((paths.noise[site] - mean) / sd, fn.event_dim))
+    return torch.cat(parts, -1)
+
+
+def smoother_paths(
+    program: Program, data: Trajectories, ahead: Lookahead, draws: int, *, known_start: bool = False
+) -> Paths:
+    """Draws of the linearised posterior as paths of the program.
+
+    The channel noise is what the program makes of the standard normal noise at the drawn states, so that a curved mean
+    does not inflate the noise; the states agree with it to first order.
+    """
+    start_noise, states, noise = (values.to(data.controls.dtype) for values in ahead.draws(draws))
+    rows, trajectories = data.time.shape
+    start, moving = Recording(), Recording()
+    certain = KnownStart(data.known_start) if known_start else Standardised(start_noise.unsqueeze(1))
+    with running(draws, 1, trajectories), start, certain:
+        program.initial()
+    with running(draws, rows - 1, trajectories), moving, Standardised(noise):
+        program.transition(states[:, :-1], data.controls[:-1], data.elapsed[:-1], data.steps)
+    event_dims = {site: fn.event_dim for site, fn in (start.distributions | moving.distributions).items()}
+    first = torch.Size((draws, 1, trajectories))
+    paths = Paths(
+        states=states,
+        start={site: broadcast_event(value, first, event_dims[site]) for site, value in start.values.items()},
+        noise=moving.values,
+        event_dims=event_dims | {"states": 1},
+    )
+    return paths.within(data)
+
+
+def _side_by_side(values: Tensor) -> Tensor:
+    """`(M, T, B, ·)` to `(T, M · B, ·)`."""
+    return values.movedim(0, 1).flatten(1, 2)

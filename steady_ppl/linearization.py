@@ -1,0 +1,183 @@
+"""The program along a path, to first order: one forward-mode derivative of its methods as they are written.
+
+With standard normal noise ε for every latent site the program is a function, x₀ = g(ε) and x' = f(x, ε), with a
+residual r(x) for every measurement. Around a path of states x̄ and noise ε̄, with δ = x − x̄,
+
+    δ₀ = offset₀ + G₀ ε,    δ' = F δ + offset + G ε,    r = r̄ − H δ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import ProgramError
+from steady_ppl.program import Program
+from steady_ppl.sites import (
+    Observing,
+    Recording,
+    Standardised,
+    as_vector,
+    broadcast_event,
+    normal_moments,
+    residual,
+    running,
+)
+
+
+@dataclass(frozen=True)
+class Path:
+    """States and the standard normal noise that goes with them.
+
+    Attributes:
+        states: `(T + 1, B, D)`.
+        noise: `(T, B, C)`, in standard deviations of the channels.
+    """
+
+    states: Tensor
+    noise: Tensor
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """The program to first order along a path, in double precision; nothing moves past a trajectory's end.
+
+    Attributes:
+        path: what it was taken along.
+        start_offset: `(B, D)` the mean start less the path's.
+        start_noise: G₀ `(B, D, C₀)`; zero where the start is known.
+        offset: `(T, B, D)` where the program arrives without noise, less the path's next state.
+        state, noise: F `(T, B, D, D)` and G `(T, B, D, C)`.
+        residual: r̄ `(T + 1, B, K)`, on the circle where the measurement is an angle; zero where missing.
+        measurement: H `(T + 1, B, K, D)`.
+        precision: `(T + 1, B, K)` observation weight over variance; zero where missing.
+        log_scale: `(T + 1, B)` the measurements' log-density at residual zero, times the observation weight.
+    """
+
+    path: Path
+    start_offset: Tensor
+    start_noise: Tensor
+    offset: Tensor
+    state: Tensor
+    noise: Tensor
+    residual: Tensor
+    measurement: Tensor
+    precision: Tensor
+    log_scale: Tensor
+
+
+@torch.no_grad()
+def linearize(
+    program: Program,
+    data: Trajectories,
+    path: Path,
+    *,
+    known_start: bool = False,
+    observation_weight: float = 1.0,
+) -> Linearization:
+    """Differentiate the program along a path, all trajectories and times at once.
+
+    Args:
+        program: its channel noise normal, its measurements normal or wrapped normal, components independent.
+        data: as returned by `for_program`.
+        path: states and noise of every trajectory.
+        known_start: the first state is certain.
+        observation_weight: tempers the observations.
+
+    Raises:
+        ProgramError: a site has another distribution, or an operation has no forward derivative.
+    """
+    states, noise = path.states, path.noise
+    offset, by_state, by_noise = _transition(program, data, states, noise)
+    start_offset, start_noise = _start(program, data, states[0], known_start)
+    residuals, by_measured, log_sd = _measurement(program, data, states)
+    observed = data.observed & torch.isfinite(by_measured).all(-1)  # a bearing to where one stands has no derivative
+    log_density = torch.distributions.Normal(0.0, 1.0).log_prob(residuals.new_zeros(())) - log_sd
+    return Linearization(
+        path=path,
+        start_offset=start_offset.double(),
+        start_noise=start_noise.double(),
+        offset=torch.where(data.transitions[..., None], offset, 0.0).double(),
+        state=torch.where(data.transitions[..., None, None], by_state, 0.0).double(),
+        noise=torch.where(data.transitions[..., None, None], by_noise, 0.0).double(),
+        residual=torch.where(observed, residuals, 0.0).double(),
+        measurement=torch.where(observed[..., None], by_measured, 0.0).double(),
+        precision=observation_weight * torch.where(observed, (-2 * log_sd).exp(), 0.0).double(),
+        log_scale=observation_weight * torch.where(observed, log_density, 0.0).double().sum(-1),
+    )
+
+
+def _transition(program: Program, data: Trajectories, states: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def step(state: Tensor, noise: Tensor) -> Tensor:
+        with running(*state.shape[:-1]), Standardised(noise):
+            return program.transition(state, data.controls[:-1], data.elapsed[:-1], data.steps)
+
+    arrived, (by_state, by_noise) = _derivatives(step, states[:-1], noise)
+    return arrived - (by_noise @ noise.unsqueeze(-1)).squeeze(-1) - states[1:], by_state, by_noise
+
+
+def _start(program: Program, data: Trajectories, first: Tensor, known_start: bool) -> tuple[Tensor, Tensor]:
+    def start(noise: Tensor) -> Tensor:
+        left = noise.shape[:-1]
+        with running(*left), Standardised(noise):
+            return broadcast_event(program.initial(), left, 1)
+
+    if known_start:
+        return data.known_start - first, first.new_zeros((*first.shape, 1))
+    began, (start_noise,) = _derivatives(start, first.new_zeros((first.shape[0], _start_channels(program))))
+    return began - first, start_noise
+
+
+def _measurement(program: Program, data: Trajectories, states: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Residuals, how the mean follows the state, and log standard deviations."""
+
+    def measure(state: Tensor) -> Tensor:
+        seen = Recording()
+        with running(*state.shape[:-1]), seen, Observing(data.measurements, data.observed):
+            program.observe(state)
+        residuals, log_sds = [], []
+        for site, fn in seen.distributions.items():
+            _, sd = normal_moments(fn, site)
+            difference = as_vector(residual(fn, seen.observed[site]), fn.event_dim)
+            residuals.append(difference)
+            log_sds.append(as_vector(sd.log(), fn.event_dim).expand(difference.shape))
+        return torch.cat(residuals + log_sds, -1)
+
+    values, (derivative,) = _derivatives(measure, states)
+    count = values.shape[-1] // 2
+    return values[..., :count], -derivative[..., :count, :], values[..., count:]
+
+
+def _start_channels(program: Program) -> int:
+    seen = Recording()
+    with running(1, 1), seen:
+        program.initial()
+    return sum(fn.event_shape.numel() for fn in seen.distributions.values())
+
+
+def _derivatives(function: Callable[..., Tensor], *inputs: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """A function's value `(..., D)` and its Jacobians `(..., D, ·)` in each input `(..., ·)`; rows, trajectories and
+    whatever else is on the left do not mix."""
+    widths = [value.shape[-1] for value in inputs]
+    directions = sum(widths)
+    duals, first = [], 0
+    with forward_ad.dual_level():
+        for value, width in zip(inputs, widths, strict=True):
+            tangent = value.new_zeros((directions, *value.shape))
+            index = torch.arange(width, device=value.device)
+            tangent[first + index, ..., index] = 1.0
+            duals.append(forward_ad.make_dual(value.expand(directions, *value.shape), tangent))
+            first += width
+        try:
+            primal, derivative = forward_ad.unpack_dual(function(*duals))
+        except NotImplementedError as error:
+            why = str(error).splitlines()[0]
+            raise ProgramError(f"the program cannot be linearised: {why} (--guide bootstrap takes any)") from error
+        if derivative is None:
+            derivative = torch.zeros_like(primal)
+        return primal[0].clone(), list(derivative.movedim(0, -1).clone().split(widths, -1))

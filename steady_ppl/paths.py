@@ -1,0 +1,80 @@
+"""Whole trajectories: equally weighted draws, and the genealogy of a filter that they are traced back through."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.resampling import systematic, take
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Equally weighted draws of whole trajectories, with everything that the joint density needs.
+
+    Attributes:
+        states: `(M, T + 1, B, D)`.
+        start: value of each site of `initial`, `(M, 1, B, ...)`.
+        noise: value of each site of `transition`, `(M, T, B, ...)`.
+        event_dims: event dimension of each of these sites.
+    """
+
+    states: Tensor
+    start: dict[str, Tensor]
+    noise: dict[str, Tensor]
+    event_dims: dict[str, int]
+
+    def within(self, data: Trajectories) -> Paths:
+        """Fill the rows past each trajectory's end with its first row, where the program is known to be finite: what
+        is masked there would still spoil a gradient if it blew up."""
+
+        def fill(value: Tensor, inside: Tensor) -> Tensor:
+            mask = inside.reshape(*inside.shape, *[1] * (value.dim() - 3))
+            return torch.where(mask, value, value[:, :1])
+
+        noise = {site: fill(value, data.transitions) for site, value in self.noise.items()}
+        return replace(self, states=fill(self.states, data.rows), noise=noise)
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """What a filter leaves behind.
+
+    Attributes:
+        log_likelihood: `(B,)` the estimate of log p(y), whose exponential is unbiased at observation weight 1.
+        log_weights: `(N, B)` normalised weights of the last row's particles.
+        effective_sizes: `(T + 1, B)` effective sample size after each observed row; N elsewhere.
+        roots: `(B,)` how many of the first row's particles still have descendants at the end.
+        states, start, noise, ancestors: the particles' history, a tensor a row; empty when it was not kept.
+    """
+
+    log_likelihood: Tensor
+    log_weights: Tensor
+    effective_sizes: Tensor
+    roots: Tensor
+    states: list[Tensor]
+    start: dict[str, Tensor]
+    noise: dict[str, list[Tensor]]
+    ancestors: list[Tensor | None]
+    event_dims: dict[str, int]
+
+    def paths(self, draws: int) -> Paths:
+        """Equally weighted paths, resampled systematically from all surviving lineages and traced back."""
+        index = systematic(self.log_weights, draws)
+        states, noise = [take(self.states[-1], index)], {site: list[Tensor]() for site in self.noise}
+        for row in range(len(self.states) - 2, -1, -1):
+            for site, values in self.noise.items():
+                noise[site].append(take(values[row], index))
+            ancestors = self.ancestors[row]
+            if ancestors is not None:
+                index = take(ancestors, index)
+            states.append(take(self.states[row], index))
+        return Paths(
+            states=torch.stack(states[::-1], 1),
+            start={site: take(value, index).unsqueeze(1) for site, value in self.start.items()},
+            noise={site: torch.stack(values[::-1], 1) for site, values in noise.items()},
+            event_dims=self.event_dims,
+        )
