@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     )
     from steady_ppl.filtering import log_likelihood, smoothed_states
     from steady_ppl.fit import Fit
-    from steady_ppl.guides import Constant, LinearRamp, PathGuide, SMCGuide, TruthGuide
+    from steady_ppl.guides import GaussianGuide, LookaheadGuide, PathGuide, SMCGuide, TruthGuide
     from steady_ppl.joint import Joint
     from steady_ppl.particles import particle_filter, roll_out
     from steady_ppl.paths import Filtered, Paths
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from steady_ppl.seeding import seeded
     from steady_ppl.simulation import simulate
     from steady_ppl.table import read_table, write_table
+    from steady_ppl.tempering import Constant, LinearRamp
     from steady_ppl.training import Optimization, Trained, train
     from steady_ppl.validation import Validation
 
@@ -38,7 +39,7 @@ _HOMES = {
     "errors": ("DataError", "FilterError", "ProgramError", "RunError", "SteadyError", "TrainingError", "UsageError"),
     "filtering": ("log_likelihood", "smoothed_states"),
     "fit": ("Fit",),
-    "guides": ("Constant", "LinearRamp", "PathGuide", "SMCGuide", "TruthGuide"),
+    "guides": ("GaussianGuide", "LookaheadGuide", "PathGuide", "SMCGuide", "TruthGuide"),
     "joint": ("Joint",),
     "particles": ("particle_filter", "roll_out"),
     "paths": ("Filtered", "Paths"),
@@ -46,6 +47,7 @@ _HOMES = {
     "program": ("Program", "for_program", "load_program"),
     "seeding": ("seeded",),
     "simulation": ("simulate",),
+    "tempering": ("Constant", "LinearRamp"),
     "table": ("read_table", "write_table"),
     "training": ("Optimization", "Trained", "train"),
     "validation": ("Validation",),

@@ -28,6 +28,7 @@ from steady_ppl.sites import (
 )
 
 
+@torch.no_grad()
 def smooth(
     program: Program,
     data: Trajectories,
@@ -68,7 +69,7 @@ def smooth(
 
 def means_as_path(ahead: Lookahead, data: Trajectories) -> Path:
     """The posterior mean as a path to linearise along, the padding filled with the first row."""
-    _, states, noise = ahead.means()
+    states, noise = ahead.means()
     kind = data.controls.dtype
     return Path(
         states=torch.where(data.rows[..., None], states, states[:1]).to(kind),
@@ -76,6 +77,7 @@ def means_as_path(ahead: Lookahead, data: Trajectories) -> Path:
     )
 
 
+@torch.no_grad()
 def find_path(
     program: Program,
     data: Trajectories,
@@ -113,6 +115,7 @@ def find_path(
     return Path(best.states[:, chosen], best.noise[:, chosen])
 
 
+@torch.no_grad()
 def standard_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor:
     """The channel noise of paths in its standard deviations, `(M, T, B, C)`."""
     seen, states = Recording(), paths.states[:, :-1]
@@ -125,6 +128,7 @@ def standard_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor
     return torch.cat(parts, -1)
 
 
+@torch.no_grad()
 def smoother_paths(
     program: Program, data: Trajectories, ahead: Lookahead, draws: int, *, known_start: bool = False
 ) -> Paths:

@@ -17,7 +17,7 @@ from torch.autograd import forward_ad
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import ProgramError
-from steady_ppl.program import Program
+from steady_ppl.program import Program, names
 from steady_ppl.sites import (
     Observing,
     Recording,
@@ -49,6 +49,7 @@ class Linearization:
 
     Attributes:
         path: what it was taken along.
+        angles: the state's components that live on a circle.
         start_offset: `(B, D)` the mean start less the path's.
         start_noise: G₀ `(B, D, C₀)`; zero where the start is known.
         offset: `(T, B, D)` where the program arrives without noise, less the path's next state.
@@ -60,6 +61,7 @@ class Linearization:
     """
 
     path: Path
+    angles: tuple[int, ...]
     start_offset: Tensor
     start_noise: Tensor
     offset: Tensor
@@ -100,6 +102,7 @@ def linearize(
     log_density = torch.distributions.Normal(0.0, 1.0).log_prob(residuals.new_zeros(())) - log_sd
     return Linearization(
         path=path,
+        angles=tuple(names(program.states).index(angle) for angle in program.angles),
         start_offset=start_offset.double(),
         start_noise=start_noise.double(),
         offset=torch.where(data.transitions[..., None], offset, 0.0).double(),
@@ -171,7 +174,7 @@ def _derivatives(function: Callable[..., Tensor], *inputs: Tensor) -> tuple[Tens
             tangent = value.new_zeros((directions, *value.shape))
             index = torch.arange(width, device=value.device)
             tangent[first + index, ..., index] = 1.0
-            duals.append(forward_ad.make_dual(value.expand(directions, *value.shape), tangent))
+            duals.append(forward_ad.make_dual(value.expand_as(tangent).contiguous(), tangent))
             first += width
         try:
             primal, derivative = forward_ad.unpack_dual(function(*duals))

@@ -1,6 +1,7 @@
-"""The bootstrap particle filter: the Pyro program itself, forward in time, for many particles and trajectories.
+"""The particle filter: the Pyro program itself, forward in time, for many particles and trajectories.
 
 Gordon, Salmond and Smith (1993); Chopin and Papaspiliopoulos (2020), algorithms 10.1 and 10.3 (adaptive resampling).
+With a twist the noise is proposed with a view to the later measurements (Guarniero, Johansen and Lee 2017).
 Densities live in the channels: a particle is a start and its channel noise, its states follow.
 """
 
@@ -18,6 +19,7 @@ from steady_ppl.data import Trajectories
 from steady_ppl.errors import FilterError, ProgramError
 from steady_ppl.paths import Filtered
 from steady_ppl.program import Program
+from steady_ppl.proposals import Proposal
 from steady_ppl.resampling import effective_sample_size, normalise, systematic, take
 from steady_ppl.sites import KnownStart, Observing, Recording, broadcast_event, running
 
@@ -33,10 +35,11 @@ def particle_filter(
     observation_weight: float = 1.0,
     known_start: bool = False,
     resample_below: float = 0.5,
+    proposal: Proposal | None = None,
     keep_history: bool = True,
     on_frame: OnFrame | None = None,
 ) -> Filtered:
-    """Run the program as a bootstrap filter on every trajectory at once.
+    """Run the program as a particle filter on every trajectory at once.
 
     Args:
         program: the state-space model.
@@ -45,9 +48,11 @@ def particle_filter(
         observation_weight: tempers the observations' log-density (w_obs in STEADY).
         known_start: start every particle at the true first state instead of drawing it from the prior.
         resample_below: resample a trajectory when its effective sample size falls below this share of N;
-            checked at its observed rows, never at the table's last one.
+            checked at its observed rows (at all rows when looking ahead), never at the table's last one.
+        proposal: where the noise of start and steps comes from; the program itself when None (the bootstrap filter).
         keep_history: keep what `Filtered.paths` needs.
-        on_frame: called at every row with (row, states `(N, B, D)`, log-weights before, log-weights after), `(N, B)`.
+        on_frame: called at every row with (row, states `(N, B, D)`, log-weights before, log-weights after), `(N, B)`;
+            not when looking ahead.
 
     Returns:
         The estimate of log p(y) and, with `keep_history`, the genealogy.
@@ -56,11 +61,16 @@ def particle_filter(
         FilterError: every weight is zero or a particle is not finite; names trajectory and time.
     """
     rows, trajectories = data.time.shape
+    proposal = proposal or Proposal()
+    if proposal.looks_ahead and on_frame is not None:
+        raise ValueError("on_frame sees what is predicted: a filter that looks ahead has seen the later measurements")
     steps, elapsed, last = data.steps, data.elapsed, rows - 1
     observed_rows = data.observed.any(-1).any(-1).tolist()
     start = Recording()
     with running(particles, 1, trajectories):
-        with start, KnownStart(data.known_start) if known_start else nullcontext():
+        certain = (KnownStart(data.known_start), 0.0) if known_start else None
+        drawing, log_ratio = certain or proposal.start(particles)
+        with start, drawing:
             state = program.initial()
         left = torch.Size((particles, 1, trajectories))
         state = broadcast_event(state, left, 1)
@@ -70,6 +80,7 @@ def particle_filter(
             )
         event_dims = {"states": 1} | {site: fn.event_dim for site, fn in start.distributions.items()}
         log_weights = state.new_full((particles, trajectories), -math.log(particles), dtype=torch.float64)
+        log_weights = log_weights + log_ratio
         log_likelihood = log_weights.new_zeros((rows, trajectories))
         effective_sizes = log_weights.new_full((rows, trajectories), float(particles))
         roots = torch.arange(particles, device=state.device)[:, None].expand(-1, trajectories)
@@ -80,20 +91,23 @@ def particle_filter(
         for row in range(rows):
             if keep_history:
                 history.append(state.squeeze(1))
-            predicted = log_weights
-            ancestors = None
+            predicted, ancestors = log_weights, None
             if observed_rows[row]:
                 recording = Recording()
                 measured = Observing(data.measurements[row, None], data.observed[row, None], observation_weight)
                 with recording, measured:
                     program.observe(state)
-                log_weights, log_likelihood[row] = normalise(log_weights + recording.total().squeeze(-2))
-                size = effective_sample_size(log_weights)
+                log_weights = log_weights + recording.total().squeeze(-2)
+            if observed_rows[row] or proposal.looks_ahead:
+                future = proposal.log_future(row, state.squeeze(1))
+                with_future, log_likelihood[row] = normalise(log_weights + future)
+                log_weights = with_future - future
+                size = effective_sample_size(with_future)
                 effective_sizes[row] = size
                 if row < last and resample_below > 0:
                     exhausted = size < resample_below * particles
                     if state.device.type != "cpu" or bool(exhausted.any()):
-                        ancestors = systematic(log_weights, particles)
+                        ancestors = systematic(with_future, particles)
                         unmoved = torch.arange(particles, device=state.device)[:, None]
                         ancestors = torch.where(exhausted, ancestors, unmoved)
             if on_frame is not None:
@@ -103,10 +117,12 @@ def particle_filter(
             if row == last:
                 break
             if ancestors is not None:
-                log_weights = torch.where(exhausted, -math.log(particles), log_weights)
+                log_weights = torch.where(exhausted, -math.log(particles) - take(future, ancestors), log_weights)
                 state, roots = take(state.squeeze(1), ancestors).unsqueeze(1), take(roots, ancestors)
             recording = Recording()
-            with recording:
+            drawing, log_ratio = proposal.step(row, state.squeeze(1))
+            log_weights = log_weights + log_ratio
+            with recording, drawing:
                 state = program.transition(state, data.controls[row, None], elapsed[row, None], steps[row, None])
             if row == 0:
                 event_dims |= {site: fn.event_dim for site, fn in recording.distributions.items()}

@@ -12,8 +12,9 @@ import inspect
 import itertools
 import sys
 from collections.abc import Mapping, Sequence
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import pyro
@@ -156,6 +157,13 @@ def load_program(source: str | Path) -> Program:
         raise ProgramError(f"{class_name}() of {file.name} failed: {one_line(error)}") from error
 
 
+class _AsWritten(SourceFileLoader):
+    """Compiles what the file says now: a cache goes by size and whole seconds, which misses a digit edited quickly."""
+
+    def get_code(self, fullname: str) -> CodeType:
+        return self.source_to_code(self.get_data(self.path), self.path)
+
+
 def run_file(file: Path) -> ModuleType:
     """Run a Python file as a module of a private package that stands for its folder.
 
@@ -169,9 +177,11 @@ def run_file(file: Path) -> ModuleType:
     parent = ModuleType(package)
     parent.__path__ = [str(folder)]
     sys.modules[package] = parent
-    spec = importlib.util.spec_from_file_location(f"{package}.{file.stem}", file)
-    if spec is None or spec.loader is None:
+    if file.suffix != ".py":
         raise ProgramError(f"{file} is not a Python file")
+    name = f"{package}.{file.stem}"
+    spec = importlib.util.spec_from_file_location(name, file, loader=_AsWritten(name, str(file)))
+    assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     try:

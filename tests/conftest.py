@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from small import FEW, HOVERCRAFT, contents, simulated, steady, written
+from small import FEW, HOVERCRAFT, contents, simulated, steady, tree, written
 
 
 @pytest.fixture(autouse=True)
@@ -34,12 +34,12 @@ def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[...,
 
     def check(code: int, says: str, *arguments: object, folder: Path = tmp_path) -> None:
         capsys.readouterr()
-        before = contents(folder), sorted(folder.rglob("*"))
+        before = contents(folder), tree(folder)
         assert steady(*arguments) == code
         out, error = capsys.readouterr()
         assert error.startswith("steady: ") and 1 <= len(error.splitlines()) <= 2, error
         assert says in error
         assert out == ""
-        assert (contents(folder), sorted(folder.rglob("*"))) == before
+        assert (contents(folder), tree(folder)) == before
 
     return check

@@ -52,9 +52,14 @@ def impossible(data: Trajectories, trajectory: int, row: int) -> Trajectories:
     return replace(data, measurements=measurements)
 
 
+def tree(folder: Path) -> list[Path]:
+    """Every file and folder below a folder but Python's caches."""
+    return [path for path in sorted(folder.rglob("*")) if "__pycache__" not in path.parts]
+
+
 def contents(folder: Path) -> dict[str, bytes]:
     """Every file below a folder; to see that nothing was written, changed or left over."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {str(path.relative_to(folder)): path.read_bytes() for path in tree(folder) if path.is_file()}
 
 
 def rewritten(path: Path, old: str, new: str, count: int = 1) -> Path:

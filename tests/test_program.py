@@ -295,3 +295,12 @@ def test_steps_late_in_a_long_log_keep_their_length() -> None:
     steps = for_program(program, replace(data, time=time)).steps
     assert steps.dtype == torch.float32
     assert float(steps[1, 0]) == pytest.approx(0.01, rel=1e-6)
+
+
+def test_a_digit_edited_within_a_second_counts(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    text = (MODELS / "linear_gaussian.py").read_text().replace("class LinearGaussian", "class Mine")
+    for noise in ("0.6", "0.7", "0.8"):
+        file.write_text(text.replace("tensor(0.6)", f"tensor({noise})"))
+        assert float(load_program(file).noise.detach()) == pytest.approx(float(noise))
+    assert not (tmp_path / "__pycache__").exists()

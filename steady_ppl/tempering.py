@@ -1,0 +1,35 @@
+"""Schedules of the observation weight (w_obs in STEADY)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+
+class Tempering(Protocol):
+    """A schedule of the observation weight."""
+
+    def __call__(self, progress: float) -> float:
+        """The weight at `progress` through the training, 0 to 1."""
+        ...
+
+
+@dataclass(frozen=True)
+class Constant:
+    """The same weight throughout; 1 is STEADY− (no tempering)."""
+
+    weight: float = 1.0
+
+    def __call__(self, progress: float) -> float:
+        return self.weight
+
+
+@dataclass(frozen=True)
+class LinearRamp:
+    """From `first` to 1 over the first `share` of the training; the paper ramps from 0.001 over all of it."""
+
+    first: float = 0.001
+    share: float = 1.0
+
+    def __call__(self, progress: float) -> float:
+        return min(1.0, self.first + (1 - self.first) * progress / self.share)
