@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from steady_ppl import recursions
 from steady_ppl.linearization import Linearization
 
 
@@ -93,61 +96,69 @@ class Lookahead:
         return torch.stack(covariances)
 
     def _forward(self, start: Tensor, random: Tensor, turns: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
+        """States and noise of the linearised program for standard normals; `start` is the start's noise itself."""
         linear, steps = self.linearization, self.steps
-        deviation = linear.start_offset + _times(linear.start_noise, start) - turns
+        begin = linear.start_offset + _times(linear.start_noise, start) - turns
         random = steps.shift + random
         moved = linear.state - linear.noise @ steps.gain  # δ' = moved δ + pushed
         pushed = linear.offset + _times(linear.noise, random)
-        deviations = [deviation]
-        for row in range(len(moved)):
-            deviation = _times(moved[row], deviation) + pushed[..., row, :, :]
-            deviations.append(deviation)
-        all_rows = torch.stack(deviations, -3)
-        return linear.path.states + all_rows, random - _times(steps.gain, all_rows[..., :-1, :, :])
+        deviations = begin.new_empty((*pushed.shape[:-3], len(moved) + 1, *begin.shape[-2:]), device="cpu")
+        deviations[..., 0, :, :] = begin
+        draws, filled = (values.reshape(-1, *values.shape[-3:]) for values in (pushed, deviations))
+        recursions.roll_out(_array(moved), _array(draws), filled.numpy())
+        deviations = deviations.to(begin.device)
+        return linear.path.states + deviations, random - _times(steps.gain, deviations[..., :-1, :, :])
 
 
 def look_ahead(linear: Linearization) -> Lookahead:
     """Run the backward information filter."""
     weighted = linear.measurement * linear.precision.unsqueeze(-1)
-    seen_precision = weighted.mT @ linear.measurement
-    seen = _times(weighted.mT, linear.residual)
-    seen_scale = linear.log_scale - 0.5 * (linear.precision * linear.residual.square()).sum(-1)
-    precision, information = torch.zeros_like(seen_precision[-1]), torch.zeros_like(seen[-1])
-    scale = torch.zeros_like(seen_scale[-1])
-    futures, steerings = [(precision, information, scale)], []
-    for row in range(len(linear.offset) - 1, -1, -1):
-        steering, precision, information, scale = _integrate(
-            precision + seen_precision[row + 1],
-            information + seen[row + 1],
-            scale + seen_scale[row + 1],
-            linear.noise[row],
-            linear.offset[row],
-        )
-        forward = linear.state[row]
-        steerings.append((steering.shift, steering.gain @ forward, steering.factor))
-        precision, information = forward.mT @ precision @ forward, _times(forward.mT, information)
-        futures.append((precision, information, scale))
-    windings = _windings(linear)
-    starts, _, _, masses = _integrate(
-        precision + seen_precision[0],
-        information + seen[0],
-        scale + seen_scale[0],
-        linear.start_noise,
-        linear.start_offset - windings.unsqueeze(1),
+    seen = (
+        weighted.mT @ linear.measurement,
+        _times(weighted.mT, linear.residual),
+        linear.log_scale - 0.5 * (linear.precision * linear.residual.square()).sum(-1),
     )
-    precisions, informations, scales = (torch.stack(values[::-1]) for values in zip(*futures, strict=True))
+    futures, steps = tuple(torch.empty_like(part, device="cpu") for part in seen), _steering(linear.noise)
+    system = (linear.state, linear.noise, linear.offset)
+    recursions.backward(_arrays(seen), *_arrays(system), _arrays(futures), _arrays(steps))
+    device = linear.offset.device
+    precision, information, log_scale = (part.to(device) for part in futures)
+    windings = _windings(linear)
+    offsets = linear.start_offset - windings.unsqueeze(1)
+    starts = _steering(linear.start_noise.expand(len(windings), *linear.start_noise.shape))
+    masses = torch.empty(offsets.shape[:-1], dtype=offsets.dtype)
+    ahead = (precision[0] + seen[0][0], information[0] + seen[1][0], log_scale[0] + seen[2][0])
+    recursions.integrate_starts(
+        _arrays(ahead), _array(linear.start_noise), _array(offsets), _arrays(starts), masses.numpy()
+    )
     log_likelihood = masses.logsumexp(0)
     return Lookahead(
         linearization=linear,
-        precision=precisions,
-        information=informations,
-        log_scale=scales,
+        precision=precision,
+        information=information,
+        log_scale=log_scale,
         windings=windings,
-        winding_masses=masses - log_likelihood,
-        starts=starts,
-        steps=Steering(*(torch.stack(values[::-1]) for values in zip(*steerings, strict=True))),
-        log_likelihood=log_likelihood,
+        winding_masses=(masses - log_likelihood).to(device),
+        starts=Steering(*(part.to(device) for part in starts)),
+        steps=Steering(*(part.to(device) for part in steps)),
+        log_likelihood=log_likelihood.to(device),
     )
+
+
+def _steering(noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Room for the steering of noise that enters by `(..., D, C)`."""
+    *left, dimension, channels = noise.shape
+    shapes = ((channels,), (channels, dimension), (channels, channels))
+    return tuple(torch.empty(*left, *shape, dtype=noise.dtype) for shape in shapes)  # type: ignore[return-value]
+
+
+def _arrays(tensors: Sequence[Tensor]) -> Any:
+    return tuple(_array(tensor) for tensor in tensors)
+
+
+def _array(tensor: Tensor) -> recursions.Array:
+    """A C-contiguous array; of a contiguous tensor in the host's memory it is that memory."""
+    return tensor.contiguous().numpy(force=True)
 
 
 def _windings(linear: Linearization) -> Tensor:
@@ -161,41 +172,6 @@ def _windings(linear: Linearization) -> Tensor:
             turn[list(angles)] = 2 * math.pi * turn.new_tensor(choice)
             turns.append(turn)
     return torch.stack(turns)
-
-
-def _integrate(
-    precision: Tensor, information: Tensor, scale: Tensor, noise: Tensor, offset: Tensor
-) -> tuple[Steering, Tensor, Tensor, Tensor]:
-    """∫ ψ(μ + offset + G ε) N(ε; 0, I) dε as a function of μ, again (Λ, λ, c), and the noise's conditional given μ.
-
-    With S = (I + GᵀΛG)⁻¹ and u = λ − Λ offset:  Λ̃ = Λ − ΛGSGᵀΛ,  λ̃ = u − ΛGSGᵀu,  ε | μ ~ N(S Gᵀ(u − Λμ), S).
-    """
-    channels, dimension = noise.shape[-1], noise.shape[-2]
-    by_noise = precision @ noise
-    pushed = _times(precision, offset)
-    pulled = information - pushed
-    unit = torch.eye(channels, dtype=noise.dtype, device=noise.device)
-    root, failed = torch.linalg.cholesky_ex(noise.mT @ by_noise + unit)
-    root = torch.where((failed > 0)[..., None, None], torch.nan, root)  # log p(y) says so
-    towards = _times(noise.mT, pulled).unsqueeze(-1)
-    left = towards.shape[:-2]
-    right = torch.cat([towards, by_noise.mT.expand(*left, channels, dimension)], -1)
-    half = torch.linalg.solve_triangular(root, right, upper=False)
-    half_shift, half_gain = half[..., 0], half[..., 1:]
-    identity = unit.expand(*left, channels, channels)
-    whole = torch.linalg.solve_triangular(root.mT, torch.cat([half, identity], -1), upper=True)
-    scale = (
-        scale
-        + ((information - 0.5 * pushed) * offset).sum(-1)
-        + 0.5 * half_shift.square().sum(-1)
-        - root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    )
-    return (
-        Steering(whole[..., 0], whole[..., 1 : 1 + dimension], whole[..., 1 + dimension :]),
-        precision - half_gain.mT @ half_gain,
-        pulled - _times(half_gain.mT, half_shift),
-        scale,
-    )
 
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:
