@@ -119,8 +119,8 @@ def look_ahead(linear: Linearization) -> Lookahead:
         linear.log_scale - 0.5 * (linear.precision * linear.residual.square()).sum(-1),
     )
     futures, steps = tuple(torch.empty_like(part, device="cpu") for part in seen), _steering(linear.noise)
-    system = (linear.state, linear.noise, linear.offset)
-    recursions.backward(_arrays(seen), *_arrays(system), _arrays(futures), _arrays(steps))
+    state, noise, offset = _arrays((linear.state, linear.noise, linear.offset))
+    recursions.backward(_arrays(seen), state, noise, offset, _arrays(futures), _arrays(steps))
     device = linear.offset.device
     precision, information, log_scale = (part.to(device) for part in futures)
     windings = _windings(linear)
