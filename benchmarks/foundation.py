@@ -113,16 +113,21 @@ def report(experiment: str, methods: list[str], results: list[dict]) -> int:
     print(f"\n{'':10} {'figure':26} {'mean ± sd':>18} {'best':>8}  {'must':16} published")
     for method in methods:
         runs = [result for result in results if result["method"] == method]
-        figures = {
-            f"{name} {group}": [run[name][group] for run in runs]
-            for name in ("forward", "forward_mean", "state_estimation")
-            for group in ("location", "angle")
-        }
-        figures["log p(y) at 1 Hz"] = [run["log_likelihood"] for run in runs]
-        figures["seconds to learn"] = [run["seconds"] for run in runs]
-        for name, values in figures.items():
+        for name, values in figures(runs).items():
             missed |= line(method, name, values, BOUNDS.get((experiment, method, name), Bound()))
     return missed
+
+
+def figures(runs: list[dict]) -> dict[str, list[float]]:
+    """What is printed of several runs, by name."""
+    named = {
+        f"{name} {group}": [run[name][group] for run in runs]
+        for name in ("forward", "forward_mean", "state_estimation")
+        for group in ("location", "angle")
+    }
+    named["log p(y) at 1 Hz"] = [run["log_likelihood"] for run in runs]
+    named["seconds to learn"] = [run["seconds"] for run in runs]
+    return named
 
 
 def line(method: str, name: str, values: list[float], bound: Bound) -> int:

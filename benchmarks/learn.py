@@ -55,7 +55,7 @@ def run(vehicle: str, folder: Path | None, out: Path, seed: int) -> None:
     fits = {}
     for method in methods:
         print(f"{NAMES[method]} …", flush=True)
-        fits[method] = learn(method, vehicle, data, seed, progress=True)
+        fits[method] = learn(method, vehicle, data, seed, guide="gaussian", progress=True)
         train = data[0] if method == "steady" else None
         fits[method].save(out / method, train=train, force=True)
     results = [evaluate(fits[method], data[2], rollouts=200) for method in methods]

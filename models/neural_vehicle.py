@@ -28,7 +28,7 @@ class NeuralVehicle(PlanarVehicle):
 
     acceleration_scale = (1.0, 1.0, 1.0)
     rates = {"noise": 4.0}
-    decays = {"hidden": 10.0, "skip": 0.1, "noise": 0.1}
+    decays = {"hidden": 10.0, "skip": 0.1, "noise": 10.0}
 
     def __init__(self, *, layers=1, absolute_heading=False, normalise="smoothed"):
         super().__init__()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
         TrainingError,
         UsageError,
     )
-    from steady_ppl.filtering import log_likelihood, smoothed_states
+    from steady_ppl.filtering import log_likelihood, neglected, run_filter, smoothed_states
     from steady_ppl.fit import Fit
     from steady_ppl.guides import GaussianGuide, LookaheadGuide, PathGuide, SMCGuide, TruthGuide
     from steady_ppl.joint import Joint
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "data": ("Trajectories",),
     "errors": ("DataError", "FilterError", "ProgramError", "RunError", "SteadyError", "TrainingError", "UsageError"),
-    "filtering": ("log_likelihood", "smoothed_states"),
+    "filtering": ("log_likelihood", "neglected", "run_filter", "smoothed_states"),
     "fit": ("Fit",),
     "guides": ("GaussianGuide", "LookaheadGuide", "PathGuide", "SMCGuide", "TruthGuide"),
     "joint": ("Joint",),

@@ -28,6 +28,7 @@ class Checkpoint:
         kept: the averaged parameters that would be returned now, empty before the first validation.
         kept_step: the step that they are from.
         best_held_out: the best held-out log p(y) so far, one a trajectory.
+        memory: what the guide begins its next E step from.
     """
 
     step: int
@@ -37,6 +38,7 @@ class Checkpoint:
     kept: dict[str, Tensor]
     kept_step: int = 0
     best_held_out: list[float] = field(default_factory=list)
+    memory: dict[str, Tensor] = field(default_factory=dict)
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: Mapping[str, str] | None = None) -> None:
@@ -68,6 +70,7 @@ def write_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optim
     tensors = {f"parameters/{name}": value for name, value in state.parameters.items()}
     tensors |= {f"averaged/{name}": value for name, value in state.averaged.items()}
     tensors |= {f"kept/{name}": value for name, value in state.kept.items()}
+    tensors |= {f"memory/{name}": value for name, value in state.memory.items()}
     for index, slots in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer/{index}/{slot}": value for slot, value in slots.items()}
     numbers = {name: getattr(state, name) for name in ("step", "history", "kept_step", "best_held_out")}
@@ -81,7 +84,7 @@ def read_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimi
         RunError: the file is missing, damaged, or of another program.
     """
     tensors, text = read_tensors(path)
-    groups: dict[str, dict[str, Tensor]] = {"parameters": {}, "averaged": {}, "kept": {}, "optimizer": {}}
+    groups: dict[str, dict[str, Tensor]] = {"parameters": {}, "averaged": {}, "kept": {}, "memory": {}, "optimizer": {}}
     for key, value in tensors.items():
         group, _, name = key.partition("/")
         groups[group][name] = value
@@ -93,6 +96,7 @@ def read_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimi
     for name, value in groups["averaged"].items():
         state.averaged[name].copy_(value)
     state.kept = {name: value.to(state.averaged[name].device) for name, value in groups["kept"].items()}
+    state.memory.update(groups["memory"])
     for name in ("step", "history", "kept_step", "best_held_out"):
         setattr(state, name, json.loads(text[name]))
     slots: dict[int, dict[str, Tensor]] = {}

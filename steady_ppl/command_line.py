@@ -42,6 +42,8 @@ class Device(StrEnum):
 class GuideName(StrEnum):
     """The E step."""
 
+    lookahead = "lookahead"
+    gaussian = "gaussian"
     bootstrap = "bootstrap"
 
 
@@ -151,7 +153,7 @@ def fit(
 def evaluate(
     arguments: Annotated[list[Path], typer.Argument(metavar="RUN... TABLE", help="Run folders, then the table.")],
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
-    particles: Annotated[int, typer.Option(help="Particles of the filters.", min=2)] = 5000,
+    particles: Annotated[int | None, typer.Option(help="Particles of the filters.", min=2)] = None,
     rollouts: Annotated[int, typer.Option(help="Noisy roll-outs from each true state.", min=1)] = 1000,
     seed: Seed = 0,
     program: Annotated[

@@ -10,6 +10,7 @@ import torch
 from steady_ppl.data import Trajectories
 from steady_ppl.filtering import log_likelihood
 from steady_ppl.fit import Fit
+from steady_ppl.linearization import why_not_linear
 from steady_ppl.measurement_errors import measurement_errors
 from steady_ppl.metrics import forward, forward_mean, state_estimation
 from steady_ppl.program import for_program
@@ -17,26 +18,40 @@ from steady_ppl.seeding import seeded
 
 
 def evaluate(
-    fit: Fit, table: Trajectories, *, particles: int = 5000, rollouts: int = 1000, seed: int = 0
+    fit: Fit,
+    table: Trajectories,
+    *,
+    particles: int | None = None,
+    rollouts: int = 1000,
+    look_ahead: bool | None = None,
+    seed: int = 0,
 ) -> dict[str, Any]:
     """Errors of one fitted program; equal seeds give every program the same random numbers.
 
     Args:
         fit: what is judged; its `known_start` decides whether the filters start at the true first state.
         table: drives that were not used for the fit.
-        particles: N of each filter (the paper: 100 000).
+        particles: N of each filter (the paper: 100 000); 200 looking ahead and 5000 otherwise when not given.
         rollouts: noisy roll-outs from each true state.
+        look_ahead: whether log p(y) and the states come from a filter that looks ahead; None where the program allows.
         seed: of the Monte-Carlo draws.
 
     Returns:
-        `log_likelihood` (mean per trajectory at every tenth row), `forward`, `forward_mean`, `state_estimation` (error
-        groups; empty without true states) and `measurement`.
+        `filter` ("lookahead", or "bootstrap" and why), `log_likelihood` (mean per trajectory at every tenth row),
+        `forward`, `forward_mean`, `state_estimation` (error groups; empty without true states) and `measurement`.
     """
     program, known_start = fit.program, fit.known_start
     data = for_program(program, table)
-    result: dict[str, Any] = {"recipe": fit.recipe}
+    reason = why_not_linear(program, data) if look_ahead is None else None
+    ahead = reason is None if look_ahead is None else look_ahead
+    particles = particles or (200 if ahead else 5000)
+    settings: dict[str, Any] = {"particles": particles, "known_start": known_start, "look_ahead": ahead}
+    result: dict[str, Any] = {
+        "recipe": fit.recipe,
+        "filter": "lookahead" if ahead else f"bootstrap ({reason or 'chosen'})",
+    }
     with seeded(seed, "log_likelihood"):
-        values = log_likelihood(program, data, particles=particles, known_start=known_start)
+        values = log_likelihood(program, data, **settings)
         result["log_likelihood"] = float(values.mean())
     result |= {"forward": {}, "forward_mean": {}, "state_estimation": {}}
     if has_truth(data):
@@ -44,11 +59,9 @@ def evaluate(
             result["forward"] = forward(program, data, rollouts=rollouts)
         result["forward_mean"] = forward_mean(program, data)
         with seeded(seed, "state_estimation"):
-            result["state_estimation"] = state_estimation(program, data, particles=particles, known_start=known_start)
+            result["state_estimation"] = state_estimation(program, data, **settings)
     with seeded(seed, "measurement"):
-        result["measurement"] = measurement_errors(
-            program, data, particles=min(particles, 2000), known_start=known_start
-        )
+        result["measurement"] = measurement_errors(program, data, particles=2000, known_start=known_start)
     return result
 
 

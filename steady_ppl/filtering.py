@@ -1,4 +1,8 @@
-"""What a filter of the program says of given drives: log p(y), and where the vehicle probably was."""
+"""What a filter of the program says of given drives: log p(y), and where the vehicle probably was.
+
+A filter that looks ahead needs some hundred particles where the bootstrap filter needs thousands, and finds a start of
+which only a broad prior is known; it needs normal noise (see `linearize`).
+"""
 
 from __future__ import annotations
 
@@ -9,12 +13,56 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError
+from steady_ppl.gaussian_smoother import find_path, means_as_path, smooth
 from steady_ppl.particles import particle_filter
+from steady_ppl.paths import Filtered
 from steady_ppl.program import Program
+from steady_ppl.proposals import Twist
+
+
+def run_filter(
+    program: Program,
+    data: Trajectories,
+    *,
+    particles: int,
+    known_start: bool,
+    look_ahead: bool = False,
+    keep_history: bool = True,
+) -> Filtered:
+    """The particle filter at observation weight 1, bootstrap or looking ahead."""
+    proposal = None
+    if look_ahead:
+        path = find_path(program, data, known_start=known_start)
+        proposal = Twist(smooth(program, data, path, known_start=known_start))
+    return particle_filter(
+        program, data, particles=particles, known_start=known_start, proposal=proposal, keep_history=keep_history
+    )
+
+
+def neglected(program: Program, data: Trajectories, *, known_start: bool, particles: int = 200) -> Tensor:
+    """What the linearised program neglects: log p(y) by the filter that looks ahead, less the linearised program's.
+
+    Near zero the Gaussian guide draws from the posterior; by a nat or more, the lookahead guide is the one to use.
+
+    Returns:
+        `(B,)` nats, with the filter's Monte-Carlo error.
+    """
+    path = find_path(program, data, known_start=known_start)
+    ahead = smooth(program, data, path, known_start=known_start)
+    filtered = particle_filter(
+        program, data, particles=particles, known_start=known_start, proposal=Twist(ahead), keep_history=False
+    )
+    return filtered.log_likelihood - ahead.log_likelihood
 
 
 def log_likelihood(
-    program: Program, data: Trajectories, *, particles: int, known_start: bool, every: int = 10
+    program: Program,
+    data: Trajectories,
+    *,
+    particles: int,
+    known_start: bool,
+    every: int = 10,
+    look_ahead: bool = False,
 ) -> Tensor:
     """Estimate log p(y) of each trajectory, untempered.
 
@@ -24,6 +72,7 @@ def log_likelihood(
         particles: N, for each trajectory.
         known_start: start at the true first state.
         every: use the measurements of every n-th row only, the first included (10 turns 10 Hz into 1 Hz).
+        look_ahead: propose with a view to the later measurements instead of blindly.
 
     Returns:
         `(B,)`.
@@ -41,29 +90,27 @@ def log_likelihood(
             trajectory=label,
         )
     parts = [
-        particle_filter(program, part, particles=particles, known_start=known_start, keep_history=False).log_likelihood
+        run_filter(
+            program, part, particles=particles, known_start=known_start, look_ahead=look_ahead, keep_history=False
+        ).log_likelihood
         for part in in_parts(thinned, particles)
     ]
     return torch.cat(parts)
 
 
-def smoothed_states(program: Program, data: Trajectories, *, known_start: bool, particles: int = 2000) -> Tensor:
-    """Posterior means of the states given all measurements, from the surviving lineages of a filter.
+def smoothed_states(program: Program, data: Trajectories, *, known_start: bool) -> Tensor:
+    """Posterior means of the states given all measurements, by the iterated smoother.
 
     Args:
-        program: the state-space model.
+        program: the state-space model, its noise normal.
         data: as returned by `for_program`.
-        particles: N, for each trajectory.
         known_start: start at the true first state.
 
     Returns:
         `(T + 1, B, D)`.
     """
-    parts = [
-        particle_filter(program, part, particles=particles, known_start=known_start).paths(100).states.mean(0)
-        for part in in_parts(data, particles)
-    ]
-    return torch.cat(parts, 1)
+    path = find_path(program, data, known_start=known_start)
+    return means_as_path(smooth(program, data, path, known_start=known_start), data).states
 
 
 def in_parts(data: Trajectories, particles: int, at_once: int = 200_000) -> Iterator[Trajectories]:

@@ -149,7 +149,8 @@ class LinearizedGuide(PathGuide):
 
     def _recall(self, data: Trajectories) -> Path:
         states, noise = (
-            torch.stack([self.memory[f"{kind}/{label}"] for label in data.labels], 1) for kind in ("states", "noise")
+            torch.stack([self.memory[f"{kind}/{label}"] for label in data.labels], 1).to(data.controls)
+            for kind in ("states", "noise")
         )
         return Path(states, noise)
 

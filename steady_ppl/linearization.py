@@ -115,6 +115,22 @@ def linearize(
     )
 
 
+@torch.no_grad()
+def why_not_linear(program: Program, data: Trajectories) -> str | None:
+    """Which site keeps a program from being linearised, None if none does."""
+    seen = Recording()
+    with running(1, 1), seen:
+        state = broadcast_event(program.initial(), torch.Size((1, 1)), 1)
+        program.transition(state, data.controls[:1, :1], data.elapsed[:1, :1], data.steps[:1, :1])
+        program.observe(state)
+    for site, fn in seen.distributions.items():
+        try:
+            normal_moments(fn, site)
+        except ProgramError as error:
+            return str(error)
+    return None
+
+
 def _transition(program: Program, data: Trajectories, states: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     def step(state: Tensor, noise: Tensor) -> Tensor:
         with running(*state.shape[:-1]), Standardised(noise):

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
-from steady_ppl.filtering import in_parts
-from steady_ppl.particles import particle_filter, roll_out
+from steady_ppl.filtering import in_parts, run_filter
+from steady_ppl.particles import roll_out
 from steady_ppl.planar_vehicle import wrap
 from steady_ppl.program import Program, error_groups, names
 from steady_ppl.sites import AtMean
@@ -32,7 +32,14 @@ def squared_errors(program: Program, states: Tensor, truth: Tensor) -> dict[str,
 
 @torch.no_grad()
 def state_estimation(
-    program: Program, data: Trajectories, *, particles: int, known_start: bool, every: int = 10, lineages: int = 1000
+    program: Program,
+    data: Trajectories,
+    *,
+    particles: int,
+    known_start: bool,
+    every: int = 10,
+    lineages: int = 1000,
+    look_ahead: bool = False,
 ) -> Errors:
     """Errors of smoothed lineages, measured at every n-th row and judged at all rows.
 
@@ -45,6 +52,7 @@ def state_estimation(
         known_start: start at the true first state.
         every: use the measurements of every n-th row only.
         lineages: paths for each trajectory.
+        look_ahead: with a filter that looks ahead.
 
     Returns:
         Error group → error, groups without truth left out.
@@ -53,7 +61,7 @@ def state_estimation(
     roots: dict[str, list[Tensor]] = {}
     for part in in_parts(data.observed_every(every), particles):
         assert part.states is not None
-        filtered = particle_filter(program, part, particles=particles, known_start=known_start)
+        filtered = run_filter(program, part, particles=particles, known_start=known_start, look_ahead=look_ahead)
         paths = filtered.paths(lineages)
         for group, squared in squared_errors(program, paths.states, part.states).items():
             mean = squared.mean(0)

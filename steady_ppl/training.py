@@ -29,6 +29,7 @@ class Guide(Protocol):
     """What the loop asks of a guide; parameters, if it is a torch module, are trained with the program's."""
 
     draws: int
+    memory: dict[str, Tensor]
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
         """The E step, outside the gradient; returns figures for the log."""
@@ -130,6 +131,7 @@ def train(
         parameters={**parameters, **_guide_parameters(guide)},
         averaged={name: value.detach().clone() for name, value in parameters.items()},
         kept={},
+        memory=guide.memory,
     )
     if resume and checkpoint is not None:
         read_checkpoint(checkpoint, state, optimizer)

@@ -23,19 +23,26 @@ class Validation:
         particles: N of the filter; the same random numbers are used at every validation.
         known_start: start at the true first state.
         every: use every n-th row's measurements (10 Hz to 1 Hz).
+        look_ahead: with a filter that looks ahead; `particles` can then be a twentieth.
     """
 
     data: Trajectories | None = None
     particles: int = 2000
     known_start: bool = False
     every: int = 10
+    look_ahead: bool = False
 
     def __call__(self, program: Program, seed: int) -> list[float]:
         """Log p(y) of each held-out trajectory."""
         assert self.data is not None
         with seeded(seed, "validate"):
             values = log_likelihood(
-                program, self.data, particles=self.particles, known_start=self.known_start, every=self.every
+                program,
+                self.data,
+                particles=self.particles,
+                known_start=self.known_start,
+                every=self.every,
+                look_ahead=self.look_ahead,
             )
         return values.tolist()
 

@@ -18,7 +18,7 @@ with warnings.catch_warnings():
 
 HOVERCRAFT, TRUTH = MODELS / "hovercraft.py", f"{MODELS / 'hovercraft.py'}:HovercraftTruth"
 
-FEW = ("--particles", 20, "--draws", 3, "--steps", 3)
+FEW = ("--guide", "bootstrap", "--particles", 20, "--draws", 3, "--steps", 3)
 QUICK = ("--particles", 50, "--rollouts", 5)
 
 

@@ -27,7 +27,7 @@ def test_evaluate_writes_the_figures_of_every_run_as_json(tmp_path: Path, work: 
     ]
     for row in content["runs"]:
         groups = {"forward", "forward_mean", "state_estimation"}
-        assert row.keys() == {"run", "recipe", "log_likelihood", "measurement"} | groups
+        assert row.keys() == {"run", "recipe", "filter", "log_likelihood", "measurement"} | groups
         assert all(row[group].keys() == ERRORS for group in groups)
         assert row["measurement"].keys() == {"one_step", "open_loop_1s", "open_loop_3s", "coverage_90"}
         figures = [

@@ -92,10 +92,10 @@ def test_a_forced_fit_that_was_killed_leaves_the_old_run_to_the_next(tmp_path: P
 
 def test_any_setting_of_a_recipe_can_be_set(tmp_path: Path, work: Path) -> None:
     run = tmp_path / "run"
-    chosen = ("--set", "ramp=0.5", "--set", "betas=(0.8, 0.9)", "--set", "guide=bootstrap")
+    chosen = ("--set", "ramp=0.5", "--set", "betas=(0.8, 0.9)", "--set", "learning_rate=2e-2")
     assert steady("fit", HOVERCRAFT, work / "train.csv", *FEW, *chosen, "--out", run) == 0
     settings = json.loads((run / "run.json").read_text())["settings"]
-    assert (settings["ramp"], settings["betas"], settings["guide"]) == (0.5, [0.8, 0.9], "bootstrap")
+    assert (settings["ramp"], settings["betas"], settings["learning_rate"]) == (0.5, [0.8, 0.9], 0.02)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_a_fit_in_a_shell_says_its_result_and_nothing_else(tmp_path: Path, work:
 
 # --- interrupted and resumed ------------------------------------------------------------------------------------------
 
-LONGER = ("--particles", 20, "--draws", 3, "--steps", 26)
+LONGER = ("--guide", "bootstrap", "--particles", 20, "--draws", 3, "--steps", 26)
 
 
 @pytest.fixture

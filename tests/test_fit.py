@@ -109,7 +109,7 @@ def test_the_record_says_where_a_result_is_from(tmp_path: Path, copy: Path) -> N
 
 def test_the_record_of_a_fit_holds_options_settings_and_the_tables_hashes(tmp_path: Path) -> None:
     train, valid = simulated(rows=6), simulated(rows=6, seed=1)
-    options = {"particles": 10, "draws": 2, "steps": 2}
+    options = {"guide": "bootstrap", "particles": 10, "draws": 2, "steps": 2}
     run_recipe("steady", load_program(HOVERCRAFT), train, valid, tmp_path / "run", options=options, seed=3)
     record = json.loads((tmp_path / "run/run.json").read_text())
     assert record["options"] == options and record["seed"] == 3 and not record["known_start"]
@@ -122,7 +122,7 @@ def test_nothing_in_a_run_is_pickled(tmp_path: Path) -> None:
     """Pickles, zipped or not, begin with their own bytes; every file here is of a format that holds no code."""
     run_recipe(
         "steady", load_program(NEURAL), simulated(rows=6), None, tmp_path / "run",
-        options={"particles": 10, "draws": 2, "steps": 2},
+        options={"guide": "bootstrap", "particles": 10, "draws": 2, "steps": 2},
     )  # fmt: skip
     files = contents(tmp_path / "run")
     assert files.keys() == FILES | {"checkpoint.safetensors"}
@@ -320,7 +320,20 @@ def test_what_is_no_run_is_an_error_of_the_run(tmp_path: Path) -> None:
 @pytest.mark.parametrize("keep", [0, 50, -1])
 def test_a_checkpoint_cut_short_is_damaged_and_says_so_in_one_line(tmp_path: Path, capsys, keep: int) -> None:
     run = tmp_path / "run"
-    command = ("fit", HOVERCRAFT, written(tmp_path / "t.csv"), "--particles", 10, "--steps", 2, "--out", run)
+    few = ("--guide", "bootstrap", "--particles", 10, "--steps", 2)
+    command = ("fit", HOVERCRAFT, written(tmp_path / "t.csv"), *few, "--out", run)
+        "fit",
+        HOVERCRAFT,
+        written(tmp_path / "t.csv"),
+        "--guide",
+        "bootstrap",
+        "--particles",
+        10,
+        "--steps",
+        2,
+        "--out",
+        run,
+    )
     assert steady(*command) == 0
     file = run / "checkpoint.safetensors"
     file.write_bytes(file.read_bytes()[:keep])
@@ -351,7 +364,7 @@ def test_a_table_goes_through_parquet_and_csv_to_the_same_run(tmp_path: Path) ->
     for name in ("t.csv", "t.parquet"):
         write_table(simulated(rows=6), tmp_path / name)
         run = tmp_path / f"run.{name}"
-        few = ("--particles", 10, "--draws", 2, "--steps", 2)
+        few = ("--guide", "bootstrap", "--particles", 10, "--draws", 2, "--steps", 2)
         assert steady("fit", HOVERCRAFT, tmp_path / name, *few, "--out", run) == 0
         runs.append(run)
     records = [json.loads((run / "run.json").read_text()) for run in runs]

@@ -16,6 +16,11 @@ from steady_ppl import UsageError, for_program, load_program, log_likelihood, se
 from steady_ppl.run_recipe import find_recipe, recipe_folder
 
 QUIET = {"progress": False}
+FEW = {
+    "bootstrap": {"guide": "bootstrap", "particles": 20, "draws": 3},
+    "lookahead": {"guide": "lookahead", "particles": 20, "draws": 3},
+    "gaussian": {"draws": 3},
+}
 
 
 def values(program) -> dict[str, torch.Tensor]:
@@ -56,13 +61,16 @@ def test_hand_changes_nothing(tmp_path: Path) -> None:
 # --- steady -----------------------------------------------------------------------------------------------------------
 
 
-def test_steady_finds_a_mass_that_was_wrong_by_far() -> None:
+@pytest.mark.parametrize("guide", list(FEW))
+def test_steady_finds_a_mass_that_was_wrong_by_far(guide: str) -> None:
     """Believed to be twice as heavy as it is and seen through bearings only; held-out drives must gain as well."""
     train, valid = simulated(trajectories=4, rows=41), simulated(trajectories=4, rows=41, seed=1)
     program = load_program(HOVERCRAFT)
     program.mass = torch.tensor(3.0)
     before = held_out(program, valid)
-    options = {"particles": 60, "draws": 5, "steps": 25, "learning_rate": 0.1, "known_start": True}
+    options = {**FEW[guide], "draws": 5, "steps": 40, "learning_rate": 0.05, "known_start": True}
+    if guide == "bootstrap":
+        options["particles"] = 60
     find_recipe("steady")(program, train, **options, **QUIET)
     assert abs(program.mass.item() - 1.5) < abs(3.0 - 1.5) / 5
     assert held_out(program, valid) > before
@@ -76,16 +84,17 @@ def held_out(program, data) -> float:
         )
 
 
+@pytest.mark.parametrize("guide", list(FEW))
 @pytest.mark.parametrize("known_start", [True, False])
 @pytest.mark.parametrize("name", ["hovercraft.py:Hovercraft", "neural_vehicle.py:NeuralHovercraft"])
-def test_steady_never_looks_at_the_true_states(name: str, known_start: bool) -> None:
+def test_steady_never_looks_at_the_true_states(name: str, known_start: bool, guide: str) -> None:
     """But for a known start, the result is the same bit for bit whatever the x. columns say."""
     train, valid = simulated(rows=6), simulated(rows=6, seed=1)
     results = []
     for given in (lambda data: data, only_start, lambda data: data.without_truth(keep_start=known_start)):
         with seeded(1):
             program = load_program(MODELS / name)
-        options = {"particles": 20, "draws": 3, "steps": 4, "validate_every": 2, "known_start": known_start}
+        options = {**FEW[guide], "steps": 4, "validate_every": 2, "known_start": known_start}
         fit = find_recipe("steady")(program, given(train), given(valid), **options, **QUIET)
         results.append((values(program), fit.trained))
     for parameters, trained in results[1:]:
@@ -96,15 +105,44 @@ def test_a_known_start_makes_a_difference() -> None:
     outcomes = []
     for known_start in (True, False):
         program = load_program(HOVERCRAFT)
-        options = {"particles": 20, "draws": 3, "steps": 2, "known_start": known_start}
+        options = {"draws": 3, "steps": 2, "known_start": known_start}
         fit = find_recipe("steady")(program, simulated(rows=6), **options, **QUIET)
         assert fit.known_start == known_start
         outcomes.append(values(program))
     assert not same(*outcomes)
 
 
+def test_what_is_not_given_comes_from_the_guides_defaults() -> None:
+    fit = find_recipe("steady")(load_program(HOVERCRAFT), simulated(rows=4), guide="lookahead", steps=1, **QUIET)
+    assert (fit.settings["particles"], fit.settings["draws"], fit.settings["gradient_steps"]) == (100, 50, 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"guide": "kalman"}, "no guide 'kalman'; there are gaussian, lookahead, bootstrap"),
+        ({"guide": "gaussian", "particles": 5}, "guide gaussian has no particles"),
+    ],
+)
+def test_a_guide_that_there_is_not_or_what_it_does_not_take_is_refused(options, says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        find_recipe("steady")(load_program(HOVERCRAFT), simulated(rows=4), **options, **QUIET)
+
+
+def test_the_gaussian_guide_says_when_the_posterior_is_not_normal() -> None:
+    """Landmarks among the drives, whose starts are not known: bearings turn quickly there."""
+    far, near = load_program(HOVERCRAFT), load_program(HOVERCRAFT)
+    near.landmarks = ((1.0, 1.0), (0.0, 0.0))
+    for program in (far, near):
+        program.duration = 3.0
+    doubted, trusted = (
+        find_recipe("steady")(program, simulate(program, 4), steps=1, **QUIET).notes for program in (near, far)
+    )
+    assert "try guide=lookahead" in doubted[0] and len(trusted) == 0
+
+
 def test_a_fits_settings_are_what_the_recipe_was_called_with() -> None:
-    options = {"particles": 20, "draws": 3, "steps": 2, "seed": 9}
+    options = {"guide": "bootstrap", "particles": 20, "draws": 3, "steps": 2, "seed": 9}
     fit = find_recipe("steady")(load_program(HOVERCRAFT), simulated(rows=4), **options, **QUIET)
     assert options.items() <= fit.settings.items() and fit.seed == 9
     assert not {"program", "table", "valid", "run", "progress"} & fit.settings.keys()
