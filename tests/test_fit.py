@@ -322,18 +322,6 @@ def test_a_checkpoint_cut_short_is_damaged_and_says_so_in_one_line(tmp_path: Pat
     run = tmp_path / "run"
     few = ("--guide", "bootstrap", "--particles", 10, "--steps", 2)
     command = ("fit", HOVERCRAFT, written(tmp_path / "t.csv"), *few, "--out", run)
-        "fit",
-        HOVERCRAFT,
-        written(tmp_path / "t.csv"),
-        "--guide",
-        "bootstrap",
-        "--particles",
-        10,
-        "--steps",
-        2,
-        "--out",
-        run,
-    )
     assert steady(*command) == 0
     file = run / "checkpoint.safetensors"
     file.write_bytes(file.read_bytes()[:keep])
