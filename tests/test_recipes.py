@@ -64,7 +64,7 @@ def test_hand_changes_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("guide", list(FEW))
 def test_steady_finds_a_mass_that_was_wrong_by_far(guide: str) -> None:
     """Believed to be twice as heavy as it is and seen through bearings only; held-out drives must gain as well."""
-    train, valid = simulated(trajectories=4, rows=41), simulated(trajectories=4, rows=41, seed=1)
+    train, valid = simulated(trajectories=12, rows=41), simulated(trajectories=4, rows=41, seed=1)
     program = load_program(HOVERCRAFT)
     program.mass = torch.tensor(3.0)
     before = held_out(program, valid)
