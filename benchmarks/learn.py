@@ -74,7 +74,7 @@ def draw(before: Fit, after: Fit, data: Split, file: Path, drives: int = 4) -> N
     shown = data[2].subset(range(drives))
     figure, axes = plt.subplots(2, drives, figsize=(3.6 * drives, 7.4), sharex="col", sharey="col")
     for row, (fit, name) in enumerate(((before, "hand-written program"), (after, "learned from bearings"))):
-        posterior = fit.posterior(shown, draws=50, particles=5000, every=10)
+        posterior = fit.posterior(shown, draws=50, every=10)
         for column, label in enumerate(shown.labels):
             one = posterior_trajectories(posterior, label, landmarks=after.program.landmarks, axes=axes[row, column])
             one.set_title(f"test drive {label}, {name}", fontsize=9)

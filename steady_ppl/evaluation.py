@@ -8,9 +8,8 @@ from typing import Any
 import torch
 
 from steady_ppl.data import Trajectories
-from steady_ppl.filtering import log_likelihood
+from steady_ppl.filtering import choose_filter, log_likelihood
 from steady_ppl.fit import Fit
-from steady_ppl.linearization import why_not_linear
 from steady_ppl.measurement_errors import measurement_errors
 from steady_ppl.metrics import forward, forward_mean, state_estimation
 from steady_ppl.program import for_program
@@ -42,14 +41,13 @@ def evaluate(
     """
     program, known_start = fit.program, fit.known_start
     data = for_program(program, table)
-    reason = why_not_linear(program, data) if look_ahead is None else None
-    ahead = reason is None if look_ahead is None else look_ahead
-    particles = particles or (200 if ahead else 5000)
-    settings: dict[str, Any] = {"particles": particles, "known_start": known_start, "look_ahead": ahead}
-    result: dict[str, Any] = {
-        "recipe": fit.recipe,
-        "filter": "lookahead" if ahead else f"bootstrap ({reason or 'chosen'})",
+    choice = choose_filter(program, data, known_start=known_start, particles=particles, look_ahead=look_ahead)
+    settings: dict[str, Any] = {
+        "particles": choice.particles,
+        "look_ahead": choice.look_ahead,
+        "known_start": known_start,
     }
+    result: dict[str, Any] = {"recipe": fit.recipe, "filter": choice.name}
     with seeded(seed, "log_likelihood"):
         values = log_likelihood(program, data, **settings)
         result["log_likelihood"] = float(values.mean())

@@ -7,6 +7,7 @@ which only a broad prior is known; it needs normal noise (see `linearize`).
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -14,6 +15,7 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError
 from steady_ppl.gaussian_smoother import find_path, means_as_path, smooth
+from steady_ppl.linearization import why_not_linear
 from steady_ppl.particles import particle_filter
 from steady_ppl.paths import Filtered
 from steady_ppl.program import Program
@@ -37,6 +39,36 @@ def run_filter(
     return particle_filter(
         program, data, particles=particles, known_start=known_start, proposal=proposal, keep_history=keep_history
     )
+
+
+@dataclass(frozen=True)
+class FilterChoice:
+    """Which filter suits a program: the one that looks ahead wherever its noise is normal.
+
+    Attributes:
+        particles: N, for each trajectory.
+        look_ahead: whether it looks ahead.
+        name: "lookahead", or "bootstrap" and why.
+    """
+
+    particles: int
+    look_ahead: bool
+    name: str
+
+
+def choose_filter(
+    program: Program,
+    data: Trajectories,
+    *,
+    known_start: bool,
+    particles: int | None = None,
+    look_ahead: bool | None = None,
+) -> FilterChoice:
+    """Settle what is None: the filter by the program's noise, its particles (200 looking ahead, else 5000)."""
+    reason = why_not_linear(program, data, known_start=known_start) if look_ahead is None else "as asked"
+    ahead = reason is None if look_ahead is None else look_ahead
+    name = "lookahead" if ahead else f"bootstrap ({reason})"
+    return FilterChoice(particles or (200 if ahead else 5000), ahead, name)
 
 
 def neglected(program: Program, data: Trajectories, *, known_start: bool, particles: int = 200) -> Tensor:

@@ -49,7 +49,7 @@ class Fit:
     notes: list[str] = field(default_factory=list)
 
     def posterior(
-        self, data: Trajectories, *, draws: int = 100, particles: int = 5000, every: int = 1, seed: int = 0
+        self, data: Trajectories, *, draws: int = 100, particles: int | None = None, every: int = 1, seed: int = 0
     ) -> arviz.InferenceData:
         """Posterior draws of states and channel noise as ArviZ `InferenceData`; see `steady_ppl.posterior`."""
         from steady_ppl.posterior import posterior
@@ -80,7 +80,7 @@ class Fit:
         write_tensors(folder / PARAMETERS, self.program.state_dict())
         if train is not None:
             beside = folder / (POSTERIOR + ".partial")
-            self.posterior(train, draws=50, particles=2000, seed=self.seed).to_netcdf(str(beside), engine="h5netcdf")
+            self.posterior(train, draws=50, seed=self.seed).to_netcdf(str(beside), engine="h5netcdf")
             os.replace(beside, folder / POSTERIOR)
         write_record(folder, {**(begun or {}), **self.record(folder)})
 

@@ -9,7 +9,7 @@ residual r(x) for every measurement. Around a path of states x̄ and noise ε̄,
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ from torch.autograd import forward_ad
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import ProgramError
+from steady_ppl.planar_vehicle import wrap
 from steady_ppl.program import Program, names
 from steady_ppl.sites import (
     Observing,
@@ -50,7 +51,8 @@ class Linearization:
     Attributes:
         path: what it was taken along.
         angles: the state's components that live on a circle.
-        start_offset: `(B, D)` the mean start less the path's.
+        start_offset: `(B, D)` the mean start less the path's, angles on the circle.
+        start_turn: `(B, D)` the whole turns that this leaves out.
         start_noise: G₀ `(B, D, C₀)`; zero where the start is known.
         offset: `(T, B, D)` where the program arrives without noise, less the path's next state.
         state, noise: F `(T, B, D, D)` and G `(T, B, D, C)`.
@@ -63,6 +65,7 @@ class Linearization:
     path: Path
     angles: tuple[int, ...]
     start_offset: Tensor
+    start_turn: Tensor
     start_noise: Tensor
     offset: Tensor
     state: Tensor
@@ -95,15 +98,20 @@ def linearize(
         ProgramError: a site has another distribution, or an operation has no forward derivative.
     """
     states, noise = path.states, path.noise
+    angles = tuple(names(program.states).index(angle) for angle in program.angles)
     offset, by_state, by_noise = _transition(program, data, states, noise)
     start_offset, start_noise = _start(program, data, states[0], known_start)
+    start_turn = torch.zeros_like(start_offset, dtype=torch.float64)
+    for angle in angles:
+        start_turn[:, angle] = start_offset[:, angle].double() - wrap(start_offset[:, angle].double())
     residuals, by_measured, log_sd = _measurement(program, data, states)
     observed = data.observed & torch.isfinite(by_measured).all(-1)  # a bearing to where one stands has no derivative
     log_density = torch.distributions.Normal(0.0, 1.0).log_prob(residuals.new_zeros(())) - log_sd
     return Linearization(
         path=path,
-        angles=tuple(names(program.states).index(angle) for angle in program.angles),
-        start_offset=start_offset.double(),
+        angles=angles,
+        start_offset=start_offset.double() - start_turn,
+        start_turn=start_turn,
         start_noise=start_noise.double(),
         offset=torch.where(data.transitions[..., None], offset, 0.0).double(),
         state=torch.where(data.transitions[..., None, None], by_state, 0.0).double(),
@@ -116,18 +124,29 @@ def linearize(
 
 
 @torch.no_grad()
-def why_not_linear(program: Program, data: Trajectories) -> str | None:
-    """Which site keeps a program from being linearised, None if none does."""
+def why_not_linear(program: Program, data: Trajectories, *, known_start: bool = False) -> str | None:
+    """What keeps a program from being linearised, None if nothing does; tried on the first two rows of a trajectory."""
+    rows = min(2, data.time.shape[0])
+    head = replace(
+        data.subset([0]),
+        **{
+            name: getattr(data, name)[:rows, :1]
+            for name in ("time", "controls", "measurements", "observed", "states")
+            if getattr(data, name) is not None
+        },
+        lengths=data.lengths[:1].clamp(max=rows),
+    )
     seen = Recording()
-    with running(1, 1), seen:
-        state = broadcast_event(program.initial(), torch.Size((1, 1)), 1)
-        program.transition(state, data.controls[:1, :1], data.elapsed[:1, :1], data.steps[:1, :1])
-        program.observe(state)
-    for site, fn in seen.distributions.items():
-        try:
-            normal_moments(fn, site)
-        except ProgramError as error:
-            return str(error)
+    with running(rows - 1, 1):
+        state = broadcast_event(program.initial(), torch.Size((rows - 1, 1)), 1)
+        with seen:
+            program.transition(state, head.controls[:-1], head.elapsed[:-1], head.steps)
+    channels = sum(fn.event_shape.numel() for fn in seen.distributions.values())
+    path = Path(state[:1].expand(rows, -1, -1), state.new_zeros((rows - 1, 1, channels)))
+    try:
+        linearize(program, head, path, known_start=known_start)
+    except ProgramError as error:
+        return str(error)
     return None
 
 

@@ -45,7 +45,7 @@ class Lookahead:
         precision: Λ `(T + 1, B, D, D)`.
         information: λ `(T + 1, B, D)`.
         log_scale: c `(T + 1, B)`.
-        windings: `(W, D)` whole turns by which the start may differ from the path's, none first.
+        windings: `(W, D)` whole turns from the one nearest to the prior's mean on which the start may lie, none first.
         winding_masses: `(W, B)` log posterior probability of each.
         starts: steering of the start's noise, `(W, B, ...)`, its deviation zero.
         steps: of every interval's noise, `(T, B, ...)`.
@@ -83,7 +83,7 @@ class Lookahead:
         turns = self.windings[winding]
         random = torch.randn(count, *self.steps.shift.shape, dtype=shift.dtype, device=shift.device)
         states, noise = self._forward(start, _times(self.steps.factor, random), turns)
-        return start, states + turns.unsqueeze(1), noise
+        return start, states + (turns + self.linearization.start_turn).unsqueeze(1), noise
 
     def covariances(self) -> Tensor:
         """Posterior covariances of the states on the path's own turn, `(T + 1, B, D, D)`."""

@@ -99,7 +99,7 @@ def particle_filter(
                     program.observe(state)
                 log_weights = log_weights + recording.total().squeeze(-2)
             if observed_rows[row] or proposal.looks_ahead:
-                future = proposal.log_future(row, state.squeeze(1))
+                future = torch.where(data.rows[row], proposal.log_future(row, state.squeeze(1)), 0.0)
                 with_future, log_likelihood[row] = normalise(log_weights + future)
                 log_weights = with_future - future
                 size = effective_sample_size(with_future)
@@ -121,7 +121,8 @@ def particle_filter(
                 state, roots = take(state.squeeze(1), ancestors).unsqueeze(1), take(roots, ancestors)
             recording = Recording()
             drawing, log_ratio = proposal.step(row, state.squeeze(1))
-            log_weights = log_weights + log_ratio
+            if proposal.looks_ahead:
+                log_weights = log_weights + torch.where(data.transitions[row], log_ratio, 0.0)
             with recording, drawing:
                 state = program.transition(state, data.controls[row, None], elapsed[row, None], steps[row, None])
             if row == 0:

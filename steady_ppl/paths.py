@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -26,6 +27,12 @@ class Paths:
     start: dict[str, Tensor]
     noise: dict[str, Tensor]
     event_dims: dict[str, int]
+
+    def of(self, trajectories: Sequence[int]) -> Paths:
+        """The paths of some trajectories."""
+        index = list(trajectories)
+        start, noise = ({site: value[:, :, index] for site, value in part.items()} for part in (self.start, self.noise))
+        return replace(self, states=self.states[:, :, index], start=start, noise=noise)
 
     def within(self, data: Trajectories) -> Paths:
         """Fill the rows past each trajectory's end with its first row, where the program is known to be finite: what

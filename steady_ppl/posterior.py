@@ -10,8 +10,7 @@ import xarray
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
-from steady_ppl.filtering import in_parts
-from steady_ppl.particles import particle_filter
+from steady_ppl.filtering import choose_filter, in_parts, run_filter
 from steady_ppl.program import Program, for_program, names, units
 from steady_ppl.seeding import seeded
 from steady_ppl.sites import as_vector
@@ -28,7 +27,7 @@ def posterior(
     data: Trajectories,
     *,
     draws: int = 100,
-    particles: int = 5000,
+    particles: int | None = None,
     every: int = 1,
     known_start: bool = False,
     seed: int = 0,
@@ -39,7 +38,7 @@ def posterior(
         program: the state-space model.
         data: drives with the program's columns.
         draws: equally weighted paths for each trajectory, resampled from all surviving lineages.
-        particles: N of the filter, for each trajectory.
+        particles: N of the filter, for each trajectory; None: see `choose_filter`.
         every: use the measurements of every n-th row only.
         known_start: start at the true first state.
         seed: the same seed gives the same draws.
@@ -54,14 +53,21 @@ def posterior(
     noise: dict[str, list[Tensor]] = {}
     evidence: list[Tensor] = []
     with seeded(seed, "posterior"):
-        for part in in_parts(run, particles):
-            filtered = particle_filter(program, part, particles=particles, known_start=known_start)
+        choice = choose_filter(program, run, known_start=known_start, particles=particles)
+        for part in in_parts(run, choice.particles):
+            filtered = run_filter(
+                program,
+                part,
+                particles=choice.particles,
+                known_start=known_start,
+                look_ahead=choice.look_ahead,
+            )
             paths = filtered.paths(draws)
             states.append(paths.states)
             evidence.append(filtered.log_likelihood)
             for site, value in paths.noise.items():
                 noise.setdefault(site, []).append(as_vector(value, paths.event_dims[site]))
-    coordinates = {
+    coordinates: dict[str, list | np.ndarray] = {
         "chain": [0],
         "draw": np.arange(draws),
         "trajectory": list(run.labels),
@@ -84,8 +90,9 @@ def posterior(
         coordinates[dimension] = list(labels) if known else [f"{site}_{i}" for i in range(values.shape[-1])]
         attributes = {"units": list(units(program.channels))} if known else {}
         variables[site if site not in variables else f"{site}_noise"] = ((*DIMENSIONS, dimension), values, attributes)
+    about = {"program": type(program).__name__, "particles": choice.particles, "filter": choice.name}
     return arviz.InferenceData(
-        posterior=xarray.Dataset(variables, coordinates, {"program": type(program).__name__, "particles": particles}),
+        posterior=xarray.Dataset(variables, coordinates, about),
         observed_data=_observed(program, run, coordinates),
         constant_data=_constants(program, run, coordinates, torch.cat(evidence)),
     )

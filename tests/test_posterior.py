@@ -134,7 +134,7 @@ def test_a_fit_draws_with_its_own_start_and_the_rows_that_are_asked_for() -> Non
     assert (starts == starts.isel(draw=0)).all()
     measured = np.isfinite(result["observed_data"]["measured_bearing_0"].values)
     assert np.array_equal(measured, np.broadcast_to(np.arange(ROWS) % 4 == 0, measured.shape))
-    assert result["posterior"].attrs == {"program": "Hovercraft", "particles": 30}
+    assert result["posterior"].attrs == {"program": "Hovercraft", "particles": 30, "filter": "lookahead"}
 
 
 def test_without_truth_no_true_state_is_shown() -> None:

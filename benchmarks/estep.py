@@ -1,0 +1,147 @@
+"""What an E step costs and how much its gradients scatter: bootstrap, lookahead and Gaussian guides on one problem.
+
+    python benchmarks/estep.py            Hov, 16 trajectories at once, a good and a first network: minutes
+    python benchmarks/estep.py --quick    4 trajectories, fewer particles and runs
+
+One core. The scatter is √trace of the covariance of the M step's gradient at fixed parameters, mean over trajectories;
+every guide draws the same number of paths from all its lineages. Cost is seconds × variance: the time for one unit of
+gradient variance, which falls as 1/N and as 1/repeats. Exits with 1 when a must is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import sys
+import time
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import torch
+from experiments import hov
+from foundation import Bound
+from pyro.infer import Trace_ELBO
+
+from inference import fit_truth
+from models.neural_vehicle import NeuralHovercraft
+from steady_ppl import (
+    Constant,
+    GaussianGuide,
+    LookaheadGuide,
+    PathGuide,
+    Program,
+    SMCGuide,
+    Trajectories,
+    for_program,
+    particle_filter,
+    seeded,
+)
+from steady_ppl.gaussian_smoother import find_path, smooth
+from steady_ppl.joint import Joint
+from steady_ppl.proposals import Twist
+
+MUSTS = {"good": Bound(0.05), "first": Bound(0.1)}
+CHEAPER = 20
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    quick = parser.parse_args().quick
+    torch.set_num_threads(1)
+    trajectories, particles, runs = (4, 5_000, 6) if quick else (16, 20_000, 12)
+    train, valid, _ = hov(1)
+    missed = 0
+    for name in ("good", "first"):
+        with seeded(1, "program"):
+            program = NeuralHovercraft()
+        if name == "good":
+            fit_truth.fit(program, train, valid, known_start=True, progress=False)
+        data = for_program(program, train).subset(range(trajectories))
+        print(f"\n{name} network, {trajectories} trajectories at once, known start, 10 Hz")
+        missed |= scatter_of_evidence(program, data, name, runs=30)
+        missed |= scatter_of_gradient(program, data, particles, runs)
+    missed |= memory()
+    return missed
+
+
+def scatter_of_evidence(program: Program, data: Trajectories, name: str, runs: int) -> int:
+    """sd of log p(y) of the lookahead filter with 100 particles."""
+    ahead = smooth(program, data, find_path(program, data, known_start=True), known_start=True)
+    values = [
+        particle_filter(
+            program, data, particles=100, known_start=True, proposal=Twist(ahead), keep_history=False
+        ).log_likelihood
+        for _ in range(runs)
+    ]
+    sd = float(torch.stack(values).std(0).mean())
+    return judged(f"lookahead, N = 100: sd of log p(y) over {runs} runs", sd, MUSTS[name].high)
+
+
+def scatter_of_gradient(program: Program, data: Trajectories, particles: int, runs: int) -> int:
+    settings = {"draws": 100, "tempering": Constant(1.0), "known_start": True}
+    guides: dict[str, PathGuide] = {
+        f"bootstrap, N = {particles}": SMCGuide(program, particles=particles, **settings),
+        "lookahead, N = 100": LookaheadGuide(program, particles=100, **settings),
+        "gaussian": GaussianGuide(program, **settings),
+    }
+    costs = {}
+    for name, guide in guides.items():
+        guide.refresh(data, 1.0)  # finds the paths, compiles
+        few = max(3, runs // 3) if name.startswith("bootstrap") else 2 * runs
+        seconds, gradients = [], []
+        for _ in range(few):
+            began = time.perf_counter()
+            guide.refresh(data, 1.0)
+            seconds.append(time.perf_counter() - began)
+            gradients.append(gradient_by_trajectory(program, guide, data))
+        variance = float(torch.stack(gradients).var(0).sum(-1).mean())
+        taken = sorted(seconds)[len(seconds) // 2]
+        costs[name] = taken * variance
+        print(f"  {name:22} {taken:8.3f} s an E step, gradient sd {variance**0.5:.3f} over {few} runs")
+    bootstrap, *others = costs.values()
+    missed = 0
+    for name, cost in zip(list(costs)[1:], others, strict=True):
+        missed |= judged(
+            f"{name}: time for the bootstrap's gradient variance, as a share", cost / bootstrap, 1 / CHEAPER
+        )
+    return missed
+
+
+def gradient_by_trajectory(program: Program, guide: PathGuide, data: Trajectories) -> torch.Tensor:
+    """The M step's gradient of each trajectory alone, `(B, parameters)`."""
+    gradients = []
+    whole = guide.paths
+    assert whole is not None
+    for b in range(len(data)):
+        guide.paths = whole.of([b])
+        elbo = Trace_ELBO(num_particles=guide.draws, vectorize_particles=True, max_plate_nesting=2)
+        loss = elbo.differentiable_loss(Joint(program, known_start=True), guide, data.subset([b]))
+        grads = torch.autograd.grad(loss, list(program.parameters()), allow_unused=True)
+        gradients.append(torch.cat([g.flatten() for g in grads if g is not None]))
+    guide.paths = whole
+    return torch.stack(gradients)
+
+
+def memory() -> int:
+    """Peak memory of one E step with 200,000 particles and 100 intervals, history kept."""
+    with seeded(1, "program"):
+        program = NeuralHovercraft()
+    data = for_program(program, hov(1)[0]).subset([0])
+    particle_filter(program, data, particles=100, known_start=True)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    particle_filter(program, data, particles=200_000, known_start=True).paths(100)
+    gigabytes = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e6
+    return judged("peak memory of a 200,000 × 100 E step beyond what was used before, GB", gigabytes, 1.5)
+
+
+def judged(name: str, value: float, high: float) -> int:
+    """Print one figure beside its must; 1 if it is missed."""
+    ok = value <= high
+    print(f"  {name}: {value:.4g} (must be ≤ {high:.4g}) {'ok' if ok else 'MISSED'}", flush=True)
+    return int(not ok)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,337 @@
+"""The program's first-order form against finite differences of the program, gaps, angles, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from examples import drives, example
+from pyro import poutine
+from torch import Tensor
+
+from steady_ppl import Program, ProgramError, seeded, stack
+from steady_ppl.linearization import Linearization, Path, linearize, why_not_linear
+from steady_ppl.sites import Standardised, running
+
+PROGRAMS = (
+    "linear_gaussian",
+    "hovercraft",
+    "hovercraft:HovercraftTruth",
+    "truck",
+    "pendulum",
+    "neural_vehicle:NeuralHovercraft",
+)
+Cart = type(example("linear_gaussian"))
+# torch scripts its decompositions when the first forward derivative is taken, and warns that it does
+
+
+def prepared(name: str) -> Program:
+    """A program in double precision, a network with random weights."""
+    program = example(name).requires_grad_(False)
+    with seeded("weights"):
+        for parameter in program.parameters():
+            if name.startswith("neural"):
+                parameter.normal_(0, 0.2)
+    return program
+
+
+def near_the_truth(program: Program, data) -> Path:
+    """The true states and no noise, both shaken; finite also past a trajectory's end."""
+    states = torch.where(data.rows[..., None], data.states, data.states[:1])
+    with seeded("shaken"):
+        noise = 0.5 * torch.randn(*data.steps.shape, len(program.channels), dtype=torch.float64)
+        return Path(states + 0.1 * torch.randn_like(states), noise)
+
+
+def arrived(program: Program, data, states: Tensor, noise: Tensor) -> Tensor:
+    """Where the transitions lead from the rows but the last."""
+    with running(*states.shape[:-1]), Standardised(noise):
+        return program.transition(states, data.controls[:-1], data.elapsed[:-1], data.steps)
+
+
+def began(program: Program, noise: Tensor) -> Tensor:
+    with running(*noise.shape[:-1]), Standardised(noise):
+        return program.initial()
+
+
+def measured(program: Program, states: Tensor) -> tuple[Tensor, Tensor]:
+    """Means and standard deviations of the measurements."""
+    with running(*states.shape[:-1]):
+        trace = poutine.trace(program.observe).get_trace(states)
+    sites = [site["fn"] for site in trace.nodes.values() if site["type"] == "sample"]
+    means, sds = ([getattr(fn, what) for fn in sites] for what in ("mean", "stddev"))
+    shape = (*states.shape[:-1], -1)
+    return torch.cat([m.reshape(shape) for m in means], -1), torch.cat([s.reshape(shape) for s in sds], -1)
+
+
+def central_differences(function: Callable[[Tensor], Tensor], at: Tensor, width: float = 1e-5) -> Tensor:
+    """`(..., D, ·)`; bearings are compared on the circle's covering, so they must not jump in between."""
+    columns = []
+    for component in range(at.shape[-1]):
+        change = torch.zeros_like(at)
+        change[..., component] = width
+        columns.append((function(at + change) - function(at - change)) / (2 * width))
+    return torch.stack(columns, -1)
+
+
+def on_the_circle(angle: Tensor) -> Tensor:
+    return torch.atan2(angle.sin(), angle.cos())
+
+
+def assert_same(a: Linearization, b: Linearization, *besides: str) -> None:
+    """Equal in everything but the fields `besides`."""
+    for name in vars(a).keys() - {"path", "angles", *besides}:
+        torch.testing.assert_close(getattr(a, name), getattr(b, name), rtol=1e-9, atol=1e-9, msg=name)
+
+
+# --- against finite differences ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_the_transition_is_that_of_finite_differences(name):
+    program = prepared(name)
+    data = drives(program, 3, 12, gaps=True)
+    path = near_the_truth(program, data)
+    linear, inside = linearize(program, data, path), data.transitions
+    before, noise = path.states[:-1], path.noise
+    by_state = central_differences(lambda states: arrived(program, data, states, noise), before)
+    by_noise = central_differences(lambda noise: arrived(program, data, before, noise), noise)
+    # central differences of width 1e-5 are off by 1e-10 of the third derivative and by 1e-10 in rounding
+    torch.testing.assert_close(linear.state[inside], by_state[inside], rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(linear.noise[inside], by_noise[inside], rtol=1e-6, atol=1e-7)
+    without = arrived(program, data, before, torch.zeros_like(noise)) - path.states[1:]
+    torch.testing.assert_close(linear.offset[inside], without[inside], rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_the_measurement_is_that_of_finite_differences(name):
+    program = prepared(name)
+    data = drives(program, 3, 12, gaps=True)
+    path = near_the_truth(program, data)
+    linear, seen = linearize(program, data, path), data.observed
+    mean, sd = measured(program, path.states)
+    by_state = central_differences(lambda states: on_the_circle(measured(program, states)[0] - mean), path.states)
+    torch.testing.assert_close(linear.measurement[seen], by_state[seen], rtol=1e-6, atol=1e-7)
+    residual = data.measurements - mean if name == "linear_gaussian" else on_the_circle(data.measurements - mean)
+    torch.testing.assert_close(linear.residual[seen], residual[seen], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(linear.precision[seen], sd[seen] ** -2)
+    scale = torch.where(seen, -sd.log() - 0.5 * math.log(2 * math.pi), 0.0).sum(-1)
+    torch.testing.assert_close(linear.log_scale, scale)
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_the_start_is_that_of_finite_differences(name):
+    program = prepared(name)
+    data = drives(program, 3, 12)
+    path = near_the_truth(program, data)
+    linear = linearize(program, data, path)
+    nothing = torch.zeros(3, len(program.states), dtype=torch.float64)
+    torch.testing.assert_close(linear.start_offset + linear.start_turn, began(program, nothing) - path.states[0])
+    torch.testing.assert_close(
+        linear.start_offset[:, linear.angles], on_the_circle(linear.start_offset[:, linear.angles])
+    )
+    by_noise = central_differences(lambda noise: began(program, noise), nothing)
+    torch.testing.assert_close(linear.start_noise, by_noise, rtol=1e-6, atol=1e-7)
+    assert (linear.start_noise.diagonal(dim1=-2, dim2=-1) > 0).all()
+
+
+def test_noise_that_enters_by_its_square_is_linearised_around_the_paths():
+    class Squared(Cart):
+        def transition(self, state, control, time, step):
+            position, velocity = state.unbind(-1)
+            acceleration = pyro.sample("acceleration", dist.Normal(0 * velocity, self.noise))
+            return stack(position + velocity * step, velocity + acceleration**2 * step)
+
+    program = Squared().double().requires_grad_(False)
+    data = drives(program, 2, 6)
+    path = near_the_truth(program, data)
+    linear, kick = linearize(program, data, path), program.noise**2 * data.steps
+    torch.testing.assert_close(linear.noise[..., 1, 0], 2 * kick * path.noise[..., 0])
+    # (2ε̄ε − ε̄²) is what is left of ε² to first order: −ε̄² at ε = 0
+    expected = path.states[:-1, :, 1] - kick * path.noise[..., 0] ** 2 - path.states[1:, :, 1]
+    torch.testing.assert_close(linear.offset[..., 1], expected)
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_a_known_start_is_certain(name):
+    program = prepared(name)
+    data = drives(program, 3, 12, gaps=True)
+    path = near_the_truth(program, data)
+    known, unknown = (linearize(program, data, path, known_start=known) for known in (True, False))
+    torch.testing.assert_close(known.start_offset, data.states[0] - path.states[0])
+    assert known.start_noise.shape[:2] == (3, len(program.states)) and not known.start_noise.any()
+    assert_same(known, unknown, "start_offset", "start_turn", "start_noise")
+
+
+# --- lengths, gaps, angles, weights -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_nothing_moves_past_a_trajectorys_end_and_missing_cells_say_nothing(name):
+    program = prepared(name)
+    data = drives(program, 3, 12, gaps=True)
+    linear = linearize(program, data, near_the_truth(program, data))
+    assert data.lengths.tolist() == [12, 10, 12]
+    for moving in (linear.offset, linear.state, linear.noise):
+        assert not moving[10:, 1].any() and not moving[~data.transitions].any()
+        assert moving[data.transitions].flatten(1).any(1).all()
+    missing = ~data.observed
+    assert missing[data.rows].any() and missing[10:, 1].all()
+    for said in (linear.precision, linear.residual, linear.measurement):
+        assert not said[missing].any()
+    assert (linear.precision[data.observed] > 0).all()
+    unseen = missing.all(-1)
+    assert not linear.log_scale[unseen].any() and (linear.log_scale[~unseen] != 0).all()
+
+
+def test_what_stands_in_padding_and_missing_cells_changes_nothing():
+    program = prepared("hovercraft")
+    data = drives(program, 3, 12, gaps=True)
+    path = near_the_truth(program, data)
+    rubbish = replace(
+        data,
+        measurements=torch.where(data.observed, data.measurements, 1e6),
+        controls=torch.where(data.rows[..., None], data.controls, 1e3),
+    )
+    assert_same(linearize(program, data, path), linearize(program, rubbish, path))
+
+
+@pytest.mark.parametrize("name", ["hovercraft", "pendulum"])
+def test_whole_turns_of_an_angle_that_is_measured_change_nothing(name):
+    program = prepared(name)
+    data = drives(program, 3, 12, gaps=True)
+    path = near_the_truth(program, data)
+    turns = torch.tensor([1, -2, 3], dtype=torch.float64)[:, None]
+    turned = replace(data, measurements=data.measurements + 2 * math.pi * turns)
+    here, there = linearize(program, data, path), linearize(program, turned, path)
+    assert here.residual.abs().max() <= math.pi
+    assert_same(here, there)
+
+
+def test_a_position_is_not_an_angle():
+    program = prepared("linear_gaussian")
+    data = drives(program, 3, 12, gaps=True)
+    path = near_the_truth(program, data)
+    further = replace(data, measurements=data.measurements + 2 * math.pi)
+    here, there = linearize(program, data, path), linearize(program, further, path)
+    torch.testing.assert_close(there.residual, here.residual + 2 * math.pi * data.observed)
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_the_observation_weight_scales_precision_and_log_scale(name):
+    program = prepared(name)
+    data = drives(program, 3, 12, gaps=True)
+    path = near_the_truth(program, data)
+    whole, tempered = (linearize(program, data, path, observation_weight=weight) for weight in (1.0, 0.3))
+    torch.testing.assert_close(tempered.precision, 0.3 * whole.precision)
+    torch.testing.assert_close(tempered.log_scale, 0.3 * whole.log_scale)
+    assert_same(whole, tempered, "precision", "log_scale")
+
+
+def test_a_bearing_to_where_one_stands_says_nothing():
+    program = prepared("hovercraft")
+    data = drives(program, 2, 6)
+    path = near_the_truth(program, data)
+    path.states[3, 1, :2] = torch.tensor(program.landmarks[2], dtype=torch.float64)
+    linear = linearize(program, data, path)
+    assert all(getattr(linear, name).isfinite().all() for name in vars(linear).keys() - {"path", "angles"})
+    assert linear.precision[3, 1, 2] == 0 and not linear.measurement[3, 1, 2].any()
+    assert (linear.precision > 0).sum() == data.observed.sum() - 1
+
+
+def test_single_precision_gives_the_same_in_double():
+    program, single = prepared("hovercraft"), example("hovercraft", torch.float32).requires_grad_(False)
+    data = drives(program, 3, 12, gaps=True)
+    path = near_the_truth(program, data)
+    rough = linearize(single, data.to(torch.float32), Path(path.states.float(), path.noise.float()))
+    exact = linearize(program, data, path)
+    for name in vars(exact).keys() - {"path", "angles"}:
+        found, wanted = getattr(rough, name), getattr(exact, name)
+        assert found.dtype == torch.float64
+        # 2⁻²⁴ of numbers up to some 10, once or twice through a difference
+        torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5, msg=name)
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+class HeavyTailed(Cart):
+    def transition(self, state, control, time, step):
+        position, velocity = state.unbind(-1)
+        acceleration = pyro.sample("kick", dist.StudentT(3.0, -self.damping * velocity, self.noise))
+        return stack(position + velocity * step, velocity + acceleration * step)
+
+
+class HeavyTailedSensor(Cart):
+    def observe(self, state):
+        pyro.sample("range", dist.StudentT(3.0, state[..., 0], self.measurement_sd))
+
+
+class Correlated(Cart):
+    measurements = ("position [m]", "velocity [m/s]")
+
+    def observe(self, state):
+        covariance = torch.tensor([[0.04, 0.01], [0.01, 0.04]]).to(state)
+        pyro.sample("both", dist.MultivariateNormal(state, covariance))
+
+
+class UncertainStart(Cart):
+    def initial(self):
+        return pyro.sample("start", dist.Laplace(torch.zeros(2).to(self.noise), 1.0).to_event(1))
+
+
+@pytest.mark.parametrize(
+    ("program", "site", "distribution"),
+    [
+        (HeavyTailed, "kick", "StudentT"),
+        (HeavyTailedSensor, "range", "StudentT"),
+        (Correlated, "both", "MultivariateNormal"),
+        (UncertainStart, "start", "Laplace"),
+    ],
+)
+def test_noise_that_is_not_normal_and_independent_is_refused_by_name(program, site, distribution):
+    refused = program().double().requires_grad_(False)
+    data = drives(refused, 2, 6)
+    path = near_the_truth(refused, data)
+    with pytest.raises(ProgramError, match=rf"site '{site}' is {distribution} .*--guide bootstrap") as error:
+        linearize(refused, data, path)
+    assert error.value.site == site
+    assert why_not_linear(refused, data) == str(error.value)
+
+
+def test_a_known_start_needs_no_normal_prior():
+    program = UncertainStart().double().requires_grad_(False)
+    data = drives(program, 2, 6)
+    linear = linearize(program, data, near_the_truth(program, data), known_start=True)
+    assert not linear.start_noise.any()
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_nothing_keeps_the_example_programs_from_being_linearised(name):
+    program = prepared(name)
+    assert why_not_linear(program, drives(program, 2, 6, gaps=True)) is None
+
+
+def test_an_operation_without_a_forward_derivative_is_refused():
+    class Backward(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, value):
+            return 2 * value
+
+        @staticmethod
+        def backward(ctx, slope):
+            return 2 * slope
+
+    class Custom(Cart):
+        def transition(self, state, control, time, step):
+            return super().transition(Backward.apply(state) / 2, control, time, step)
+
+    program = Custom().double().requires_grad_(False)
+    data = drives(program, 2, 6)
+    with pytest.raises(ProgramError, match="cannot be linearised.*--guide bootstrap"):
+        linearize(program, data, near_the_truth(program, data))

@@ -1,0 +1,471 @@
+"""Looking ahead: exact on the cart, unbiased wherever it looks, and the same in any world."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pyro
+import pytest
+import torch
+from examples import copies, drives, example
+from oracles import START_MEAN, START_SD, CartPosterior, assert_mean, cart_parameters, kalman
+from torch import Tensor
+
+from steady_ppl import particle_filter, seeded
+from steady_ppl.filtering import run_filter
+from steady_ppl.gaussian_smoother import find_path, smooth
+from steady_ppl.linearization import Path, linearize
+from steady_ppl.lookahead import Lookahead, look_ahead
+from steady_ppl.planar_vehicle import bearings_to, wrap
+from steady_ppl.proposals import Twist
+from steady_ppl.sites import Standardised, running
+
+# torch scripts its decompositions when the first forward derivative is taken, and warns that it does
+
+
+@pytest.fixture(scope="module")
+def cart():
+    return example("linear_gaussian").requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def even(cart):
+    """Three complete trajectories."""
+    return drives(cart, 3, 12)
+
+
+@pytest.fixture(scope="module")
+def uneven(cart):
+    """Lengths 12 and 10, gaps in the measurements, irregular steps."""
+    return drives(cart, 3, 12, gaps=True)
+
+
+def anywhere(program, data) -> Path:
+    """A path that has nothing to do with the drives."""
+    with seeded("anywhere"):
+        states = 3 * torch.randn(*data.time.shape, len(program.states), dtype=torch.float64)
+        return Path(states, torch.randn(*data.steps.shape, len(program.channels), dtype=torch.float64))
+
+
+def near_the_truth(program, data) -> Path:
+    """The true states, with no noise; finite also past a trajectory's end."""
+    states = torch.where(data.rows[..., None], data.states, data.states[:1])
+    return Path(states, states.new_zeros((*data.steps.shape, len(program.channels))))
+
+
+def estimates(program, data, runs: int, particles: int, twist=Twist, *, aim=None, **settings) -> Tensor:
+    """log p(y) of each trajectory by `runs` independent filters, `(runs, B)`; `aim` is the program, and a change of
+    the data, that the lookahead is of."""
+    filter_settings = {name: settings.pop(name) for name in ("resample_below",) if name in settings}
+    known_start = settings.pop("known_start", False)
+    many = copies(data, runs)
+    other, change = aim or (program, {})
+    seen = replace(many, **{name: function(many) for name, function in change.items()})
+    with seeded("estimates"):
+        ahead = smooth(other, seen, anywhere(program, many), known_start=known_start, passes=2)
+        filtered = particle_filter(
+            program,
+            many,
+            particles=particles,
+            known_start=known_start,
+            proposal=twist(ahead, **settings),
+            keep_history=False,
+            **filter_settings,
+        )
+    return filtered.log_likelihood.view(len(data), runs).T
+
+
+# --- the smoother -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("known_start", [False, True])
+@pytest.mark.parametrize("drive", ["even", "uneven"])
+def test_the_smoother_is_exact_from_any_path(cart, drive, known_start, request):
+    data = request.getfixturevalue(drive)
+    ahead = smooth(cart, data, anywhere(cart, data), known_start=known_start, passes=2, tolerance=0.0)
+    (states, noise), covariances = ahead.means(), ahead.covariances()
+    for trajectory, rows in enumerate(data.lengths.tolist()):
+        exact = CartPosterior(data, trajectory, cart_parameters(cart), known_start=known_start)
+        torch.testing.assert_close(states[:rows, trajectory], exact.states_mean, rtol=0, atol=1e-10)
+        expected = torch.stack([exact.states_covariance[row, :, row] for row in range(rows)])
+        torch.testing.assert_close(covariances[:rows, trajectory], expected, rtol=0, atol=1e-10)
+        push, velocity = data.controls[: rows - 1, trajectory, 0], exact.states_mean[:-1, 1]
+        excess = exact.latent_mean[2:] - cart.gain * push + cart.damping * velocity
+        torch.testing.assert_close(noise[: rows - 1, trajectory, 0], excess / cart.noise, rtol=0, atol=1e-9)
+        torch.testing.assert_close(ahead.log_likelihood[trajectory], exact.log_likelihood, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("known_start", [False, True])
+@pytest.mark.parametrize("weight", [1.0, 0.6, 0.1])
+@pytest.mark.parametrize("drive", ["even", "uneven"])
+def test_the_log_likelihood_is_kalmans(cart, drive, weight, known_start, request):
+    data = request.getfixturevalue(drive)
+    settings = {"known_start": known_start, "observation_weight": weight}
+    ahead = smooth(cart, data, anywhere(cart, data), passes=2, tolerance=0.0, **settings)
+    exact = kalman(data, cart_parameters(cart), weight=weight, known_start=known_start).log_likelihood
+    torch.testing.assert_close(ahead.log_likelihood, exact, rtol=0, atol=1e-10)
+    assert torch.equal(ahead.winding_masses, torch.zeros(1, 3, dtype=torch.float64))
+
+
+def test_the_first_lookahead_is_exact_wherever_it_is_taken(cart, uneven):
+    ahead = look_ahead(linearize(cart, uneven, anywhere(cart, uneven)))
+    exact = kalman(uneven, cart_parameters(cart)).log_likelihood
+    # the path is some 15 measurement deviations off: its cost of some thousand nats cancels
+    torch.testing.assert_close(ahead.log_likelihood, exact, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("known_start", [False, True])
+def test_the_future_of_a_row_is_worth_what_kalman_says_of_it(cart, even, known_start):
+    ahead = smooth(cart, even, anywhere(cart, even), known_start=known_start, passes=2)
+    future = Twist(ahead).log_future(4, even.states[4].unsqueeze(0))[0]
+    rest = replace(
+        even,
+        time=even.time[4:],
+        controls=even.controls[4:],
+        measurements=even.measurements[4:],
+        observed=even.observed[4:] & (torch.arange(8) > 0)[:, None, None],
+        states=even.states[4:],
+        lengths=even.lengths - 4,
+    )
+    exact = kalman(rest, cart_parameters(cart), known_start=True).log_likelihood
+    torch.testing.assert_close(future, exact, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("known_start", [False, True])
+@pytest.mark.parametrize("drive", ["even", "uneven"])
+def test_draws_have_the_moments_of_the_exact_smoother(cart, drive, known_start, request):
+    data = request.getfixturevalue(drive)
+    ahead = smooth(cart, data, anywhere(cart, data), known_start=known_start, passes=2)
+    start, states, _ = ahead.draws(3000)
+    if not known_start:
+        torch.testing.assert_close(states[:, 0], START_MEAN + START_SD * start, rtol=0, atol=1e-10)
+    for trajectory, rows in enumerate(data.lengths.tolist()):
+        exact = CartPosterior(data, trajectory, cart_parameters(cart), known_start=known_start)
+        drawn = states[:, :rows, trajectory]
+        assert_mean(drawn, exact.states_mean)
+        centred = drawn - exact.states_mean
+        within = centred[..., :, None] * centred[..., None, :]
+        assert_mean(within, torch.stack([exact.states_covariance[t, :, t] for t in range(rows)]))
+        lagged = centred[:, 1:, :, None] * centred[:, :-1, None, :]
+        assert_mean(lagged, torch.stack([exact.states_covariance[t + 1, :, t] for t in range(rows - 1)]))
+
+
+def test_the_noise_of_draws_leads_from_each_state_to_the_next(cart, uneven):
+    _, states, noise = smooth(cart, uneven, anywhere(cart, uneven), passes=2).draws(50)
+    with running(50, 11, 3), Standardised(noise):
+        after = cart.transition(states[:, :-1], uneven.controls[:-1], uneven.elapsed[:-1], uneven.steps)
+    inside = uneven.transitions
+    torch.testing.assert_close(after[:, inside], states[:, 1:][:, inside], rtol=0, atol=1e-10)
+
+
+# --- the filter -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("known_start", [False, True])
+@pytest.mark.parametrize("resample_below", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("drive", ["even", "uneven"])
+def test_an_exact_twist_leaves_no_variance(cart, drive, resample_below, known_start, request):
+    data = request.getfixturevalue(drive)
+    settings = {"resample_below": resample_below, "known_start": known_start}
+    runs = estimates(cart, data, 20, 5, untwisted=0.0, **settings)
+    exact = kalman(data, cart_parameters(cart), known_start=known_start).log_likelihood
+    assert runs.std(0).max() < 1e-10
+    torch.testing.assert_close(runs, exact.expand(20, 3), rtol=0, atol=1e-9)
+
+
+def bad_aim(cart) -> tuple:
+    """The lookahead of a cart that is more strongly damped, seen less well, and a little further on."""
+    other = example("linear_gaussian").requires_grad_(False)
+    other.damping, other.noise, other.measurement_sd = (
+        torch.tensor(value, dtype=torch.float64) for value in (1.6, 0.8, 0.3)
+    )
+    return other, {"measurements": lambda data: data.measurements + 0.1}
+
+
+@pytest.mark.parametrize("known_start", [False, True])
+@pytest.mark.parametrize("resample_below", [0.0, 0.5, 1.0])
+def test_a_bad_twist_is_unbiased(cart, uneven, resample_below, known_start):
+    data = uneven
+    settings = {"resample_below": resample_below, "known_start": known_start, "untwisted": 0.1}
+    runs = estimates(cart, data, 1000, 20, aim=bad_aim(cart), **settings)
+    exact = kalman(data, cart_parameters(cart), known_start=known_start).log_likelihood
+    assert runs.std(0).min() > 0.03  # bad, far beyond the rounding of a good one
+    assert_mean((runs - exact).exp(), torch.ones(3))
+
+
+def test_a_twist_towards_tempered_observations_is_unbiased(cart, uneven):
+    many = copies(uneven, 1000)
+    with seeded("tempered"):
+        ahead = smooth(cart, many, anywhere(cart, many), observation_weight=0.2, passes=2)
+        filtered = particle_filter(cart, many, particles=20, proposal=Twist(ahead, untwisted=0.1))
+    runs = filtered.log_likelihood.view(3, 1000).T
+    assert_mean((runs - kalman(uneven, cart_parameters(cart)).log_likelihood).exp(), torch.ones(3))
+
+
+@pytest.mark.parametrize("weight", [0.1, 0.6])
+def test_a_tempered_filter_that_looks_ahead_estimates_the_power_posteriors_evidence(cart, uneven, weight):
+    many = copies(uneven, 500)
+    with seeded("power"):
+        ahead = smooth(cart, many, anywhere(cart, many), observation_weight=weight, passes=2)
+        proposal = Twist(ahead, untwisted=0.3)
+        filtered = particle_filter(cart, many, particles=20, observation_weight=weight, proposal=proposal)
+    runs = filtered.log_likelihood.view(3, 500).T
+    exact = kalman(uneven, cart_parameters(cart), weight=weight).log_likelihood
+    assert_mean((runs - exact).exp(), torch.ones(3))
+
+
+class Unweighted(Twist):
+    """The twist's proposals without their weights."""
+
+    def step(self, row, state):
+        return super().step(row, state)[0], 0.0
+
+
+class Unstarted(Twist):
+    """The same, of the start alone."""
+
+    def start(self, particles):
+        return super().start(particles)[0], 0.0
+
+
+@pytest.mark.parametrize("twist", [Unweighted, Unstarted])
+def test_proposals_without_their_weights_are_biased(cart, even, twist):
+    runs = estimates(cart, even, 200, 20, twist, resample_below=0.5, untwisted=0.1)
+    ratio = (runs - kalman(even, cart_parameters(cart)).log_likelihood).exp()
+    assert ((ratio.mean(0) - 1).abs() > 10 * ratio.std(0) / math.sqrt(200)).all()
+
+
+def test_paths_of_a_filter_with_a_bad_twist_have_the_moments_of_the_exact_smoother(cart, uneven):
+    runs = 60
+    many = copies(uneven, runs)
+    other, change = bad_aim(cart)
+    with seeded("smoother"):
+        ahead = smooth(other, replace(many, measurements=change["measurements"](many)), anywhere(cart, many), passes=2)
+        filtered = particle_filter(cart, many, particles=1000, proposal=Twist(ahead, untwisted=0.1))
+        paths = filtered.paths(300)
+    for trajectory, rows in enumerate(uneven.lengths.tolist()):
+        states = paths.states.view(300, -1, 3, runs, 2)[:, :rows, trajectory]
+        exact = CartPosterior(uneven, trajectory, cart_parameters(cart))
+        assert_mean(states.mean(0).transpose(0, 1), exact.states_mean)
+        centred = states - exact.states_mean[:, None]
+        within = (centred[..., :, None] * centred[..., None, :]).mean(0).transpose(0, 1)
+        assert_mean(within, torch.stack([exact.states_covariance[t, :, t] for t in range(rows)]))
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.0, 1.5, math.nan])
+def test_the_untwisted_share_is_below_one(cart, even, share):
+    ahead = smooth(cart, even, anywhere(cart, even), passes=2)
+    with pytest.raises(ValueError, match=r"\[0, 1\)"):
+        Twist(ahead, untwisted=share)
+
+
+def test_a_filter_that_looks_ahead_shows_no_frames(cart, even):
+    twist = Twist(smooth(cart, even, anywhere(cart, even), passes=2))
+    with pytest.raises(ValueError, match="on_frame"):
+        particle_filter(cart, even, particles=5, proposal=twist, on_frame=lambda *_: None)
+
+
+# --- against a large bootstrap filter ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def hovercraft():
+    return example("hovercraft:HovercraftTruth").requires_grad_(False)
+
+
+class Coarse(type(example("hovercraft:HovercraftTruth"))):
+    """Bearings to 20°: some hundred of ten thousand particles from the broad prior fit them."""
+
+    def observe(self, state):
+        pyro.sample("bearing", bearings_to(self.landmarks, state, sd=math.radians(20)))
+
+
+@pytest.mark.parametrize(("known_start", "rows", "blind"), [(True, 8, 3000), (False, 5, 10_000)])
+def test_looking_ahead_agrees_with_a_large_bootstrap_filter(hovercraft, known_start, rows, blind):
+    runs = 40
+    program = hovercraft if known_start else Coarse().double().requires_grad_(False)
+    data = copies(drives(program, 1, rows), runs)
+    found = []
+    for ahead, particles in ((False, blind), (True, 300)):
+        with seeded("either"):
+            filtered = run_filter(program, data, particles=particles, known_start=known_start, look_ahead=ahead)
+            states = filtered.paths(300).states.mean(0).transpose(0, 1)
+        evidence = filtered.log_likelihood
+        found.append(torch.cat([evidence[:, None] + evidence.var() / 2, states[:, 1:].flatten(1)], -1))
+    assert_mean(found[0] - found[1], torch.zeros_like(found[0][0]))
+    assert found[1][:, 0].std() < found[0][:, 0].std()
+
+
+# --- invariances ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def bearings(hovercraft):
+    return drives(hovercraft, 3, 21, gaps=True)
+
+
+def smoothed(program, data, **settings) -> Lookahead:
+    """At the mode, so that it does not matter how one got there."""
+    settings = {"known_start": True, "passes": 40, "tolerance": 1e-11} | settings
+    return smooth(program, data, near_the_truth(program, data), **settings)
+
+
+@pytest.mark.parametrize("turn", [0.5, math.pi, 4.0])
+def test_turning_and_moving_the_world_changes_nothing(hovercraft, bearings, turn):
+    cos, sin, away = math.cos(turn), math.sin(turn), torch.tensor([3.0, -8.0], dtype=torch.float64)
+    rotation = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
+
+    class Elsewhere(type(hovercraft)):
+        landmarks = (torch.tensor(hovercraft.landmarks, dtype=torch.float64) @ rotation.T + away).tolist()
+
+    states = bearings.states
+    place, velocity = states[..., :2] @ rotation.T + away, states[..., 3:5] @ rotation.T
+    moved = replace(bearings, states=torch.cat([place, states[..., 2:3] + turn, velocity, states[..., 5:]], -1))
+    here, there = smoothed(hovercraft, bearings), smoothed(Elsewhere().double(), moved)
+    torch.testing.assert_close(here.log_likelihood, there.log_likelihood, rtol=0, atol=1e-6)
+    (ours, our_noise), (theirs, their_noise) = here.means(), there.means()
+    torch.testing.assert_close(our_noise, their_noise, rtol=0, atol=1e-6)
+    torch.testing.assert_close(ours[..., :2] @ rotation.T + away, theirs[..., :2], rtol=0, atol=1e-6)
+
+
+def test_whole_turns_of_the_heading_change_nothing(hovercraft, bearings):
+    turned = bearings.states.clone()
+    turned[..., 2] += math.pi * torch.tensor([2, -4, 6], dtype=torch.float64)
+    here, there = smoothed(hovercraft, bearings), smoothed(hovercraft, replace(bearings, states=turned))
+    torch.testing.assert_close(here.log_likelihood, there.log_likelihood, rtol=0, atol=1e-6)
+
+
+def test_whole_turns_of_a_bearing_change_nothing(hovercraft, bearings):
+    turns = 2 * math.pi * torch.tensor([1, -2, 0, 3], dtype=torch.float64)
+    turned = replace(bearings, measurements=bearings.measurements + turns)
+    here, there = smoothed(hovercraft, bearings), smoothed(hovercraft, turned)
+    torch.testing.assert_close(here.log_likelihood, there.log_likelihood, rtol=0, atol=1e-6)
+
+
+def test_the_order_of_trajectories_and_landmarks_changes_nothing(hovercraft, bearings):
+    order, places = [2, 0, 3, 1], [1, 2, 0]
+
+    class Shuffled(type(hovercraft)):
+        landmarks = [hovercraft.landmarks[i] for i in order]
+
+    shuffled = replace(bearings, measurements=bearings.measurements[..., order], observed=bearings.observed[..., order])
+    here = smoothed(hovercraft, bearings).log_likelihood
+    there = smoothed(Shuffled().double(), shuffled.subset(places)).log_likelihood
+    torch.testing.assert_close(here[places], there, rtol=0, atol=1e-6)
+    assert (here - here[places]).abs().min() > 1e-3
+
+
+def test_a_filters_particles_on_another_turn_than_the_path_weigh_the_same(hovercraft, bearings):
+    ahead = smoothed(hovercraft, bearings)
+    turned = bearings.states.clone()
+    turned[..., 2] += math.pi * torch.tensor([2, -4, 6], dtype=torch.float64)
+    runs = []
+    for data in (bearings, replace(bearings, states=turned)):
+        with seeded("turned"):
+            filtered = particle_filter(hovercraft, data, particles=50, known_start=True, proposal=Twist(ahead))
+        runs.append(filtered.log_likelihood)
+    torch.testing.assert_close(runs[0], runs[1], rtol=1e-9, atol=1e-9)
+
+
+def test_a_trajectory_scores_the_same_alone_as_padded(hovercraft, bearings):
+    alone = bearings.subset([1])
+    rows = int(alone.lengths[0])
+    names = ("time", "controls", "measurements", "observed", "states")
+    cut = replace(alone, **{name: getattr(alone, name)[:rows] for name in names})
+    padded, whole = (smoothed(hovercraft, data).log_likelihood for data in (alone, cut))
+    torch.testing.assert_close(padded, whole, rtol=0, atol=1e-9)
+
+
+def test_a_wrong_landmark_costs_many_nats(hovercraft, bearings):
+    class Wrong(type(hovercraft)):
+        landmarks = ((12.0, -3.0), *hovercraft.landmarks[1:])
+
+    right, wrong = (smoothed(program, bearings).log_likelihood for program in (hovercraft, Wrong().double()))
+    assert (right - wrong).min() > 20
+
+
+def test_reversed_time_costs_many_nats(hovercraft, bearings):
+    whole = bearings.subset([0, 2])
+    reversed_ = replace(whole, measurements=whole.measurements.flip(0), observed=whole.observed.flip(0))
+    right, wrong = (smoothed(hovercraft, data).log_likelihood for data in (whole, reversed_))
+    assert (right - wrong).sum() > 100
+
+
+# --- a broad start ----------------------------------------------------------------------------------------------------
+
+
+def test_a_broad_start_counts_the_neighbouring_turns(hovercraft, bearings):
+    ahead = smoothed(hovercraft, bearings, known_start=False)
+    masses = ahead.winding_masses.exp()
+    torch.testing.assert_close(masses.sum(0), torch.ones(3, dtype=torch.float64))
+    assert ((masses > 1e-3).sum(0) > 1).all()
+
+    class OneTurn(type(hovercraft)):
+        """Its prior some turns further on, and no component known as an angle."""
+
+        angles = ()
+        turns = 0
+
+        def initial(self):
+            start = super().initial()
+            return start + 2 * math.pi * self.turns * (torch.arange(6) == 2).to(start)
+
+    single = OneTurn().double().requires_grad_(False)
+    found = ahead.linearization
+    path = replace(found.path, states=found.path.states + found.start_turn)  # on the turn of its prior
+    alone = {}
+    for turns in (0, 1, -1):
+        single.turns = turns
+        alone[turns] = look_ahead(linearize(single, bearings, path)).log_likelihood
+    assert (ahead.log_likelihood - alone[0]).min() > 0.01
+    together = torch.stack(list(alone.values()))
+    torch.testing.assert_close(ahead.log_likelihood, together.logsumexp(0), rtol=0, atol=1e-9)
+    torch.testing.assert_close(masses.sort(0).values, together.softmax(0).sort(0).values, rtol=0, atol=1e-9)
+
+
+def test_whole_turns_of_the_path_change_nothing_from_a_broad_start(hovercraft, bearings):
+    path = smoothed(hovercraft, bearings, known_start=False).linearization.path
+    turn = 2 * math.pi * (torch.arange(6) == 2).double()
+    turned = Path(path.states + turn, path.noise)
+    here, there = (look_ahead(linearize(hovercraft, bearings, p)).log_likelihood for p in (path, turned))
+    # a turn that is left out on both sides has a hundredth of the mass: at least 3 prior deviations off
+    torch.testing.assert_close(here, there, rtol=0, atol=0.02)
+
+
+def test_draws_from_a_broad_start_are_on_the_turns_that_their_masses_say(hovercraft, bearings):
+    ahead = smoothed(hovercraft, bearings, known_start=False)
+    start, states, _ = ahead.draws(3000)
+    mean, sd = began(hovercraft, torch.zeros(1, 6).double()), began(hovercraft, torch.ones(1, 6).double())
+    torch.testing.assert_close(states[:, 0], mean + (sd - mean) * start, rtol=0, atol=1e-9)
+    away = (states[..., 2] - (ahead.means()[0] + ahead.linearization.start_turn)[..., 2]) / (2 * math.pi)
+    assert (away.round() == away[:, :1].round())[:, bearings.rows].all()  # the whole drive is on the start's turn
+    counted = away[:, 0].round() == ahead.windings[:, None, None, 2] / (2 * math.pi)
+    assert ahead.windings.shape == (3, 6)
+    assert_mean(counted.transpose(0, 1).double(), ahead.winding_masses.exp())
+
+
+def began(program, noise: Tensor) -> Tensor:
+    with running(*noise.shape[:-1]), Standardised(noise):
+        return program.initial()
+
+
+# --- finding a path ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("known_start", [False, True])
+def test_a_path_is_found_from_the_measurements_alone(hovercraft, bearings, known_start):
+    blind = bearings.without_truth(keep_start=known_start)
+    with seeded("find"):
+        path = find_path(hovercraft, blind, known_start=known_start)
+    found = smooth(hovercraft, blind, path, known_start=known_start, passes=40, tolerance=1e-11).means()[0]
+    apart = found - smoothed(hovercraft, bearings, known_start=known_start).means()[0]
+    # one turn further on the broad prior pulls the heading by 2π (.05 / π)², its posterior deviation being below .05
+    assert max(wrap(apart[..., 2])[bearings.rows].abs().max(), apart[bearings.rows][:, [0, 1]].abs().max()) < 2e-3
+
+
+def test_a_found_path_on_the_cart_is_the_exact_mean(cart, uneven):
+    path = find_path(cart, uneven, particles=50, candidates=2)
+    for trajectory, rows in enumerate(uneven.lengths.tolist()):
+        exact = CartPosterior(uneven, trajectory, cart_parameters(cart))
+        torch.testing.assert_close(path.states[:rows, trajectory], exact.states_mean, rtol=0, atol=1e-9)
