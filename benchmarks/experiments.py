@@ -28,8 +28,8 @@ STEADY_SETTINGS: dict[tuple[str, str], dict] = {
     ("bootstrap", "truck"): {"particles": 1000, "steps": 160, "ramp": 3.0},
     ("gaussian", "hov"): {},
     ("gaussian", "hov-mechanistic"): {"learning_rate": 2e-2},
-    ("gaussian", "hov+"): {},
-    ("gaussian", "truck"): {"ramp": 3.0},
+    ("gaussian", "hov+"): {"batch": 32},
+    ("gaussian", "truck"): {"ramp": 3.0, "steps": 160},
 }
 STEADY_SETTINGS |= {("lookahead", e): s for (guide, e), s in STEADY_SETTINGS.items() if guide == "gaussian"}
 # Likewise: a decay of .3 or 1, 500 or 1500 steps. The longer training has the same log p(y) on the valid split (34.1
