@@ -7,7 +7,7 @@ import pyro.distributions as dist
 import torch
 from torch import nn, tensor
 
-from steady_ppl import DataError, PlanarVehicle, bearings_to, smoothed_states, stack
+from steady_ppl import DataError, PlanarVehicle, bearings_to, dense, smoothed_states, stack
 
 
 class NeuralVehicle(PlanarVehicle):
@@ -66,13 +66,13 @@ class NeuralVehicle(PlanarVehicle):
         inputs = stack(*self.body_velocity(state), *control.unbind(-1))
         inputs = (inputs - self.input_mean) / self.input_sd
         if self.absolute_heading:
-            heading = state[..., 2:3]
-            inputs = torch.cat([inputs, heading.cos(), heading.sin()], -1)
-        hidden = self.hidden_in(inputs).relu()
+            heading = state[..., 2]
+            inputs = stack(*inputs.unbind(-1), heading.cos(), heading.sin())
+        hidden = dense(self.hidden_in, inputs).relu()
         if self.hidden_residual is not None:
-            hidden = hidden + self.hidden_residual(hidden).relu()
-        mean = self.scale * (self.skip(inputs) + self.hidden_out(hidden))
-        sd = self.scale * nn.functional.softplus(self.noise(inputs)).clamp(min=1e-3)
+            hidden = hidden + dense(self.hidden_residual, hidden).relu()
+        mean = self.scale * (dense(self.skip, inputs) + dense(self.hidden_out, hidden))
+        sd = self.scale * nn.functional.softplus(dense(self.noise, inputs)).clamp(min=1e-3)
         acceleration = pyro.sample("acceleration", dist.Normal(mean, sd).to_event(1))
         return self.integrate(state, acceleration, step)
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from steady_ppl.joint import Joint
     from steady_ppl.particles import particle_filter, roll_out
     from steady_ppl.paths import Filtered, Paths
-    from steady_ppl.planar_vehicle import PlanarVehicle, WrappedNormal, bearings_to, stack, wrap
+    from steady_ppl.planar_vehicle import PlanarVehicle, WrappedNormal, bearings_to, dense, stack, wrap
     from steady_ppl.program import Program, for_program, load_program
     from steady_ppl.seeding import seeded
     from steady_ppl.simulation import simulate
@@ -43,7 +43,7 @@ _HOMES = {
     "joint": ("Joint",),
     "particles": ("particle_filter", "roll_out"),
     "paths": ("Filtered", "Paths"),
-    "planar_vehicle": ("PlanarVehicle", "WrappedNormal", "bearings_to", "stack", "wrap"),
+    "planar_vehicle": ("PlanarVehicle", "WrappedNormal", "bearings_to", "dense", "stack", "wrap"),
     "program": ("Program", "for_program", "load_program"),
     "seeding": ("seeded",),
     "simulation": ("simulate",),

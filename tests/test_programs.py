@@ -16,7 +16,7 @@ from examples import MODELS, drives, example
 from pyro.infer import Trace_ELBO
 from small import HOVERCRAFT, TRUTH, only_start, simulated, steady, written
 
-from steady_ppl import Joint, SteadyError, TruthGuide, for_program, load_program, simulate
+from steady_ppl import Joint, SteadyError, TruthGuide, dense, for_program, load_program, simulate, stack
 from steady_ppl.probe import probe
 from steady_ppl.program import names
 from steady_ppl.sites import Recording, Replaying
@@ -414,3 +414,11 @@ def test_normalising_by_a_truth_that_is_not_there_is_an_error(known: str) -> Non
     data = data.without_truth(keep_start=known == "the start")
     with pytest.raises(SteadyError, match="true state"):
         neural(normalise="truth").prepare(data, False)
+
+
+@pytest.mark.parametrize("left", [(), (7,), (3, 1, 4)])
+def test_dense_is_the_layer_whatever_the_layout(left):
+    layer = torch.nn.Linear(5, 3).double()
+    by_components = stack(*torch.randn(5, *left, dtype=torch.float64))
+    for inputs in (by_components, by_components.contiguous()):
+        torch.testing.assert_close(dense(layer, inputs), layer(inputs))
