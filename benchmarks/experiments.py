@@ -28,7 +28,7 @@ STEADY_SETTINGS: dict[tuple[str, str], dict] = {
     ("bootstrap", "truck"): {"particles": 1000, "steps": 160, "ramp": 3.0},
     ("gaussian", "hov"): {},
     ("gaussian", "hov-mechanistic"): {"learning_rate": 2e-2},
-    ("gaussian", "hov+"): {"batch": 32},
+    ("gaussian", "hov+"): {"batch": 32, "steps": 400, "weight_decay": 0.3, "validate_every": 40},
     ("gaussian", "truck"): {"ramp": 3.0, "steps": 160},
 }
 STEADY_SETTINGS |= {("lookahead", e): s for (guide, e), s in STEADY_SETTINGS.items() if guide == "gaussian"}

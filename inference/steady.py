@@ -21,6 +21,7 @@ from steady_ppl import (
     neglected,
     seeded,
     train,
+    why_not_linear,
 )
 
 # What the paper and its authors' code use, best with AuthorsHovercraft or AuthorsTruck; hours on two cores:
@@ -61,7 +62,7 @@ def fit(
     valid: Trajectories | None = None,
     *,
     known_start: bool = False,
-    guide: str = "gaussian",
+    guide: str = "auto",
     particles: int | None = None,
     draws: int | None = None,
     steps: int = 250,
@@ -87,7 +88,8 @@ def fit(
         table: the training drives; true states, where there are any, are used for a known start only.
         valid: held-out drives.
         known_start: the first row's true state is given.
-        guide: the E step, one of GUIDES; settings that are None come from its DEFAULTS.
+        guide: the E step, one of GUIDES, or "auto": gaussian (lookahead if `particles` is given) where the program's
+            noise is normal, else bootstrap, and `notes` say why. Settings that are None come from its DEFAULTS.
         particles: N of the E step, for each drive; the Gaussian guide has none.
         draws: M, paths for each drive in the M step.
         steps: number of E steps.
@@ -97,12 +99,17 @@ def fit(
         run: checkpoint, resume and progress of `train`.
     """
     settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
+    data, notes = for_program(program, table), []
+    if guide == "auto":
+        reason = why_not_linear(program, data, known_start=known_start)
+        guide = "bootstrap" if reason else "gaussian" if particles is None else "lookahead"
+        notes += [f"guide bootstrap: {reason}"] if reason else []
     if guide not in GUIDES:
-        raise UsageError(f"no guide {guide!r}; there are {', '.join(GUIDES)}")
+        raise UsageError(f"no guide {guide!r}; there are {', '.join(GUIDES)}, auto")
     if particles is not None and "particles" not in DEFAULTS[guide]:
         raise UsageError(f"guide {guide} has no particles")
+    settings["guide"] = guide
     settings |= {name: value for name, value in DEFAULTS[guide].items() if settings[name] is None}
-    data = for_program(program, table)
     with seeded(seed, "prepare"):
         program.prepare(data, known_start)
     e_step = GUIDES[guide](
@@ -122,10 +129,9 @@ def fit(
         look_ahead=looks_ahead,
     )
     trained = train(program, e_step, data, validation, optimization, known_start=known_start, seed=seed, **run)
-    fitted = Fit(program, "steady", settings, seed=seed, known_start=known_start, trained=trained)
     if guide == "gaussian":
-        fitted.notes += doubts(program, data, known_start, seed)
-    return fitted
+        notes += doubts(program, data, known_start, seed)
+    return Fit(program, "steady", settings, seed=seed, known_start=known_start, trained=trained, notes=notes)
 
 
 def doubts(program, data: Trajectories, known_start: bool, seed: int) -> list[str]:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from steady_ppl.fit import Fit
     from steady_ppl.guides import GaussianGuide, LookaheadGuide, PathGuide, SMCGuide, TruthGuide
     from steady_ppl.joint import Joint
+    from steady_ppl.linearization import why_not_linear
     from steady_ppl.particles import particle_filter, roll_out
     from steady_ppl.paths import Filtered, Paths
     from steady_ppl.planar_vehicle import PlanarVehicle, WrappedNormal, bearings_to, dense, stack, wrap
@@ -41,6 +42,7 @@ _HOMES = {
     "fit": ("Fit",),
     "guides": ("GaussianGuide", "LookaheadGuide", "PathGuide", "SMCGuide", "TruthGuide"),
     "joint": ("Joint",),
+    "linearization": ("why_not_linear",),
     "particles": ("particle_filter", "roll_out"),
     "paths": ("Filtered", "Paths"),
     "planar_vehicle": ("PlanarVehicle", "WrappedNormal", "bearings_to", "dense", "stack", "wrap"),

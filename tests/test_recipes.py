@@ -7,12 +7,14 @@ import math
 from pathlib import Path
 
 import numpy as np
+import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 from examples import MODELS
 from small import HOVERCRAFT, TRUTH, contents, only_start, simulated, steady, written
 
-from steady_ppl import UsageError, for_program, load_program, log_likelihood, seeded, simulate
+from steady_ppl import UsageError, for_program, load_program, log_likelihood, seeded, simulate, stack
 from steady_ppl.run_recipe import find_recipe, recipe_folder
 
 QUIET = {"progress": False}
@@ -117,10 +119,33 @@ def test_what_is_not_given_comes_from_the_guides_defaults() -> None:
     assert (fit.settings["particles"], fit.settings["draws"], fit.settings["gradient_steps"]) == (100, 50, 1)
 
 
+class HeavyTailed(type(load_program(HOVERCRAFT))):
+    """Accelerations of Student's distribution."""
+
+    def transition(self, state, control, time, step):
+        pushed = stack(control.sum(-1), torch.zeros_like(time), control[..., 1] - control[..., 0])
+        acceleration = pyro.sample("acceleration", dist.StudentT(4.0, pushed / self.mass, self.noise).to_event(1))
+        return self.integrate(state, acceleration, step)
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "guide", "notes"),
+    [
+        (lambda: load_program(HOVERCRAFT), {}, "gaussian", []),
+        (lambda: load_program(HOVERCRAFT), {"particles": 10}, "lookahead", []),
+        (HeavyTailed, {"particles": 50}, "bootstrap", ["guide bootstrap: site 'acceleration' is StudentT"]),
+    ],
+)
+def test_the_guide_is_chosen_by_the_programs_noise(make, options, guide: str, notes: list[str]) -> None:
+    fit = find_recipe("steady")(make(), simulated(rows=5), steps=1, known_start=True, **options, **QUIET)
+    assert fit.settings["guide"] == guide and len(fit.notes) == len(notes)
+    assert all(said.startswith(note) for said, note in zip(fit.notes, notes, strict=True))
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"guide": "kalman"}, "no guide 'kalman'; there are gaussian, lookahead, bootstrap"),
+        ({"guide": "kalman"}, "no guide 'kalman'; there are gaussian, lookahead, bootstrap, auto"),
         ({"guide": "gaussian", "particles": 5}, "guide gaussian has no particles"),
     ],
 )
