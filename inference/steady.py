@@ -8,6 +8,7 @@ decides which parameters are kept. The paper's E step is the bootstrap particle 
 import dataclasses
 
 from steady_ppl import (
+    FilterError,
     Fit,
     GaussianGuide,
     LinearRamp,
@@ -107,7 +108,7 @@ def fit(
     if guide not in GUIDES:
         raise UsageError(f"no guide {guide!r}; there are {', '.join(GUIDES)}, auto")
     if particles is not None and "particles" not in DEFAULTS[guide]:
-        raise UsageError(f"guide {guide} has no particles")
+        raise UsageError(f"guide {guide} has no particles; lookahead and bootstrap have")
     settings["guide"] = guide
     settings |= {name: value for name, value in DEFAULTS[guide].items() if settings[name] is None}
     with seeded(seed, "prepare"):
@@ -129,15 +130,18 @@ def fit(
         look_ahead=looks_ahead,
     )
     trained = train(program, e_step, data, validation, optimization, known_start=known_start, seed=seed, **run)
-    if guide == "gaussian":
+    if guide == "gaussian" and not trained.interrupted:
         notes += doubts(program, data, known_start, seed)
     return Fit(program, "steady", settings, seed=seed, known_start=known_start, trained=trained, notes=notes)
 
 
 def doubts(program, data: Trajectories, known_start: bool, seed: int) -> list[str]:
     """Whether the Gaussian guide can be trusted: a filter weighs what the linearisation neglects."""
-    with seeded(seed, "doubts"):
-        nats = float(neglected(program, data, known_start=known_start).abs().mean())
+    try:
+        with seeded(seed, "doubts"):
+            nats = float(neglected(program, data, known_start=known_start).abs().mean())
+    except FilterError as error:
+        return [f"the filter that looks ahead breaks down on the learned program: {error}"]
     if nats < 0.5:
         return []
     return [f"linearised, the program misses log p(y) by {nats:.1f} nats a drive: try guide=lookahead"]

@@ -179,6 +179,9 @@ def evaluate(
     drives = read_table(table)
     results = [judge(fit, drives, particles=particles, rollouts=rollouts, seed=seed) for fit in fits]
     print(table_of(results, [f"{run.name} ({result['recipe']})" for run, result in zip(runs, results, strict=True)]))
+    for run, result in zip(runs, results, strict=True):
+        if result["filter"] != "lookahead":
+            _say(f"{run}: log p(y) and states are those of the {result['filter']} filter")
     if json_file is not None:
         rows = [{"run": str(run), **result} for run, result in zip(runs, results, strict=True)]
         _write_json(json_file, {"runs": rows})

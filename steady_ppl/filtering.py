@@ -14,7 +14,7 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError
-from steady_ppl.gaussian_smoother import find_path, means_as_path, smooth
+from steady_ppl.gaussian_smoother import find_and_smooth, means_as_path
 from steady_ppl.linearization import why_not_linear
 from steady_ppl.particles import particle_filter
 from steady_ppl.paths import Filtered
@@ -34,8 +34,7 @@ def run_filter(
     """The particle filter at observation weight 1, bootstrap or looking ahead."""
     proposal = None
     if look_ahead:
-        path = find_path(program, data, known_start=known_start)
-        proposal = Twist(smooth(program, data, path, known_start=known_start))
+        proposal = Twist(find_and_smooth(program, data, known_start=known_start))
     return particle_filter(
         program, data, particles=particles, known_start=known_start, proposal=proposal, keep_history=keep_history
     )
@@ -74,13 +73,13 @@ def choose_filter(
 def neglected(program: Program, data: Trajectories, *, known_start: bool, particles: int = 200) -> Tensor:
     """What the linearised program neglects: log p(y) by the filter that looks ahead, less the linearised program's.
 
-    Near zero the Gaussian guide draws from the posterior; by a nat or more, the lookahead guide is the one to use.
+    Near zero the Gaussian guide draws from the posterior, as far as its path is near the right mode: the filter is
+    steered along the same path and cannot tell.
 
     Returns:
         `(B,)` nats, with the filter's Monte-Carlo error.
     """
-    path = find_path(program, data, known_start=known_start)
-    ahead = smooth(program, data, path, known_start=known_start)
+    ahead = find_and_smooth(program, data, known_start=known_start)
     filtered = particle_filter(
         program, data, particles=particles, known_start=known_start, proposal=Twist(ahead), keep_history=False
     )
@@ -125,28 +124,40 @@ def log_likelihood(
         run_filter(
             program, part, particles=particles, known_start=known_start, look_ahead=look_ahead, keep_history=False
         ).log_likelihood
-        for part in in_parts(thinned, particles)
+        for part in in_parts(thinned, particles, look_ahead=look_ahead)
     ]
     return torch.cat(parts)
 
 
 def smoothed_states(program: Program, data: Trajectories, *, known_start: bool) -> Tensor:
-    """Posterior means of the states given all measurements, by the iterated smoother.
+    """Posterior means of the states given all measurements.
+
+    By the iterated smoother, angles on its path's turn; where the program's noise is not normal, from the surviving
+    lineages of a bootstrap filter.
 
     Args:
-        program: the state-space model, its noise normal.
+        program: the state-space model.
         data: as returned by `for_program`.
         known_start: start at the true first state.
 
     Returns:
         `(T + 1, B, D)`.
     """
-    path = find_path(program, data, known_start=known_start)
-    return means_as_path(smooth(program, data, path, known_start=known_start), data).states
+    if why_not_linear(program, data, known_start=known_start) is None:
+        return means_as_path(find_and_smooth(program, data, known_start=known_start), data).states
+    parts = [
+        particle_filter(program, part, particles=2000, known_start=known_start).paths(100).states.mean(0)
+        for part in in_parts(data, 2000)
+    ]
+    return torch.cat(parts, 1)
 
 
-def in_parts(data: Trajectories, particles: int, at_once: int = 200_000) -> Iterator[Trajectories]:
-    """Split into groups of trajectories such that no filter carries more than about `at_once` particles."""
+def in_parts(
+    data: Trajectories, particles: int, *, look_ahead: bool = False, at_once: int = 200_000
+) -> Iterator[Trajectories]:
+    """Split into groups of trajectories such that no filter carries more than about `at_once` particles; the search
+    for a path to look ahead along uses a thousand itself."""
+    particles = max(particles, 1000) if look_ahead else particles
     size = max(1, at_once // particles)
     for first in range(0, len(data), size):
         yield data.subset(range(first, min(first + size, len(data))))

@@ -182,7 +182,7 @@ def _load_recorded(folder: Path, source: dict[str, str] | None, moved: str | Pat
 def versions() -> dict[str, str]:
     """Versions that a result may depend on."""
     found = {"python": platform.python_version(), "torch_threads": str(torch.get_num_threads())}
-    for package in ("steady-ppl", "torch", "pyro-ppl", "numpy"):
+    for package in ("steady-ppl", "torch", "pyro-ppl", "numpy", "numba"):
         try:
             found[package] = version(package)
         except PackageNotFoundError:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
+from steady_ppl.errors import FilterError
 from steady_ppl.linearization import Path, linearize
 from steady_ppl.lookahead import Lookahead, look_ahead
 from steady_ppl.particles import particle_filter
@@ -60,10 +61,31 @@ def smooth(
         if index == passes - 1:
             break
         moved = means_as_path(ahead, data)
-        change = (moved.noise - path.noise).abs().max()
+        change = torch.nan_to_num((moved.noise - path.noise).abs(), nan=0.0).max()  # of those that have not blown up
         path = moved
         if not bool(change > tolerance):
             break
+    return ahead
+
+
+def find_and_smooth(
+    program: Program, data: Trajectories, *, known_start: bool = False, observation_weight: float = 1.0
+) -> Lookahead:
+    """Find paths from the measurements alone and look ahead along them.
+
+    Raises:
+        FilterError: the bootstrap filter of the search or the linearised program broke down.
+    """
+    path = find_path(program, data, known_start=known_start, observation_weight=observation_weight)
+    ahead = smooth(program, data, path, known_start=known_start, observation_weight=observation_weight)
+    broken = ~torch.isfinite(ahead.log_likelihood)
+    if bool(broken.any()):
+        label = data.labels[int(broken.nonzero()[0])]
+        raise FilterError(
+            f"trajectory {label}: the linearised program's log p(y) is not finite: its parameters or states have blown "
+            "up, or it cannot be linearised there (--guide bootstrap does not)",
+            trajectory=label,
+        )
     return ahead
 
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import pyro
 import pyro.distributions as dist
 import torch
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import FilterError
-from steady_ppl.gaussian_smoother import find_path, means_as_path, smooth, smoother_paths
+from steady_ppl.gaussian_smoother import find_and_smooth, means_as_path, smooth, smoother_paths
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.particles import particle_filter
@@ -130,29 +128,53 @@ class LinearizedGuide(PathGuide):
     ) -> None:
         super().__init__(draws)
         self.program, self.tempering = program, tempering or LinearRamp()
-        self.known_start, self.passes = known_start, passes
+        self.known_start, self.passes, self.lost = known_start, passes, 0
 
     def look_ahead(self, data: Trajectories, weight: float) -> Lookahead:
-        """Linearise along the remembered paths, or newly found ones where there are none; remember the new means."""
-        find = partial(find_path, self.program, data, known_start=self.known_start, observation_weight=weight)
-        move = partial(smooth, self.program, data, known_start=self.known_start, observation_weight=weight)
-        found = all(f"states/{label}" in self.memory for label in data.labels)
-        ahead = move(self._recall(data), passes=self.passes) if found else move(find())
-        if found and not bool(torch.isfinite(ahead.log_likelihood).all()):
-            ahead = move(find())
-        _require_finite_lookahead(ahead, data)
-        path = means_as_path(ahead, data)
+        """Linearise along the remembered paths; search for those that are not there, and again for those that are lost.
+
+        Raises:
+            FilterError: a path cannot be found.
+        """
+        self._search(data, [i for i, label in enumerate(data.labels) if f"states/{label}" not in self.memory], weight)
+        ahead = self._smooth(data, weight)
+        lost = (~torch.isfinite(ahead.log_likelihood)).nonzero().flatten().tolist()
+        self.lost = len(lost)
+        if lost:
+            self._search(data, lost, weight)
+            ahead = self._smooth(data, weight)
+        self._remember(means_as_path(ahead, data), data)
+        return ahead
+
+    def _search(self, data: Trajectories, trajectories: list[int], weight: float) -> None:
+        if trajectories:
+            part = data.subset(trajectories)
+            ahead = find_and_smooth(self.program, part, known_start=self.known_start, observation_weight=weight)
+            self._remember(means_as_path(ahead, part), part)
+
+    def _smooth(self, data: Trajectories, weight: float) -> Lookahead:
+        path = Path(self._recall("states", data), self._recall("noise", data))
+        return smooth(
+            self.program,
+            data,
+            path,
+            known_start=self.known_start,
+            observation_weight=weight,
+            passes=self.passes,
+        )
+
+    def _recall(self, kind: str, data: Trajectories) -> torch.Tensor:
+        return torch.stack([self.memory[f"{kind}/{label}"] for label in data.labels], 1).to(data.controls)
+
+    def _remember(self, path: Path, data: Trajectories) -> None:
         for i, label in enumerate(data.labels):
             self.memory[f"states/{label}"] = path.states[:, i]
             self.memory[f"noise/{label}"] = path.noise[:, i]
-        return ahead
 
-    def _recall(self, data: Trajectories) -> Path:
-        states, noise = (
-            torch.stack([self.memory[f"{kind}/{label}"] for label in data.labels], 1).to(data.controls)
-            for kind in ("states", "noise")
-        )
-        return Path(states, noise)
+    def _figures(self, ahead: Lookahead) -> dict[str, float]:
+        """Log p(y) of the linearised program, at this step's observation weight; and whether paths were lost."""
+        figures = {"log_evidence": float(ahead.log_likelihood.mean())}
+        return figures | {"paths_lost": float(self.lost)} if self.lost else figures
 
 
 class GaussianGuide(LinearizedGuide):
@@ -172,7 +194,7 @@ class GaussianGuide(LinearizedGuide):
         ahead = self.look_ahead(data, weight)
         self.paths = smoother_paths(self.program, data, ahead, self.draws, known_start=self.known_start)
         _require_finite(self.paths, data)
-        return {"observation_weight": weight}
+        return {"observation_weight": weight} | self._figures(ahead)
 
 
 class LookaheadGuide(LinearizedGuide):
@@ -206,6 +228,7 @@ class LookaheadGuide(LinearizedGuide):
             FilterError: the filter broke down.
         """
         weight = self.tempering(progress)
+        ahead = self.look_ahead(data, weight)
         filtered = particle_filter(
             self.program,
             data,
@@ -213,11 +236,11 @@ class LookaheadGuide(LinearizedGuide):
             observation_weight=weight,
             known_start=self.known_start,
             resample_below=self.resample_below,
-            proposal=Twist(self.look_ahead(data, weight), untwisted=self.untwisted),
+            proposal=Twist(ahead, untwisted=self.untwisted),
         )
         self.paths = filtered.paths(self.draws).within(data)
         _require_finite(self.paths, data)
-        return {"observation_weight": weight} | _health(filtered, data.rows)
+        return {"observation_weight": weight} | self._figures(ahead) | _health(filtered, data.rows)
 
 
 class TruthGuide(PathGuide):
@@ -237,16 +260,6 @@ class TruthGuide(PathGuide):
 
 def _health(filtered: Filtered, rows: torch.Tensor) -> dict[str, float]:
     return {"ess": float(filtered.effective_sizes[rows].mean()), "roots": float(filtered.roots.mean())}
-
-
-def _require_finite_lookahead(ahead: Lookahead, data: Trajectories) -> None:
-    broken = ~torch.isfinite(ahead.log_likelihood)
-    if bool(broken.any()):
-        label = data.labels[int(broken.nonzero()[0])]
-        raise FilterError(
-            f"trajectory {label}: the linearised program's log p(y) is not finite: the program has blown up",
-            trajectory=label,
-        )
 
 
 def _require_finite(paths: Paths, data: Trajectories) -> None:

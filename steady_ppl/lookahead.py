@@ -131,6 +131,9 @@ def look_ahead(linear: Linearization) -> Lookahead:
     recursions.integrate_starts(
         _arrays(ahead), _array(linear.start_noise), _array(offsets), _arrays(starts), masses.numpy()
     )
+    spread = (linear.start_noise @ starts[2][0].to(device)).square().sum(-1)[:, list(linear.angles)]
+    vague = (spread > 1).any(-1).cpu()  # the measurements leave an angle open: one turn's integral covers the others
+    masses[1:, vague] = -torch.inf
     log_likelihood = masses.logsumexp(0)
     return Lookahead(
         linearization=linear,

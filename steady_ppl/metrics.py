@@ -59,7 +59,7 @@ def state_estimation(
     """
     assert data.states is not None
     roots: dict[str, list[Tensor]] = {}
-    for part in in_parts(data.observed_every(every), particles):
+    for part in in_parts(data.observed_every(every), particles, look_ahead=look_ahead):
         assert part.states is not None
         filtered = run_filter(program, part, particles=particles, known_start=known_start, look_ahead=look_ahead)
         paths = filtered.paths(lineages)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
+from typing import Any
 
 import torch
 from pyro.poutine.messenger import Messenger
@@ -64,7 +65,7 @@ def particle_filter(
     proposal = proposal or Proposal()
     if proposal.looks_ahead and on_frame is not None:
         raise ValueError("on_frame sees what is predicted: a filter that looks ahead has seen the later measurements")
-    steps, elapsed, last = data.steps, data.elapsed, rows - 1
+    steps, elapsed, inside, last = data.steps, data.elapsed, data.rows, rows - 1
     observed_rows = data.observed.any(-1).any(-1).tolist()
     start = Recording()
     with running(particles, 1, trajectories):
@@ -88,6 +89,7 @@ def particle_filter(
         noise: dict[str, list[Tensor]] = {}
         all_ancestors: list[Tensor | None] = []
 
+        future: Any = 0.0
         for row in range(rows):
             if keep_history:
                 history.append(state.squeeze(1))
@@ -99,7 +101,8 @@ def particle_filter(
                     program.observe(state)
                 log_weights = log_weights + recording.total().squeeze(-2)
             if observed_rows[row] or proposal.looks_ahead:
-                future = torch.where(data.rows[row], proposal.log_future(row, state.squeeze(1)), 0.0)
+                if proposal.looks_ahead:
+                    future = torch.where(inside[row], proposal.log_future(row, state.squeeze(1)), 0.0)
                 with_future, log_likelihood[row] = normalise(log_weights + future)
                 log_weights = with_future - future
                 size = effective_sample_size(with_future)
@@ -117,12 +120,13 @@ def particle_filter(
             if row == last:
                 break
             if ancestors is not None:
-                log_weights = torch.where(exhausted, -math.log(particles) - take(future, ancestors), log_weights)
+                fresh = -math.log(particles) - (take(future, ancestors) if proposal.looks_ahead else 0.0)
+                log_weights = torch.where(exhausted, fresh, log_weights)
                 state, roots = take(state.squeeze(1), ancestors).unsqueeze(1), take(roots, ancestors)
             recording = Recording()
             drawing, log_ratio = proposal.step(row, state.squeeze(1))
             if proposal.looks_ahead:
-                log_weights = log_weights + torch.where(data.transitions[row], log_ratio, 0.0)
+                log_weights = log_weights + torch.where(inside[row + 1], log_ratio, 0.0)
             with recording, drawing:
                 state = program.transition(state, data.controls[row, None], elapsed[row, None], steps[row, None])
             if row == 0:

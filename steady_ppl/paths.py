@@ -53,7 +53,7 @@ class Filtered:
     Attributes:
         log_likelihood: `(B,)` the estimate of log p(y), whose exponential is unbiased at observation weight 1.
         log_weights: `(N, B)` normalised weights of the last row's particles.
-        effective_sizes: `(T + 1, B)` effective sample size after each observed row; N elsewhere.
+        effective_sizes: `(T + 1, B)` ESS after each observed row (each row when looking ahead), or N.
         roots: `(B,)` how many of the first row's particles still have descendants at the end.
         states, start, noise, ancestors: the particles' history, a tensor a row; empty when it was not kept.
     """

@@ -80,6 +80,8 @@ def dense(layer: nn.Linear, inputs: Tensor) -> Tensor:
     The same numbers as `layer(inputs)` but for rounding; matrix products of few rows and many columns take half the
     time, their gradients a third.
     """
+    if inputs.dim() < 2 or layer.bias is None:
+        return layer(inputs)
     columns = inputs.movedim(-1, 0).flatten(1)
     outputs = torch.addmm(layer.bias.unsqueeze(-1), layer.weight, columns)
     return outputs.view(-1, *inputs.shape[:-1]).movedim(0, -1)

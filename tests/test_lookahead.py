@@ -12,7 +12,7 @@ from examples import copies, drives, example
 from oracles import START_MEAN, START_SD, CartPosterior, assert_mean, cart_parameters, kalman
 from torch import Tensor
 
-from steady_ppl import particle_filter, seeded
+from steady_ppl import FilterError, particle_filter, seeded
 from steady_ppl.filtering import run_filter
 from steady_ppl.gaussian_smoother import find_path, smooth
 from steady_ppl.linearization import Path, linearize
@@ -20,8 +20,6 @@ from steady_ppl.lookahead import Lookahead, look_ahead
 from steady_ppl.planar_vehicle import bearings_to, wrap
 from steady_ppl.proposals import Twist
 from steady_ppl.sites import Standardised, running
-
-# torch scripts its decompositions when the first forward derivative is taken, and warns that it does
 
 
 @pytest.fixture(scope="module")
@@ -469,3 +467,33 @@ def test_a_found_path_on_the_cart_is_the_exact_mean(cart, uneven):
     for trajectory, rows in enumerate(uneven.lengths.tolist()):
         exact = CartPosterior(uneven, trajectory, cart_parameters(cart))
         torch.testing.assert_close(path.states[:rows, trajectory], exact.states_mean, rtol=0, atol=1e-9)
+
+
+# --- what goes wrong --------------------------------------------------------------------------------------------------
+
+
+def test_a_drive_without_measurements_has_no_evidence_whatever_the_turns(hovercraft, bearings):
+    unseen = replace(bearings, observed=torch.zeros_like(bearings.observed))
+    ahead = smoothed(hovercraft, unseen, known_start=False)
+    torch.testing.assert_close(ahead.log_likelihood, torch.zeros(3, dtype=torch.float64), rtol=0, atol=1e-9)
+
+
+def test_one_trajectory_that_blows_up_does_not_stop_the_passes_of_the_others(hovercraft, bearings):
+    path = smoothed(hovercraft, bearings).linearization.path
+    far = replace(path, states=path.states + torch.tensor([0.3, -0.3, 0.1, 0.0, 0.0, 0.0]).double())
+    alone = smooth(hovercraft, bearings.subset([1, 2]), of(far, [1, 2]), known_start=True, passes=4, tolerance=1e-9)
+    far.states[:, 0] = torch.nan
+    together = smooth(hovercraft, bearings, far, known_start=True, passes=4, tolerance=1e-9)
+    assert not torch.isfinite(together.log_likelihood[0])
+    torch.testing.assert_close(together.log_likelihood[1:], alone.log_likelihood, rtol=0, atol=1e-9)
+
+
+def of(path: Path, trajectories: list[int]) -> Path:
+    return Path(path.states[:, trajectories], path.noise[:, trajectories])
+
+
+def test_a_program_that_blows_up_names_the_trajectory(hovercraft, bearings):
+    broken = replace(bearings, controls=bearings.controls.clone())
+    broken.controls[3, 1] = torch.nan
+    with pytest.raises(FilterError, match="trajectory 2"):
+        run_filter(hovercraft, broken, particles=50, known_start=True, look_ahead=True)

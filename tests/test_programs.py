@@ -416,7 +416,7 @@ def test_normalising_by_a_truth_that_is_not_there_is_an_error(known: str) -> Non
         neural(normalise="truth").prepare(data, False)
 
 
-@pytest.mark.parametrize("left", [(1,), (7,), (3, 1, 4)])
+@pytest.mark.parametrize("left", [(), (7,), (3, 1, 4)])
 def test_dense_is_the_layer_whatever_the_layout(left):
     layer = torch.nn.Linear(5, 3).double()
     by_components = stack(*torch.randn(5, *left, dtype=torch.float64))
