@@ -114,7 +114,7 @@ def main() -> int:
             )
     if arguments.json:
         arguments.json.write_text(json.dumps(results, indent=1) + "\n")
-    print(f"\n{'':10} {'figure':26} {'mean ± sd':>18} {'best':>8}  {'must':16} published")
+    print(f"\n{'':15} {'figure':26} {'mean ± sd':>18} {'best':>8}  {'must':16} published")
     missed = 0
     for experiment in experiments:
         runs = [result for result in results if result["method"] == experiment]

@@ -110,7 +110,7 @@ def main() -> int:
 def report(experiment: str, methods: list[str], results: list[dict]) -> int:
     """Print the table; 1 if a bound is missed."""
     missed = 0
-    print(f"\n{'':10} {'figure':26} {'mean ± sd':>18} {'best':>8}  {'must':16} published")
+    print(f"\n{'':15} {'figure':26} {'mean ± sd':>18} {'best':>8}  {'must':16} published")
     for method in methods:
         runs = [result for result in results if result["method"] == method]
         for name, values in figures(runs).items():
@@ -141,7 +141,7 @@ def line(method: str, name: str, values: list[float], bound: Bound) -> int:
         must = f"≤ {bound.high:g}" if not bound.low else f"{bound.low:g} – {bound.high:g}"
         verdict = "  ok" if bound.low <= mean <= bound.high else "  MISSED"
     figure = f"{mean:.{digits}f} ± {sd:.{digits}f}"
-    print(f"{method:10} {name:26} {figure:>18} {best:8.{digits}f}  {must:16} {bound.published}{verdict}".rstrip())
+    print(f"{method:15} {name:26} {figure:>18} {best:8.{digits}f}  {must:16} {bound.published}{verdict}".rstrip())
     return int(verdict.strip() == "MISSED")
 
 

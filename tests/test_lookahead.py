@@ -6,15 +6,16 @@ import math
 from dataclasses import replace
 
 import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 from examples import copies, drives, example
 from oracles import START_MEAN, START_SD, CartPosterior, assert_mean, cart_parameters, kalman
 from torch import Tensor
 
-from steady_ppl import FilterError, particle_filter, seeded
+from steady_ppl import FilterError, particle_filter, seeded, stack
 from steady_ppl.filtering import run_filter
-from steady_ppl.gaussian_smoother import find_path, smooth
+from steady_ppl.gaussian_smoother import find_path, smooth, smoother_paths
 from steady_ppl.linearization import Path, linearize
 from steady_ppl.lookahead import Lookahead, look_ahead
 from steady_ppl.planar_vehicle import bearings_to, wrap
@@ -497,3 +498,38 @@ def test_a_program_that_blows_up_names_the_trajectory(hovercraft, bearings):
     broken.controls[3, 1] = torch.nan
     with pytest.raises(FilterError, match="trajectory 2"):
         run_filter(hovercraft, broken, particles=50, known_start=True, look_ahead=True)
+
+
+# --- several sites ----------------------------------------------------------------------------------------------------
+
+
+class TwoKicks(type(example("linear_gaussian"))):
+    """The cart, its noise split into a scalar site and a vector site of one component: the same law."""
+
+    def transition(self, state, control, time, step):
+        position, velocity = state.unbind(-1)
+        mean, half = self.gain * control[..., 0] - self.damping * velocity, self.noise / math.sqrt(2)
+        first = pyro.sample("first", dist.Normal(mean, half))
+        second = pyro.sample("second", dist.Normal(torch.zeros_like(mean).unsqueeze(-1), half).to_event(1))
+        return stack(position + velocity * step, velocity + (first + second[..., 0]) * step)
+
+
+@pytest.mark.parametrize("known_start", [False, True])
+def test_several_noise_sites_are_steered_together(uneven, known_start):
+    program = TwoKicks().double().requires_grad_(False)
+    exact = kalman(uneven, cart_parameters(program), known_start=known_start).log_likelihood
+    ahead = smooth(program, uneven, anywhere_of(uneven, channels=2), known_start=known_start, passes=2)
+    torch.testing.assert_close(ahead.log_likelihood, exact, rtol=0, atol=1e-9)
+    steered = Twist(ahead, untwisted=0.0)
+    found = particle_filter(program, uneven, particles=5, known_start=known_start, proposal=steered)
+    torch.testing.assert_close(found.log_likelihood, exact, rtol=0, atol=1e-9)
+    paths = smoother_paths(program, uneven, ahead, 4000, known_start=known_start)
+    assert paths.noise["first"].shape == (4000, 11, 3) and paths.noise["second"].shape == (4000, 11, 3, 1)
+    posterior = CartPosterior(uneven, 0, cart_parameters(program), known_start=known_start)
+    both = paths.noise["first"][:, :, 0] + paths.noise["second"][:, :, 0, 0]
+    assert_mean(both, posterior.latent_mean[2:])
+
+
+def anywhere_of(data, channels: int) -> Path:
+    rows, trajectories = data.time.shape
+    return Path(torch.zeros(rows, trajectories, 2).double(), torch.zeros(rows - 1, trajectories, channels).double())
