@@ -181,7 +181,7 @@ def evaluate(
     print(table_of(results, [f"{run.name} ({result['recipe']})" for run, result in zip(runs, results, strict=True)]))
     for run, result in zip(runs, results, strict=True):
         if result["filter"] != "lookahead":
-            _say(f"{run}: log p(y) and states are those of the {result['filter']} filter")
+            _say(f"{run}: judged by the filter {result['filter']}")
     if json_file is not None:
         rows = [{"run": str(run), **result} for run, result in zip(runs, results, strict=True)]
         _write_json(json_file, {"runs": rows})
