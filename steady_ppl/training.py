@@ -185,7 +185,9 @@ def train(
 
 def _in_words(figures: Mapping[str, float], steps: int = 0) -> str:
     """Figures of the log in one line."""
-    shown = {name.replace("log_likelihood", "held-out log p(y)").replace("_", " "): value for name, value in figures.items()}
+    shown = {
+        name.replace("log_likelihood", "held-out log p(y)").replace("_", " "): value for name, value in figures.items()
+    }
     step = shown.pop("step", None)
     begin = f"step {step:.0f} of {steps}: " if step is not None else ""
     return begin + ", ".join(f"{name} {value:.4g}" for name, value in shown.items())
