@@ -14,18 +14,16 @@ The true states are used to judge, and for the first row where the start is know
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
 from experiments import LOGS, STEADY_SETTINGS, hov, truck
-from foundation import Bound, figures, line
+from foundation import Bound, report, run_jobs
 
 from inference import steady
 from models.hovercraft import HovercraftTruth
@@ -101,28 +99,8 @@ def main() -> int:
         experiments.remove("truck")
     seeds = range(1, 2 if arguments.quick else 1 + arguments.seeds)
     jobs = [(e, seed, arguments.guide, not arguments.leak_free, arguments.data) for e in experiments for seed in seeds]
-    results = []
-    with ProcessPoolExecutor(2) as pool:
-        for result in pool.map(learn_and_judge, jobs):
-            results.append(result)
-            forward, mean = result["forward"], result["forward_mean"]
-            print(
-                f"{result['method']} seed {result['seed']}: forward {forward['location']:.4f} m {forward['angle']:.4f} "
-                f"rad, mean {mean['location']:.4f} m {mean['angle']:.4f} rad, log p(y) {result['log_likelihood']:.2f}, "
-                f"learnt in {result['seconds']:.0f} s {result['found']}",
-                flush=True,
-            )
-    if arguments.json:
-        arguments.json.write_text(json.dumps(results, indent=1) + "\n")
-    print(f"\n{'':15} {'figure':26} {'mean ± sd':>18} {'best':>8}  {'must':16} published")
-    missed = 0
-    for experiment in experiments:
-        runs = [result for result in results if result["method"] == experiment]
-        for name, values in figures(runs).items():
-            held = not (arguments.leak_free or arguments.quick)  # the musts are means of several seeds, known start
-            bound = MUSTS.get((experiment, name), Bound()) if held else Bound()
-            missed |= line(experiment, name, values, bound)
-    return missed
+    held = not (arguments.leak_free or arguments.quick)  # the musts are means of several seeds, known start
+    return report(experiments, run_jobs(learn_and_judge, jobs, arguments.json), MUSTS if held else {})
 
 
 if __name__ == "__main__":

@@ -169,13 +169,12 @@ def smoother_paths(
         program.transition(states[:, :-1], data.controls[:-1], data.elapsed[:-1], data.steps)
     event_dims = {site: fn.event_dim for site, fn in (start.distributions | moving.distributions).items()}
     first = torch.Size((draws, 1, trajectories))
-    paths = Paths(
+    return Paths(
         states=states,
         start={site: broadcast_event(value, first, event_dims[site]) for site, value in start.values.items()},
         noise=moving.values,
         event_dims=event_dims | {"states": 1},
     )
-    return paths.within(data)
 
 
 def _side_by_side(values: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from steady_ppl.lookahead import Lookahead
 from steady_ppl.particles import particle_filter
 from steady_ppl.paths import Filtered, Paths
 from steady_ppl.program import Program
-from steady_ppl.proposals import Twist
+from steady_ppl.proposals import Proposal, Twist
 from steady_ppl.sites import masked
 from steady_ppl.tempering import LinearRamp, Tempering
 from steady_ppl.true_paths import true_paths
@@ -37,6 +37,23 @@ class PathGuide:
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
         """The E step: draw new paths for `data` at `progress` (0 to 1); returns figures for the log."""
         raise NotImplementedError
+
+    def keep(self, paths: Paths, data: Trajectories) -> None:
+        """Store paths of `data`, their padding filled.
+
+        Raises:
+            FilterError: a state is not finite.
+        """
+        self.paths = paths.within(data)
+        broken = ~torch.isfinite(self.paths.states).all(-1).all(0) & data.rows
+        if bool(broken.any()):
+            row, trajectory = (int(i) for i in broken.nonzero()[0])
+            label, time = data.labels[trajectory], float(data.elapsed[row, trajectory])
+            raise FilterError(
+                f"trajectory {label} at {time:.3g} s: a state is not finite: the program has blown up",
+                trajectory=label,
+                time=time,
+            )
 
     def __call__(self, data: Trajectories) -> None:
         """The guide of the model `Joint`; `data` are the trajectories of the last `refresh`."""
@@ -93,16 +110,8 @@ class SMCGuide(PathGuide):
             FilterError: the filter broke down, or a path is not finite.
         """
         weight = self.tempering(progress)
-        filtered = particle_filter(
-            self.program,
-            data,
-            particles=self.particles,
-            observation_weight=weight,
-            known_start=self.known_start,
-            resample_below=self.resample_below,
-        )
-        self.paths = filtered.paths(self.draws).within(data)
-        _require_finite(self.paths, data)
+        filtered = _run_filter(self, data, weight)
+        self.keep(filtered.paths(self.draws), data)
         return {"observation_weight": weight} | _health(filtered, data.observed.any(-1))
 
 
@@ -192,8 +201,7 @@ class GaussianGuide(LinearizedGuide):
         """
         weight = self.tempering(progress)
         ahead = self.look_ahead(data, weight)
-        self.paths = smoother_paths(self.program, data, ahead, self.draws, known_start=self.known_start)
-        _require_finite(self.paths, data)
+        self.keep(smoother_paths(self.program, data, ahead, self.draws, known_start=self.known_start), data)
         return {"observation_weight": weight} | self._figures(ahead)
 
 
@@ -229,17 +237,8 @@ class LookaheadGuide(LinearizedGuide):
         """
         weight = self.tempering(progress)
         ahead = self.look_ahead(data, weight)
-        filtered = particle_filter(
-            self.program,
-            data,
-            particles=self.particles,
-            observation_weight=weight,
-            known_start=self.known_start,
-            resample_below=self.resample_below,
-            proposal=Twist(ahead, untwisted=self.untwisted),
-        )
-        self.paths = filtered.paths(self.draws).within(data)
-        _require_finite(self.paths, data)
+        filtered = _run_filter(self, data, weight, Twist(ahead, untwisted=self.untwisted))
+        self.keep(filtered.paths(self.draws), data)
         return {"observation_weight": weight} | self._figures(ahead) | _health(filtered, data.rows)
 
 
@@ -258,17 +257,19 @@ class TruthGuide(PathGuide):
         return {}
 
 
+def _run_filter(
+    guide: SMCGuide | LookaheadGuide, data: Trajectories, weight: float, proposal: Proposal | None = None
+) -> Filtered:
+    return particle_filter(
+        guide.program,
+        data,
+        particles=guide.particles,
+        observation_weight=weight,
+        known_start=guide.known_start,
+        resample_below=guide.resample_below,
+        proposal=proposal,
+    )
+
+
 def _health(filtered: Filtered, rows: torch.Tensor) -> dict[str, float]:
     return {"ess": float(filtered.effective_sizes[rows].mean()), "roots": float(filtered.roots.mean())}
-
-
-def _require_finite(paths: Paths, data: Trajectories) -> None:
-    broken = ~torch.isfinite(paths.states).all(-1).all(0) & data.rows
-    if bool(broken.any()):
-        row, trajectory = (int(i) for i in broken.nonzero()[0])
-        label, time = data.labels[trajectory], float(data.elapsed[row, trajectory])
-        raise FilterError(
-            f"trajectory {label} at {time:.3g} s: a state is not finite: the program has blown up",
-            trajectory=label,
-            time=time,
-        )

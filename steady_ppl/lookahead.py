@@ -65,8 +65,7 @@ class Lookahead:
     def means(self) -> tuple[Tensor, Tensor]:
         """Posterior means of the linearised program, on the path's own turn: states `(T + 1, B, D)` and noise
         `(T, B, C)`."""
-        states, noise = self._forward(self.starts.shift[0], torch.zeros_like(self.steps.shift))
-        return states, noise
+        return self._forward(self.starts.shift[0], torch.zeros_like(self.steps.shift))
 
     def draws(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
         """Independent draws of the linearised program's posterior.

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from examples import drives, example
 from small import FEW, HOVERCRAFT, contents, simulated, steady, tree, written
 
 
@@ -43,3 +44,20 @@ def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[...,
         assert (contents(folder), tree(folder)) == before
 
     return check
+
+
+@pytest.fixture(scope="module")
+def cart():
+    return example("linear_gaussian").requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def even(cart):
+    """Three complete trajectories."""
+    return drives(cart, 3, 12)
+
+
+@pytest.fixture(scope="module")
+def uneven(cart):
+    """Lengths 12 and 10, gaps in the measurements, irregular steps."""
+    return drives(cart, 3, 12, gaps=True)

@@ -23,23 +23,6 @@ from steady_ppl.proposals import Twist
 from steady_ppl.sites import Standardised, running
 
 
-@pytest.fixture(scope="module")
-def cart():
-    return example("linear_gaussian").requires_grad_(False)
-
-
-@pytest.fixture(scope="module")
-def even(cart):
-    """Three complete trajectories."""
-    return drives(cart, 3, 12)
-
-
-@pytest.fixture(scope="module")
-def uneven(cart):
-    """Lengths 12 and 10, gaps in the measurements, irregular steps."""
-    return drives(cart, 3, 12, gaps=True)
-
-
 def anywhere(program, data) -> Path:
     """A path that has nothing to do with the drives."""
     with seeded("anywhere"):

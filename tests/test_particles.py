@@ -19,23 +19,6 @@ from steady_ppl.sites import AtMean, Replaying
 PROGRAMS = ("linear_gaussian", "hovercraft", "hovercraft:HovercraftTruth", "truck", "pendulum")
 
 
-@pytest.fixture(scope="module")
-def cart():
-    return example("linear_gaussian").requires_grad_(False)
-
-
-@pytest.fixture(scope="module")
-def even(cart):
-    """Three complete trajectories."""
-    return drives(cart, 3, 12)
-
-
-@pytest.fixture(scope="module")
-def uneven(cart):
-    """Lengths 12 and 10, gaps in the measurements, irregular steps."""
-    return drives(cart, 3, 12, gaps=True)
-
-
 def estimates(program, data, runs: int, particles: int, **settings) -> torch.Tensor:
     """log p(y) of each trajectory by `runs` independent filters, `(runs, B)`."""
     with seeded("estimates"):
