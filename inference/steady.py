@@ -6,6 +6,7 @@ decides which parameters are kept. The paper's E step is the bootstrap particle 
 """
 
 import dataclasses
+import math
 
 from steady_ppl import (
     FilterError,
@@ -130,6 +131,11 @@ def fit(
         look_ahead=looks_ahead,
     )
     trained = train(program, e_step, data, validation, optimization, known_start=known_start, seed=seed, **run)
+    if e_step.in_plain_torch:
+        notes.append(f"the particle filter ran in plain torch, without compiled kernels: {e_step.in_plain_torch}")
+    roots = trained.history[-1].get("roots", math.inf) if trained.history else math.inf
+    if roots < 10:
+        notes.append(f"of the particles' starts {roots:.0f} survive a drive: raise particles, or try guide=lookahead")
     if guide == "gaussian" and not trained.interrupted:
         notes += doubts(program, data, known_start, seed)
     return Fit(program, "steady", settings, seed=seed, known_start=known_start, trained=trained, notes=notes)

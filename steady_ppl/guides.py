@@ -11,7 +11,7 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import find_and_smooth, means_as_path, smooth, smoother_paths
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
-from steady_ppl.particles import particle_filter
+from steady_ppl.particles import WORTH_COMPILING, particle_filter
 from steady_ppl.paths import Filtered, Paths
 from steady_ppl.program import Program
 from steady_ppl.proposals import Proposal, Twist
@@ -27,12 +27,14 @@ class PathGuide:
         draws: M, the number of paths for each trajectory.
         paths: the stored paths, None before the first `refresh`.
         memory: tensors that the next `refresh` begins from; a checkpoint keeps them.
+        in_plain_torch: why no kernels served in the last `refresh` of a guide that filters; None where they did.
     """
 
     def __init__(self, draws: int) -> None:
         self.draws = draws
         self.paths: Paths | None = None
         self.memory: dict[str, torch.Tensor] = {}
+        self.in_plain_torch: str | None = None
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
         """The E step: draw new paths for `data` at `progress` (0 to 1); returns figures for the log."""
@@ -211,7 +213,7 @@ class LookaheadGuide(LinearizedGuide):
     Args:
         particles: N, for each trajectory.
         resample_below: share of N under which the effective sample size triggers resampling.
-        untwisted: share of the particles that draw their noise as the program does, see `Twist`.
+        untwisted, tempered: see `Twist`.
     """
 
     def __init__(
@@ -225,9 +227,11 @@ class LookaheadGuide(LinearizedGuide):
         passes: int = 1,
         resample_below: float = 0.5,
         untwisted: float = 0.01,
+        tempered: float = 1.0,
     ) -> None:
         super().__init__(program, draws=draws, tempering=tempering, known_start=known_start, passes=passes)
-        self.particles, self.resample_below, self.untwisted = particles, resample_below, untwisted
+        self.particles, self.resample_below = particles, resample_below
+        self.untwisted, self.tempered = untwisted, tempered
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
         """Run the filter and keep `draws` paths.
@@ -237,7 +241,7 @@ class LookaheadGuide(LinearizedGuide):
         """
         weight = self.tempering(progress)
         ahead = self.look_ahead(data, weight)
-        filtered = _run_filter(self, data, weight, Twist(ahead, untwisted=self.untwisted))
+        filtered = _run_filter(self, data, weight, Twist(ahead, untwisted=self.untwisted, tempered=self.tempered))
         self.keep(filtered.paths(self.draws), data)
         return {"observation_weight": weight} | self._figures(ahead) | _health(filtered, data.rows)
 
@@ -260,7 +264,7 @@ class TruthGuide(PathGuide):
 def _run_filter(
     guide: SMCGuide | LookaheadGuide, data: Trajectories, weight: float, proposal: Proposal | None = None
 ) -> Filtered:
-    return particle_filter(
+    filtered = particle_filter(
         guide.program,
         data,
         particles=guide.particles,
@@ -268,7 +272,10 @@ def _run_filter(
         known_start=guide.known_start,
         resample_below=guide.resample_below,
         proposal=proposal,
+        kernels=100 * guide.particles * data.time.numel() >= WORTH_COMPILING,  # a training has hundreds of E steps
     )
+    guide.in_plain_torch = filtered.in_plain_torch
+    return filtered
 
 
 def _health(filtered: Filtered, rows: torch.Tensor) -> dict[str, float]:

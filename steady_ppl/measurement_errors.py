@@ -57,7 +57,7 @@ def _totals(
 
     def on_frame(row: int, states: Tensor, before: Tensor, after: Tensor) -> None:
         nonlocal squares, covered, count
-        draws.append(take(states, systematic(after, OPEN_LOOP_DRAWS)))
+        draws.append(take(states, systematic(after.exp(), OPEN_LOOP_DRAWS)))
         observed = data.observed[row]
         if row == 0 or not bool(observed.any()):
             return

@@ -16,14 +16,17 @@ import torch
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
+from steady_ppl.compiled import stepping_for
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import FilterError, ProgramError
 from steady_ppl.paths import Filtered
 from steady_ppl.program import Program
 from steady_ppl.proposals import Proposal
 from steady_ppl.resampling import effective_sample_size, normalise, systematic, take
-from steady_ppl.sites import KnownStart, Observing, Recording, broadcast_event, running
+from steady_ppl.sites import KnownStart, Recording, Standardised, broadcast_event, running
+from steady_ppl.stepping import Stepping
 
+WORTH_COMPILING = 2_000_000  # steps of particles, which take the program's own lines a second or two
 OnFrame = Callable[[int, Tensor, Tensor, Tensor], None]
 
 
@@ -38,6 +41,7 @@ def particle_filter(
     resample_below: float = 0.5,
     proposal: Proposal | None = None,
     keep_history: bool = True,
+    kernels: bool | None = None,
     on_frame: OnFrame | None = None,
 ) -> Filtered:
     """Run the program as a particle filter on every trajectory at once.
@@ -52,6 +56,7 @@ def particle_filter(
             checked at its observed rows (at all rows when looking ahead), never at the table's last one.
         proposal: where the noise of start and steps comes from; the program itself when None (the bootstrap filter).
         keep_history: keep what `Filtered.paths` needs.
+        kernels: run compiled methods where they can serve; None: if there is enough to do, see `WORTH_COMPILING`.
         on_frame: called at every row with (row, states `(N, B, D)`, log-weights before, log-weights after), `(N, B)`;
             not when looking ahead.
 
@@ -65,76 +70,72 @@ def particle_filter(
     proposal = proposal or Proposal()
     if proposal.looks_ahead and on_frame is not None:
         raise ValueError("on_frame sees what is predicted: a filter that looks ahead has seen the later measurements")
-    steps, elapsed, inside, last = data.steps, data.elapsed, data.rows, rows - 1
+    inside, last = data.rows, rows - 1
     observed_rows = data.observed.any(-1).any(-1).tolist()
     start = Recording()
-    with running(particles, 1, trajectories):
-        certain = (KnownStart(data.known_start), 0.0) if known_start else None
-        drawing, log_ratio = certain or proposal.start(particles)
-        with start, drawing:
-            state = program.initial()
-        left = torch.Size((particles, 1, trajectories))
-        state = broadcast_event(state, left, 1)
-        if known_start and not bool((state == data.known_start).all()):
-            raise ProgramError(
-                "a known start needs initial() to return the sampled state as it is; it returns another", site="initial"
-            )
-        event_dims = {"states": 1} | {site: fn.event_dim for site, fn in start.distributions.items()}
-        log_weights = state.new_full((particles, trajectories), -math.log(particles), dtype=torch.float64)
-        log_weights = log_weights + log_ratio
-        log_likelihood = log_weights.new_zeros((rows, trajectories))
-        effective_sizes = log_weights.new_full((rows, trajectories), float(particles))
-        roots = torch.arange(particles, device=state.device)[:, None].expand(-1, trajectories)
-        history: list[Tensor] = []
-        noise: dict[str, list[Tensor]] = {}
-        all_ancestors: list[Tensor | None] = []
+    noise, log_ratio = (None, 0.0) if known_start else proposal.start(particles)
+    drawing = KnownStart(data.known_start) if known_start else nullcontext() if noise is None else _given(noise)
+    with running(particles, 1, trajectories), start, drawing:
+        state = program.initial()
+    left = torch.Size((particles, 1, trajectories))
+    state = broadcast_event(state, left, 1).squeeze(1)
+    if known_start and not bool((state == data.known_start).all()):
+        raise ProgramError(
+            "a known start needs initial() to return the sampled state as it is; it returns another", site="initial"
+        )
+    stepping, reason = Stepping(program, data, observation_weight), None
+    if kernels is None:
+        kernels = particles * data.time.numel() >= WORTH_COMPILING
+    if kernels and rows > 1:
+        stepping, reason = stepping_for(program, data, state, observation_weight)
+    log_weights = state.new_full((trajectories, particles), -math.log(particles), dtype=torch.float64).t()
+    log_weights = log_weights + log_ratio
+    log_likelihood = log_weights.new_zeros((rows, trajectories))
+    effective_sizes = log_weights.new_full((rows, trajectories), float(particles))
+    unmoved = torch.arange(particles, device=state.device).expand(trajectories, -1).t()
+    roots = unmoved
+    history: list[Tensor] = []
+    noises: dict[str, list[Tensor]] = {}
+    all_ancestors: list[Tensor | None] = []
 
-        future: Any = 0.0
-        for row in range(rows):
-            if keep_history:
-                history.append(state.squeeze(1))
-            predicted, ancestors = log_weights, None
-            if observed_rows[row]:
-                recording = Recording()
-                measured = Observing(data.measurements[row, None], data.observed[row, None], observation_weight)
-                with recording, measured:
-                    program.observe(state)
-                log_weights = log_weights + recording.total().squeeze(-2)
-            if observed_rows[row] or proposal.looks_ahead:
-                if proposal.looks_ahead:
-                    future = torch.where(inside[row], proposal.log_future(row, state.squeeze(1)), 0.0)
-                with_future, log_likelihood[row] = normalise(log_weights + future)
-                log_weights = with_future - future
-                size = effective_sample_size(with_future)
-                effective_sizes[row] = size
-                if row < last and resample_below > 0:
-                    exhausted = size < resample_below * particles
-                    if state.device.type != "cpu" or bool(exhausted.any()):
-                        ancestors = systematic(with_future, particles)
-                        unmoved = torch.arange(particles, device=state.device)[:, None]
-                        ancestors = torch.where(exhausted, ancestors, unmoved)
-            if on_frame is not None:
-                on_frame(row, state.squeeze(1), predicted, log_weights)
-            if keep_history:
-                all_ancestors.append(ancestors)
-            if row == last:
-                break
-            if ancestors is not None:
-                fresh = -math.log(particles) - (take(future, ancestors) if proposal.looks_ahead else 0.0)
-                log_weights = torch.where(exhausted, fresh, log_weights)
-                state, roots = take(state.squeeze(1), ancestors).unsqueeze(1), take(roots, ancestors)
-            recording = Recording()
-            drawing, log_ratio = proposal.step(row, state.squeeze(1))
+    future: Any = 0.0
+    for row in range(rows):
+        if keep_history:
+            history.append(state)
+        predicted, ancestors = log_weights, None
+        if observed_rows[row]:
+            log_weights = log_weights + stepping.log_density(row, state)
+        if observed_rows[row] or proposal.looks_ahead:
             if proposal.looks_ahead:
-                log_weights = log_weights + torch.where(inside[row + 1], log_ratio, 0.0)
-            with recording, drawing:
-                state = program.transition(state, data.controls[row, None], elapsed[row, None], steps[row, None])
-            if row == 0:
-                event_dims |= {site: fn.event_dim for site, fn in recording.distributions.items()}
-            if keep_history:
-                for site, value in recording.values.items():
-                    noise.setdefault(site, []).append(value.squeeze(1))
+                future = torch.where(inside[row], proposal.log_future(row, state), 0.0)
+            weights, log_likelihood[row] = normalise(log_weights + future)
+            log_weights = log_weights - log_likelihood[row]
+            effective_sizes[row] = effective_sample_size(weights)
+            if row < last and resample_below > 0:
+                exhausted = effective_sizes[row] < resample_below * particles
+                if state.device.type != "cpu" or bool(exhausted.any()):
+                    ancestors = torch.where(exhausted, systematic(weights, particles), unmoved)
+        if on_frame is not None:
+            on_frame(row, state, predicted, log_weights)
+        if keep_history:
+            all_ancestors.append(ancestors)
+        if row == last:
+            break
+        if ancestors is not None:
+            fresh = -math.log(particles) - (take(future, ancestors) if proposal.looks_ahead else 0.0)
+            log_weights = torch.where(exhausted, fresh, log_weights)
+            roots = take(roots, ancestors)
+        if ancestors is not None and proposal.looks_ahead:
+            state, ancestors = take(state, ancestors), None
+        noise, log_ratio = proposal.step(row, state)
+        if proposal.looks_ahead:
+            log_weights = log_weights + torch.where(inside[row + 1], log_ratio, 0.0)
+        state, values = stepping.transition(row, state, ancestors, noise)
+        if keep_history:
+            for site, value in values.items():
+                noises.setdefault(site, []).append(value)
 
+    event_dims = {"states": 1} | {site: fn.event_dim for site, fn in start.distributions.items()} | stepping.event_dims
     _raise_if_broken(log_likelihood, data)
     survivors = torch.zeros_like(log_weights).scatter_(0, roots, 1.0).sum(0)
     return Filtered(
@@ -144,10 +145,15 @@ def particle_filter(
         roots=survivors,
         states=history,
         start={site: broadcast_event(value, left, event_dims[site]).squeeze(1) for site, value in start.values.items()},
-        noise=noise,
+        noise=noises,
         ancestors=all_ancestors,
         event_dims=event_dims,
+        in_plain_torch=reason,
     )
+
+
+def _given(noise: Tensor) -> Standardised:
+    return Standardised(noise.unsqueeze(1))
 
 
 def _raise_if_broken(log_likelihood: Tensor, data: Trajectories) -> None:

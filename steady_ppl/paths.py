@@ -55,6 +55,7 @@ class Filtered:
         log_weights: `(N, B)` normalised weights of the last row's particles.
         effective_sizes: `(T + 1, B)` ESS after each observed row (each row when looking ahead), or N.
         roots: `(B,)` how many of the first row's particles still have descendants at the end.
+        in_plain_torch: why no kernels served; None where they did or were not asked for.
         states, start, noise, ancestors: the particles' history, a tensor a row; empty when it was not kept.
     """
 
@@ -67,10 +68,11 @@ class Filtered:
     noise: dict[str, list[Tensor]]
     ancestors: list[Tensor | None]
     event_dims: dict[str, int]
+    in_plain_torch: str | None = None
 
     def paths(self, draws: int) -> Paths:
         """Equally weighted paths, resampled systematically from all surviving lineages and traced back."""
-        index = systematic(self.log_weights, draws)
+        index = systematic(self.log_weights.exp(), draws)
         states, noise = [take(self.states[-1], index)], {site: list[Tensor]() for site in self.noise}
         for row in range(len(self.states) - 2, -1, -1):
             for site, values in self.noise.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import ClassVar
 
 import pyro.distributions as dist
@@ -128,10 +129,22 @@ def bearings_to(landmarks: Sequence[Sequence[float]] | Tensor, state: Tensor, sd
     Returns:
         A distribution over `(..., K)` rad.
     """
-    places = torch.as_tensor(landmarks, dtype=state.dtype, device=state.device)
+    places = _on_device(landmarks, state)
     x, y, heading = state[..., 0], state[..., 1], state[..., 2]
     to_x = places[:, 0] - x.unsqueeze(-1)
     to_y = places[:, 1] - y.unsqueeze(-1)
     nearness = (to_x * to_x + to_y * to_y).clamp(1e-4, 1e-2).rsqrt() * 0.1
     bearing = torch.atan2(to_y, to_x) - heading.unsqueeze(-1)
     return WrappedNormal(bearing, sd * nearness).to_event(1)
+
+
+def _on_device(landmarks: Sequence[Sequence[float]] | Tensor, state: Tensor) -> Tensor:
+    """The landmarks beside the states; on a device they are kept, as copying there would wait for it at every step."""
+    if isinstance(landmarks, Tensor) or state.device.type == "cpu":
+        return torch.as_tensor(landmarks, dtype=state.dtype, device=state.device)
+    return _kept_on_device(tuple((x, y) for x, y in landmarks), state.dtype, state.device)
+
+
+@lru_cache(maxsize=16)
+def _kept_on_device(landmarks: tuple[tuple[float, float], ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.tensor(landmarks, dtype=dtype, device=device)

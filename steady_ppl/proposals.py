@@ -7,16 +7,15 @@ the share.
 
 from __future__ import annotations
 
-import math
-from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from steady_ppl.lookahead import Lookahead
-from steady_ppl.planar_vehicle import wrap
-from steady_ppl.sites import Standardised
+from steady_ppl import twisting
+from steady_ppl.lookahead import Lookahead, look_ahead
+from steady_ppl.twisting import inverse
 
 
 class Proposal:
@@ -28,13 +27,14 @@ class Proposal:
 
     looks_ahead = False
 
-    def start(self, particles: int) -> tuple[AbstractContextManager[Any], Tensor | float]:
-        """A handler that gives `initial` its noise, and log density less log density of the proposal, `(N, B)`."""
-        return nullcontext(), 0.0
+    def start(self, particles: int) -> tuple[Tensor | None, Tensor | float]:
+        """The standard normal noise of `initial`, `(N, B, C)`, and its log density less that of the proposal, `(N, B)`;
+        None lets the program draw."""
+        return None, 0.0
 
-    def step(self, row: int, state: Tensor) -> tuple[AbstractContextManager[Any], Tensor | float]:
+    def step(self, row: int, state: Tensor) -> tuple[Tensor | None, Tensor | float]:
         """The same for the `transition` after a row, from states `(N, B, D)`."""
-        return nullcontext(), 0.0
+        return None, 0.0
 
     def log_future(self, row: int, state: Tensor) -> Tensor:
         """What is thought of all measurements after a row, `(N, B)` in double precision."""
@@ -48,36 +48,35 @@ class Twist(Proposal):
         lookahead: along any path; the closer to the posterior, the smaller the variance.
         untwisted: probability with which a particle draws one step's noise as the program does. At 100 intervals a
             share of .05 doubles the scatter of log p(y) that .01 has.
+        tempered: weight of the later measurements as the twist sees them, relative to their own; less than 1 guards
+            against a twist that is narrower than the posterior.
     """
 
     looks_ahead = True
 
-    def __init__(self, lookahead: Lookahead, *, untwisted: float = 0.01) -> None:
+    def __init__(self, lookahead: Lookahead, *, untwisted: float = 0.01, tempered: float = 1.0) -> None:
         if not 0 <= untwisted < 1:
             raise ValueError(f"the untwisted share is in [0, 1), got {untwisted}")
+        if not 0 < tempered <= 1:
+            raise ValueError(f"the weight of the tempered measurements is in (0, 1], got {tempered}")
+        if tempered < 1:
+            seen = lookahead.linearization
+            weighted = replace(seen, precision=tempered * seen.precision, log_scale=tempered * seen.log_scale)
+            lookahead = look_ahead(weighted)
         self.lookahead, self.untwisted = lookahead, untwisted
-        path = lookahead.linearization.path
-        self.path, self.dtype = path.states, path.states.dtype
-        self.angles = list(lookahead.linearization.angles)
-        self.precision = lookahead.precision.to(self.dtype)
-        self.information = lookahead.information.to(self.dtype)
-        steps = lookahead.steps
-        self.shift, self.gain, self.factor = (v.to(self.dtype) for v in (steps.shift, steps.gain, steps.factor))
-        self.whitening = _inverse(steps.factor).to(self.dtype)
-
-    def deviation(self, row: int, state: Tensor) -> Tensor:
-        """States `(N, B, D)` less the path's, angles on the circle."""
-        deviation = state - self.path[row]
-        for angle in self.angles:
-            deviation[..., angle] = wrap(deviation[..., angle])
-        return deviation
+        path, steps = lookahead.linearization.path.states, lookahead.steps
+        self.dtype, self.path = path.dtype, path.double()
+        self.angles = torch.zeros(path.shape[-1], dtype=torch.bool, device=path.device)
+        self.angles[list(lookahead.linearization.angles)] = True
+        self.steering = (steps.shift, steps.gain, steps.factor, inverse(steps.factor))
 
     def log_future(self, row: int, state: Tensor) -> Tensor:
-        deviation = self.deviation(row, state)
-        pulled = self.information[row] - 0.5 * _times(self.precision[row], deviation)
-        return self.lookahead.log_scale[row] + (pulled * deviation).sum(-1).double()
+        ahead = self.lookahead
+        future = twisting.log_future if state.device.type == "cpu" else twisting.log_future_in_parallel
+        parts = (self.path[row], self.angles, ahead.precision[row], ahead.information[row], ahead.log_scale[row])
+        return future(state, *parts)
 
-    def start(self, particles: int) -> tuple[AbstractContextManager[Any], Tensor | float]:
+    def start(self, particles: int) -> tuple[Tensor | None, Tensor | float]:
         ahead = self.lookahead
         starts = ahead.starts
         winding = torch.distributions.Categorical(logits=ahead.winding_masses.t()).sample((particles,))
@@ -85,48 +84,23 @@ class Twist(Proposal):
         shift = starts.shift[winding, trajectory]
         own = torch.randn_like(shift)
         twisted = shift + (starts.factor[winding, trajectory] @ own.unsqueeze(-1)).squeeze(-1)
-        noise = self._mixed(twisted, own)
-        whitening = _inverse(starts.factor)
+        stays = torch.rand(own.shape[:-1], dtype=torch.float64, device=own.device) < self.untwisted
+        noise = torch.where(stays.unsqueeze(-1), own, twisted)
+        whitening = inverse(starts.factor)
         ratios = [
-            ahead.winding_masses[k] + _log_ratio(noise, starts.shift[k], whitening[k])
+            ahead.winding_masses[k] + twisting.log_ratio(noise, starts.shift[k], whitening[k])
             for k in range(len(ahead.windings))
         ]
-        handler = Standardised(noise.to(self.dtype).unsqueeze(1))
-        return handler, -self._mixture(torch.stack(ratios).logsumexp(0))
+        return noise.to(self.dtype), -twisting.mixture(torch.stack(ratios).logsumexp(0), self.untwisted)
 
-    def step(self, row: int, state: Tensor) -> tuple[AbstractContextManager[Any], Tensor | float]:
-        mean = self.shift[row] - _times(self.gain[row], self.deviation(row, state))
-        own = torch.randn_like(mean)
-        noise = self._mixed(mean + _times(self.factor[row], own), own)
-        handler = Standardised(noise.unsqueeze(1))
-        return handler, -self._mixture(_log_ratio(noise, mean, self.whitening[row]).double())
-
-    def _mixed(self, twisted: Tensor, own: Tensor) -> Tensor:
-        if self.untwisted == 0:
-            return twisted
-        stays = torch.rand(own.shape[:-1], dtype=torch.float64, device=own.device) < self.untwisted
-        return torch.where(stays.unsqueeze(-1), own, twisted)
-
-    def _mixture(self, log_ratio: Tensor) -> Tensor:
-        """log((1 − share) ratio + share)."""
-        if self.untwisted == 0:
-            return log_ratio
-        log_share = math.log(self.untwisted)
-        return torch.logaddexp(log_ratio + math.log1p(-self.untwisted), torch.full_like(log_ratio, log_share))
-
-
-def _log_ratio(noise: Tensor, mean: Tensor, whitening: Tensor) -> Tensor:
-    """log N(noise; mean, factor factorᵀ) − log N(noise; 0, I), `(N, B)`."""
-    white = _times(whitening, noise - mean)
-    log_determinant = whitening.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    return 0.5 * (noise.square().sum(-1) - white.square().sum(-1)) + log_determinant
-
-
-def _inverse(upper: Tensor) -> Tensor:
-    unit = torch.eye(upper.shape[-1], dtype=upper.dtype, device=upper.device).expand_as(upper)
-    return torch.linalg.solve_triangular(upper, unit, upper=True)
-
-
-def _times(matrix: Tensor, vectors: Tensor) -> Tensor:
-    """`(B, R, D)` times `(N, B, D)`: `(N, B, R)`, one product a trajectory."""
-    return (vectors.transpose(0, 1) @ matrix.mT).transpose(0, 1)
+    def step(self, row: int, state: Tensor) -> tuple[Tensor | None, Tensor | float]:
+        particles, trajectories = state.shape[:2]
+        kind: Any = {"device": state.device, "dtype": self.dtype}
+        own = torch.randn(self.steering[0].shape[-1], trajectories, particles, **kind).permute(2, 1, 0)
+        stays = torch.zeros(trajectories, particles, dtype=torch.bool, device=state.device).t()
+        if self.untwisted:
+            stays = torch.rand(trajectories, particles, **kind).t() < self.untwisted
+        steer = twisting.steer if state.device.type == "cpu" else twisting.steer_in_parallel
+        shift, gain, factor, whitening = (part[row] for part in self.steering)
+        steering = shift, gain, factor, whitening
+        return steer(state, self.path[row], self.angles, steering, own, stays, self.untwisted)

@@ -2,64 +2,106 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 
 
 def normalise(log_weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Log-weights `(N, B)` that sum to one, and the log of their sum, `(B,)`."""
-    log_sum = torch.logsumexp(log_weights, 0)
-    return log_weights - log_sum, log_sum
+    """Weights that sum to one, of log-weights `(N, B)`, and the log of their sum, `(B,)`."""
+    largest = log_weights.amax(0)
+    largest = torch.where(largest == -math.inf, 0.0, largest)
+    weights = (log_weights - largest).exp_()
+    total = weights.sum(0)
+    return weights / total, largest + total.log()
 
 
-def effective_sample_size(log_weights: Tensor) -> Tensor:
-    """1 / Σ w² of normalised log-weights `(N, B)`: `(B,)`, between 1 and N (Kong, Liu and Wong 1994)."""
-    return torch.exp(-torch.logsumexp(2 * log_weights, 0))
+def effective_sample_size(weights: Tensor) -> Tensor:
+    """1 / Σ w² of normalised weights `(N, B)`: `(B,)`, between 1 and N (Kong, Liu and Wong 1994)."""
+    return 1 / weights.square().sum(0)
 
 
-def systematic(log_weights: Tensor, draws: int, uniform: Tensor | None = None) -> Tensor:
+def systematic(weights: Tensor, draws: int, uniform: Tensor | None = None) -> Tensor:
     """Systematic resampling in O(N): particle i is drawn floor or ceiling of `draws · w_i` times.
 
     The number of offspring up to particle i is ⌈draws · (w_1 + … + w_i) − u⌉, one u a trajectory
     (Kitagawa 1996; Chopin and Papaspiliopoulos 2020, section 9.6). Sums are taken in double precision.
 
     Args:
-        log_weights: `(N, B)`, normalised.
+        weights: `(N, B)`, normalised.
         draws: how many to draw for each trajectory.
         uniform: `(B,)` in [0, 1); drawn when not given.
 
     Returns:
         `(draws, B)` indices in 0 … N − 1, in ascending order.
     """
-    particles, trajectories = log_weights.shape
-    device = log_weights.device
+    trajectories, device = weights.shape[1], weights.device
     if uniform is None:
         uniform = torch.rand(trajectories, dtype=torch.float64, device=device)
-    cumulative = log_weights.t().to(torch.float64).exp().cumsum(1)
+    by_trajectory = weights.t().to(torch.float64)
+    if device.type != "cpu":
+        return systematic_in_parallel(by_trajectory, draws, uniform).t()
+    chosen = torch.empty(trajectories, draws, dtype=torch.int64)
+    _systematic(by_trajectory.contiguous().numpy(), uniform.contiguous().numpy(), chosen.numpy())
+    return chosen.t()
+
+
+@njit(cache=True, error_model="numpy")
+def _systematic(weights: np.ndarray, uniform: np.ndarray, chosen: np.ndarray) -> None:
+    trajectories, particles = weights.shape
+    draws = chosen.shape[1]
+    for b in range(trajectories):
+        total = 0.0
+        for i in range(particles):
+            total += weights[b, i]
+        cumulative, born = 0.0, 0
+        for i in range(particles):
+            cumulative += weights[b, i]
+            share = cumulative / total
+            until = (
+                math.ceil(share * draws - uniform[b]) if share < 1 else draws
+            )  # all, also for u within rounding of 1
+            while born < until:
+                chosen[b, born] = i
+                born += 1
+        while born < draws:  # where a weight is not a number: the filter says so at its end
+            chosen[b, born] = particles - 1
+            born += 1
+
+
+def systematic_in_parallel(weights: Tensor, draws: int, uniform: Tensor) -> Tensor:
+    """`systematic` without a loop over particles, for a device: `(B, N)` weights to `(B, draws)` indices."""
+    trajectories, particles = weights.shape
+    cumulative = weights.cumsum(1)
     cumulative = cumulative / cumulative[:, -1:]
     born = (cumulative * draws - uniform[:, None]).ceil().long().clamp(0, draws)
-    born.masked_fill_(cumulative >= 1, draws)  # a uniform within rounding of 1 leaves nothing to weights of zero
-    born[:, -1] = draws  # also where a weight is not a number: the filter says so at its end
-    if device.type != "cpu":
-        born = born.cummax(1).values  # a parallel sum may round one of its terms below the one before
+    born.masked_fill_(cumulative >= 1, draws)
+    born[:, -1] = draws
+    born = born.cummax(1).values  # a parallel sum may round one of its terms below the one before
     offspring = torch.diff(born, dim=1, prepend=born.new_zeros((trajectories, 1)))
-    index = torch.arange(particles, device=device).repeat(trajectories)
+    index = torch.arange(particles, device=weights.device).repeat(trajectories)
     chosen = torch.repeat_interleave(index, offspring.flatten(), output_size=trajectories * draws)
-    return chosen.view(trajectories, draws).t()
+    return chosen.view(trajectories, draws)
 
 
 def take(values: Tensor, index: Tensor) -> Tensor:
-    """The particles `index` of each trajectory, component by component: states from `stack` are laid out that way.
+    """The particles `index` of each trajectory.
 
     Args:
-        values: `(N, B)` or `(N, B, D)`.
+        values: `(N, B)` or `(N, B, ...)`.
         index: `(M, B)` in 0 … N − 1.
 
     Returns:
-        `(M, B)` or `(M, B, D)`.
+        `(M, B)` or `(M, B, ...)`, laid out component by component.
     """
-    particles, trajectories = values.shape[:2]
-    flat = (index * trajectories + torch.arange(trajectories, device=index.device)).flatten()
-    components = values.reshape(particles, trajectories, -1).movedim(-1, 0)
-    taken = components.reshape(-1, particles * trajectories).index_select(1, flat)
-    return taken.view(-1, *index.shape).movedim(0, -1).reshape(*index.shape, *values.shape[2:])
+    components = values.flatten(2).permute(2, 1, 0) if values.dim() > 2 else values.t().unsqueeze(0)
+    taken = components.gather(2, index.t().expand(len(components), -1, -1))
+    return taken.permute(2, 1, 0).reshape(*index.shape, *values.shape[2:])
+
+
+def by_component(state: Tensor) -> Tensor:
+    """`(N, B, D)` as contiguous `(D, B, N)`: without copying where a kernel has made it."""
+    return state.permute(2, 1, 0).contiguous()

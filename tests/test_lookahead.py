@@ -13,7 +13,7 @@ from examples import copies, drives, example
 from oracles import START_MEAN, START_SD, CartPosterior, assert_mean, cart_parameters, kalman
 from torch import Tensor
 
-from steady_ppl import FilterError, particle_filter, seeded, stack
+from steady_ppl import FilterError, particle_filter, seeded, stack, twisting
 from steady_ppl.filtering import run_filter
 from steady_ppl.gaussian_smoother import find_path, smooth, smoother_paths
 from steady_ppl.linearization import Path, linearize
@@ -240,6 +240,22 @@ def test_the_untwisted_share_is_below_one(cart, even, share):
     ahead = smooth(cart, even, anywhere(cart, even), passes=2)
     with pytest.raises(ValueError, match=r"\[0, 1\)"):
         Twist(ahead, untwisted=share)
+
+
+@pytest.mark.parametrize("weight", [0.0, -0.5, 1.1, math.nan])
+def test_the_weight_of_a_tempered_twist_is_at_most_one(cart, even, weight):
+    ahead = smooth(cart, even, anywhere(cart, even), passes=2)
+    with pytest.raises(ValueError, match=r"\(0, 1\]"):
+        Twist(ahead, tempered=weight)
+
+
+def test_a_tempered_twist_is_wider_and_the_estimate_stays_unbiased(cart, even):
+    ahead = smooth(cart, even, anywhere(cart, even), passes=2)
+    exact, tempered = Twist(ahead), Twist(ahead, tempered=0.5)
+    widths = [twist.lookahead.steps.factor.det() for twist in (exact, tempered)]
+    assert (widths[1] > widths[0])[:-1].all()
+    runs = estimates(cart, even, 500, 20, tempered=0.5)
+    assert_mean((runs - kalman(even, cart_parameters(cart)).log_likelihood).exp(), torch.ones(runs.shape[1]))
 
 
 def test_a_filter_that_looks_ahead_shows_no_frames(cart, even):
@@ -516,3 +532,20 @@ def test_several_noise_sites_are_steered_together(uneven, known_start):
 def anywhere_of(data, channels: int) -> Path:
     rows, trajectories = data.time.shape
     return Path(torch.zeros(rows, trajectories, 2).double(), torch.zeros(rows - 1, trajectories, channels).double())
+
+
+def test_one_after_the_other_and_in_parallel_particles_are_steered_the_same() -> None:
+    torch.manual_seed(0)
+    double = {"dtype": torch.float64}
+    state, path = 5 * torch.randn(7, 3, 4, **double), torch.randn(3, 4, **double)
+    angles = torch.tensor([False, True, False, True])
+    factor = torch.randn(3, 2, 2, **double).triu() + 2 * torch.eye(2, **double)
+    steering = (torch.randn(3, 2, **double), torch.randn(3, 2, 4, **double), factor, twisting.inverse(factor))
+    own, stays = torch.randn(7, 3, 2, **double), torch.rand(7, 3) < 0.5
+    for share in (0.0, 0.3):
+        one = twisting.steer(state, path, angles, steering, own, stays & (share > 0), share)
+        other = twisting.steer_in_parallel(state, path, angles, steering, own, stays & (share > 0), share)
+        torch.testing.assert_close(one, other)
+    future = (torch.randn(3, 4, 4, **double), torch.randn(3, 4, **double), torch.randn(3, **double))
+    one = twisting.log_future(state, path, angles, *future)
+    torch.testing.assert_close(one, twisting.log_future_in_parallel(state, path, angles, *future))

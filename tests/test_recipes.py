@@ -142,6 +142,16 @@ def test_the_guide_is_chosen_by_the_programs_noise(make, options, guide: str, no
     assert all(said.startswith(note) for said, note in zip(fit.notes, notes, strict=True))
 
 
+def test_a_fit_says_why_its_filter_ran_in_plain_torch() -> None:
+    data = simulated(trajectories=4, rows=51)
+    settings = {"guide": "bootstrap", "particles": 120, "draws": 2, "steps": 1, "known_start": True, **QUIET}
+    plain, compiled = (
+        find_recipe("steady")(make(), data, **settings) for make in (HeavyTailed, lambda: load_program(HOVERCRAFT))
+    )
+    assert any(note.startswith("the particle filter ran in plain torch") and "StudentT" in note for note in plain.notes)
+    assert not any("plain torch" in note for note in compiled.notes)
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [

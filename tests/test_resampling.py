@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 from oracles import assert_mean
 
 from steady_ppl import seeded
-from steady_ppl.resampling import effective_sample_size, normalise, systematic, take
+from steady_ppl.resampling import effective_sample_size, normalise, systematic, systematic_in_parallel, take
 
 weights = st.lists(st.one_of(st.just(0.0), st.floats(1e-12, 1.0)), min_size=1, max_size=12).filter(any)
 draws = st.integers(1, 30)
 uniforms = st.floats(0, 1, exclude_max=True)
 
 
-def log_weights(values: list[float]) -> torch.Tensor:
-    """`(N, 1)` normalised."""
+def normalised(values: list[float]) -> torch.Tensor:
+    """`(N, 1)`."""
     return normalise(torch.tensor(values, dtype=torch.float64).log()[:, None])[0]
 
 
@@ -31,9 +31,9 @@ def counts(index: torch.Tensor, particles: int) -> torch.Tensor:
 @given(weights, draws, uniforms)
 @settings(deadline=None, derandomize=True)
 def test_each_particle_is_drawn_floor_or_ceiling_of_its_share(values, draws, uniform):
-    log_w = log_weights(values)
-    drawn = counts(systematic(log_w, draws, torch.tensor([uniform], dtype=torch.float64)), len(values))
-    share = draws * log_w.exp()
+    w = normalised(values)
+    drawn = counts(systematic(w, draws, torch.tensor([uniform], dtype=torch.float64)), len(values))
+    share = draws * w
     assert (drawn >= (share - 1e-9).floor()).all()
     assert (drawn <= (share + 1e-9).ceil()).all()
 
@@ -41,18 +41,18 @@ def test_each_particle_is_drawn_floor_or_ceiling_of_its_share(values, draws, uni
 @given(weights, draws)
 @settings(deadline=None, derandomize=True)
 def test_the_mean_number_of_offspring_is_the_weight(values, draws):
-    log_w, grid = log_weights(values), 1000
+    w, grid = normalised(values), 1000
     uniform = (torch.arange(grid, dtype=torch.float64) + 0.5) / grid
-    index = systematic(log_w.expand(-1, grid), draws, uniform)
+    index = systematic(w.expand(-1, grid), draws, uniform)
     mean = counts(index, len(values)).double().mean(1)
     # the number of offspring is a step function of u with at most two steps, each at most one grid cell off
-    assert ((mean - draws * log_w[:, 0].exp()).abs() <= 2 / grid).all()
+    assert ((mean - draws * w[:, 0]).abs() <= 2 / grid).all()
 
 
 @given(weights, draws, uniforms)
 @settings(deadline=None, derandomize=True)
 def test_indices_ascend_and_stay_within_range(values, draws, uniform):
-    index = systematic(log_weights(values), draws, torch.tensor([uniform], dtype=torch.float64))
+    index = systematic(normalised(values), draws, torch.tensor([uniform], dtype=torch.float64))
     assert index.shape == (draws, 1)
     assert (index.diff(dim=0) >= 0).all()
     assert index.min() >= 0 and index.max() < len(values)
@@ -61,33 +61,40 @@ def test_indices_ascend_and_stay_within_range(values, draws, uniform):
 @given(weights, draws, st.floats(0, 1 - 1e-9))
 @settings(deadline=None, derandomize=True)
 def test_a_particle_of_weight_zero_is_never_drawn(values, draws, uniform):
-    index = systematic(log_weights(values), draws, torch.tensor([uniform], dtype=torch.float64))
+    index = systematic(normalised(values), draws, torch.tensor([uniform], dtype=torch.float64))
     assert (torch.tensor(values)[index] > 0).all()
 
 
 def test_a_particle_of_weight_zero_is_not_drawn_by_the_largest_uniform_either():
-    index = systematic(log_weights([1.0, 0.0]), 3, torch.tensor([1 - 2.0**-52], dtype=torch.float64))
+    index = systematic(normalised([1.0, 0.0]), 3, torch.tensor([1 - 2.0**-52], dtype=torch.float64))
     assert index[:, 0].tolist() == [0, 0, 0]
 
 
 def test_offspring_of_a_hand_computed_case():
     # cumulative weights times four are 0.4, 2.0, 4.0; the four points at u + 0, 1, 2, 3 for u = 0.3 and for u = 0.5
-    index = systematic(log_weights([0.1, 0.4, 0.5]).expand(3, 2), 4, torch.tensor([0.3, 0.5], dtype=torch.float64))
+    index = systematic(normalised([0.1, 0.4, 0.5]).expand(3, 2), 4, torch.tensor([0.3, 0.5], dtype=torch.float64))
     assert index.t().tolist() == [[0, 1, 2, 2], [1, 1, 2, 2]]
 
 
+@given(weights, draws, uniforms)
+@settings(deadline=None, derandomize=True)
+def test_one_after_the_other_and_in_parallel_the_same_are_drawn(values, draws, uniform):
+    w, u = normalised(values).expand(-1, 2), torch.tensor([uniform, 1 - uniform / 2], dtype=torch.float64)
+    assert torch.equal(systematic(w, draws, u), systematic_in_parallel(w.t(), draws, u).t())
+
+
 def test_each_trajectory_has_its_own_weights_and_uniform():
-    both = torch.cat([log_weights([0.7, 0.2, 0.1]), log_weights([0.1, 0.1, 0.8])], 1)
+    both = torch.cat([normalised([0.7, 0.2, 0.1]), normalised([0.1, 0.1, 0.8])], 1)
     uniform = torch.tensor([0.1, 0.9], dtype=torch.float64)
     alone = [systematic(both[:, [b]], 7, uniform[[b]]) for b in range(2)]
     assert torch.equal(systematic(both, 7, uniform), torch.cat(alone, 1))
 
 
 def test_drawn_uniforms_are_unbiased_and_independent_between_trajectories():
-    log_w, runs = log_weights([0.25, 0.35, 0.4]), 4000
+    w, runs = normalised([0.25, 0.35, 0.4]), 4000
     with seeded("resampling"):
-        drawn = counts(systematic(log_w.expand(-1, runs), 1), 3)
-    assert_mean(drawn[:2].T, log_w[:2, 0].exp())
+        drawn = counts(systematic(w.expand(-1, runs), 1), 3)
+    assert_mean(drawn[:2].T, w[:2, 0])
     pairs = drawn[0, ::2] * drawn[0, 1::2]
     assert_mean(pairs, 0.25**2)
 
@@ -96,33 +103,33 @@ def test_drawn_uniforms_are_unbiased_and_independent_between_trajectories():
 def test_200_000_float32_particles_never_give_an_index_out_of_range(spread):
     particles = 200_000
     with seeded("extreme", int(spread)):
-        log_w = normalise(spread * torch.randn(particles, 4))[0]
-        assert log_w.dtype == torch.float32
+        w = normalise(spread * torch.randn(particles, 4))[0]
+        assert w.dtype == torch.float32
         for uniform in (torch.zeros(4), torch.full((4,), 1 - 2**-24), torch.rand(4)):
-            index = systematic(log_w, particles, uniform.double())
+            index = systematic(w, particles, uniform.double())
             assert index.min() >= 0 and index.max() < particles
-            share = particles * (log_w.double() - log_w.double().logsumexp(0)).exp()
+            share = particles * w.double() / w.double().sum(0)
             assert ((counts(index, particles) - share).abs() < 1 + 1e-6).all()
 
 
 def test_one_particle_may_hold_all_the_weight():
-    log_w = torch.full((200_000, 3), -math.inf)
-    log_w[0, 0], log_w[77_777, 1], log_w[-1, 2] = 0.0, 0.0, 0.0
-    index = systematic(log_w, 200_000)
+    w = torch.zeros(200_000, 3)
+    w[0, 0], w[77_777, 1], w[-1, 2] = 1.0, 1.0, 1.0
+    index = systematic(w, 200_000)
     assert index.unique(dim=0).tolist() == [[0, 77_777, 199_999]]
 
 
 def test_effective_sample_size_is_one_over_the_sum_of_squares():
-    log_w = torch.cat([log_weights(w) for w in ([1, 1, 1, 1], [1, 0, 0, 0], [0.5, 0.5, 0, 0], [4, 3, 2, 1])], 1)
+    w = torch.cat([normalised(w) for w in ([1, 1, 1, 1], [1, 0, 0, 0], [0.5, 0.5, 0, 0], [4, 3, 2, 1])], 1)
     expected = torch.tensor([4, 1, 2, 100 / 30], dtype=torch.float64)
-    torch.testing.assert_close(effective_sample_size(log_w), expected)
+    torch.testing.assert_close(effective_sample_size(w), expected)
 
 
 def test_normalise_returns_the_log_of_the_sum_however_small():
     double = torch.float64
-    log_w, log_sum = normalise(torch.tensor([[-2000.0, 3.0], [-2000.0, -math.inf]], dtype=double))
+    w, log_sum = normalise(torch.tensor([[-2000.0, 3.0], [-2000.0, -math.inf]], dtype=double))
     torch.testing.assert_close(log_sum, torch.tensor([math.log(2) - 2000, 3.0], dtype=double))
-    torch.testing.assert_close(log_w.exp(), torch.tensor([[0.5, 1.0], [0.5, 0.0]], dtype=double))
+    torch.testing.assert_close(w, torch.tensor([[0.5, 1.0], [0.5, 0.0]], dtype=double))
 
 
 def test_take_picks_particles_of_each_trajectory():

@@ -1,0 +1,235 @@
+"""A program's methods as kernels: traced once, compiled, and run for all particles in a few nanoseconds each.
+
+What runs is the program: Pyro runs its own lines under the usual handlers while torch notes every operation
+(`torch.fx`), and the kernel computes these operations. Parameters are read afresh for every run. Where this does not
+work the filter runs the program as written, and says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from torch import Tensor, fx
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from steady_ppl.data import Trajectories
+from steady_ppl.kernel_writer import LANES, source
+from steady_ppl.kernels import Kernel
+from steady_ppl.program import Program, one_line
+from steady_ppl.resampling import by_component
+from steady_ppl.scalar_graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph
+from steady_ppl.sites import Observing, Recording, Standardised, running
+from steady_ppl.stepping import Stepping
+from steady_ppl.translation import Translation, evaluate
+
+_METHODS: WeakKeyDictionary[Program, dict[Any, _Methods | NotCompilable]] = WeakKeyDictionary()
+
+
+def stepping_for(
+    program: Program, data: Trajectories, state: Tensor, observation_weight: float
+) -> tuple[Stepping, str | None]:
+    """Kernels where they can serve, and otherwise the program as written and why.
+
+    Args:
+        state: `(N, B, D)`, the particles' starts, on some of which kernels are compared with the program's lines.
+    """
+    plain = Stepping(program, data, observation_weight)
+    if state.device.type != "cpu" or state.dtype != torch.float32:
+        return plain, f"{str(state.dtype).removeprefix('torch.')} on {state.device.type}"
+    if state.shape[0] < LANES:
+        return plain, f"fewer than {LANES} particles"
+    known = _METHODS.setdefault(program, {})
+    key = _signature(program)
+    if key not in known:
+        with torch.random.fork_rng(devices=[]):
+            try:
+                known[key] = _Methods(program, data, state)
+            except NotCompilable as reason:
+                known[key] = reason
+    methods = known[key]
+    if isinstance(methods, NotCompilable):
+        return plain, str(methods)
+    stepping = CompiledStepping(methods, plain)
+    if not stepping.agrees(state[:LANES]):
+        known[key] = NotCompilable("its kernel and its own lines come to different numbers")
+        return plain, str(known[key])
+    return stepping, None
+
+
+def _signature(program: Program) -> tuple[Any, ...]:
+    """What a trace takes as given: which tensors a program has, and its plain settings."""
+    tensors = (*program.named_parameters(), *program.named_buffers())
+    plain = [
+        (at, name, value)
+        for at, module in program.named_modules()
+        for name, value in vars(module).items()
+        if isinstance(value, bool | int | float | str)
+    ]
+    return tuple((name, id(tensor)) for name, tensor in tensors), tuple(plain)
+
+
+class _ReadsNumbers(TorchDispatchMode):
+    """Refuses to trace what a number read from a tensor decides: it would be the same for ever."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func is torch.ops.aten._local_scalar_dense.default:
+            raise NotCompilable("it reads a number out of a tensor (float(), .item(), if)")
+        return func(*args, **(kwargs or {}))
+
+
+class _Method:
+    """One method: its graph, its kernel, and its parameters as the kernel takes them."""
+
+    def __init__(
+        self, function: Callable[..., Any], particle: dict[str, Tensor], trajectory: dict[str, Tensor]
+    ) -> None:
+        from torch.fx.experimental.proxy_tensor import make_fx  # takes a second to import
+
+        examples = (*particle.values(), *trajectory.values())
+        try:
+            with torch.no_grad(), _ReadsNumbers():
+                self.traced = make_fx(torch.func.functionalize(function))(*examples)
+        except NotCompilable:
+            raise
+        except Exception as error:
+            raise NotCompilable(f"it cannot be traced: {one_line(error)}") from error
+        levels = dict.fromkeys(particle, PARTICLE) | dict.fromkeys(trajectory, TRAJECTORY)
+        translation = Translation(self.traced, levels)
+        self.graph: ScalarGraph = translation.run()
+        self.by_parameters = [node for node in self.traced.graph.nodes if node in translation.known]
+        columns, at = {}, 0
+        for name, example in trajectory.items():
+            columns[name], at = at, at + example.numel()
+        self.kernel = _kernel(self.graph, tuple(particle), columns)
+
+    def parameters(self) -> np.ndarray:
+        """What the kernel takes of the parameters, as they are now."""
+        known: dict[fx.Node, Any] = {}
+        with torch.no_grad():
+            for node in self.by_parameters:
+                known[node] = _attribute(self.traced, node) if node.op == "get_attr" else evaluate(node, known)
+            parts = [known[node].detach().to(torch.float32).flatten() for node in self.graph.parameters]
+            return torch.cat([*parts, torch.zeros(1)]).numpy()
+
+
+def _attribute(traced: fx.GraphModule, node: fx.Node) -> Any:
+    value: Any = traced
+    for name in str(node.target).split("."):
+        value = getattr(value, name)
+    return value
+
+
+@lru_cache(maxsize=64)
+def _compiled(text: str, inputs: int, outputs: int) -> Kernel:
+    return Kernel(text, inputs, outputs)
+
+
+def _kernel(graph: ScalarGraph, inputs: Sequence[str], columns: dict[str, int]) -> Kernel:
+    """The kernel of a graph; programs that differ in their parameters only share one."""
+    return _compiled(source(graph, inputs, columns), len(inputs), len(graph.outputs))
+
+
+class _Methods:
+    """`transition` and `observe` of a program."""
+
+    def __init__(self, program: Program, data: Trajectories, state: Tensor) -> None:
+        one = (1, 1, 1)
+        seen = Recording()
+        first = state[:1, :1].unsqueeze(1)
+        inputs = {
+            "control": data.controls[:1, :1].unsqueeze(0),
+            "time": data.elapsed[:1, :1].unsqueeze(0),
+            "step": data.steps[:1, :1].unsqueeze(0),
+        }
+        with torch.no_grad(), running(*one), seen:
+            program.transition(first, *inputs.values())
+        self.event_dims = {site: fn.event_dim for site, fn in seen.distributions.items()}
+        self.sizes = {site: value.numel() for site, value in seen.values.items()}
+        self.channels, self.width = sum(self.sizes.values()), state.shape[-1]
+
+        def transition(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Any:
+            recording = Recording()
+            with running(*one), recording, Standardised(noise):
+                moved = program.transition(state, control, time, step)
+            return (moved, *recording.values.values())
+
+        def observe(state: Tensor, measurement: Tensor, observed: Tensor, weight: Tensor) -> Any:
+            recording = Recording()
+            with running(*one), recording, Observing(measurement, observed, weight):  # type: ignore[arg-type]
+                program.observe(state)
+            return (recording.total(),)
+
+        noise = torch.zeros(*one, self.channels)
+        self.transition = _Method(transition, {"state": first, "noise": noise}, inputs)
+        measured = {
+            "measurement": data.measurements[:1, :1].unsqueeze(0),
+            "observed": torch.ones_like(data.observed[:1, :1].unsqueeze(0)),
+            "weight": torch.ones(()),
+        }
+        self.observe = _Method(observe, {"state": first}, measured)
+
+
+class CompiledStepping(Stepping):
+    """A program's kernels; see `Stepping`. Noise that is not given is drawn standard normal."""
+
+    def __init__(self, methods: _Methods, plain: Stepping) -> None:
+        super().__init__(plain.program, plain.data, plain.observation_weight)
+        self.methods, self.plain, self.event_dims = methods, plain, methods.event_dims
+        data = plain.data
+        self.moving = methods.transition.parameters()
+        self.observing = methods.observe.parameters()
+        moved = (data.controls[:-1], data.elapsed[:-1, :, None], data.steps[..., None])
+        self.moved = torch.cat(moved, -1).float().contiguous().numpy()
+        weight = data.measurements.new_full((*data.time.shape, 1), self.observation_weight)
+        self.measured = torch.cat((data.measurements, data.observed.to(weight), weight), -1).contiguous().numpy()
+
+    def transition(
+        self, row: int, state: Tensor, ancestors: Tensor | None, noise: Tensor | None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        methods = self.methods
+        particles, trajectories = state.shape[:2]
+        if noise is None:
+            drawn = torch.randn(methods.channels, trajectories, particles)
+        else:
+            drawn = noise.permute(2, 1, 0).contiguous()
+        out = torch.empty(methods.width + methods.channels, trajectories, particles)
+        came_from = None if ancestors is None else ancestors.t().contiguous().numpy()
+        inputs = [by_component(state).numpy(), drawn.numpy()]
+        methods.transition.kernel(self.moving, self.moved[row], inputs, came_from, out.numpy())
+        moved, *values = out.split([methods.width, *methods.sizes.values()])
+        noises = {
+            site: value.permute(2, 1, 0) if self.event_dims[site] else value[0].t()
+            for site, value in zip(methods.sizes, values, strict=True)
+        }
+        return moved.permute(2, 1, 0), noises
+
+    def log_density(self, row: int, state: Tensor) -> Tensor:
+        out = torch.empty(1, state.shape[1], state.shape[0])
+        inputs = [by_component(state).numpy()]
+        self.methods.observe.kernel(self.observing, self.measured[row], inputs, None, out.numpy())
+        return out[0].t()
+
+    def agrees(self, state: Tensor) -> bool:
+        """Whether the kernels come to the numbers of the program's own lines, from a few states at two rows."""
+        generator = torch.Generator().manual_seed(0)
+        last = len(self.moved) - 1
+        return all(self._agrees_at(row, state, generator) for row in {last // 2, last})
+
+    def _agrees_at(self, row: int, state: Tensor, generator: torch.Generator) -> bool:
+        noise = torch.randn(*state.shape[:2], self.methods.channels, generator=generator)
+        moved, values = self.transition(row, state, None, noise)
+        plain, plain_values = self.plain.transition(row, state, None, noise)
+        density, plain_density = self.log_density(row, moved), self.plain.log_density(row, moved)
+        pairs = [(moved, plain), (density, plain_density), *((values[s], plain_values[s]) for s in values)]
+        return all(_close(mine, theirs.expand_as(mine)) for mine, theirs in pairs)
+
+
+def _close(mine: Tensor, theirs: Tensor) -> bool:
+    """Equal but for rounding, and for the few that stand at a jump."""
+    same = torch.isclose(mine, theirs, rtol=1e-4, atol=1e-4, equal_nan=True)
+    return float(same.float().mean()) > 0.98

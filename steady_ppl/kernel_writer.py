@@ -1,0 +1,342 @@
+"""Writes the code of a kernel from its scalar graph.
+
+Each instruction works on `LANES` particles at once; what does not differ between them is computed once a trajectory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from llvmlite import ir
+
+from steady_ppl.lane_math import OPERATIONS
+from steady_ppl.lanes import FLOAT, Lanes
+from steady_ppl.scalar_graph import LEAVES, PARTICLE, Each, NotCompilable, Product, ScalarGraph
+
+NAME = "kernel"
+LANES = 16
+WIDE, LONG = ir.VectorType(FLOAT, LANES), ir.IntType(64)
+POINTER = FLOAT.as_pointer()
+
+
+def source(graph: ScalarGraph, inputs: Sequence[str], columns: dict[str, int]) -> str:
+    """The code of a graph, for a `Kernel`.
+
+    Args:
+        graph: what to compute.
+        inputs: the names of the inputs that differ between particles; the first is looked up at the ancestors.
+        columns: those that differ between trajectories only, name → first column.
+
+    Raises:
+        NotCompilable: for some operation there is no code.
+    """
+    return str(_Writer(graph, inputs, columns).module)
+
+
+class _Writer:
+    """Writes the code of one kernel; values are written when they are first asked for."""
+
+    def __init__(self, graph: ScalarGraph, inputs: Sequence[str], columns: dict[str, int]) -> None:
+        self.graph, self.columns = graph, columns
+        self.module = ir.Module(NAME)
+        kind = ir.FunctionType(ir.VoidType(), [POINTER] * (len(inputs) + 2) + [LONG.as_pointer(), POINTER, *[LONG] * 3])
+        function = ir.Function(self.module, kind, NAME)
+        for argument in function.args[: len(inputs) + 4]:
+            argument.add_attribute("noalias")
+        self.parameters, self.uniform, *data = function.args[: len(inputs) + 2]
+        self.data = dict(zip(inputs, data, strict=True))
+        self.first_input = inputs[0]
+        self.ancestors, self.out, self.trajectories, self.particles, self.width = function.args[len(inputs) + 2 :]
+        self.entry = function.append_basic_block("entry")
+        self.builder = ir.IRBuilder(self.entry)
+        self.values: dict[int, Lanes] = {}
+        self.stored: dict[int, Any] = {}  # vectors as a whole, in the function's own memory
+        self._uses()
+        self._write()
+        self.builder.ret_void()
+
+    # loops
+
+    @contextmanager
+    def _loop(self, end: Any, step: int = 1) -> Any:
+        """for i in range(0, end, step)."""
+        builder = self.builder
+        index = self._reserve(LONG, 1)
+        builder.store(LONG(0), index)
+        head, body, after = (builder.append_basic_block(name) for name in ("head", "body", "after"))
+        builder.branch(head)
+        builder.position_at_end(head)
+        i = builder.load(index)
+        builder.cbranch(builder.icmp_signed("<", i, end), body, after)
+        builder.position_at_end(body)
+        yield i
+        builder.store(builder.add(i, LONG(step)), index)
+        builder.branch(head)
+        builder.position_at_end(after)
+
+    def _reserve(self, kind: Any, count: int) -> Any:
+        with self.builder.goto_block(self.entry):
+            return self.builder.alloca(kind, count)
+
+    def _write(self) -> None:
+        builder, graph = self.builder, self.graph
+        start = builder.append_basic_block("start")
+        builder.branch(start)
+        builder.position_at_end(start)
+        with self._loop(self.trajectories) as b:
+            self.trajectory = builder.mul(b, self.width)
+            self.row = builder.mul(b, self.particles)
+            self.stride = builder.mul(self.trajectories, self.particles)
+            for number in sorted(self.needed):
+                if graph.levels[number] < PARTICLE:
+                    self.scalar(number)
+            for vector in self.bases:
+                self._base(vector)
+            shared = dict(self.values)
+            with self._loop(self.particles, LANES) as i:
+                last = builder.sub(self.particles, LONG(LANES))
+                beyond = builder.icmp_signed(">", i, last)
+                self.at = builder.add(self.row, builder.select(beyond, last, i))  # the last block overlaps
+                self._gather()
+                for number in sorted(self.needed):
+                    self.scalar(number)
+                for k, number in enumerate(graph.outputs):
+                    value = self.scalar(number).spread(LANES)
+                    if value.type.element == ir.IntType(1):
+                        raise NotCompilable("a truth value as a result")
+                    self._store_wide(value, self.out, builder.add(builder.mul(LONG(k), self.stride), self.at))
+            self.values = shared
+
+    # memory
+
+    def _load(self, pointer: Any, index: Any) -> Lanes:
+        return Lanes(self.builder, self.builder.load(self.builder.gep(pointer, [index])))
+
+    def _load_wide(self, pointer: Any, index: Any) -> Lanes:
+        where = self.builder.bitcast(self.builder.gep(pointer, [index]), WIDE.as_pointer())
+        return Lanes(self.builder, self.builder.load(where, align=4))
+
+    def _store_wide(self, value: Lanes, pointer: Any, index: Any) -> None:
+        where = self.builder.bitcast(self.builder.gep(pointer, [index]), WIDE.as_pointer())
+        self.builder.store(value.value, where, align=4)
+
+    def _gather(self) -> None:
+        """Load the elements of the first input that are needed, where the ancestors lie."""
+        builder, graph = self.builder, self.graph
+        wanted = [n for n in sorted(self.needed) if graph.scalars[n].arguments[:1] == (self.first_input,)]
+        places = [self._reserve(WIDE, 1) for _ in wanted]
+        pointer = self.data[self.first_input]
+        starts = [builder.mul(LONG(graph.scalars[n].arguments[1]), self.stride) for n in wanted]
+        none = builder.icmp_unsigned("==", builder.ptrtoint(self.ancestors, LONG), LONG(0))
+        with builder.if_else(none) as (same, moved):
+            with same:
+                for start, place in zip(starts, places, strict=True):
+                    builder.store(self._load_wide(pointer, builder.add(start, self.at)).value, place)
+            with moved:
+                from_row = [builder.add(start, self.row) for start in starts]
+                gathered = [ir.Constant(WIDE, ir.Undefined)] * len(wanted)
+                for lane in range(LANES):
+                    index = builder.load(builder.gep(self.ancestors, [builder.add(self.at, LONG(lane))]))
+                    for j, start in enumerate(from_row):
+                        value = builder.load(builder.gep(pointer, [builder.add(start, index)]))
+                        gathered[j] = builder.insert_element(gathered[j], value, ir.IntType(32)(lane))
+                for value, place in zip(gathered, places, strict=True):
+                    builder.store(value, place)
+        for number, place in zip(wanted, places, strict=True):
+            self.values[number] = Lanes(builder, builder.load(place))
+
+    # scalars
+
+    def scalar(self, number: int) -> Lanes:
+        """The value of a scalar of the graph."""
+        if number in self.values:
+            return self.values[number]
+        operation, arguments = self.graph.scalars[number]
+        builder = self.builder
+        match operation:
+            case "constant":
+                return Lanes(builder, FLOAT(arguments[0]))
+            case "parameter":
+                value = self._load(self.parameters, LONG(arguments[0]))
+            case "input" if self.graph.levels[number] < PARTICLE:
+                column = self.columns[arguments[0]] + arguments[1]
+                value = self._load(self.uniform, builder.add(self.trajectory, LONG(column)))
+            case "input":
+                start = builder.mul(LONG(arguments[1]), self.stride)
+                value = self._load_wide(self.data[arguments[0]], builder.add(start, self.at))
+            case "element":
+                vector, k = arguments
+                if vector not in self.stored:
+                    self._vector(vector)
+                value = Lanes(builder, builder.load(builder.gep(self.stored[vector], [LONG(k)])))
+            case _:
+                value = self._operate(operation, [self.scalar(n) for n in arguments])
+        self.values[number] = value
+        return value
+
+    def _operate(self, operation: str, operands: Sequence[Lanes]) -> Lanes:
+        if operation not in OPERATIONS:
+            raise NotCompilable(f"no kernel for {operation}")
+        return OPERATIONS[operation](*operands)
+
+    # vectors
+
+    def _uses(self) -> None:
+        """Find the scalars that must be computed, the vectors, and which of these somebody takes element by element."""
+        graph = self.graph
+        self.needed: set[int] = set()
+        self.vectors: set[int] = set()
+        self.bases: dict[int, Any] = {}
+        left = list(graph.outputs)
+        wanted: list[int] = []
+        while left or wanted:
+            if wanted:
+                vector = wanted.pop()
+                if vector in self.vectors:
+                    continue
+                self.vectors.add(vector)
+                what = graph.vectors[vector]
+                if isinstance(what, Each):
+                    wanted += [n for kind, n in what.operands if kind == "vector"]
+                    left += [n for kind, n in what.operands if kind == "scalar"]
+                    continue
+                left += [] if graph.run_of_parameters(what.bias) is not None else what.bias or ()
+                whole = graph.whole_vector(what.x)
+                if whole is not None:
+                    wanted.append(whole)
+                else:
+                    left += what.x
+                    self.bases[vector] = self._reserve(FLOAT, what.length)
+                continue
+            number = left.pop()
+            if number in self.needed:
+                continue
+            self.needed.add(number)
+            operation, arguments = graph.scalars[number]
+            if operation == "element":
+                wanted.append(arguments[0])
+            elif operation not in LEAVES:
+                left += arguments
+
+    def _bias(self, product: Product, k: Any) -> Lanes:
+        """The bias of one element; k is the kernel's own number, or known now."""
+        run = self.graph.run_of_parameters(product.bias)
+        if product.bias is None:
+            return Lanes(self.builder, FLOAT(0))
+        if run is not None:
+            return self._load(self.parameters, self.builder.add(LONG(run), LONG(k) if isinstance(k, int) else k))
+        if not isinstance(k, int):
+            raise NotCompilable("a long product whose bias is no parameter")
+        return self.scalar(product.bias[k])
+
+    def _weight(self, product: Product, row: Any, column: Any) -> Lanes:
+        builder = self.builder
+        places = [LONG(product.at)]
+        for index, stride in ((row, product.rows), (column, product.columns)):
+            index = LONG(index) if isinstance(index, int) else index
+            places.append(builder.mul(index, LONG(stride)))
+        return self._load(self.parameters, builder.add(builder.add(places[0], places[1]), places[2]))
+
+    def _base(self, vector: int) -> None:
+        """Bias and whatever else of a product does not differ between particles, once a trajectory."""
+        product = self.graph.vectors[vector]
+        assert isinstance(product, Product)
+        shared = [(i, self.scalar(n)) for i, n in enumerate(product.x) if self.graph.levels[n] < PARTICLE]
+        with self._loop(LONG(product.length)) as k:
+            value = self._bias(product, k)
+            for i, x in shared:
+                value = value + self._weight(product, k, i) * x
+            self.builder.store(value.value, self.builder.gep(self.bases[vector], [k]))
+
+    def _vector(self, vector: int) -> None:
+        """Compute a vector as a whole and keep it."""
+        graph = self.graph
+        what = graph.vectors[vector]
+        place = self._reserve(WIDE, what.length)
+        whole = graph.whole_vector(what.x) if isinstance(what, Product) else None
+        if whole is None:
+            chain = self._chain(vector)
+            self._prepare(chain)
+            with self._loop(LONG(what.length)) as k:
+                value = self._element(vector, k, {})
+                self.builder.store(value.spread(LANES).value, self.builder.gep(place, [k]))
+            self.stored[vector] = place
+            return
+        assert isinstance(what, Product)
+        if what.length > 8:
+            if whole not in self.stored:
+                self._vector(whole)
+            with self._loop(LONG(what.length)) as row:
+                self._sum(what, whole, [row], place)
+        else:
+            self._prepare(self._chain(whole))
+            self._sum(what, whole, range(what.length), place)
+        self.stored[vector] = place
+
+    def _sum(self, product: Product, whole: int, rows: Sequence[Any], place: Any) -> None:
+        """Some rows of a product with a whole vector, whose elements are computed on the way unless they are stored."""
+        builder = self.builder
+        sums = [self._reserve(WIDE, 1) for _ in rows]
+        for row, total in zip(rows, sums, strict=True):
+            builder.store(self._bias(product, row).spread(LANES).value, total)
+        with self._loop(LONG(self.graph.vectors[whole].length)) as k:
+            value = self._element(whole, k, {})
+            for row, total in zip(rows, sums, strict=True):
+                so_far = Lanes(builder, builder.load(total))
+                builder.store((so_far + self._weight(product, row, k) * value).value, total)
+        for row, total in zip(rows, sums, strict=True):
+            where = builder.gep(place, [LONG(row) if isinstance(row, int) else row])
+            builder.store(builder.load(total), where)
+
+    def _chain(self, vector: int) -> set[int]:
+        """The vectors that are computed along with a vector, element by element."""
+        if vector in self.stored:
+            return set()
+        what, chain = self.graph.vectors[vector], {vector}
+        if isinstance(what, Each):
+            for kind, n in what.operands:
+                if kind == "vector":
+                    chain |= self._chain(n)
+        return chain
+
+    def _prepare(self, chain: set[int]) -> None:
+        """Compute before a loop what its body takes as given."""
+        for vector in sorted(chain):
+            what = self.graph.vectors[vector]
+            if isinstance(what, Each):
+                for kind, n in what.operands:
+                    if kind == "scalar":
+                        self.scalar(n)
+            elif self.graph.whole_vector(what.x) is not None:
+                self._vector(vector)
+            else:
+                for n in what.x:
+                    self.scalar(n)
+
+    def _element(self, vector: int, k: Any, done: dict[int, Lanes]) -> Lanes:
+        """Element k of a vector, in the body of a loop over k."""
+        if vector in done:
+            return done[vector]
+        graph, builder = self.graph, self.builder
+        what = graph.vectors[vector]
+        if vector in self.stored:
+            value = Lanes(builder, builder.load(builder.gep(self.stored[vector], [k])))
+        elif isinstance(what, Product):
+            value = Lanes(builder, builder.load(builder.gep(self.bases[vector], [k])))
+            for i, n in enumerate(what.x):
+                if graph.levels[n] == PARTICLE:
+                    value = value + self._weight(what, k, i) * self.scalar(n)
+        else:
+            operands = []
+            for kind, n in what.operands:
+                if kind == "vector":
+                    operands.append(self._element(n, k, done))
+                elif kind == "scalar":
+                    operands.append(self.scalar(n))
+                else:
+                    operands.append(self._load(self.parameters, builder.add(LONG(n), k)))
+            value = self._operate(what.operation, operands)
+        done[vector] = value
+        return value

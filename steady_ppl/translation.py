@@ -1,0 +1,233 @@
+"""From what torch notes of a method to scalars: tensors of values become tensors of scalars' numbers."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, fx
+
+from steady_ppl.scalar_graph import NotCompilable, ScalarGraph
+
+aten: Any = torch.ops.aten
+
+
+def _packets(*names: str) -> dict[Any, str]:
+    return {getattr(aten, name): name for name in names}
+
+
+# what only moves elements works on the scalars' numbers as it does on their values
+MOVING = {
+    packet: getattr(torch, "reshape" if name in ("view", "_unsafe_view") else name, packet)
+    for packet, name in _packets(
+        *("view", "_unsafe_view", "reshape", "permute", "transpose", "t", "movedim", "select", "slice", "unsqueeze"),
+        *("squeeze", "expand", "unbind", "split", "split_with_sizes", "stack", "cat", "alias", "detach", "clone"),
+        *("lift_fresh_copy", "lift_fresh", "flip", "repeat", "diagonal", "contiguous", "select_scatter"),
+        "slice_scatter",
+    ).items()
+}
+ELEMENTWISE = _packets(
+    *("neg", "abs", "sin", "cos", "tan", "exp", "log", "log1p", "expm1", "sqrt", "rsqrt", "reciprocal", "relu"),
+    *("sigmoid", "tanh", "silu", "atan", "asin", "acos", "round", "floor", "ceil", "sign", "square"),
+    *("mul", "atan2", "maximum", "minimum", "remainder", "hypot", "gt", "ge", "lt", "le", "eq", "ne"),
+    *("logical_not", "logical_and", "logical_or", "where"),
+) | {
+    aten.__and__: "logical_and",
+    aten.bitwise_and: "logical_and",
+    aten.__or__: "logical_or",
+    aten.bitwise_or: "logical_or",
+    aten.bitwise_not: "logical_not",
+}
+FILLED = {aten.zeros_like: 0.0, aten.new_zeros: 0.0, aten.zeros: 0.0, aten.ones_like: 1.0, aten.new_ones: 1.0}
+
+
+class Translation:
+    """From a traced graph to scalars: tensors of values become tensors of scalars' numbers, of the same shape."""
+
+    def __init__(self, traced: fx.GraphModule, levels_of_inputs: dict[str, int]) -> None:
+        self.traced, self.graph = traced, ScalarGraph(levels_of_inputs)
+        self.known: dict[fx.Node, Any] = {}  # what depends on parameters alone, as torch computes it
+        self.numbers: dict[fx.Node, Any] = {}
+        self.offset = 0
+
+    def run(self) -> ScalarGraph:
+        inputs = iter(self.graph.levels_of_inputs)
+        for node in self.traced.graph.nodes:
+            if node.op == "placeholder":
+                size = node.meta["val"].shape
+                name = next(inputs)
+                count = torch.Size(size).numel()
+                elements = [self.graph.scalar("input", name, k) for k in range(count)]
+                self.numbers[node] = torch.tensor(elements, dtype=torch.int64).view(size)
+            elif node.op == "get_attr":
+                self.known[node] = operator.attrgetter(str(node.target))(self.traced)
+            elif node.op == "output":
+                for value in fx.node.map_arg(node.args[0], self._number):
+                    self.graph.outputs += value.flatten().tolist()
+            elif _is_random(node):
+                raise NotCompilable(f"{node.target} draws random numbers of its own")
+            elif all(argument in self.known for argument in node.all_input_nodes):
+                self.known[node] = evaluate(node, self.known)
+            else:
+                self.numbers[node] = self._translate(node)
+        return self.graph
+
+    def _number(self, node: fx.Node) -> Any:
+        """The scalars' numbers of a node; parameters become inputs of the kernel when they are first needed."""
+        if node not in self.numbers:
+            value = self.known[node]
+            if not isinstance(value, Tensor):
+                return value
+            elements = [self.graph.scalar("parameter", self.offset + k) for k in range(value.numel())]
+            self.numbers[node] = torch.tensor(elements, dtype=torch.int64).view(value.shape)
+            self.graph.parameters.append(node)
+            self.offset += value.numel()
+        return self.numbers[node]
+
+    def _translate(self, node: fx.Node) -> Any:
+        arguments: Any = fx.node.map_arg(node.args, self._number)
+        keywords: Any = fx.node.map_arg(node.kwargs, self._number)
+        if node.target is operator.getitem:
+            return arguments[0][arguments[1]]
+        packet = getattr(node.target, "overloadpacket", None)
+        if packet in MOVING:
+            return MOVING[packet](*arguments, **keywords)
+        if packet in ELEMENTWISE and not keywords:
+            return self._each(ELEMENTWISE[packet], *arguments)
+        if packet in (aten.index, aten.index_select):
+            return self._at_known(node)
+        if packet in FILLED:
+            return torch.full(node.meta["val"].shape, self.graph.constant(FILLED[packet]), dtype=torch.int64)
+        special = getattr(self, f"_{packet.__name__.lstrip('_')}", None) if packet else None
+        if special is None:
+            raise NotCompilable(f"no kernel for {node.target}")
+        return special(*arguments, **keywords)
+
+    def _each(self, operation: str, *operands: Any) -> Tensor:
+        """An elementwise operation on operands that broadcast; numbers of Python are constants."""
+        tensors = [
+            operand if isinstance(operand, Tensor) else torch.tensor(self.graph.constant(operand))
+            for operand in operands
+        ]
+        tensors = list(torch.broadcast_tensors(*tensors))
+        elements = self.graph.each(operation, *(tensor.flatten().tolist() for tensor in tensors))
+        return torch.tensor(elements, dtype=torch.int64).view(tensors[0].shape)
+
+    def _at_known(self, node: fx.Node) -> Tensor:
+        """Elements at places that are known now."""
+        if any(argument not in self.known for argument in node.all_input_nodes[1:]):
+            raise NotCompilable("it looks elements up at places that depend on the state")
+        value = self._number(node.all_input_nodes[0])
+        rest = fx.node.map_arg(node.args[1:], self.known.__getitem__)
+        target: Callable[..., Tensor] = node.target  # type: ignore[assignment]
+        return target(value, *rest)
+
+    def _copy(self, value: Tensor, other: Tensor, non_blocking: bool = False) -> Tensor:
+        return other.broadcast_to(value.shape)
+
+    def _add(self, left: Any, right: Any, *, alpha: float = 1) -> Tensor:
+        return self._each("add", left, right if alpha == 1 else self._each("mul", right, alpha))
+
+    def _sub(self, left: Any, right: Any, *, alpha: float = 1) -> Tensor:
+        return self._each("sub", left, right if alpha == 1 else self._each("mul", right, alpha))
+
+    def _rsub(self, left: Any, right: Any, alpha: float = 1) -> Tensor:
+        return self._sub(right, left, alpha=alpha)
+
+    def _div(self, left: Any, right: Any, *, rounding_mode: str | None = None) -> Tensor:
+        if rounding_mode is not None:
+            raise NotCompilable(f"no kernel for a division with rounding_mode={rounding_mode!r}")
+        return self._each("div", left, right)
+
+    def _pow(self, base: Any, exponent: Any) -> Tensor:
+        if exponent in (1, 2, 3, 4):
+            power = base
+            for _ in range(int(exponent) - 1):
+                power = self._each("mul", power, base)
+            return power
+        named = (
+            {0.5: "sqrt", -0.5: "rsqrt", -1: "reciprocal"}.get(exponent) if isinstance(exponent, int | float) else None
+        )
+        return self._each(named, base) if named else self._each("pow", base, exponent)
+
+    def _softplus(self, value: Tensor, beta: float = 1, threshold: float = 20) -> Tensor:
+        if beta != 1 or threshold < 20:
+            raise NotCompilable("no kernel for softplus with beta or threshold")
+        return self._each("softplus", value)
+
+    def _clamp(self, value: Tensor, low: Any = None, high: Any = None, *, min: Any = None, max: Any = None) -> Tensor:
+        low, high = (min if low is None else low), (max if high is None else high)
+        value = value if low is None else self._each("maximum", value, low)
+        return value if high is None else self._each("minimum", value, high)
+
+    _clamp_min = _clamp
+
+    def _clamp_max(self, value: Tensor, high: Any) -> Tensor:
+        return self._each("minimum", value, high)
+
+    def _masked_fill(self, value: Tensor, mask: Tensor, other: Any) -> Tensor:
+        return self._each("where", mask, other, value)
+
+    def _sum(self, value: Tensor, dims: Sequence[int] | None = None, keepdim: bool = False) -> Tensor:
+        dims = [d % value.dim() for d in (dims or range(value.dim()))]
+        kept = [d for d in range(value.dim()) if d not in dims]
+        rows = value.permute(*kept, *dims).reshape(*[value.shape[d] for d in kept], -1)
+        totals = [self.graph.total(row) for row in rows.reshape(-1, rows.shape[-1]).tolist()]
+        shape = [1 if d in dims else n for d, n in enumerate(value.shape)] if keepdim else rows.shape[:-1]
+        return torch.tensor(totals, dtype=torch.int64).view(torch.Size(shape))
+
+    def _mean(self, value: Tensor, dims: Sequence[int] | None = None, keepdim: bool = False) -> Tensor:
+        total = self._sum(value, dims, keepdim)
+        return self._each("mul", total, total.numel() / value.numel())
+
+    def _linalg_vector_norm(
+        self, value: Tensor, order: float = 2, dims: Sequence[int] | None = None, keepdim: bool = False
+    ) -> Tensor:
+        if order != 2:
+            raise NotCompilable(f"no kernel for a norm of order {order}")
+        return self._each("sqrt", self._sum(self._each("mul", value, value), dims, keepdim))
+
+    def _mm(self, left: Tensor, right: Tensor) -> Tensor:
+        return self._addmm(None, left, right)
+
+    def _addmm(self, bias: Tensor | None, left: Tensor, right: Tensor) -> Tensor:
+        shape = torch.Size((left.shape[0], right.shape[1]))
+        biases = None if bias is None else bias.broadcast_to(shape)
+        if shape[0] == 1:  # a row vector times a matrix
+            own = None if biases is None else biases.flatten().tolist()
+            return torch.tensor(self.graph.product(right.t(), left[0].tolist(), own)).view(shape)
+        columns = [
+            self.graph.product(left, column.tolist(), None if biases is None else biases[:, j].tolist())
+            for j, column in enumerate(right.unbind(1))
+        ]
+        return torch.tensor(columns).t()
+
+    def _mv(self, matrix: Tensor, vector: Tensor) -> Tensor:
+        return self._addmm(None, matrix, vector.unsqueeze(1)).squeeze(1)
+
+    def _dot(self, left: Tensor, right: Tensor) -> Tensor:
+        return self._sum(self._each("mul", left, right))
+
+    def _bmm(self, left: Tensor, right: Tensor) -> Tensor:
+        return torch.stack([self._mm(one, other) for one, other in zip(left, right, strict=True)])
+
+    def _leaky_relu(self, value: Tensor, slope: float = 0.01) -> Tensor:
+        return self._each("where", self._each("gt", value, 0.0), value, self._each("mul", value, slope))
+
+    def _to_copy(self, value: Tensor, *, dtype: torch.dtype | None = None, **keywords: Any) -> Tensor:
+        if dtype not in (None, torch.float32):
+            raise NotCompilable(f"it converts to {str(dtype).removeprefix('torch.')}")
+        return self._each("number", value)
+
+
+def evaluate(node: fx.Node, known: dict[fx.Node, Any]) -> Any:
+    """What torch makes of a node whose arguments are known."""
+    arguments, keywords = fx.node.map_arg((node.args, dict(node.kwargs)), known.__getitem__)
+    target: Callable[..., Any] = node.target  # type: ignore[assignment]
+    return target(*arguments, **keywords)
+
+
+def _is_random(node: fx.Node) -> bool:
+    return torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ())

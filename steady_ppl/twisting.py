@@ -1,0 +1,175 @@
+"""The arithmetic of a twist at one row, the same whatever the program: compiled on the processor, one particle after
+the other, and for a device all at once.
+
+States are `(N, B, D)` and noise `(N, B, C)`. What the lookahead holds of the row is in double precision: path `(B, D)`,
+Λ `(B, D, D)`, λ `(B, D)`, log_scale `(B,)`, and the steering, which is shift `(B, C)`, gain `(B, C, D)`, factor and its
+inverse `(B, C, C)`, upper triangular.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+
+from steady_ppl.planar_vehicle import wrap
+from steady_ppl.resampling import by_component
+
+Steering = tuple[Tensor, Tensor, Tensor, Tensor]
+Array = np.ndarray[Any, Any]
+
+
+def log_future(
+    state: Tensor, path: Tensor, angles: Tensor, precision: Tensor, information: Tensor, log_scale: Tensor
+) -> Tensor:
+    """log_scale + λᵀδ − ½ δᵀΛδ of every particle's deviation δ from the path, `(N, B)`."""
+    out = torch.empty(state.shape[1], state.shape[0], dtype=torch.float64)
+    parts = (path, angles, precision, information, log_scale, out)
+    _log_future(by_component(state).numpy(), *(part.numpy() for part in parts))
+    return out.t()
+
+
+def steer(
+    state: Tensor, path: Tensor, angles: Tensor, steering: Steering, own: Tensor, stays: Tensor, untwisted: float
+) -> tuple[Tensor, Tensor]:
+    """Draw every particle's noise, steered unless it stays as it is.
+
+    Args:
+        own: standard normal noise `(N, B, C)`.
+        stays: `(N, B)` bool, which particles keep it.
+        untwisted: the probability of that.
+
+    Returns:
+        The noise `(N, B, C)`, and its log density less that of the mixture that it was drawn from, `(N, B)`.
+    """
+    noise = torch.empty(own.shape[::-1], dtype=own.dtype)
+    ratio = torch.empty(noise.shape[1:], dtype=torch.float64)
+    parts: Any = tuple(part.numpy() for part in steering)
+    given = (by_component(state).numpy(), path.numpy(), angles.numpy(), parts)
+    _steer(*given, by_component(own).numpy(), stays.t().contiguous().numpy(), untwisted, (noise.numpy(), ratio.numpy()))
+    return noise.permute(2, 1, 0), ratio.t()
+
+
+@njit(cache=True, error_model="numpy")
+def _deviate(state: Array, path: Array, angles: Array, b: int, n: int, out: Array) -> None:
+    """A state less the path's, angles on the circle."""
+    for i in range(len(out)):
+        out[i] = state[i, b, n] - path[b, i]
+        if angles[i]:
+            out[i] -= 2 * math.pi * np.rint(out[i] / (2 * math.pi))
+
+
+@njit(cache=True, error_model="numpy")
+def _log_future(
+    state: Array, path: Array, angles: Array, precision: Array, information: Array, log_scale: Array, out: Array
+) -> None:
+    dimension, trajectories, particles = state.shape
+    deviation = np.empty(dimension)
+    for b in range(trajectories):
+        for n in range(particles):
+            _deviate(state, path, angles, b, n, deviation)
+            total = log_scale[b]
+            for i in range(dimension):
+                pulled = information[b, i]
+                for j in range(dimension):
+                    pulled -= 0.5 * precision[b, i, j] * deviation[j]
+                total += pulled * deviation[i]
+            out[b, n] = total
+
+
+@njit(cache=True, error_model="numpy")
+def _steer(
+    state: Array,
+    path: Array,
+    angles: Array,
+    steering: tuple[Array, Array, Array, Array],
+    own: Array,
+    stays: Array,
+    untwisted: float,
+    out: tuple[Array, Array],
+) -> None:
+    shift, gain, factor, whitening = steering
+    noise, log_ratio = out
+    dimension, trajectories, particles = state.shape
+    channels = len(own)
+    deviation, mean, drawn = np.empty(dimension), np.empty(channels), np.empty(channels)
+    for b in range(trajectories):
+        log_determinant = 0.0
+        for c in range(channels):
+            log_determinant += math.log(whitening[b, c, c])
+        for n in range(particles):
+            _deviate(state, path, angles, b, n, deviation)
+            squares = 0.0
+            for c in range(channels):
+                mean[c] = shift[b, c]
+                for i in range(dimension):
+                    mean[c] -= gain[b, c, i] * deviation[i]
+                drawn[c] = own[c, b, n]
+                if not stays[b, n]:
+                    drawn[c] = mean[c]
+                    for k in range(c, channels):
+                        drawn[c] += factor[b, c, k] * own[k, b, n]
+                noise[c, b, n] = drawn[c]
+                squares += drawn[c] * drawn[c]
+            for c in range(channels):
+                white = 0.0
+                for k in range(c, channels):
+                    white += whitening[b, c, k] * (drawn[k] - mean[k])
+                squares -= white * white
+            ratio = 0.5 * squares + log_determinant
+            if untwisted > 0:
+                high = max(ratio, 0.0)
+                ratio = high + math.log((1 - untwisted) * math.exp(ratio - high) + untwisted * math.exp(-high))
+            log_ratio[b, n] = -ratio
+
+
+def log_future_in_parallel(
+    state: Tensor, path: Tensor, angles: Tensor, precision: Tensor, information: Tensor, log_scale: Tensor
+) -> Tensor:
+    """`log_future` for a device."""
+    deviation = _deviation(state, path, angles)
+    return log_scale + ((information - 0.5 * _times(precision, deviation)) * deviation).sum(-1)
+
+
+def steer_in_parallel(
+    state: Tensor, path: Tensor, angles: Tensor, steering: Steering, own: Tensor, stays: Tensor, untwisted: float
+) -> tuple[Tensor, Tensor]:
+    """`steer` for a device."""
+    shift, gain, factor, whitening = steering
+    mean = shift - _times(gain, _deviation(state, path, angles))
+    noise = torch.where(stays.unsqueeze(-1), own.double(), mean + _times(factor, own.double()))
+    return noise.to(own.dtype), -mixture(log_ratio(noise, mean, whitening), untwisted)
+
+
+def log_ratio(noise: Tensor, mean: Tensor, whitening: Tensor) -> Tensor:
+    """log N(noise; mean, factor factorᵀ) − log N(noise; 0, I), `(N, B)`."""
+    white = _times(whitening, noise - mean)
+    log_determinant = whitening.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return 0.5 * (noise.square().sum(-1) - white.square().sum(-1)) + log_determinant
+
+
+def mixture(log_ratio: Tensor, untwisted: float) -> Tensor:
+    """log((1 − share) ratio + share)."""
+    if untwisted == 0:
+        return log_ratio
+    return torch.logaddexp(log_ratio + math.log1p(-untwisted), torch.full_like(log_ratio, math.log(untwisted)))
+
+
+def inverse(upper: Tensor) -> Tensor:
+    """Of upper triangular matrices."""
+    unit = torch.eye(upper.shape[-1], dtype=upper.dtype, device=upper.device).expand_as(upper)
+    return torch.linalg.solve_triangular(upper, unit, upper=True)
+
+
+def _deviation(state: Tensor, path: Tensor, angles: Tensor) -> Tensor:
+    deviation = state.double() - path
+    return torch.where(angles, wrap(deviation), deviation)
+
+
+def _times(matrix: Tensor, vectors: Tensor) -> Tensor:
+    """`(B, R, D)` times `(N, B, D)`: `(N, B, R)`, one product a trajectory."""
+    return (vectors.transpose(0, 1) @ matrix.mT).transpose(0, 1)

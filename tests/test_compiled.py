@@ -1,0 +1,193 @@
+"""Compiled methods are the program: the same numbers from the same noise, whatever its parameters become."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from examples import drives, example
+from oracles import assert_mean
+
+from steady_ppl import Constant, FilterError, SMCGuide, particle_filter, seeded
+from steady_ppl.compiled import CompiledStepping, stepping_for
+from steady_ppl.gaussian_smoother import find_and_smooth
+from steady_ppl.proposals import Twist
+from steady_ppl.stepping import Stepping
+
+HovercraftTruth = type(example("hovercraft:HovercraftTruth"))
+EXAMPLES = [
+    "hovercraft",
+    "hovercraft.py:HovercraftTruth",
+    "truck",
+    "pendulum",
+    "linear_gaussian",
+    "neural_vehicle.py:NeuralHovercraft",
+    "neural_vehicle.py:NeuralTruck",
+    "neural_vehicle.py:AuthorsHovercraft",
+]
+
+
+def single(name: str):
+    """A program in single precision, its parameters moved away from zero."""
+    program = example(name, torch.float32)
+    with seeded("moved", name), torch.no_grad():
+        for parameter in program.parameters():
+            parameter += 0.1 * torch.randn_like(parameter)
+    return program
+
+
+def stepping(program, data, particles: int = 40, weight: float = 0.7):
+    """Its kernels and its own lines, and some states."""
+    size = len(program.states)
+    states = 2 * torch.randn(particles, len(data), size)
+    compiled, reason = stepping_for(program, data, states, weight)
+    assert isinstance(compiled, CompiledStepping), reason
+    return compiled, Stepping(program, data, weight), states
+
+
+def assert_same(compiled: CompiledStepping, plain: Stepping, states: torch.Tensor, row: int = 2) -> None:
+    noise = torch.randn(*states.shape[:2], compiled.methods.channels)
+    ancestors = torch.randint(len(states), states.shape[:2])
+    moved, values = compiled.transition(row, states, ancestors, noise)
+    expected, sites = plain.transition(row, states, ancestors, noise)
+    torch.testing.assert_close(moved, expected, rtol=1e-4, atol=2e-5)
+    assert values.keys() == sites.keys() and compiled.event_dims == plain.event_dims
+    for site, value in values.items():
+        torch.testing.assert_close(value, sites[site].expand_as(value), rtol=1e-4, atol=2e-5)
+    density = plain.log_density(row, states)
+    torch.testing.assert_close(compiled.log_density(row, states), density, rtol=1e-4, atol=2e-3)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_kernels_come_to_the_numbers_of_the_programs_own_lines(name):
+    program = single(name)
+    data = drives(program, 3, 6, gaps=True)
+    torch.manual_seed(1)
+    assert_same(*stepping(program, data))
+
+
+def test_parameters_that_move_are_read_afresh():
+    program = single("hovercraft.py:HovercraftTruth")
+    data = drives(program, 2, 5)
+    torch.manual_seed(1)
+    before, _, states = stepping(program, data)
+    with torch.no_grad():
+        for parameter in program.parameters():
+            parameter += 0.5
+    after, plain, _ = stepping(program, data)
+    assert_same(after, plain, states)
+    noise = torch.randn(*states.shape[:2], 3)
+    assert not torch.allclose(before.transition(1, states, None, noise)[0], after.transition(1, states, None, noise)[0])
+
+
+def test_other_settings_and_other_tensors_are_traced_anew():
+    program = single("neural_vehicle.py:NeuralHovercraft")
+    data = drives(program, 2, 5)
+    torch.manual_seed(1)
+    stepping(program, data)
+    program.input_sd = torch.full_like(program.input_sd, 3.0)
+    program.hidden_out = torch.nn.Linear(64, 3)
+    program.absolute_heading = False
+    assert_same(*stepping(program, data))
+
+
+@pytest.mark.parametrize("look_ahead", [False, True])
+@pytest.mark.parametrize("gaps", [False, True])
+def test_a_filter_estimates_the_same_with_kernels_as_without(look_ahead, gaps):
+    program = single("hovercraft.py:HovercraftTruth")
+    data = drives(program, 2, 9, gaps=gaps)
+    many = data.subset(torch.arange(2).repeat_interleave(100))
+    proposal = Twist(find_and_smooth(program, many, known_start=True)) if look_ahead else None
+    ratios = []
+    for kernels in (True, False):
+        with seeded("filter", int(kernels)):
+            found = particle_filter(program, many, particles=128, known_start=True, proposal=proposal, kernels=kernels)
+        assert found.in_plain_torch is None
+        paths = found.paths(4)
+        assert paths.states.shape == (4, 9, 200, 6) and paths.noise["acceleration"].shape == (4, 8, 200, 3)
+        ratios.append(found.log_likelihood.view(2, 100))
+    level = ratios[1].mean(1, keepdim=True)
+    likelihood = [(ratio - level).exp() for ratio in ratios]
+    # the difference of independent estimates of p(y) has mean zero
+    assert_mean((likelihood[0] - likelihood[1]).t(), 0.0)
+
+
+def test_paths_of_a_compiled_filter_are_paths_of_the_program():
+    program = single("hovercraft.py:HovercraftTruth")
+    data = drives(program, 3, 8)
+    guide = SMCGuide(program, particles=1000, draws=5, tempering=Constant(1.0), known_start=True)
+    with seeded("paths"):
+        guide.refresh(data, 1.0)
+    assert guide.in_plain_torch is None and guide.paths is not None
+    states, noise = guide.paths.states, guide.paths.noise["acceleration"]
+    moved = program.integrate(states[:, :-1], noise, data.steps)
+    torch.testing.assert_close(moved, states[:, 1:], rtol=1e-5, atol=1e-5)
+
+
+def test_a_program_that_blows_up_is_said_to_have_done_so():
+    program = single("hovercraft.py:HovercraftTruth")
+    data = drives(program, 2, 6)
+    controls = data.controls.clone()
+    controls[2, 1] = math.inf
+    with pytest.raises(FilterError, match="trajectory 2 at .* not a number"):
+        particle_filter(program, replace(data, controls=controls), particles=64, known_start=True, kernels=True)
+
+
+class Switching(HovercraftTruth):
+    """Reads a number out of a parameter."""
+
+    def transition(self, state, control, time, step):
+        return super().transition(state, control * (2 if float(self.mass) > 1 else 1), time, step)
+
+
+class Stale(HovercraftTruth):
+    """Takes a parameter in a way that no trace sees."""
+
+    def transition(self, state, control, time, step):
+        return super().transition(state, control * self.mass.detach().numpy().item(), time, step)
+
+
+class HeavyTailed(HovercraftTruth):
+    """Noise that is not normal."""
+
+    def transition(self, state, control, time, step):
+        jerk = pyro.sample("acceleration", dist.StudentT(4.0, torch.zeros(3), self.noise).to_event(1))
+        return self.integrate(state, jerk.expand(*state.shape[:-1], 3), step)
+
+
+@pytest.mark.parametrize(
+    ("program", "says"), [(Switching, "reads a number out of a tensor"), (HeavyTailed, "StudentT")]
+)
+def test_what_cannot_be_compiled_runs_as_written_and_says_why(program, says):
+    data = drives(example("hovercraft", torch.float32), 2, 6)
+    with seeded("plain"):
+        found = particle_filter(program(), data, particles=100, known_start=True, kernels=True)
+    assert says in found.in_plain_torch
+    with seeded("plain"):
+        plain = particle_filter(program(), data, particles=100, known_start=True)
+    assert plain.in_plain_torch is None
+    assert torch.equal(found.log_likelihood, plain.log_likelihood)
+
+
+def test_a_kernel_that_has_fallen_behind_its_program_is_found_out():
+    program = Stale()
+    data = drives(example("hovercraft", torch.float32), 2, 31)
+    assert particle_filter(program, data, particles=50, known_start=True, kernels=True).in_plain_torch is None
+    with torch.no_grad():
+        for parameter in program.parameters():
+            parameter += 0.1
+    found = particle_filter(program, data, particles=50, known_start=True, kernels=True)
+    assert "different numbers" in found.in_plain_torch
+
+
+def test_kernels_are_for_single_precision_and_more_than_a_few_particles():
+    program = example("hovercraft", torch.float64)
+    data = drives(program, 2, 6)
+    assert "float64" in particle_filter(program, data, particles=50, kernels=True).in_plain_torch
+    program = single("hovercraft")
+    data = drives(program, 2, 6)
+    assert "fewer than" in particle_filter(program, data, particles=5, kernels=True).in_plain_torch
