@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -15,7 +17,7 @@ from inference import fit_truth, hand, steady  # noqa: E402
 from models.hovercraft import Hovercraft, HovercraftTruth  # noqa: E402
 from models.neural_vehicle import NeuralHovercraft, NeuralTruck  # noqa: E402
 from models.truck import Truck  # noqa: E402
-from steady_ppl import Fit, Trajectories, seeded, simulate  # noqa: E402
+from steady_ppl import Fit, PlanarVehicle, Trajectories, seeded, simulate  # noqa: E402
 from steady_ppl.alpha_truck import read_alpha_truck  # noqa: E402
 from steady_ppl.evaluation import evaluate  # noqa: E402
 
@@ -35,6 +37,7 @@ STEADY_SETTINGS: dict[tuple[str, str], dict] = {
     ("gaussian", "truck"): {"ramp": 3.0, "steps": 160},
 }
 STEADY_SETTINGS |= {("lookahead", e): s for (guide, e), s in STEADY_SETTINGS.items() if guide == "gaussian"}
+STEADY_SETTINGS |= {("bootstrap", e): STEADY_SETTINGS["gaussian", e] for e in ("hov-mechanistic", "hov+")}  # not chosen
 # Likewise: a decay of .3 or 1, 500 or 1500 steps. The longer training has the same log p(y) on the valid split (34.1
 # against 33.9, 34.5 against 34.7, draws 11 and 12) and the smaller error of its true states (.142 m against .152).
 FIT_TRUTH_SETTINGS: dict[str, dict] = {"hov": {}, "truck": {"weight_decay": 0.3, "steps": 1500, "validate_every": 150}}
@@ -42,19 +45,52 @@ LOGS = ROOT.parent / "shared" / "data" / "alpha_truck"
 Split = tuple[Trajectories, Trajectories, Trajectories]
 
 
-def hov(seed: int, train: int = 16, valid: int = 16, test: int = 32) -> Split:
+@dataclass(frozen=True)
+class Condition:
+    """What is seen of the drives; the drives themselves are the same.
+
+    Attributes:
+        degrees: standard deviation of the bearings.
+        landmarks: how many of the declared ones the program sees, the first; all when None.
+        every: measurements of every n-th row only.
+    """
+
+    degrees: float = 5.0
+    landmarks: int | None = None
+    every: int = 1
+
+    def of(self, vehicle: PlanarVehicle) -> PlanarVehicle:
+        """The vehicle, made to see so."""
+        vehicle.landmarks, vehicle.bearing_sd = vehicle.landmarks[: self.landmarks], math.radians(self.degrees)
+        return vehicle
+
+
+STANDARD = Condition()
+CONDITIONS = {
+    "standard": STANDARD,
+    "1hz": Condition(every=10),
+    "two-landmarks": Condition(landmarks=2),
+    "1.25deg": Condition(degrees=1.25),
+    "20deg": Condition(degrees=20),
+}
+
+
+def hov(seed: int, train: int = 16, valid: int = 16, test: int = 32, condition: Condition = STANDARD) -> Split:
     """Hov (train 16) or Hov+ (train 160, valid 32): train, valid and test drives of one data seed."""
     truth = HovercraftTruth()
-    return (
-        simulate(truth, train, seed=10 * seed + 1),
-        simulate(truth, valid, seed=10 * seed + 2),
-        simulate(truth, test, seed=10 * seed + 3),
+    truth.bearing_sd = math.radians(condition.degrees)
+    sizes = enumerate((train, valid, test), 1)
+    return tuple(  # type: ignore
+        simulate(truth, size, seed=10 * seed + part).observed_every(condition.every) for part, size in sizes
     )
 
 
-def truck(folder: Path, seed: int) -> Split:
+def truck(folder: Path, seed: int, condition: Condition = STANDARD) -> Split:
     """The AlphaTruck logs with one draw of the bearings."""
-    return tuple(read_alpha_truck(folder / split, seed=seed) for split in ("train", "valid", "test"))  # type: ignore
+    return tuple(  # type: ignore
+        read_alpha_truck(folder / split, seed=seed, sigma_degrees=condition.degrees).observed_every(condition.every)
+        for split in ("train", "valid", "test")
+    )
 
 
 def learn(

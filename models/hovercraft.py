@@ -40,7 +40,7 @@ class Hovercraft(PlanarVehicle):
         return self.integrate(state, acceleration, step)
 
     def observe(self, state):
-        pyro.sample("bearing", bearings_to(self.landmarks, state, sd=math.radians(5)))
+        pyro.sample("bearing", bearings_to(self.landmarks, state, sd=self.bearing_sd))
 
     def example_controls(self, time):
         """Thrusts through random way-points, the same manoeuvre as in the paper; the sides swap in 3 drives of 5."""

@@ -77,7 +77,7 @@ class NeuralVehicle(PlanarVehicle):
         return self.integrate(state, acceleration, step)
 
     def observe(self, state):
-        pyro.sample("bearing", bearings_to(self.landmarks, state, sd=math.radians(5)))
+        pyro.sample("bearing", bearings_to(self.landmarks, state, sd=self.bearing_sd))
 
 
 class NeuralHovercraft(NeuralVehicle):

@@ -48,7 +48,7 @@ class Truck(PlanarVehicle):
         return self.integrate(state, acceleration, step)
 
     def observe(self, state):
-        pyro.sample("bearing", bearings_to(self.landmarks, state, sd=math.radians(5)))
+        pyro.sample("bearing", bearings_to(self.landmarks, state, sd=self.bearing_sd))
 
     def example_controls(self, time):
         """Speeds and curvatures held for two seconds each."""

@@ -22,6 +22,7 @@ class PlanarVehicle(Program):
 
     Attributes:
         landmarks: positions that bearings are measured to, m.
+        bearing_sd: standard deviation of a bearing, rad.
     """
 
     states = ("x [m]", "y [m]", "heading [rad]", "vx [m/s]", "vy [m/s]", "yaw_rate [rad/s]")
@@ -34,6 +35,7 @@ class PlanarVehicle(Program):
         "yaw_rate": ("yaw_rate",),
     }
     landmarks: Sequence[Sequence[float]] = ()
+    bearing_sd: float = math.radians(5)
 
     @property
     def measurements(self) -> tuple[str, ...]:  # type: ignore[override]

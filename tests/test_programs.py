@@ -220,6 +220,17 @@ def test_the_hovercraft_sees_bearings_to_its_landmarks() -> None:
     assert recording.values["bearing"].abs().max() <= math.pi
 
 
+def test_a_vehicle_may_see_fewer_landmarks_and_worse() -> None:
+    program = load_program(TRUTH).double()
+    program.landmarks, program.bearing_sd = program.landmarks[:2], math.radians(20)
+    recording = Recording()
+    with recording:
+        program.observe(torch.from_numpy(some_states()[0]))
+    stddev = recording.distributions["bearing"].stddev.detach()
+    np.testing.assert_allclose(stddev, np.full((len(stddev), 2), math.radians(20)))
+    assert names(program.measurements) == ("bearing_0", "bearing_1")
+
+
 def test_the_hovercraft_starts_as_in_the_paper() -> None:
     program = load_program(TRUTH).double()
     recording = Recording()
