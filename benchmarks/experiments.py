@@ -77,8 +77,7 @@ CONDITIONS = {
 
 def hov(seed: int, train: int = 16, valid: int = 16, test: int = 32, condition: Condition = STANDARD) -> Split:
     """Hov (train 16) or Hov+ (train 160, valid 32): train, valid and test drives of one data seed."""
-    truth = HovercraftTruth()
-    truth.bearing_sd = math.radians(condition.degrees)
+    truth = condition.of(HovercraftTruth())
     sizes = enumerate((train, valid, test), 1)
     return tuple(  # type: ignore
         simulate(truth, size, seed=10 * seed + part).observed_every(condition.every) for part, size in sizes

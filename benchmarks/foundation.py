@@ -135,14 +135,14 @@ def figures(runs: list[dict]) -> dict[str, list[float]]:
     }
     named["log p(y) at 1 Hz"] = [run["log_likelihood"] for run in runs]
     named["seconds to learn"] = [run["seconds"] for run in runs]
-    return named
+    return named | {name: [run["guides"][name] for run in runs] for name in runs[0].get("guides", {})}
 
 
 def line(method: str, name: str, values: list[float], bound: Bound) -> int:
     """Print one figure; 1 if it misses its bound."""
     mean = statistics.fmean(values)
     sd = statistics.stdev(values) if len(values) > 1 else 0.0
-    best = max(values) if name.startswith("log p") else min(values)
+    best = max(values) if name.startswith(("log p", "lookahead")) else min(values)
     digits = 4 if abs(mean) < 5 else 1
     verdict = must = ""
     if math.isfinite(bound.high):
