@@ -7,6 +7,8 @@ Roweis 1999).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -106,32 +108,44 @@ def find_path(
     *,
     known_start: bool = False,
     observation_weight: float = 1.0,
-    particles: int = 1000,
-    candidates: int = 4,
+    particles: int = 250,
+    tempering: Sequence[float] = (1.0, 0.1, 0.01, 0.001),
     passes: int = 3,
 ) -> Path:
     """A path near the posterior's best mode, from the measurements alone.
 
-    Smooths from several paths of a bootstrap filter, whose start comes from the program's prior and the first
-    measurements, and takes the one under which the measurements are most likely.
+    Smooths from a path each of several bootstrap filters, whose start comes from the program's prior and the first
+    measurements, and takes the one under which the measurements are most likely. The filters trust the measurements
+    less and less: from a broad prior sharp measurements leave a single root, often metres off, and all draws with it.
+
+    Args:
+        particles: of each filter, for each trajectory.
+        tempering: of each filter's observations, times `observation_weight`.
 
     Raises:
-        FilterError: the bootstrap filter broke down.
+        FilterError: a bootstrap filter broke down.
     """
-    filtered = particle_filter(
-        program, data, particles=particles, observation_weight=observation_weight, known_start=known_start
-    )
-    found = filtered.paths(candidates).within(data)
-    copies = data.subset(torch.arange(len(data)).repeat(candidates))
+    candidates = []
+    for share in tempering:
+        filtered = particle_filter(
+            program,
+            data,
+            particles=particles,
+            observation_weight=share * observation_weight,
+            known_start=known_start,
+        )
+        found = filtered.paths(1).within(data)
+        candidates.append(Path(found.states[0], standard_noise(program, data, found)[0]))
+    copies = data.subset(torch.arange(len(data)).repeat(len(candidates)))
     ahead = smooth(
         program,
         copies,
-        Path(_side_by_side(found.states), _side_by_side(standard_noise(program, data, found))),
+        Path(torch.cat([c.states for c in candidates], 1), torch.cat([c.noise for c in candidates], 1)),
         known_start=known_start,
         observation_weight=observation_weight,
         passes=passes,
     )
-    likely = torch.nan_to_num(ahead.log_likelihood, nan=-torch.inf).view(candidates, len(data))
+    likely = torch.nan_to_num(ahead.log_likelihood, nan=-torch.inf).view(len(candidates), len(data))
     chosen = likely.argmax(0) * len(data) + torch.arange(len(data), device=likely.device)
     best = means_as_path(ahead, copies)
     return Path(best.states[:, chosen], best.noise[:, chosen])
@@ -175,8 +189,3 @@ def smoother_paths(
         noise=moving.values,
         event_dims=event_dims | {"states": 1},
     )
-
-
-def _side_by_side(values: Tensor) -> Tensor:
-    """`(M, T, B, ·)` to `(T, M · B, ·)`."""
-    return values.movedim(0, 1).flatten(1, 2)
