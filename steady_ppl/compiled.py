@@ -31,7 +31,7 @@ _METHODS: WeakKeyDictionary[Program, dict[Any, _Methods | NotCompilable]] = Weak
 
 
 def stepping_for(
-    program: Program, data: Trajectories, state: Tensor, observation_weight: float
+    program: Program, data: Trajectories, state: Tensor, observation_weight: float | Tensor
 ) -> tuple[Stepping, str | None]:
     """Kernels where they can serve, and otherwise the program as written and why.
 
@@ -160,7 +160,7 @@ class _Methods:
 
         def observe(state: Tensor, measurement: Tensor, observed: Tensor, weight: Tensor) -> Any:
             recording = Recording()
-            with running(*one), recording, Observing(measurement, observed, weight):  # type: ignore[arg-type]
+            with running(*one), recording, Observing(measurement, observed, weight):
                 program.observe(state)
             return (recording.total(),)
 
@@ -185,7 +185,7 @@ class CompiledStepping(Stepping):
         self.observing = methods.observe.parameters()
         moved = (data.controls[:-1], data.elapsed[:-1, :, None], data.steps[..., None])
         self.moved = torch.cat(moved, -1).float().contiguous().numpy()
-        weight = data.measurements.new_full((*data.time.shape, 1), self.observation_weight)
+        weight = torch.as_tensor(self.observation_weight, dtype=torch.float32).expand(data.time.shape).unsqueeze(-1)
         self.measured = torch.cat((data.measurements, data.observed.to(weight), weight), -1).contiguous().numpy()
 
     def transition(

@@ -125,27 +125,21 @@ def find_path(
     Raises:
         FilterError: a bootstrap filter broke down.
     """
-    candidates = []
-    for share in tempering:
-        filtered = particle_filter(
-            program,
-            data,
-            particles=particles,
-            observation_weight=share * observation_weight,
-            known_start=known_start,
-        )
-        found = filtered.paths(1).within(data)
-        candidates.append(Path(found.states[0], standard_noise(program, data, found)[0]))
-    copies = data.subset(torch.arange(len(data)).repeat(len(candidates)))
+    copies = data.subset(torch.arange(len(data)).repeat(len(tempering)))
+    weights = observation_weight * data.controls.new_tensor(tempering).repeat_interleave(len(data))
+    filtered = particle_filter(
+        program, copies, particles=particles, observation_weight=weights, known_start=known_start
+    )
+    found = filtered.paths(1).within(copies)
     ahead = smooth(
         program,
         copies,
-        Path(torch.cat([c.states for c in candidates], 1), torch.cat([c.noise for c in candidates], 1)),
+        Path(found.states[0], standard_noise(program, copies, found)[0]),
         known_start=known_start,
         observation_weight=observation_weight,
         passes=passes,
     )
-    likely = torch.nan_to_num(ahead.log_likelihood, nan=-torch.inf).view(len(candidates), len(data))
+    likely = torch.nan_to_num(ahead.log_likelihood, nan=-torch.inf).view(len(tempering), len(data))
     chosen = likely.argmax(0) * len(data) + torch.arange(len(data), device=likely.device)
     best = means_as_path(ahead, copies)
     return Path(best.states[:, chosen], best.noise[:, chosen])

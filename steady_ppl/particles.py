@@ -26,7 +26,7 @@ from steady_ppl.resampling import effective_sample_size, normalise, systematic, 
 from steady_ppl.sites import KnownStart, Recording, Standardised, broadcast_event, running
 from steady_ppl.stepping import Stepping
 
-WORTH_COMPILING = 2_000_000  # steps of particles, which take the program's own lines a second or two
+WORTH_COMPILING = 1_000_000  # steps of particles, which take the program's own lines a second
 OnFrame = Callable[[int, Tensor, Tensor, Tensor], None]
 
 
@@ -36,7 +36,7 @@ def particle_filter(
     data: Trajectories,
     *,
     particles: int,
-    observation_weight: float = 1.0,
+    observation_weight: float | Tensor = 1.0,
     known_start: bool = False,
     resample_below: float = 0.5,
     proposal: Proposal | None = None,
@@ -50,7 +50,7 @@ def particle_filter(
         program: the state-space model.
         data: as returned by `for_program`.
         particles: N, for each trajectory.
-        observation_weight: tempers the observations' log-density (w_obs in STEADY).
+        observation_weight: tempers the observations' log-density (w_obs in STEADY); `(B,)` for one a trajectory.
         known_start: start every particle at the true first state instead of drawing it from the prior.
         resample_below: resample a trajectory when its effective sample size falls below this share of N;
             checked at its observed rows (at all rows when looking ahead), never at the table's last one.

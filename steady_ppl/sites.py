@@ -25,10 +25,11 @@ class Observing(Messenger):
     Args:
         measurements: `(..., K)`, finite also where missing.
         observed: `(..., K)` bool.
-        weight: multiplies the observations' log-density (w_obs in STEADY); 1 is the model as written.
+        weight: multiplies the observations' log-density (w_obs in STEADY), `(...)` where it is a tensor; 1 is the model
+            as written.
     """
 
-    def __init__(self, measurements: Tensor, observed: Tensor, weight: float = 1.0) -> None:
+    def __init__(self, measurements: Tensor, observed: Tensor, weight: float | Tensor = 1.0) -> None:
         super().__init__()
         self.measurements, self.observed, self.weight = measurements, observed, weight
         self.column = 0

@@ -18,13 +18,13 @@ class Stepping:
     Args:
         program: the state-space model.
         data: as returned by `for_program`.
-        observation_weight: tempers the observations' log-density.
+        observation_weight: tempers the observations' log-density; `(B,)` for one a trajectory.
 
     Attributes:
         event_dims: event dimension of each site of `transition`, known after the first.
     """
 
-    def __init__(self, program: Program, data: Trajectories, observation_weight: float) -> None:
+    def __init__(self, program: Program, data: Trajectories, observation_weight: float | Tensor) -> None:
         self.program, self.data, self.observation_weight = program, data, observation_weight
         self.steps, self.elapsed = data.steps, data.elapsed
         self.event_dims: dict[str, int] = {}

@@ -40,7 +40,7 @@ def single(name: str):
     return program
 
 
-def stepping(program, data, particles: int = 40, weight: float = 0.7):
+def stepping(program, data, particles: int = 40, weight: float | torch.Tensor = 0.7):
     """Its kernels and its own lines, and some states."""
     size = len(program.states)
     states = 2 * torch.randn(particles, len(data), size)
@@ -68,6 +68,17 @@ def test_kernels_come_to_the_numbers_of_the_programs_own_lines(name):
     data = drives(program, 3, 6, gaps=True)
     torch.manual_seed(1)
     assert_same(*stepping(program, data))
+
+
+def test_every_trajectory_may_have_an_observation_weight_of_its_own():
+    program = single("hovercraft")
+    data = drives(program, 3, 6)
+    torch.manual_seed(1)
+    weights = torch.tensor([0.7, 0.1, 0.0])
+    compiled, plain, states = stepping(program, data, weight=weights)
+    assert_same(compiled, plain, states)
+    once = Stepping(program, data, 1.0).log_density(2, states)
+    torch.testing.assert_close(plain.log_density(2, states), weights * once)
 
 
 def test_parameters_that_move_are_read_afresh():
