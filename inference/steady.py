@@ -52,9 +52,9 @@ GUIDES = {"gaussian": GaussianGuide, "lookahead": LookaheadGuide, "bootstrap": S
 # What two cores afford. The first two need normal noise; they are judged at every row by the filter that looks ahead,
 # the bootstrap at every tenth row, where it needs fewer particles.
 DEFAULTS = {
-    "lookahead": {"particles": 100, "draws": 50, "gradient_steps": 1, "validation_particles": 100},
+    "lookahead": {"particles": 100, "draws": 64, "gradient_steps": 1, "validation_particles": 100},
     "gaussian": {"draws": 30, "gradient_steps": 1, "validation_particles": 100},
-    "bootstrap": {"particles": 300, "draws": 30, "gradient_steps": 2, "validation_particles": 2000},
+    "bootstrap": {"particles": 600, "draws": 64, "gradient_steps": 2, "validation_particles": 2000},
 }
 
 
@@ -132,7 +132,7 @@ def fit(
     )
     trained = train(program, e_step, data, validation, optimization, known_start=known_start, seed=seed, **run)
     if e_step.in_plain_torch:
-        notes.append(f"the particle filter ran in plain torch, without compiled kernels: {e_step.in_plain_torch}")
+        notes.append(f"the E steps ran in plain torch, without compiled kernels: {e_step.in_plain_torch}")
     roots = trained.history[-1].get("roots", math.inf) if trained.history else math.inf
     if roots < 10:
         notes.append(f"of the particles' starts {roots:.0f} survive a drive: raise particles, or try guide=lookahead")

@@ -7,25 +7,20 @@ work the filter runs the program as written, and says so.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import lru_cache
 from typing import Any
 from weakref import WeakKeyDictionary
 
-import numpy as np
 import torch
-from torch import Tensor, fx
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch import Tensor
 
 from steady_ppl.data import Trajectories
-from steady_ppl.kernel_writer import LANES, source
-from steady_ppl.kernels import Kernel
-from steady_ppl.program import Program, one_line
+from steady_ppl.kernel_writer import LANES
+from steady_ppl.method import Method, signature
+from steady_ppl.program import Program
 from steady_ppl.resampling import by_component
-from steady_ppl.scalar_graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph
+from steady_ppl.scalar_graph import NotCompilable
 from steady_ppl.sites import Observing, Recording, Standardised, running
 from steady_ppl.stepping import Stepping
-from steady_ppl.translation import Translation, evaluate
 
 _METHODS: WeakKeyDictionary[Program, dict[Any, _Methods | NotCompilable]] = WeakKeyDictionary()
 
@@ -44,7 +39,7 @@ def stepping_for(
     if state.shape[0] < LANES:
         return plain, f"fewer than {LANES} particles"
     known = _METHODS.setdefault(program, {})
-    key = _signature(program)
+    key = signature(program)
     if key not in known:
         with torch.random.fork_rng(devices=[]):
             try:
@@ -59,79 +54,6 @@ def stepping_for(
         known[key] = NotCompilable("its kernel and its own lines come to different numbers")
         return plain, str(known[key])
     return stepping, None
-
-
-def _signature(program: Program) -> tuple[Any, ...]:
-    """What a trace takes as given: which tensors a program has, and its plain settings."""
-    tensors = (*program.named_parameters(), *program.named_buffers())
-    plain = [
-        (at, name, value)
-        for at, module in program.named_modules()
-        for name, value in vars(module).items()
-        if isinstance(value, bool | int | float | str)
-    ]
-    return tuple((name, id(tensor)) for name, tensor in tensors), tuple(plain)
-
-
-class _ReadsNumbers(TorchDispatchMode):
-    """Refuses to trace what a number read from a tensor decides: it would be the same for ever."""
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if func is torch.ops.aten._local_scalar_dense.default:
-            raise NotCompilable("it reads a number out of a tensor (float(), .item(), if)")
-        return func(*args, **(kwargs or {}))
-
-
-class _Method:
-    """One method: its graph, its kernel, and its parameters as the kernel takes them."""
-
-    def __init__(
-        self, function: Callable[..., Any], particle: dict[str, Tensor], trajectory: dict[str, Tensor]
-    ) -> None:
-        from torch.fx.experimental.proxy_tensor import make_fx  # takes a second to import
-
-        examples = (*particle.values(), *trajectory.values())
-        try:
-            with torch.no_grad(), _ReadsNumbers():
-                self.traced = make_fx(torch.func.functionalize(function))(*examples)
-        except NotCompilable:
-            raise
-        except Exception as error:
-            raise NotCompilable(f"it cannot be traced: {one_line(error)}") from error
-        levels = dict.fromkeys(particle, PARTICLE) | dict.fromkeys(trajectory, TRAJECTORY)
-        translation = Translation(self.traced, levels)
-        self.graph: ScalarGraph = translation.run()
-        self.by_parameters = [node for node in self.traced.graph.nodes if node in translation.known]
-        columns, at = {}, 0
-        for name, example in trajectory.items():
-            columns[name], at = at, at + example.numel()
-        self.kernel = _kernel(self.graph, tuple(particle), columns)
-
-    def parameters(self) -> np.ndarray:
-        """What the kernel takes of the parameters, as they are now."""
-        known: dict[fx.Node, Any] = {}
-        with torch.no_grad():
-            for node in self.by_parameters:
-                known[node] = _attribute(self.traced, node) if node.op == "get_attr" else evaluate(node, known)
-            parts = [known[node].detach().to(torch.float32).flatten() for node in self.graph.parameters]
-            return torch.cat([*parts, torch.zeros(1)]).numpy()
-
-
-def _attribute(traced: fx.GraphModule, node: fx.Node) -> Any:
-    value: Any = traced
-    for name in str(node.target).split("."):
-        value = getattr(value, name)
-    return value
-
-
-@lru_cache(maxsize=64)
-def _compiled(text: str, inputs: int, outputs: int) -> Kernel:
-    return Kernel(text, inputs, outputs)
-
-
-def _kernel(graph: ScalarGraph, inputs: Sequence[str], columns: dict[str, int]) -> Kernel:
-    """The kernel of a graph; programs that differ in their parameters only share one."""
-    return _compiled(source(graph, inputs, columns), len(inputs), len(graph.outputs))
 
 
 class _Methods:
@@ -165,13 +87,13 @@ class _Methods:
             return (recording.total(),)
 
         noise = torch.zeros(*one, self.channels)
-        self.transition = _Method(transition, {"state": first, "noise": noise}, inputs)
+        self.transition = Method(transition, {"state": first, "noise": noise}, inputs)
         measured = {
             "measurement": data.measurements[:1, :1].unsqueeze(0),
             "observed": torch.ones_like(data.observed[:1, :1].unsqueeze(0)),
             "weight": torch.ones(()),
         }
-        self.observe = _Method(observe, {"state": first}, measured)
+        self.observe = Method(observe, {"state": first}, measured)
 
 
 class CompiledStepping(Stepping):

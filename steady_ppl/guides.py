@@ -27,7 +27,7 @@ class PathGuide:
         draws: M, the number of paths for each trajectory.
         paths: the stored paths, None before the first `refresh`.
         memory: tensors that the next `refresh` begins from; a checkpoint keeps them.
-        in_plain_torch: why no kernels served in the last `refresh` of a guide that filters; None where they did.
+        in_plain_torch: why no kernels served in the last `refresh`; None where they did or were not worth it.
     """
 
     def __init__(self, draws: int) -> None:
@@ -155,6 +155,7 @@ class LinearizedGuide(PathGuide):
             self._search(data, lost, weight)
             ahead = self._smooth(data, weight)
         self._remember(means_as_path(ahead, data), data)
+        self.in_plain_torch = ahead.linearization.in_plain_torch
         return ahead
 
     def _search(self, data: Trajectories, trajectories: list[int], weight: float) -> None:
@@ -274,7 +275,7 @@ def _run_filter(
         proposal=proposal,
         kernels=100 * guide.particles * data.time.numel() >= WORTH_COMPILING,  # a training has hundreds of E steps
     )
-    guide.in_plain_torch = filtered.in_plain_torch
+    guide.in_plain_torch = filtered.in_plain_torch or (proposal and guide.in_plain_torch) or None
     return filtered
 
 

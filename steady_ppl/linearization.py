@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from steady_ppl.compiled_jacobians import compiled_jacobians
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import ProgramError
 from steady_ppl.planar_vehicle import wrap
@@ -60,6 +61,7 @@ class Linearization:
         measurement: H `(T + 1, B, K, D)`.
         precision: `(T + 1, B, K)` observation weight over variance; zero where missing.
         log_scale: `(T + 1, B)` the measurements' log-density at residual zero, times the observation weight.
+        in_plain_torch: why no kernels served; None where they did or were not worth it.
     """
 
     path: Path
@@ -74,6 +76,7 @@ class Linearization:
     measurement: Tensor
     precision: Tensor
     log_scale: Tensor
+    in_plain_torch: str | None = None
 
 
 @torch.no_grad()
@@ -99,12 +102,16 @@ def linearize(
     """
     states, noise = path.states, path.noise
     angles = tuple(names(program.states).index(angle) for angle in program.angles)
-    offset, by_state, by_noise = _transition(program, data, states, noise)
+    moved = _transition(program, data, states, noise)
+    by_state, by_noise = moved.by
+    offset = moved.value - (by_noise @ noise.unsqueeze(-1)).squeeze(-1) - states[1:]
     start_offset, start_noise = _start(program, data, states[0], known_start)
     start_turn = torch.zeros_like(start_offset, dtype=torch.float64)
     for angle in angles:
         start_turn[:, angle] = start_offset[:, angle].double() - wrap(start_offset[:, angle].double())
-    residuals, by_measured, log_sd = _measurement(program, data, states)
+    measured = _measurement(program, data, states)
+    residuals, log_sd = measured.value.chunk(2, -1)
+    by_measured = -measured.by[0][..., : residuals.shape[-1], :]
     observed = data.observed & torch.isfinite(by_measured).all(-1)  # a bearing to where one stands has no derivative
     log_density = torch.distributions.Normal(0.0, 1.0).log_prob(residuals.new_zeros(())) - log_sd
     return Linearization(
@@ -120,6 +127,7 @@ def linearize(
         measurement=torch.where(observed[..., None], by_measured, 0.0).double(),
         precision=observation_weight * torch.where(observed, (-2 * log_sd).exp(), 0.0).double(),
         log_scale=observation_weight * torch.where(observed, log_density, 0.0).double().sum(-1),
+        in_plain_torch=moved.in_plain_torch or measured.in_plain_torch,
     )
 
 
@@ -150,13 +158,14 @@ def why_not_linear(program: Program, data: Trajectories, *, known_start: bool = 
     return None
 
 
-def _transition(program: Program, data: Trajectories, states: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    def step(state: Tensor, noise: Tensor) -> Tensor:
+def _transition(program: Program, data: Trajectories, states: Tensor, noise: Tensor) -> _Jacobians:
+    def step(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
         with running(*state.shape[:-1]), Standardised(noise):
-            return program.transition(state, data.controls[:-1], data.elapsed[:-1], data.steps)
+            return program.transition(state, control, time, step)
 
-    arrived, (by_state, by_noise) = _derivatives(step, states[:-1], noise)
-    return arrived - (by_noise @ noise.unsqueeze(-1)).squeeze(-1) - states[1:], by_state, by_noise
+    along = {"state": states[:-1], "noise": noise}
+    given = {"control": data.controls[:-1], "time": data.elapsed[:-1], "step": data.steps}
+    return _jacobians(program, step, along, given)
 
 
 def _start(program: Program, data: Trajectories, first: Tensor, known_start: bool) -> tuple[Tensor, Tensor]:
@@ -171,12 +180,12 @@ def _start(program: Program, data: Trajectories, first: Tensor, known_start: boo
     return began - first, start_noise
 
 
-def _measurement(program: Program, data: Trajectories, states: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Residuals, how the mean follows the state, and log standard deviations."""
+def _measurement(program: Program, data: Trajectories, states: Tensor) -> _Jacobians:
+    """Of the residuals and, beside them, the log standard deviations."""
 
-    def measure(state: Tensor) -> Tensor:
+    def measure(state: Tensor, measurement: Tensor, observed: Tensor) -> Tensor:
         seen = Recording()
-        with running(*state.shape[:-1]), seen, Observing(data.measurements, data.observed):
+        with running(*state.shape[:-1]), seen, Observing(measurement, observed):
             program.observe(state)
         residuals, log_sds = [], []
         for site, fn in seen.distributions.items():
@@ -186,9 +195,8 @@ def _measurement(program: Program, data: Trajectories, states: Tensor) -> tuple[
             log_sds.append(as_vector(sd.log(), fn.event_dim).expand(difference.shape))
         return torch.cat(residuals + log_sds, -1)
 
-    values, (derivative,) = _derivatives(measure, states)
-    count = values.shape[-1] // 2
-    return values[..., :count], -derivative[..., :count, :], values[..., count:]
+    given = {"measurement": data.measurements, "observed": data.observed}
+    return _jacobians(program, measure, {"state": states}, given)
 
 
 def _start_channels(program: Program) -> int:
@@ -196,6 +204,26 @@ def _start_channels(program: Program) -> int:
     with running(1, 1), seen:
         program.initial()
     return sum(fn.event_shape.numel() for fn in seen.distributions.values())
+
+
+@dataclass(frozen=True)
+class _Jacobians:
+    """A function's value `(..., V)`, its Jacobians `(..., V, ·)`, and why they had to come from plain torch, if so."""
+
+    value: Tensor
+    by: list[Tensor]
+    in_plain_torch: str | None = None
+
+
+def _jacobians(
+    program: Program, function: Callable[..., Tensor], along: dict[str, Tensor], given: dict[str, Tensor]
+) -> _Jacobians:
+    """By a kernel where it can serve, else by torch."""
+    found = compiled_jacobians(program, function.__name__, function, along, given)
+    if isinstance(found, tuple):
+        return _Jacobians(*found)
+    value, by = _derivatives(lambda *inputs: function(*inputs, *given.values()), *along.values())
+    return _Jacobians(value, by, found)
 
 
 def _derivatives(function: Callable[..., Tensor], *inputs: Tensor) -> tuple[Tensor, list[Tensor]]:

@@ -12,9 +12,10 @@ import torch
 from examples import drives, example
 from oracles import assert_mean
 
-from steady_ppl import Constant, FilterError, SMCGuide, particle_filter, seeded
+from steady_ppl import Constant, FilterError, GaussianGuide, SMCGuide, compiled_jacobians, particle_filter, seeded
 from steady_ppl.compiled import CompiledStepping, stepping_for
 from steady_ppl.gaussian_smoother import find_and_smooth
+from steady_ppl.linearization import Path, linearize
 from steady_ppl.proposals import Twist
 from steady_ppl.stepping import Stepping
 
@@ -68,6 +69,45 @@ def test_kernels_come_to_the_numbers_of_the_programs_own_lines(name):
     data = drives(program, 3, 6, gaps=True)
     torch.manual_seed(1)
     assert_same(*stepping(program, data))
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_a_kernels_jacobians_are_those_of_torch(name, monkeypatch):
+    program = single(name)
+    data = drives(program, 3, 9, gaps=True)
+    torch.manual_seed(1)
+    states, noise = 2 * torch.randn(9, 3, len(program.states)), torch.randn(8, 3, len(program.channels))
+    by_torch = linearize(program, data, Path(states, noise))
+    monkeypatch.setattr(compiled_jacobians, "WORTH_COMPILING", 1)
+    by_kernel = linearize(program, data, Path(states, noise))
+    assert by_kernel.in_plain_torch is None and compiled_jacobians._METHODS[program]
+    for part in ("offset", "state", "noise", "residual", "measurement", "precision", "log_scale"):
+        torch.testing.assert_close(getattr(by_kernel, part), getattr(by_torch, part), rtol=1e-4, atol=2e-5)
+
+
+def test_jacobians_that_cannot_be_compiled_come_from_torch_and_the_guide_says_why(monkeypatch):
+    monkeypatch.setattr(compiled_jacobians, "WORTH_COMPILING", 1)
+    data = drives(example("hovercraft", torch.float32), 2, 12)
+    guide = GaussianGuide(Switching(), draws=3, known_start=True)
+    with seeded("plain"):
+        guide.refresh(data, 1.0)
+    assert "reads a number out of a tensor" in guide.in_plain_torch
+    other = GaussianGuide(single("hovercraft"), draws=3, known_start=True)
+    with seeded("plain"):
+        other.refresh(data, 1.0)
+    assert other.in_plain_torch is None
+
+
+def test_jacobians_that_have_fallen_behind_their_program_are_found_out(monkeypatch):
+    monkeypatch.setattr(compiled_jacobians, "WORTH_COMPILING", 1)
+    program = Stale()
+    data = drives(example("hovercraft", torch.float32), 2, 31)
+    path = Path(torch.randn(31, 2, 6), torch.randn(30, 2, 3))
+    assert linearize(program, data, path).in_plain_torch is None
+    with torch.no_grad():
+        for parameter in program.parameters():
+            parameter += 0.1
+    assert "different numbers" in linearize(program, data, path).in_plain_torch
 
 
 def test_every_trajectory_may_have_an_observation_weight_of_its_own():

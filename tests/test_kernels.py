@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.fx.experimental.proxy_tensor import make_fx
 
 from steady_ppl.kernel_writer import LANES, source
 from steady_ppl.kernels import Kernel
-from steady_ppl.scalar_graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph
-from steady_ppl.translation import Translation
+from steady_ppl.method import Method
+from steady_ppl.scalar_graph import PARTICLE, NotCompilable, ScalarGraph
 
 SPECIAL = [
     0.0,
@@ -36,23 +35,20 @@ SPECIAL = [
 ]
 
 
-def kernel_of(function: Callable[..., Tensor], *inputs: Tensor, uniform: Tensor | None = None) -> Tensor:
-    """The function of `(B, N)` inputs, and of numbers that differ between trajectories only, `(B,)`, by a kernel."""
-    particle = [one[:1, 0] for one in inputs]
-    shared = [] if uniform is None else [uniform[:1]]
-    translation = Translation(
-        traced := make_fx(torch.func.functionalize(function))(*particle, *shared),
-        {f"x{i}": PARTICLE for i in range(len(particle))} | ({"u": TRAJECTORY} if shared else {}),
-    )
-    graph = translation.run()
-    assert traced is translation.traced
-    kernel = Kernel(source(graph, [f"x{i}" for i in range(len(particle))], {"u": 0}), len(inputs), len(graph.outputs))
-    known = [translation.known[node].detach().float().flatten() for node in graph.parameters]
-    parameters = torch.cat([*known, torch.zeros(1)]).numpy()
-    out = torch.empty(len(graph.outputs), *inputs[0].shape)
+def kernel_of(
+    function: Callable[..., Tensor], *inputs: Tensor, uniform: Tensor | None = None, differentiate: bool = False
+) -> Tensor:
+    """The function of `(B, N)` inputs, and of numbers that differ between trajectories only, `(B,)`, by a kernel; with
+    `differentiate` its derivatives in the inputs instead."""
+    names = [f"x{i}" for i in range(len(inputs))]
+    particle = {name: one[:1, 0].clone() for name, one in zip(names, inputs, strict=True)}
+    shared = {} if uniform is None else {"u": uniform[:1].clone()}
+    method = Method(lambda *values: (function(*values),), particle, shared, along=names if differentiate else ())
+    out = torch.empty(len(method.graph.outputs), *inputs[0].shape)
     columns = (torch.zeros(len(inputs[0]), 1) if uniform is None else uniform[:, None]).numpy()
-    kernel(parameters, columns, [one.unsqueeze(0).contiguous().numpy() for one in inputs], None, out.numpy())
-    return out
+    given = [one.unsqueeze(0).contiguous().numpy() for one in inputs]
+    method.kernel(method.parameters(), columns, given, None, out.numpy())
+    return out[method.values :] if differentiate else out
 
 
 def relative(mine: Tensor, exact: Tensor) -> float:
@@ -112,23 +108,40 @@ def test_what_is_special_to_torch_is_special_to_a_kernel(function):
     torch.testing.assert_close(kernel_of(function, x)[0], function(x), equal_nan=True, rtol=1e-6, atol=1e-35)
 
 
-@pytest.mark.parametrize(
-    "function",
-    [
-        lambda x, y: x + 2 * y - x * y / (1 + y * y),
-        lambda x, y: torch.hypot(x, y) + x**2 + x**3 + (1 + y * y) ** 0.5 + (1 + y * y) ** -0.5,
-        lambda x, y: (x.abs() + 0.1) ** 1.7 + (x.abs() + 0.1) ** (y * 0.1),
-        lambda x, y: torch.remainder(x, 0.7) + 3 - torch.sub(x, y, alpha=2) - 1.0 / (2 + x * x),
-        lambda x, y: nn.functional.silu(x) + nn.functional.leaky_relu(y, 0.2) + (0.3 * x).clamp(-1, 1).asin(),
-        lambda x, y: torch.stack([x, y], -1).norm(dim=-1) + torch.stack([x, y], -1).sum(-1) * torch.cat([x, y]).mean(),
-        lambda x, y: torch.linalg.solve(torch.tensor([[2.0, 0.3], [0.1, 1.0]]), torch.eye(2))[0, 1] * x + y,
-    ],
-)
+ARITHMETIC = [
+    lambda x, y: x + 2 * y - x * y / (1 + y * y),
+    lambda x, y: torch.hypot(x, y) + x**2 + x**3 + (1 + y * y) ** 0.5 + (1 + y * y) ** -0.5,
+    lambda x, y: (x.abs() + 0.1) ** 1.7 + (x.abs() + 0.1) ** (y * 0.1),
+    lambda x, y: torch.remainder(x, 0.7) + 3 - torch.sub(x, y, alpha=2) - 1.0 / (2 + x * x),
+    lambda x, y: nn.functional.silu(x) + nn.functional.leaky_relu(y, 0.2) + (0.3 * x).clamp(-0.9, 0.9).asin(),
+    lambda x, y: torch.stack([x, y], -1).norm(dim=-1) + torch.stack([x, y], -1).sum(-1) * torch.cat([x, y]).mean(),
+    lambda x, y: torch.linalg.solve(torch.tensor([[2.0, 0.3], [0.1, 1.0]]), torch.eye(2))[0, 1] * x + y,
+    lambda x, y: torch.sin(x) * torch.cos(y) + torch.tan(0.3 * x) + torch.atan2(x, y) + torch.atan(x),
+    lambda x, y: torch.exp(-x) + torch.log(1 + x * x) + torch.log1p(y * y) + torch.expm1(0.2 * y) + torch.tanh(x * y),
+    lambda x, y: torch.sqrt(1 + x * x) + torch.rsqrt(2 + y * y) + torch.reciprocal(3 + x * x) + x.square() + x.abs(),
+    lambda x, y: nn.functional.softplus(x) + torch.sigmoid(y) + (0.2 * x).clamp(-0.9, 0.9).acos() - y.relu(),
+    lambda x, y: torch.where(x > y, x * x, 3 * y),
+    lambda x, y: torch.maximum(x, y * y) + torch.minimum(x, y) + (x > 0).float() * y + torch.floor(x) * y + x.sign(),
+]
+
+
+@pytest.mark.parametrize("function", ARITHMETIC)
 def test_arithmetic_is_that_of_torch(function):
     torch.manual_seed(0)
     x, y = 2 * torch.randn(1, 1, 200), 2 * torch.randn(1, 1, 200)
     each = torch.stack([function(a, b) for a, b in zip(x[0, 0, :, None], y[0, 0, :, None], strict=True)], -1)
     torch.testing.assert_close(kernel_of(function, x[0], y[0])[0], each.expand(1, -1), rtol=3e-6, atol=3e-6)
+
+
+@pytest.mark.parametrize("function", ARITHMETIC)
+def test_derivatives_are_those_of_torch(function):
+    torch.manual_seed(0)
+    x, y = 2 * torch.randn(1, 1, 200), 2 * torch.randn(1, 1, 200)
+    pairs = list(zip(x[0, 0, :, None], y[0, 0, :, None], strict=True))
+    exact = [torch.autograd.functional.jacobian(lambda a, b: function(a, b).sum(), pair) for pair in pairs]
+    expected = torch.stack([torch.cat(one) for one in exact], 1)
+    found = kernel_of(lambda a, b: function(a, b).sum(-1), x[0], y[0], differentiate=True)[:, 0]
+    torch.testing.assert_close(found, expected, rtol=2e-5, atol=2e-5)
 
 
 def network(hidden: int, layers: int, outputs: int = 3) -> nn.Module:
@@ -156,6 +169,19 @@ def test_a_network_of_any_size_is_that_of_torch(hidden, layers, columns):
         mine = kernel_of(function, x, y, uniform=u)
         theirs = layers_of(torch.stack([x, y, u[:, None].expand_as(x)], -1)) * x[..., None]
     torch.testing.assert_close(mine.permute(1, 2, 0), theirs, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(("hidden", "layers"), [(5, 1), (64, 1), (64, 2)])
+def test_a_networks_derivatives_are_those_of_torch(hidden, layers):
+    layers_of = network(hidden, layers)
+
+    def function(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+        return layers_of(torch.stack([x * y, y, z], -1)) * x.unsqueeze(-1)
+
+    inputs = torch.randn(3, 40)
+    found = kernel_of(function, *inputs.unsqueeze(1), differentiate=True).view(3, 3, 40)
+    exact = torch.vmap(torch.func.jacfwd(lambda v: function(*v)))(inputs.t())
+    torch.testing.assert_close(found.permute(2, 0, 1), exact.detach(), rtol=1e-4, atol=1e-5)
 
 
 def test_residual_layers_and_two_heads_of_one_hidden_layer_are_those_of_torch():

@@ -1,0 +1,82 @@
+"""Jacobians of a program's methods as kernels, for all rows of all trajectories in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from steady_ppl.kernel_writer import LANES
+from steady_ppl.method import Method, signature
+from steady_ppl.program import Program
+from steady_ppl.scalar_graph import NotCompilable
+
+WORTH_COMPILING = 1000  # rows of trajectories
+Function = Callable[..., Tensor]
+_METHODS: WeakKeyDictionary[Program, dict[Any, Method | NotCompilable]] = WeakKeyDictionary()
+
+
+def compiled_jacobians(
+    program: Program, name: str, function: Function, along: dict[str, Tensor], given: dict[str, Tensor]
+) -> tuple[Tensor, list[Tensor]] | str | None:
+    """A function's value and its Jacobians.
+
+    Args:
+        program: what the function belongs to.
+        name: of the function, by which its kernel is kept.
+        function: of one row of one trajectory or of many; it returns `(..., V)`.
+        along: its first arguments, in which to differentiate, each `(rows, B, ·)`.
+        given: the others, `(rows, B)` or `(rows, B, ·)`.
+
+    Returns:
+        The value `(rows, B, V)` and the Jacobians `(rows, B, V, ·)`; why there is no kernel; None where it is not
+        worth one.
+    """
+    first = next(iter(along.values()))
+    rows, trajectories = first.shape[:2]
+    if rows * trajectories < WORTH_COMPILING or first.device.type != "cpu" or first.dtype != torch.float32:
+        return None
+    arguments = along | given
+    known = _METHODS.setdefault(program, {})
+    key = (name, signature(program))
+    if key not in known:
+        examples = {at: value[:1, :1].unsqueeze(0).clone() for at, value in arguments.items()}
+        with torch.random.fork_rng(devices=[]):
+            try:
+                known[key] = Method(lambda *values: (function(*values),), examples, {}, along=tuple(along))
+            except NotCompilable as reason:
+                known[key] = reason
+    method = known[key]
+    if isinstance(method, NotCompilable):
+        return str(method)
+    found = _run(method, arguments, rows, trajectories)
+    values, rest = found[..., : method.values], found[..., method.values :]
+    few = [
+        value.reshape(1, -1, *value.shape[2:])[:, :: max(1, rows * trajectories // LANES)]
+        for value in arguments.values()
+    ]
+    plain = function(*few)
+    mine = values.reshape(1, -1, method.values)[:, :: max(1, rows * trajectories // LANES)]
+    if not torch.allclose(mine, plain, rtol=1e-4, atol=1e-4, equal_nan=True):
+        known[key] = NotCompilable("its kernel and its own lines come to different numbers")
+        return str(known[key])
+    widths = [value.shape[-1] for value in along.values()]
+    return values, list(rest.unflatten(-1, (method.values, sum(widths))).split(widths, -1))
+
+
+def _a_few(values: Tensor) -> Tensor:
+    """Some sixteen of all rows, `(1, ·, ·)`."""
+    return values.flatten(0, 1)[None, :: max(1, values.shape[0] * values.shape[1] // LANES)]
+
+
+def _run(method: Method, arguments: dict[str, Tensor], rows: int, trajectories: int) -> Tensor:
+    """Everything that the kernel computes, `(rows, B, ·)`."""
+    cells = rows * trajectories
+    inputs = [value.float().reshape(cells, 1, -1).permute(2, 1, 0).contiguous().numpy() for value in arguments.values()]
+    out = torch.empty(len(method.graph.outputs), 1, cells)
+    method.kernel(method.parameters(), np.zeros((1, 0), np.float32), inputs, None, out.numpy())
+    return out.squeeze(1).t().reshape(rows, trajectories, -1)

@@ -1,0 +1,114 @@
+"""A function of a program, traced by torch for one particle and compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, fx
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from steady_ppl.kernel_writer import source
+from steady_ppl.kernels import Kernel
+from steady_ppl.program import Program, one_line
+from steady_ppl.scalar_graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph
+from steady_ppl.tangents import jacobian
+from steady_ppl.translation import Translation, evaluate
+
+
+class _ReadsNumbers(TorchDispatchMode):
+    """Refuses to trace what a number read from a tensor decides: it would be the same for ever."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func is torch.ops.aten._local_scalar_dense.default:
+            raise NotCompilable("it reads a number out of a tensor (float(), .item(), if)")
+        return func(*args, **(kwargs or {}))
+
+
+class Method:
+    """A function of a program as a kernel.
+
+    Args:
+        function: of one particle of one trajectory, `(1, 1, 1, ·)`; returns tensors.
+        particle: examples of the arguments that differ between particles, the first ones.
+        trajectory: examples of those that differ between trajectories only.
+        along: the arguments in which to differentiate; the Jacobian's rows follow the values.
+
+    Attributes:
+        values: how many numbers the function returns.
+
+    Raises:
+        NotCompilable: it cannot be traced, or what it does has no kernel.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        particle: dict[str, Tensor],
+        trajectory: dict[str, Tensor],
+        *,
+        along: Sequence[str] = (),
+    ) -> None:
+        from torch.fx.experimental.proxy_tensor import make_fx  # takes a second to import
+
+        examples = (*particle.values(), *trajectory.values())
+        try:
+            with torch.no_grad(), _ReadsNumbers():
+                self.traced = make_fx(torch.func.functionalize(function))(*examples)
+        except NotCompilable:
+            raise
+        except Exception as error:
+            raise NotCompilable(f"it cannot be traced: {one_line(error)}") from error
+        levels = dict.fromkeys(particle, PARTICLE) | dict.fromkeys(trajectory, TRAJECTORY)
+        translation = Translation(self.traced, levels)
+        self.graph: ScalarGraph = translation.run()
+        self.values = len(self.graph.outputs)
+        if along:
+            inputs = [self.graph.scalar("input", name, k) for name in along for k in range(particle[name].numel())]
+            self.graph.outputs += jacobian(self.graph, self.graph.outputs, inputs)
+        self.by_parameters = [node for node in self.traced.graph.nodes if node in translation.known]
+        columns, at = {}, 0
+        for name, example in trajectory.items():
+            columns[name], at = at, at + example.numel()
+        self.kernel = _kernel(self.graph, tuple(particle), columns)
+
+    def parameters(self) -> np.ndarray:
+        """What the kernel takes of the parameters, as they are now."""
+        known: dict[fx.Node, Any] = {}
+        with torch.no_grad():
+            for node in self.by_parameters:
+                known[node] = _attribute(self.traced, node) if node.op == "get_attr" else evaluate(node, known)
+            parts = [known[node].detach().to(torch.float32).flatten() for node in self.graph.parameters]
+            return torch.cat([*parts, torch.zeros(1)]).numpy()
+
+
+def _attribute(traced: fx.GraphModule, node: fx.Node) -> Any:
+    value: Any = traced
+    for name in str(node.target).split("."):
+        value = getattr(value, name)
+    return value
+
+
+@lru_cache(maxsize=64)
+def _compiled(text: str, inputs: int, outputs: int) -> Kernel:
+    return Kernel(text, inputs, outputs)
+
+
+def _kernel(graph: ScalarGraph, inputs: Sequence[str], columns: dict[str, int]) -> Kernel:
+    """The kernel of a graph; programs that differ in their parameters only share one."""
+    return _compiled(source(graph, inputs, columns), len(inputs), len(graph.outputs))
+
+
+def signature(program: Program) -> tuple[Any, ...]:
+    """What a trace takes as given: which tensors a program has, and its plain settings."""
+    tensors = (*program.named_parameters(), *program.named_buffers())
+    plain = [
+        (at, name, value)
+        for at, module in program.named_modules()
+        for name, value in vars(module).items()
+        if isinstance(value, bool | int | float | str)
+    ]
+    return tuple((name, id(tensor)) for name, tensor in tensors), tuple(plain)
