@@ -116,7 +116,7 @@ def test_a_known_start_makes_a_difference() -> None:
 
 def test_what_is_not_given_comes_from_the_guides_defaults() -> None:
     fit = find_recipe("steady")(load_program(HOVERCRAFT), simulated(rows=4), guide="lookahead", steps=1, **QUIET)
-    assert (fit.settings["particles"], fit.settings["draws"], fit.settings["gradient_steps"]) == (100, 50, 1)
+    assert (fit.settings["particles"], fit.settings["draws"], fit.settings["gradient_steps"]) == (100, 64, 1)
 
 
 class HeavyTailed(type(load_program(HOVERCRAFT))):
