@@ -324,6 +324,12 @@ def test_turning_and_moving_the_world_changes_nothing(hovercraft, bearings, turn
     (ours, our_noise), (theirs, their_noise) = here.means(), there.means()
     torch.testing.assert_close(our_noise, their_noise, rtol=0, atol=1e-6)
     torch.testing.assert_close(ours[..., :2] @ rotation.T + away, theirs[..., :2], rtol=0, atol=1e-6)
+    drawn = []
+    for ahead, data, program in ((here, bearings, hovercraft), (there, moved, Elsewhere().double())):
+        with seeded("world"):
+            filtered = particle_filter(program, data, particles=50, known_start=True, proposal=Twist(ahead))
+            drawn.append((filtered.log_likelihood, filtered.paths(20).noise["acceleration"]))
+    torch.testing.assert_close(drawn[0], tuple(value.detach() for value in drawn[1]), rtol=0, atol=1e-5)
 
 
 def test_whole_turns_of_the_heading_change_nothing(hovercraft, bearings):

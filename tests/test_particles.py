@@ -13,8 +13,11 @@ from examples import copies, cut, drives, example
 from oracles import CartPosterior, assert_mean, cart_parameters, kalman
 
 from steady_ppl import DataError, FilterError, ProgramError, particle_filter, roll_out, seeded
+from steady_ppl.gaussian_smoother import find_and_smooth
 from steady_ppl.program import Program
-from steady_ppl.sites import AtMean, Replaying
+from steady_ppl.proposals import Proposal, Twist
+from steady_ppl.resampling import systematic
+from steady_ppl.sites import AtMean, Replaying, Standardised
 
 PROGRAMS = ("linear_gaussian", "hovercraft", "hovercraft:HovercraftTruth", "truck", "pendulum")
 
@@ -366,6 +369,66 @@ def test_the_order_of_the_landmarks_changes_nothing(hovercraft, bearings):
     shuffled = replace(bearings, measurements=bearings.measurements[..., order], observed=bearings.observed[..., order])
     here, there = hovercraft_evidence(hovercraft, bearings), hovercraft_evidence(Shuffled().double(), shuffled)
     torch.testing.assert_close(here, there.detach(), rtol=1e-9, atol=1e-9)
+
+
+class InOrder(Proposal):
+    """A proposal's noise, given to the particles in another order: particle i is the other filter's particle order[i].
+
+    Without a lookahead it is the program's own noise.
+    """
+
+    def __init__(self, order: torch.Tensor, ahead: Twist | None) -> None:
+        self.order, self.back, self.ahead = order, order.argsort(), ahead
+        self.looks_ahead = ahead is not None
+
+    def start(self, particles):
+        return self._reordered(self.ahead.start(particles) if self.ahead else self._own(particles, 6))
+
+    def step(self, row, state):
+        return self._reordered(self.ahead.step(row, state[self.back]) if self.ahead else self._own(len(state), 3))
+
+    def log_future(self, row, state):
+        return self.ahead.log_future(row, state)
+
+    def systematic(self, log_weights, draws):
+        """Resampling of particles that are told apart by their place in the other filter."""
+        index = self.back[systematic(log_weights[self.back], draws)]
+        return index[self.order] if draws == len(self.order) else index
+
+    def _own(self, particles, components):
+        noise = torch.randn(particles, 1, 3, components, dtype=torch.float64)
+        return Standardised(noise), torch.zeros(particles, 3, dtype=torch.float64)
+
+    def _reordered(self, drawn):
+        handler, log_ratio = drawn
+        return Standardised(handler.noise[self.order]), log_ratio[self.order]
+
+
+@pytest.mark.parametrize("look_ahead", [False, True])
+@pytest.mark.parametrize("resample_below", [0.0, 1.0])
+def test_the_order_of_the_particles_changes_nothing(hovercraft, bearings, resample_below, look_ahead, monkeypatch):
+    ahead = Twist(find_and_smooth(hovercraft, bearings), untwisted=0.3) if look_ahead else None
+    order, runs = torch.randperm(60), []
+    for proposal in (InOrder(torch.arange(60), ahead), InOrder(order, ahead)):
+        for module in ("particles", "paths"):
+            monkeypatch.setattr(f"steady_ppl.{module}.systematic", proposal.systematic)
+        with seeded("particles"):
+            filtered = particle_filter(
+                hovercraft, bearings, particles=60, proposal=proposal, resample_below=resample_below
+            )
+            runs.append((filtered, filtered.paths(25)))
+    (ours, our_paths), (theirs, their_paths) = runs
+    assert any(ancestors is not None for ancestors in ours.ancestors) == (resample_below > 0)
+    assert torch.equal(ours.roots, theirs.roots)
+    for our, their in (
+        (ours.log_likelihood, theirs.log_likelihood),
+        (ours.effective_sizes, theirs.effective_sizes),
+        (ours.log_weights[order], theirs.log_weights),
+        (torch.stack(ours.states)[:, order], torch.stack(theirs.states)),
+        (our_paths.states, their_paths.states),
+        (our_paths.noise, their_paths.noise),
+    ):
+        torch.testing.assert_close(our, their, rtol=1e-9, atol=1e-9)
 
 
 def test_a_wrong_landmark_costs_many_nats(hovercraft, bearings):
