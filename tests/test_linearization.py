@@ -238,7 +238,8 @@ def test_a_bearing_to_where_one_stands_says_nothing():
     path = near_the_truth(program, data)
     path.states[3, 1, :2] = torch.tensor(program.landmarks[2], dtype=torch.float64)
     linear = linearize(program, data, path)
-    assert all(getattr(linear, name).isfinite().all() for name in vars(linear).keys() - {"path", "angles", "in_plain_torch"})
+    tensors = vars(linear).keys() - {"path", "angles", "in_plain_torch"}
+    assert all(getattr(linear, name).isfinite().all() for name in tensors)
     assert linear.precision[3, 1, 2] == 0 and not linear.measurement[3, 1, 2].any()
     assert (linear.precision > 0).sum() == data.observed.sum() - 1
 

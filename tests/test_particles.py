@@ -17,7 +17,7 @@ from steady_ppl.gaussian_smoother import find_and_smooth
 from steady_ppl.program import Program
 from steady_ppl.proposals import Proposal, Twist
 from steady_ppl.resampling import systematic
-from steady_ppl.sites import AtMean, Replaying, Standardised
+from steady_ppl.sites import AtMean, Replaying
 
 PROGRAMS = ("linear_gaussian", "hovercraft", "hovercraft:HovercraftTruth", "truck", "pendulum")
 
@@ -390,18 +390,18 @@ class InOrder(Proposal):
     def log_future(self, row, state):
         return self.ahead.log_future(row, state)
 
-    def systematic(self, log_weights, draws):
+    def systematic(self, weights, draws):
         """Resampling of particles that are told apart by their place in the other filter."""
-        index = self.back[systematic(log_weights[self.back], draws)]
+        index = self.back[systematic(weights[self.back], draws)]
         return index[self.order] if draws == len(self.order) else index
 
     def _own(self, particles, components):
-        noise = torch.randn(particles, 1, 3, components, dtype=torch.float64)
-        return Standardised(noise), torch.zeros(particles, 3, dtype=torch.float64)
+        noise = torch.randn(particles, 3, components, dtype=torch.float64)
+        return noise, torch.zeros(particles, 3, dtype=torch.float64)
 
     def _reordered(self, drawn):
-        handler, log_ratio = drawn
-        return Standardised(handler.noise[self.order]), log_ratio[self.order]
+        noise, log_ratio = drawn
+        return noise[self.order], log_ratio[self.order]
 
 
 @pytest.mark.parametrize("look_ahead", [False, True])
