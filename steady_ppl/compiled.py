@@ -94,6 +94,8 @@ class _Methods:
             "weight": torch.ones(()),
         }
         self.observe = Method(observe, {"state": first}, measured)
+        if self.transition.values != self.width + self.channels or self.observe.values != 1:
+            raise NotCompilable("its results for one particle have other shapes: it mixes particles or trajectories")
 
 
 class CompiledStepping(Stepping):

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from steady_ppl.compiled_rows import on_all_rows
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.linearization import Path, linearize
@@ -168,18 +169,45 @@ def smoother_paths(
     does not inflate the noise; the states agree with it to first order.
     """
     start_noise, states, noise = (values.to(data.controls.dtype) for values in ahead.draws(draws))
-    rows, trajectories = data.time.shape
+    trajectories = len(data)
     start, moving = Recording(), Recording()
     certain = KnownStart(data.known_start) if known_start else Standardised(start_noise.unsqueeze(1))
     with running(draws, 1, trajectories), start, certain:
         program.initial()
-    with running(draws, rows - 1, trajectories), moving, Standardised(noise):
-        program.transition(states[:, :-1], data.controls[:-1], data.elapsed[:-1], data.steps)
+    few = slice(0, 1)  # one transition says which sites there are
+    with running(1, 1, trajectories), moving, Standardised(noise[few, few]):
+        program.transition(states[few, few], data.controls[few], data.elapsed[few], data.steps[few])
     event_dims = {site: fn.event_dim for site, fn in (start.distributions | moving.distributions).items()}
     first = torch.Size((draws, 1, trajectories))
     return Paths(
         states=states,
         start={site: broadcast_event(value, first, event_dims[site]) for site, value in start.values.items()},
-        noise=moving.values,
+        noise=_noise_along(program, data, states, noise, moving),
         event_dims=event_dims | {"states": 1},
     )
+
+
+def _noise_along(
+    program: Program, data: Trajectories, states: Tensor, noise: Tensor, sites: Recording
+) -> dict[str, Tensor]:
+    """What each site of `transition` draws at given states for standard normal noise, `(M, T, B, ...)`."""
+
+    def drawn(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
+        seen = Recording()
+        with running(*state.shape[:-1]), seen, Standardised(noise):
+            program.transition(state, control, time, step)
+        values = [as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()]
+        return torch.cat([value.expand(*state.shape[:-1], value.shape[-1]) for value in values], -1)
+
+    draws, rows = noise.shape[:2]
+    given = {"control": data.controls[:-1], "time": data.elapsed[:-1], "step": data.steps}
+    arguments = {"state": states[:, :-1], "noise": noise} | {
+        name: value.expand(draws, *value.shape) for name, value in given.items()
+    }
+    found = on_all_rows(program, "drawn", drawn, {name: value.flatten(0, 1) for name, value in arguments.items()})
+    values = found[0].unflatten(0, (draws, rows)) if isinstance(found, tuple) else drawn(*arguments.values())
+    widths = [fn.event_shape.numel() for fn in sites.distributions.values()]
+    return {
+        site: part if fn.event_dim else part.squeeze(-1)
+        for (site, fn), part in zip(sites.distributions.items(), values.split(widths, -1), strict=True)
+    }

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from steady_ppl.compiled_jacobians import compiled_jacobians
+from steady_ppl.compiled_rows import on_all_rows
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import ProgramError
 from steady_ppl.planar_vehicle import wrap
@@ -219,7 +219,7 @@ def _jacobians(
     program: Program, function: Callable[..., Tensor], along: dict[str, Tensor], given: dict[str, Tensor]
 ) -> _Jacobians:
     """By a kernel where it can serve, else by torch."""
-    found = compiled_jacobians(program, function.__name__, function, along, given)
+    found = on_all_rows(program, function.__name__, function, along | given, tuple(along))
     if isinstance(found, tuple):
         return _Jacobians(*found)
     value, by = _derivatives(lambda *inputs: function(*inputs, *given.values()), *along.values())

@@ -54,13 +54,28 @@ def steer(
     return noise.permute(2, 1, 0), ratio.t()
 
 
+# the innermost loops run over a trajectory's particles, side by side in memory: the processor takes several at once
+
+
 @njit(cache=True, error_model="numpy")
-def _deviate(state: Array, path: Array, angles: Array, b: int, n: int, out: Array) -> None:
-    """A state less the path's, angles on the circle."""
+def _deviations(state: Array, path: Array, angles: Array, b: int, out: Array) -> None:
+    """A trajectory's states less the path's, angles on the circle, into `out` `(D, N)`."""
     for i in range(len(out)):
-        out[i] = state[i, b, n] - path[b, i]
+        mine = out[i]
+        mine[:] = state[i, b]
+        mine -= path[b, i]
         if angles[i]:
-            out[i] -= 2 * math.pi * np.rint(out[i] / (2 * math.pi))
+            for n in range(len(mine)):
+                mine[n] -= 2 * math.pi * np.rint(mine[n] / (2 * math.pi))
+
+
+@njit(cache=True, error_model="numpy")
+def _add_products(matrix: Array, vectors: Array, first: int, sign: float, out: Array) -> None:
+    """Add one row of a matrix, from an element on, times vectors `(·, N)` to `out` `(N,)`."""
+    for i in range(first, len(vectors)):
+        weight, vector = sign * matrix[i], vectors[i]
+        for n in range(len(out)):
+            out[n] += weight * vector[n]
 
 
 @njit(cache=True, error_model="numpy")
@@ -68,17 +83,16 @@ def _log_future(
     state: Array, path: Array, angles: Array, precision: Array, information: Array, log_scale: Array, out: Array
 ) -> None:
     dimension, trajectories, particles = state.shape
-    deviation = np.empty(dimension)
+    deviation, pulled = np.empty((dimension, particles)), np.empty(particles)
     for b in range(trajectories):
-        for n in range(particles):
-            _deviate(state, path, angles, b, n, deviation)
-            total = log_scale[b]
-            for i in range(dimension):
-                pulled = information[b, i]
-                for j in range(dimension):
-                    pulled -= 0.5 * precision[b, i, j] * deviation[j]
-                total += pulled * deviation[i]
-            out[b, n] = total
+        _deviations(state, path, angles, b, deviation)
+        out[b] = log_scale[b]
+        for i in range(dimension):
+            pulled[:] = information[b, i]
+            _add_products(precision[b, i], deviation, 0, -0.5, pulled)
+            own, total = deviation[i], out[b]
+            for n in range(particles):
+                total[n] += pulled[n] * own[n]
 
 
 @njit(cache=True, error_model="numpy")
@@ -96,35 +110,40 @@ def _steer(
     noise, log_ratio = out
     dimension, trajectories, particles = state.shape
     channels = len(own)
-    deviation, mean, drawn = np.empty(dimension), np.empty(channels), np.empty(channels)
+    deviation, wide = np.empty((dimension, particles)), np.empty((channels, particles))
+    mean, drawn, white = np.empty((channels, particles)), np.empty((channels, particles)), np.empty(particles)
     for b in range(trajectories):
-        log_determinant = 0.0
+        _deviations(state, path, angles, b, deviation)
+        ratio = log_ratio[b]
+        ratio[:] = 0.0
         for c in range(channels):
-            log_determinant += math.log(whitening[b, c, c])
+            ratio += math.log(whitening[b, c, c])
+            wide[c] = own[c, b]
+        for c in range(channels):
+            mean[c] = shift[b, c]
+            _add_products(gain[b, c], deviation, 0, -1.0, mean[c])
+            drawn[c] = mean[c]
+            _add_products(factor[b, c], wide, c, 1.0, drawn[c])
+            mine, unsteered = drawn[c], wide[c]
+            for n in range(particles):
+                mine[n] = unsteered[n] if stays[b, n] else mine[n]
+                ratio[n] += 0.5 * mine[n] * mine[n]
+            noise[c, b] = mine
+        for c in range(channels):
+            white[:] = 0.0
+            _add_products(whitening[b, c], drawn, c, 1.0, white)
+            _add_products(whitening[b, c], mean, c, -1.0, white)
+            for n in range(particles):
+                ratio[n] -= 0.5 * white[n] * white[n]
         for n in range(particles):
-            _deviate(state, path, angles, b, n, deviation)
-            squares = 0.0
-            for c in range(channels):
-                mean[c] = shift[b, c]
-                for i in range(dimension):
-                    mean[c] -= gain[b, c, i] * deviation[i]
-                drawn[c] = own[c, b, n]
-                if not stays[b, n]:
-                    drawn[c] = mean[c]
-                    for k in range(c, channels):
-                        drawn[c] += factor[b, c, k] * own[k, b, n]
-                noise[c, b, n] = drawn[c]
-                squares += drawn[c] * drawn[c]
-            for c in range(channels):
-                white = 0.0
-                for k in range(c, channels):
-                    white += whitening[b, c, k] * (drawn[k] - mean[k])
-                squares -= white * white
-            ratio = 0.5 * squares + log_determinant
+            value = ratio[n]
             if untwisted > 0:
-                high = max(ratio, 0.0)
-                ratio = high + math.log((1 - untwisted) * math.exp(ratio - high) + untwisted * math.exp(-high))
-            log_ratio[b, n] = -ratio
+                smaller = math.exp(-abs(value))
+                if value > 0:
+                    value += math.log1p(untwisted * (smaller - 1))
+                else:
+                    value = math.log((1 - untwisted) * smaller + untwisted)
+            ratio[n] = -value
 
 
 def log_future_in_parallel(

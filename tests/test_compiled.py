@@ -12,7 +12,7 @@ import torch
 from examples import drives, example
 from oracles import assert_mean
 
-from steady_ppl import Constant, FilterError, GaussianGuide, SMCGuide, compiled_jacobians, particle_filter, seeded
+from steady_ppl import Constant, FilterError, GaussianGuide, SMCGuide, compiled_rows, particle_filter, seeded
 from steady_ppl.compiled import CompiledStepping, stepping_for
 from steady_ppl.gaussian_smoother import find_and_smooth
 from steady_ppl.linearization import Path, linearize
@@ -78,15 +78,15 @@ def test_a_kernels_jacobians_are_those_of_torch(name, monkeypatch):
     torch.manual_seed(1)
     states, noise = 2 * torch.randn(9, 3, len(program.states)), torch.randn(8, 3, len(program.channels))
     by_torch = linearize(program, data, Path(states, noise))
-    monkeypatch.setattr(compiled_jacobians, "WORTH_COMPILING", 1)
+    monkeypatch.setattr(compiled_rows, "WORTH_COMPILING", 1)
     by_kernel = linearize(program, data, Path(states, noise))
-    assert by_kernel.in_plain_torch is None and compiled_jacobians._METHODS[program]
+    assert by_kernel.in_plain_torch is None and compiled_rows._METHODS[program]
     for part in ("offset", "state", "noise", "residual", "measurement", "precision", "log_scale"):
         torch.testing.assert_close(getattr(by_kernel, part), getattr(by_torch, part), rtol=1e-4, atol=2e-5)
 
 
 def test_jacobians_that_cannot_be_compiled_come_from_torch_and_the_guide_says_why(monkeypatch):
-    monkeypatch.setattr(compiled_jacobians, "WORTH_COMPILING", 1)
+    monkeypatch.setattr(compiled_rows, "WORTH_COMPILING", 1)
     data = drives(example("hovercraft", torch.float32), 2, 12)
     guide = GaussianGuide(Switching(), draws=3, known_start=True)
     with seeded("plain"):
@@ -99,7 +99,7 @@ def test_jacobians_that_cannot_be_compiled_come_from_torch_and_the_guide_says_wh
 
 
 def test_jacobians_that_have_fallen_behind_their_program_are_found_out(monkeypatch):
-    monkeypatch.setattr(compiled_jacobians, "WORTH_COMPILING", 1)
+    monkeypatch.setattr(compiled_rows, "WORTH_COMPILING", 1)
     program = Stale()
     data = drives(example("hovercraft", torch.float32), 2, 31)
     path = Path(torch.randn(31, 2, 6), torch.randn(30, 2, 3))

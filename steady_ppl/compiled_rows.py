@@ -1,8 +1,8 @@
-"""Jacobians of a program's methods as kernels, for all rows of all trajectories in one call."""
+"""Functions of a program, and their Jacobians, as kernels for all rows of all trajectories in one call."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -20,8 +20,8 @@ Function = Callable[..., Tensor]
 _METHODS: WeakKeyDictionary[Program, dict[Any, Method | NotCompilable]] = WeakKeyDictionary()
 
 
-def compiled_jacobians(
-    program: Program, name: str, function: Function, along: dict[str, Tensor], given: dict[str, Tensor]
+def on_all_rows(
+    program: Program, name: str, function: Function, arguments: dict[str, Tensor], along: Sequence[str] = ()
 ) -> tuple[Tensor, list[Tensor]] | str | None:
     """A function's value and its Jacobians.
 
@@ -29,25 +29,24 @@ def compiled_jacobians(
         program: what the function belongs to.
         name: of the function, by which its kernel is kept.
         function: of one row of one trajectory or of many; it returns `(..., V)`.
-        along: its first arguments, in which to differentiate, each `(rows, B, ·)`.
-        given: the others, `(rows, B)` or `(rows, B, ·)`.
+        arguments: its arguments in order, each `(rows, B)` or `(rows, B, ·)`.
+        along: those in which to differentiate, the first ones.
 
     Returns:
         The value `(rows, B, V)` and the Jacobians `(rows, B, V, ·)`; why there is no kernel; None where it is not
         worth one.
     """
-    first = next(iter(along.values()))
+    first = next(iter(arguments.values()))
     rows, trajectories = first.shape[:2]
     if rows * trajectories < WORTH_COMPILING or first.device.type != "cpu" or first.dtype != torch.float32:
         return None
-    arguments = along | given
     known = _METHODS.setdefault(program, {})
     key = (name, signature(program))
     if key not in known:
         examples = {at: value[:1, :1].unsqueeze(0).clone() for at, value in arguments.items()}
         with torch.random.fork_rng(devices=[]):
             try:
-                known[key] = Method(lambda *values: (function(*values),), examples, {}, along=tuple(along))
+                known[key] = Method(lambda *values: (function(*values),), examples, {}, along=along)
             except NotCompilable as reason:
                 known[key] = reason
     method = known[key]
@@ -55,17 +54,12 @@ def compiled_jacobians(
         return str(method)
     found = _run(method, arguments, rows, trajectories)
     values, rest = found[..., : method.values], found[..., method.values :]
-    few = [
-        value.reshape(1, -1, *value.shape[2:])[:, :: max(1, rows * trajectories // LANES)]
-        for value in arguments.values()
-    ]
-    plain = function(*few)
-    mine = values.reshape(1, -1, method.values)[:, :: max(1, rows * trajectories // LANES)]
-    if not torch.allclose(mine, plain, rtol=1e-4, atol=1e-4, equal_nan=True):
+    plain = function(*(_a_few(value) for value in arguments.values()))
+    if not torch.allclose(_a_few(values), plain, rtol=1e-4, atol=1e-4, equal_nan=True):
         known[key] = NotCompilable("its kernel and its own lines come to different numbers")
         return str(known[key])
-    widths = [value.shape[-1] for value in along.values()]
-    return values, list(rest.unflatten(-1, (method.values, sum(widths))).split(widths, -1))
+    widths = [arguments[at].shape[-1] for at in along]
+    return values, list(rest.unflatten(-1, (method.values, sum(widths))).split(widths, -1)) if along else []
 
 
 def _a_few(values: Tensor) -> Tensor:
