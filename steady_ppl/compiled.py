@@ -15,7 +15,7 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.kernel_writer import LANES
-from steady_ppl.method import Method, signature
+from steady_ppl.method import Method, close, signature
 from steady_ppl.program import Program
 from steady_ppl.resampling import by_component
 from steady_ppl.scalar_graph import NotCompilable
@@ -150,10 +150,4 @@ class CompiledStepping(Stepping):
         plain, plain_values = self.plain.transition(row, state, None, noise)
         density, plain_density = self.log_density(row, moved), self.plain.log_density(row, moved)
         pairs = [(moved, plain), (density, plain_density), *((values[s], plain_values[s]) for s in values)]
-        return all(_close(mine, theirs.expand_as(mine)) for mine, theirs in pairs)
-
-
-def _close(mine: Tensor, theirs: Tensor) -> bool:
-    """Equal but for rounding, and for the few that stand at a jump."""
-    same = torch.isclose(mine, theirs, rtol=1e-4, atol=1e-4, equal_nan=True)
-    return float(same.float().mean()) > 0.98
+        return all(close(mine, theirs.expand_as(mine)) for mine, theirs in pairs)

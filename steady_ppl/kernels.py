@@ -46,6 +46,7 @@ class Kernel:
         _, trajectories, particles = out.shape
         for array in (parameters, uniform, *inputs, out):
             assert array.dtype == np.float32 and array.flags.c_contiguous
+        assert len(out) == self.outputs and len(uniform) == trajectories
         assert particles >= LANES and all(array.shape[1:] == out.shape[1:] for array in inputs)
         assert ancestors is None or (ancestors.dtype == np.int64 and ancestors.flags.c_contiguous)
         pointers = [parameters.ctypes.data, uniform.ctypes.data, *(array.ctypes.data for array in inputs)]

@@ -117,7 +117,7 @@ def atan2(y: Lanes, x: Lanes) -> Lanes:
     angle = big.where(angle + math.pi / 4, angle)
     angle = steep.where(math.pi / 2 - angle, angle)
     angle = (x < 0.0).where(math.pi - angle, angle)
-    return (y < 0.0).where(-angle, angle)
+    return (y + x).compare("!=", y + x).where(y + x, (y < 0.0).where(-angle, angle))
 
 
 def maximum(x: Lanes, y: Lanes) -> Lanes:
@@ -134,8 +134,15 @@ def expm1(x: Lanes) -> Lanes:
 
 
 def power(x: Lanes, y: Lanes) -> Lanes:
-    """xʸ; not a number where x is negative."""
+    """xʸ of x ≥ 0; of negative x not a number."""
     return y.compare("==", 0.0).where(1.0, exp(log(x) * y))
+
+
+def remainder(x: Lanes, y: Lanes) -> Lanes:
+    """x less the multiple of y below it; in [0, y) for positive y."""
+    rest = x - (x / y).call("floor") * y
+    rest = (rest < 0.0).logical("and_", y > y.like(0.0)).where(rest + y, rest)
+    return (absolute(rest) < absolute(y)).where(rest, rest - y)
 
 
 def _compare(how: str, x: Lanes, y: Lanes) -> Lanes:
@@ -154,7 +161,7 @@ OPERATIONS: dict[str, Any] = {
     "asin": lambda x: atan2(x, _other_leg(x)),
     "acos": lambda x: atan2(_other_leg(x), x),
     "hypot": lambda x, y: (x * x + y * y).call("sqrt"),
-    "remainder": lambda x, y: x - (x / y).call("floor") * y,
+    "remainder": remainder,
     "silu": lambda x: x * sigmoid(x),
     "add": lambda x, y: x + y,
     "sub": lambda x, y: x - y,

@@ -75,7 +75,7 @@ class Lanes:
 
     def compare(self, how: str, other: Any) -> Lanes:
         """A truth value; false where either is not a number, except for "!="."""
-        left, right = self._pair(other)
+        left, right = number(self)._pair(number(other) if isinstance(other, Lanes) else other)
         unordered = how == "!="
         make = self.builder.fcmp_unordered if unordered else self.builder.fcmp_ordered
         return Lanes(self.builder, make(how, left.value, right.value))

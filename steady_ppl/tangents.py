@@ -11,7 +11,7 @@ from typing import Any
 from steady_ppl.scalar_graph import Each, NotCompilable, Product, ScalarGraph
 
 FLAT = (
-    *("round", "floor", "ceil", "sign", "number", "gt", "ge", "lt", "le", "eq", "ne"),
+    *("round", "floor", "ceil", "sign", "gt", "ge", "lt", "le", "eq", "ne"),
     *("logical_and", "logical_or", "logical_not"),
 )
 Values = list[int]  # a scalar, or the elements of a vector
@@ -150,6 +150,7 @@ PARTIALS: dict[str, Partial] = {
     "mul": lambda d, value, x, y: (y, x),
     "div": lambda d, value, x, y: (d.do("reciprocal", y), d.do("neg", _over(d, value, y))),
     "neg": lambda d, value, x: (d.constants(-1.0, value),),
+    "number": lambda d, value, x: (None,),
     "abs": lambda d, value, x: (d.do("sign", x),),
     "square": lambda d, value, x: (d.do("mul", x, 2.0),),
     "sqrt": lambda d, value, x: (_over(d, d.constants(0.5, value), value),),

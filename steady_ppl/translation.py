@@ -92,6 +92,7 @@ class Translation:
         if node.target is operator.getitem:
             return arguments[0][arguments[1]]
         packet = getattr(node.target, "overloadpacket", None)
+        self._check_kind(node)
         if packet in MOVING:
             return MOVING[packet](*arguments, **keywords)
         if packet in ELEMENTWISE and not keywords:
@@ -104,6 +105,19 @@ class Translation:
         if special is None:
             raise NotCompilable(f"no kernel for {node.target}")
         return special(*arguments, **keywords)
+
+    def _check_kind(self, node: fx.Node) -> None:
+        """Kernels compute in single precision and with truth values."""
+        kind = getattr(node.meta.get("val"), "dtype", torch.float32)
+        if kind not in (torch.float32, torch.bool):
+            raise NotCompilable(f"it computes in {str(kind).removeprefix('torch.')}")
+        name = str(getattr(node.target, "overloadpacket", "")).rsplit(".")[-1]
+        if kind == torch.bool and name in ("add", "mul", "maximum", "minimum"):
+            raise NotCompilable("arithmetic with truth values")
+        for argument in node.all_input_nodes[:1] if "index" in name else node.all_input_nodes:
+            taken = getattr(argument.meta.get("val"), "dtype", torch.float32)
+            if taken not in (torch.float32, torch.bool):
+                raise NotCompilable(f"it computes with {str(taken).removeprefix('torch.')}")
 
     def _each(self, operation: str, *operands: Any) -> Tensor:
         """An elementwise operation on operands that broadcast; numbers of Python are constants."""
@@ -142,11 +156,15 @@ class Translation:
         return self._each("div", left, right)
 
     def _pow(self, base: Any, exponent: Any) -> Tensor:
-        if exponent in (1, 2, 3, 4):
+        if isinstance(exponent, Tensor):
+            return self._each("pow", base, exponent)
+        if float(exponent).is_integer() and 0 < abs(exponent) <= 16:
             power = base
-            for _ in range(int(exponent) - 1):
+            for _ in range(abs(int(exponent)) - 1):
                 power = self._each("mul", power, base)
-            return power
+            return power if exponent > 0 else self._each("reciprocal", power)
+        if float(exponent).is_integer() and exponent:
+            raise NotCompilable(f"a power of {exponent}")
         named = (
             {0.5: "sqrt", -0.5: "rsqrt", -1: "reciprocal"}.get(exponent) if isinstance(exponent, int | float) else None
         )
@@ -159,8 +177,9 @@ class Translation:
 
     def _clamp(self, value: Tensor, low: Any = None, high: Any = None, *, min: Any = None, max: Any = None) -> Tensor:
         low, high = (min if low is None else low), (max if high is None else high)
-        value = value if low is None else self._each("maximum", value, low)
-        return value if high is None else self._each("minimum", value, high)
+        if low is not None:  # at the bound the value passes, as does its derivative
+            value = self._each("where", self._each("lt", value, low), low, value)
+        return value if high is None else self._each("where", self._each("gt", value, high), high, value)
 
     _clamp_min = _clamp
 

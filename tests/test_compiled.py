@@ -143,6 +143,7 @@ def test_other_settings_and_other_tensors_are_traced_anew():
     program.input_sd = torch.full_like(program.input_sd, 3.0)
     program.hidden_out = torch.nn.Linear(64, 3)
     program.absolute_heading = False
+    program.landmarks = ((1.0, 2.0), *program.landmarks[1:])
     assert_same(*stepping(program, data))
 
 
@@ -210,8 +211,24 @@ class HeavyTailed(HovercraftTruth):
         return self.integrate(state, jerk.expand(*state.shape[:-1], 3), step)
 
 
+class ByTrajectory(HovercraftTruth):
+    """Has a gain for each of two trajectories, which a kernel, traced for one, cannot know."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("gain", torch.tensor([1.0, 1.2]))
+
+    def transition(self, state, control, time, step):
+        return super().transition(state, control * self.gain[:, None], time, step)
+
+
 @pytest.mark.parametrize(
-    ("program", "says"), [(Switching, "reads a number out of a tensor"), (HeavyTailed, "StudentT")]
+    ("program", "says"),
+    [
+        (Switching, "reads a number out of a tensor"),
+        (HeavyTailed, "StudentT"),
+        (ByTrajectory, "mixes particles or trajectories"),
+    ],
 )
 def test_what_cannot_be_compiled_runs_as_written_and_says_why(program, says):
     data = drives(example("hovercraft", torch.float32), 2, 6)

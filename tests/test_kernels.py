@@ -95,7 +95,8 @@ def test_the_direction_is_exact_in_every_quadrant():
     "function",
     [
         *(torch.exp, torch.log, torch.tanh, torch.sigmoid, torch.relu, torch.abs, torch.floor, torch.round, torch.sign),
-        *(torch.sqrt, torch.log1p, nn.functional.softplus, torch.square, torch.neg, torch.ceil),
+        *(torch.sqrt, torch.log1p, nn.functional.softplus, torch.square, torch.neg, torch.ceil, torch.asin, torch.acos),
+        lambda x: ((x > 0) == (x < 2)).float(),
         lambda x: x.clamp(-1.0, 2.0),
         lambda x: torch.where(x > 0.5, x, -x),
         lambda x: torch.maximum(x, -x) + torch.minimum(x, torch.zeros_like(x)),
@@ -113,6 +114,7 @@ ARITHMETIC = [
     lambda x, y: torch.hypot(x, y) + x**2 + x**3 + (1 + y * y) ** 0.5 + (1 + y * y) ** -0.5,
     lambda x, y: (x.abs() + 0.1) ** 1.7 + (x.abs() + 0.1) ** (y * 0.1),
     lambda x, y: torch.remainder(x, 0.7) + 3 - torch.sub(x, y, alpha=2) - 1.0 / (2 + x * x),
+    lambda x, y: (0.3 * x) ** 5 + (2 + x * x) ** -3 + (0.2 * x - 0.5) ** 7 + 1.5**y,
     lambda x, y: nn.functional.silu(x) + nn.functional.leaky_relu(y, 0.2) + (0.3 * x).clamp(-0.9, 0.9).asin(),
     lambda x, y: torch.stack([x, y], -1).norm(dim=-1) + torch.stack([x, y], -1).sum(-1) * torch.cat([x, y]).mean(),
     lambda x, y: torch.linalg.solve(torch.tensor([[2.0, 0.3], [0.1, 1.0]]), torch.eye(2))[0, 1] * x + y,
@@ -142,6 +144,24 @@ def test_derivatives_are_those_of_torch(function):
     expected = torch.stack([torch.cat(one) for one in exact], 1)
     found = kernel_of(lambda a, b: function(a, b).sum(-1), x[0], y[0], differentiate=True)[:, 0]
     torch.testing.assert_close(found, expected, rtol=2e-5, atol=2e-5)
+
+
+@pytest.mark.parametrize("function", [torch.atan2, torch.hypot, torch.maximum, torch.minimum, torch.remainder])
+def test_what_is_not_a_number_stays_so(function):
+    x, nan = torch.ones(1, 20), torch.full((1, 20), math.nan)
+    assert kernel_of(function, x, nan).isnan().all() and kernel_of(function, nan, x).isnan().all()
+
+
+def test_a_value_at_its_bound_passes_its_derivative_on():
+    x = torch.zeros(1, 20)
+    for function in (lambda x: x.clamp(min=0.0), lambda x: x.clamp(max=0.0), lambda x: x.to(torch.float32, copy=True)):
+        assert (kernel_of(function, x, differentiate=True) == 1).all()
+
+
+def test_a_remainder_lies_between_zero_and_its_divisor():
+    x = 0.1 * torch.arange(-1600.0, 1600.0)[None]
+    rest = kernel_of(lambda x: x % 0.1, x)[0]
+    assert ((rest >= 0) & (rest < 0.1)).all()
 
 
 def network(hidden: int, layers: int, outputs: int = 3) -> nn.Module:
@@ -222,9 +242,12 @@ def test_assignments_in_place_are_understood():
     [
         (torch.erfc, "no kernel for aten.erfc"),
         (lambda x: x + torch.randn(()), "random numbers of its own"),
-        (lambda x: x.double().exp().float(), "it converts to float64"),
+        (lambda x: x.double().exp().float(), "it computes in float64"),
         (lambda x: x > 0, "a truth value as a result"),
-        (lambda x: torch.tensor([1.0, 2.0])[(x > 0).long()], "no kernel|converts|look"),
+        (lambda x: (x > -9) + (x > -8), "arithmetic with truth values"),
+        (lambda x: x**21, "a power of 21"),
+        (lambda x: x[:0] * 2, "it cannot be compiled"),
+        (lambda x: torch.tensor([1.0, 2.0])[(x > 0).long()], "it computes in int64"),
         (lambda x: torch.linspace(0, 1, 4000) * x, "more than"),
     ],
 )
