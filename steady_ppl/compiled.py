@@ -15,7 +15,7 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.kernel_writer import LANES
-from steady_ppl.method import Method, close, signature
+from steady_ppl.method import RESTLESS, TRACES, Method, close, signature
 from steady_ppl.program import Program
 from steady_ppl.resampling import by_component
 from steady_ppl.scalar_graph import NotCompilable
@@ -40,6 +40,8 @@ def stepping_for(
         return plain, f"fewer than {LANES} particles"
     known = _METHODS.setdefault(program, {})
     key = signature(program)
+    if key not in known and len(known) >= TRACES:
+        return plain, RESTLESS
     if key not in known:
         with torch.random.fork_rng(devices=[]):
             try:

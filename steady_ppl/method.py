@@ -20,6 +20,10 @@ from steady_ppl.tangents import jacobian
 from steady_ppl.translation import Translation, evaluate
 
 
+TRACES = 8  # of one method of one program; each takes some tenths of a second
+RESTLESS = "its settings or tensors change from run to run"
+
+
 class _ReadsNumbers(TorchDispatchMode):
     """Refuses to trace what a number read from a tensor decides: it would be the same for ever."""
 

@@ -252,6 +252,22 @@ def test_a_kernel_that_has_fallen_behind_its_program_is_found_out():
     assert "different numbers" in found.in_plain_torch
 
 
+class Counting(HovercraftTruth):
+    """Counts how often it is run."""
+
+    calls = 0
+
+    def transition(self, state, control, time, step):
+        self.calls += 1
+        return super().transition(state, control, time, step)
+
+
+def test_a_program_whose_settings_never_rest_is_not_compiled_for_ever():
+    program, data = Counting(), drives(example("hovercraft", torch.float32), 2, 4)
+    reasons = [particle_filter(program, data, particles=20, kernels=True).in_plain_torch for _ in range(10)]
+    assert reasons[0] is None and "change from run to run" in reasons[-1]
+
+
 def test_kernels_are_for_single_precision_and_more_than_a_few_particles():
     program = example("hovercraft", torch.float64)
     data = drives(program, 2, 6)
