@@ -19,7 +19,6 @@ from steady_ppl.scalar_graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarG
 from steady_ppl.tangents import jacobian
 from steady_ppl.translation import Translation, evaluate
 
-
 TRACES = 8  # of one method of one program; each takes some tenths of a second
 RESTLESS = "its settings or tensors change from run to run"
 
