@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     )
     from steady_ppl.filtering import log_likelihood, neglected, run_filter, smoothed_states
     from steady_ppl.fit import Fit
-    from steady_ppl.guides import GaussianGuide, LookaheadGuide, PathGuide, SMCGuide, TruthGuide
+    from steady_ppl.guides import PathGuide, SMCGuide, TruthGuide
     from steady_ppl.joint import Joint
     from steady_ppl.linearization import why_not_linear
+    from steady_ppl.linearized_guides import GaussianGuide, LookaheadGuide
     from steady_ppl.particles import particle_filter, roll_out
     from steady_ppl.paths import Filtered, Paths
     from steady_ppl.planar_vehicle import PlanarVehicle, WrappedNormal, bearings_to, dense, stack, wrap
@@ -40,9 +41,10 @@ _HOMES = {
     "errors": ("DataError", "FilterError", "ProgramError", "RunError", "SteadyError", "TrainingError", "UsageError"),
     "filtering": ("log_likelihood", "neglected", "run_filter", "smoothed_states"),
     "fit": ("Fit",),
-    "guides": ("GaussianGuide", "LookaheadGuide", "PathGuide", "SMCGuide", "TruthGuide"),
+    "guides": ("PathGuide", "SMCGuide", "TruthGuide"),
     "joint": ("Joint",),
     "linearization": ("why_not_linear",),
+    "linearized_guides": ("GaussianGuide", "LookaheadGuide"),
     "particles": ("particle_filter", "roll_out"),
     "paths": ("Filtered", "Paths"),
     "planar_vehicle": ("PlanarVehicle", "WrappedNormal", "bearings_to", "dense", "stack", "wrap"),

@@ -35,6 +35,7 @@ from steady_ppl.gaussian_smoother import find_and_smooth, find_path, means_as_pa
 from steady_ppl.sites import AtMean, Recording, Replaying, Standardised, running
 
 GUIDES = (GaussianGuide, LookaheadGuide)
+REMEMBERED = ("states", "noise", "searched")
 Cart = type(example("linear_gaussian"))
 
 
@@ -206,11 +207,11 @@ def test_a_guide_remembers_its_paths_from_one_refresh_to_the_next(monkeypatch):
         searched.append(data.labels)
         return find_and_smooth(program, data, **settings)
 
-    monkeypatch.setattr("steady_ppl.guides.find_and_smooth", counting)
+    monkeypatch.setattr("steady_ppl.linearized_guides.find_and_smooth", counting)
     guide = GaussianGuide(program, draws=4, known_start=True, tempering=Constant())
     guide.refresh(data.subset([0, 1]), 0.0)
     guide.refresh(data.subset([1, 0]), 0.0)
-    assert searched == [("1", "2")] and set(guide.memory) == {f"{k}/{i}" for k in ("states", "noise") for i in "12"}
+    assert searched == [("1", "2")] and set(guide.memory) == {f"{kind}/{i}" for kind in REMEMBERED for i in "12"}
     guide.refresh(data.subset([1, 2]), 0.0)
     assert searched == [("1", "2"), ("3",)]
     guide.memory["noise/3"].fill_(math.nan)
@@ -220,6 +221,43 @@ def test_a_guide_remembers_its_paths_from_one_refresh_to_the_next(monkeypatch):
     for i, label in enumerate(data.labels):
         apart = guide.memory[f"states/{label}"] - exact.means()[0][:, i]
         assert apart[data.rows[:, i]].abs().max() < 0.02
+
+
+@pytest.mark.parametrize("guide", GUIDES)
+def test_a_guide_leaves_a_wrong_place_for_a_likelier_path(guide, monkeypatch):
+    program = example("hovercraft:HovercraftTruth").requires_grad_(False)
+    data = drives(program, 3, 12, gaps=True)
+    looking = guide(program, draws=4, known_start=True, tempering=Constant(), search_again=0.5)
+    looking.refresh(data, 0.0)
+    right = {name: value.clone() for name, value in looking.memory.items()}
+    wrong = right["states/2"] + torch.tensor([0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
+    stays_put = lambda ahead, part: ahead.linearization.path  # noqa: E731
+    monkeypatch.setattr("steady_ppl.linearized_guides.means_as_path", stays_put)
+    looking.memory["states/2"] = wrong
+    looking.refresh(data, 0.4)
+    assert torch.equal(looking.memory["states/2"], wrong)
+    looking.refresh(data, 0.5)
+    for label in data.labels:
+        torch.testing.assert_close(looking.memory[f"states/{label}"], right[f"states/{label}"], rtol=0, atol=0.05)
+    looking.refresh(data, 0.9)
+    assert {label: float(looking.memory[f"searched/{label}"]) for label in data.labels} == dict.fromkeys("123", 0.5)
+
+
+@pytest.mark.parametrize("guide", GUIDES)
+def test_a_search_that_was_not_needed_may_fail(guide, monkeypatch):
+    program = example("hovercraft:HovercraftTruth").requires_grad_(False)
+    data = drives(program, 3, 12, gaps=True)
+    looking = guide(program, draws=4, known_start=True, tempering=Constant())
+    looking.refresh(data, 0.0)
+
+    def fails(*_, **__):
+        raise FilterError("no path")
+
+    monkeypatch.setattr("steady_ppl.linearized_guides.find_and_smooth", fails)
+    assert looking.refresh(data, 0.3)["searches_failed"] == 1
+    looking.memory["noise/3"].fill_(math.nan)
+    with pytest.raises(FilterError, match="no path"):
+        looking.refresh(data, 0.3)
 
 
 # --- training ---------------------------------------------------------------------------------------------------------
@@ -298,7 +336,7 @@ def test_a_resumed_run_repeats_an_uninterrupted_one_bit_for_bit(data, tmp_path, 
     with pytest.raises(RuntimeError, match="killed"):
         run(killed, data, killed_at(guide(killed, draws=5), 3), batch=batch, checkpoint=tmp_path / "cut")
     remembered = [name for name in read_tensors(tmp_path / "cut")[0] if name.startswith("memory/")]
-    assert "memory/states/1" in remembered and len(remembered) % 2 == 0
+    assert "memory/states/1" in remembered and len(remembered) % len(REMEMBERED) == 0
     b = run(resumed, data, guide(resumed, draws=5), batch=batch, checkpoint=tmp_path / "cut", resume=True)
     assert a == b and same(values(whole), values(resumed))
     left = [read_tensors(tmp_path / name) for name in ("whole", "cut")]
@@ -331,8 +369,8 @@ def test_mini_batches_train_and_every_trajectory_is_remembered(data, guide):
     before = values(program)
     trained = run(program, data, batched, batch=2)
     assert sizes == [2] * 5 and [entry["step"] for entry in trained.history] == [2, 4, 5]
-    assert set(batched.memory) == {f"{kind}/{label}" for kind in ("states", "noise") for label in data.labels}
-    assert all(value.shape[0] in (11, 12) for value in batched.memory.values())
+    assert set(batched.memory) == {f"{kind}/{label}" for kind in REMEMBERED for label in data.labels}
+    assert all(value.shape[0] in (11, 12) for value in batched.memory.values() if value.dim())
     after = values(program)
     assert all(after[name].isfinite() and not torch.equal(after[name], before[name]) for name in after)
 

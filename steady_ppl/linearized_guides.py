@@ -1,0 +1,177 @@
+"""Guides that linearise the program along a path of every trajectory, which they keep from one E step to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import FilterError
+from steady_ppl.gaussian_smoother import find_and_smooth, means_as_path, smooth, smoother_paths
+from steady_ppl.guides import FilteringGuide, PathGuide
+from steady_ppl.linearization import Path
+from steady_ppl.lookahead import Lookahead
+from steady_ppl.program import Program
+from steady_ppl.proposals import Twist
+from steady_ppl.tempering import LinearRamp, Tempering
+
+
+class LinearizedGuide(PathGuide):
+    """What the guides share that linearise the program: each trajectory's path, kept from one `refresh` to the next.
+
+    Args:
+        program: the state-space model; its noise is normal, see `linearize`.
+        draws: M, paths for each trajectory.
+        tempering: schedule of the observation weight.
+        known_start: the first state is certain.
+        passes: linearisations a `refresh`; one is enough where the parameters have moved little since the last.
+        search_again: progress after which a drive's path is searched for anew; the likelier of the two is kept.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        *,
+        draws: int = 30,
+        tempering: Tempering | None = None,
+        known_start: bool = False,
+        passes: int = 1,
+        search_again: float = 0.2,
+    ) -> None:
+        super().__init__(draws)
+        self.program, self.tempering = program, tempering or LinearRamp()
+        self.known_start, self.passes, self.search_again = known_start, passes, search_again
+        self.counts: dict[str, int] = {}
+
+    def look_ahead(self, data: Trajectories, progress: float) -> Lookahead:
+        """Linearise along the remembered paths; search for those that are not there, again for those that are lost, and
+        now and then for all: what was found while the program knew little can be a wrong place that it never leaves.
+
+        Raises:
+            FilterError: a path cannot be found.
+        """
+        self._search(data, [i for i, label in enumerate(data.labels) if f"states/{label}" not in self.memory], progress)
+        ahead = self._smooth(data, progress)
+        lost = (~torch.isfinite(ahead.log_likelihood)).nonzero().flatten().tolist()
+        searched = [float(self.memory[f"searched/{label}"]) for label in data.labels]
+        due = [i for i, then in enumerate(searched) if progress - then >= self.search_again and i not in lost]
+        self.counts = {"paths_lost": len(lost)}
+        self._search(data, lost, progress)
+        try:
+            self._search(data, due, progress, ahead.log_likelihood)
+        except FilterError:  # nothing likelier was found than what is known
+            self.counts["searches_failed"] = 1
+        if lost or due:
+            ahead = self._smooth(data, progress)
+        self._remember(means_as_path(ahead, data), data)
+        self.in_plain_torch = ahead.linearization.in_plain_torch
+        return ahead
+
+    def _search(
+        self, data: Trajectories, trajectories: Sequence[int], progress: float, known: Tensor | None = None
+    ) -> None:
+        """Remember paths found from the measurements alone, where they are likelier than what is known already."""
+        if not trajectories:
+            return
+        part = data.subset(trajectories)
+        for label in part.labels:
+            self.memory[f"searched/{label}"] = torch.tensor(progress, dtype=torch.float64)
+        ahead = find_and_smooth(
+            self.program, part, known_start=self.known_start, observation_weight=self.tempering(progress)
+        )
+        found = means_as_path(ahead, part)
+        better = ahead.log_likelihood > (-torch.inf if known is None else known[trajectories])
+        kept = better.nonzero().flatten().tolist()
+        if kept:
+            self._remember(Path(found.states[:, kept], found.noise[:, kept]), part.subset(kept))
+
+    def _smooth(self, data: Trajectories, progress: float) -> Lookahead:
+        path = Path(self._recall("states", data), self._recall("noise", data))
+        return smooth(
+            self.program,
+            data,
+            path,
+            known_start=self.known_start,
+            observation_weight=self.tempering(progress),
+            passes=self.passes,
+        )
+
+    def _recall(self, kind: str, data: Trajectories) -> Tensor:
+        return torch.stack([self.memory[f"{kind}/{label}"] for label in data.labels], 1).to(data.controls)
+
+    def _remember(self, path: Path, data: Trajectories) -> None:
+        for i, label in enumerate(data.labels):
+            self.memory[f"states/{label}"] = path.states[:, i]
+            self.memory[f"noise/{label}"] = path.noise[:, i]
+
+    def _figures(self, ahead: Lookahead) -> dict[str, float]:
+        """Log p(y) of the linearised program, at this step's observation weight; and what happened to its paths."""
+        figures = {"log_evidence": float(ahead.log_likelihood.mean())}
+        return figures | {name: float(count) for name, count in self.counts.items() if count}
+
+
+class GaussianGuide(LinearizedGuide):
+    """Draws of the linearised program's posterior as the E step: the iterated extended Kalman smoother.
+
+    The cheapest, and as good as any where the posterior is close to normal (10 Hz, three landmarks or more); what it
+    neglects, `LookaheadGuide` weighs.
+    """
+
+    def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
+        """Linearise, smooth and keep `draws` independent paths.
+
+        Raises:
+            FilterError: the linearised program blew up.
+        """
+        weight = self.tempering(progress)
+        ahead = self.look_ahead(data, progress)
+        self.keep(smoother_paths(self.program, data, ahead, self.draws, known_start=self.known_start), data)
+        return {"observation_weight": weight} | self._figures(ahead)
+
+
+class LookaheadGuide(LinearizedGuide, FilteringGuide):
+    """The particle filter that looks ahead as a guide: a hundred particles do what twenty thousand do in `SMCGuide`.
+
+    Args:
+        particles: N, for each trajectory.
+        resample_below: share of N under which the effective sample size triggers resampling.
+        untwisted, tempered: see `Twist`.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        *,
+        particles: int = 100,
+        draws: int = 100,
+        tempering: Tempering | None = None,
+        known_start: bool = False,
+        passes: int = 1,
+        search_again: float = 0.2,
+        resample_below: float = 0.5,
+        untwisted: float = 0.01,
+        tempered: float = 1.0,
+    ) -> None:
+        super().__init__(
+            program,
+            draws=draws,
+            tempering=tempering,
+            known_start=known_start,
+            passes=passes,
+            search_again=search_again,
+        )
+        self.particles, self.resample_below = particles, resample_below
+        self.untwisted, self.tempered = untwisted, tempered
+
+    def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
+        """Run the filter and keep `draws` paths.
+
+        Raises:
+            FilterError: the filter broke down.
+        """
+        weight = self.tempering(progress)
+        ahead = self.look_ahead(data, progress)
+        health = self._filter(data, weight, Twist(ahead, untwisted=self.untwisted, tempered=self.tempered))
+        return {"observation_weight": weight} | self._figures(ahead) | health
