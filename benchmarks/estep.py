@@ -86,24 +86,27 @@ def scatter_of_gradient(program: Program, data: Trajectories, particles: int, ru
         "lookahead, N = 100": LookaheadGuide(program, particles=100, **settings),
         "gaussian": GaussianGuide(program, **settings),
     }
-    costs = {}
-    for name, guide in guides.items():
+    for guide in guides.values():
         guide.refresh(data, 1.0)  # finds the paths, compiles
-        repeats = runs if name.startswith("bootstrap") else 3 * runs
-        seconds, gradients = [], []
-        for run in range(repeats):
-            with seeded("gradient", run):
-                began = time.perf_counter()
-                guide.refresh(data, 1.0)
-                seconds.append(time.perf_counter() - began)
-            gradients.append(gradient_by_trajectory(program, guide, data))
-        by_trajectory = torch.stack(gradients).var(0).sum(-1)
+    seconds: dict[str, list[float]] = {name: [] for name in guides}
+    gradients: dict[str, list[torch.Tensor]] = {name: [] for name in guides}
+    for run in range(runs):  # in turns: whatever else the machine does slows all of them
+        for name, guide in guides.items():
+            for repeat in range(1 if name.startswith("bootstrap") else 3):
+                with seeded("gradient", run, repeat):
+                    began = time.perf_counter()
+                    guide.refresh(data, 1.0)
+                    seconds[name].append(time.perf_counter() - began)
+                gradients[name].append(gradient_by_trajectory(program, guide, data))
+    costs = {}
+    for name in guides:
+        by_trajectory = torch.stack(gradients[name]).var(0).sum(-1)
         variance, error = float(by_trajectory.mean()), float(by_trajectory.std()) / len(by_trajectory) ** 0.5
-        taken = sorted(seconds)[len(seconds) // 2]
+        taken = sorted(seconds[name])[len(seconds[name]) // 2]
         costs[name] = taken * variance
-        share = error / variance
         print(
-            f"  {name:22} {taken:8.3f} s an E step, gradient variance {variance:.4g} ± {share:.0%} over {repeats} runs",
+            f"  {name:22} {taken:8.3f} s an E step, gradient variance {variance:.4g} ± {error / variance:.0%} "
+            f"over {len(seconds[name])} runs",
             flush=True,
         )
     bootstrap, *others = costs.values()

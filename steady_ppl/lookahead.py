@@ -176,5 +176,8 @@ def _windings(linear: Linearization) -> Tensor:
     return torch.stack(turns)
 
 
-def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+def _times(matrix: Tensor, vectors: Tensor) -> Tensor:
+    """A vector for each matrix, or draws of it in front: these are side by side for the product."""
+    if vectors.dim() < matrix.dim():
+        return (matrix @ vectors.unsqueeze(-1)).squeeze(-1)
+    return (matrix @ vectors.movedim(0, -1)).movedim(-1, 0)

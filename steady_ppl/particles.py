@@ -71,6 +71,7 @@ def particle_filter(
     if proposal.looks_ahead and on_frame is not None:
         raise ValueError("on_frame sees what is predicted: a filter that looks ahead has seen the later measurements")
     inside, last = data.rows, rows - 1
+    ended = (~inside).any(1).tolist()  # rows past a trajectory's end
     observed_rows = data.observed.any(-1).any(-1).tolist()
     start = Recording()
     noise, log_ratio = (None, 0.0) if known_start else proposal.start(particles)
@@ -107,7 +108,9 @@ def particle_filter(
             log_weights = log_weights + stepping.log_density(row, state)
         if observed_rows[row] or proposal.looks_ahead:
             if proposal.looks_ahead:
-                future = torch.where(inside[row], proposal.log_future(row, state), 0.0)
+                future = proposal.log_future(row, state)
+                if ended[row]:
+                    future = torch.where(inside[row], future, 0.0)
             weights, log_likelihood[row] = normalise(log_weights + future)
             log_weights = log_weights - log_likelihood[row]
             effective_sizes[row] = effective_sample_size(weights)
@@ -129,7 +132,7 @@ def particle_filter(
             state, ancestors = take(state, ancestors), None
         noise, log_ratio = proposal.step(row, state)
         if proposal.looks_ahead:
-            log_weights = log_weights + torch.where(inside[row + 1], log_ratio, 0.0)
+            log_weights = log_weights + (torch.where(inside[row + 1], log_ratio, 0.0) if ended[row + 1] else log_ratio)
         state, values = stepping.transition(row, state, ancestors, noise)
         if keep_history:
             for site, value in values.items():

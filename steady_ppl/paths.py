@@ -37,6 +37,8 @@ class Paths:
     def within(self, data: Trajectories) -> Paths:
         """Fill the rows past each trajectory's end with its first row, where the program is known to be finite: what
         is masked there would still spoil a gradient if it blew up."""
+        if bool(data.rows.all()):
+            return self
 
         def fill(value: Tensor, inside: Tensor) -> Tensor:
             mask = inside.reshape(*inside.shape, *[1] * (value.dim() - 3))
