@@ -1,11 +1,11 @@
 """What an E step costs as drives are added and as they grow longer: in proportion, beyond a fixed overhead.
 
-    python benchmarks/cost.py            up to 64 trajectories and 1600 rows; draws docs/cost.png: minutes
+    python benchmarks/cost.py            up to 256 trajectories and 6400 rows; draws docs/cost.png: ten minutes
     python benchmarks/cost.py --quick    up to 16 trajectories and 400 rows, once each; judges nothing
 
 One core, its processor time, which other processes hardly touch. Hov's truth simulates the drives, the network as it
 begins filters and smooths them; 30 paths each. The least of several runs counts, after one that finds the paths and
-compiles: the sizes take turns for half a minute a guide. seconds = a + b·n is fitted, with equal relative weights, to
+compiles: the sizes take turns for a minute a guide. seconds = a + b·n is fitted, with equal relative weights, to
 the four largest sizes; with few drives a filter also resamples at fewer rows. Exits with 1 when (seconds − a)/n at the
 largest n differs from that at a quarter of it by more than 25 %.
 """
@@ -97,7 +97,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="where the picture goes (docs/cost.png; with --quick nowhere)")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    most_drives, most_rows, patience = (16, 400, 0.0) if arguments.quick else (64, 1600, 30.0)
+    most_drives, most_rows, patience = (16, 400, 0.0) if arguments.quick else (256, 6400, 60.0)
     drives, rows = (doubled(1, most_drives), doubled(25, most_rows))
     panels = {
         "trajectories of 101 rows": measured(drives, [simulated(n, 101) for n in drives], patience),
