@@ -13,7 +13,7 @@ from llvmlite import ir
 
 from steady_ppl.lane_math import OPERATIONS
 from steady_ppl.lanes import FLOAT, Lanes
-from steady_ppl.scalar_graph import LEAVES, PARTICLE, Each, NotCompilable, Product, ScalarGraph
+from steady_ppl.scalar_graph import PARTICLE, Each, NotCompilable, Product, ScalarGraph
 
 NAME = "kernel"
 LANES = 16
@@ -53,7 +53,12 @@ class _Writer:
         self.builder = ir.IRBuilder(self.entry)
         self.values: dict[int, Lanes] = {}
         self.stored: dict[int, Any] = {}  # vectors as a whole, in the function's own memory
-        self._uses()
+        self.needed, vectors = graph.uses()
+        self.bases = {  # what a product with single scalars shares between particles
+            number: self._reserve(FLOAT, vector.length)
+            for number, vector in ((number, graph.vectors[number]) for number in sorted(vectors))
+            if isinstance(vector, Product) and graph.whole_vector(vector.x) is None
+        }
         self._write()
         self.builder.ret_void()
 
@@ -182,43 +187,6 @@ class _Writer:
         return OPERATIONS[operation](*operands)
 
     # vectors
-
-    def _uses(self) -> None:
-        """Find the scalars that must be computed, the vectors, and which of these somebody takes element by element."""
-        graph = self.graph
-        self.needed: set[int] = set()
-        self.vectors: set[int] = set()
-        self.bases: dict[int, Any] = {}
-        left = list(graph.outputs)
-        wanted: list[int] = []
-        while left or wanted:
-            if wanted:
-                vector = wanted.pop()
-                if vector in self.vectors:
-                    continue
-                self.vectors.add(vector)
-                what = graph.vectors[vector]
-                if isinstance(what, Each):
-                    wanted += [n for kind, n in what.operands if kind == "vector"]
-                    left += [n for kind, n in what.operands if kind == "scalar"]
-                    continue
-                left += [] if graph.run_of_parameters(what.bias) is not None else what.bias or ()
-                whole = graph.whole_vector(what.x)
-                if whole is not None:
-                    wanted.append(whole)
-                else:
-                    left += what.x
-                    self.bases[vector] = self._reserve(FLOAT, what.length)
-                continue
-            number = left.pop()
-            if number in self.needed:
-                continue
-            self.needed.add(number)
-            operation, arguments = graph.scalars[number]
-            if operation == "element":
-                wanted.append(arguments[0])
-            elif operation not in LEAVES:
-                left += arguments
 
     def _bias(self, product: Product, k: Any) -> Lanes:
         """The bias of one element; k is the kernel's own number, or known now."""

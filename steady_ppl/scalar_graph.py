@@ -179,3 +179,28 @@ class ScalarGraph:
         columns = int(at[0, 1] - at[0, 0]) if matrix.shape[1] > 1 else 0
         regular = at[0, 0] + rows * torch.arange(matrix.shape[0])[:, None] + columns * torch.arange(matrix.shape[1])
         return (int(at[0, 0]), rows, columns) if bool((at == regular).all()) else None
+
+    def uses(self) -> tuple[set[int], set[int]]:
+        """The scalars and the vectors that the outputs need."""
+        found: dict[str, set[int]] = {"scalar": set(), "vector": set()}
+        left = [("scalar", number) for number in self.outputs]
+        while left:
+            kind, number = left.pop()
+            if kind in found and number not in found[kind]:
+                found[kind].add(number)
+                left += self._operands(kind, number)
+        return found["scalar"], found["vector"]
+
+    def _operands(self, kind: str, number: int) -> list[tuple[str, int]]:
+        """What one scalar or vector is computed from, as in `Each`."""
+        if kind == "scalar":
+            operation, arguments = self.scalars[number]
+            if operation == "element":
+                return [("vector", arguments[0])]
+            return [] if operation in LEAVES else [("scalar", argument) for argument in arguments]
+        vector = self.vectors[number]
+        if isinstance(vector, Each):
+            return list(vector.operands)
+        whole, run = self.whole_vector(vector.x), self.run_of_parameters(vector.bias)
+        x = [("scalar", n) for n in vector.x] if whole is None else [("vector", whole)]
+        return x + [("scalar", n) for n in vector.bias or () if run is None]
