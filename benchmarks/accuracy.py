@@ -7,8 +7,8 @@
     python benchmarks/accuracy.py hov --guide lookahead
     python benchmarks/accuracy.py hov --condition 20deg
 
-Prints mean ± sd over data seeds beside the musts; exits with 1 when one is missed, not with --quick,
---leak-free or a condition. Two processes of one thread each.
+Prints mean ± sd over data seeds beside the musts; exits with 1 when one is missed. With --quick a single seed may miss
+them by a fifth; --leak-free and a condition have none. Two processes of one thread each.
 The true states are used to judge, and for the first row where the start is known (the paper's setting).
 The last rows say which guide suits the learned program on its training drives: how even the weights of the lookahead
 filter are, and by how much the linearised program, which the Gaussian guide draws from, misses log p(y).
@@ -20,6 +20,7 @@ import argparse
 import os
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -118,6 +119,8 @@ def main() -> int:
         parser.error(f"no experiment {', '.join(sorted(unknown))}; there are {', '.join(PROGRAMS)}")
     experiments = arguments.experiments or (["hov-mechanistic", "hov"] if arguments.quick else list(PROGRAMS))
     if "truck" in experiments and not arguments.data.is_dir():
+        if arguments.data != LOGS:
+            parser.error(f"no AlphaTruck logs at {arguments.data}")
         print(f"truck is left out: no AlphaTruck logs at {arguments.data}", file=sys.stderr)
         experiments.remove("truck")
     seeds = range(arguments.first_seed, arguments.first_seed + (1 if arguments.quick else arguments.seeds))
@@ -127,9 +130,11 @@ def main() -> int:
         for experiment in experiments
         for seed in seeds
     ]
-    # the musts are means of several seeds, known start
-    held = not (arguments.leak_free or arguments.quick or condition != STANDARD)
-    return report(experiments, run_jobs(learn_and_judge, jobs, arguments.json), MUSTS if held else {})
+    results = run_jobs(learn_and_judge, jobs, arguments.json)
+    if arguments.leak_free or condition != STANDARD:
+        return report(experiments, results, {})
+    slack = 1.2 if arguments.quick else 1.0  # the musts are means of several seeds
+    return report(experiments, results, {at: replace(must, high=slack * must.high) for at, must in MUSTS.items()})
 
 
 if __name__ == "__main__":

@@ -96,9 +96,16 @@ def fit(
         draws: M, paths for each drive in the M step.
         steps: number of E steps.
         gradient_steps: Adam steps on the draws of each E step.
+        learning_rate, betas, final_rate, weight_decay, averaging, batch, validate_every, patience: see `Optimization`.
+        validation_particles: N of the filter that judges the held-out drives.
         first_weight: the observation weight at the first step.
         ramp: share of the training over which it grows to 1.
         run: checkpoint, resume and progress of `train`.
+
+    Raises:
+        UsageError: no such guide, or it has no particles.
+        FilterError: the E step broke down.
+        TrainingError: the loss is not finite.
     """
     settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
     data, notes = for_program(program, table), []
@@ -135,7 +142,8 @@ def fit(
         notes.append(f"the E steps ran in plain torch, without compiled kernels: {e_step.in_plain_torch}")
     roots = trained.history[-1].get("roots", math.inf) if trained.history else math.inf
     if roots < 10:
-        notes.append(f"of the particles' starts {roots:.0f} survive a drive: raise particles, or try guide=lookahead")
+        advice = ", or try guide=lookahead" if guide == "bootstrap" else ""
+        notes.append(f"of the particles' starts {roots:.0f} survive a drive: raise particles{advice}")
     if guide == "gaussian" and not trained.interrupted:
         notes += doubts(program, data, known_start, seed)
     return Fit(program, "steady", settings, seed=seed, known_start=known_start, trained=trained, notes=notes)

@@ -8,21 +8,20 @@ work the filter runs the program as written, and says so.
 from __future__ import annotations
 
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.kernel_writer import LANES
-from steady_ppl.method import RESTLESS, TRACES, Method, close, signature
+from steady_ppl.method import Method, close, compiled, distrust
 from steady_ppl.program import Program
 from steady_ppl.resampling import by_component
 from steady_ppl.scalar_graph import NotCompilable
 from steady_ppl.sites import Observing, Recording, Standardised, running
 from steady_ppl.stepping import Stepping
 
-_METHODS: WeakKeyDictionary[Program, dict[Any, _Methods | NotCompilable]] = WeakKeyDictionary()
+FILTER = "filter"  # the name of what is compiled for it
 
 
 def stepping_for(
@@ -38,23 +37,12 @@ def stepping_for(
         return plain, f"{str(state.dtype).removeprefix('torch.')} on {state.device.type}"
     if state.shape[0] < LANES:
         return plain, f"fewer than {LANES} particles"
-    known = _METHODS.setdefault(program, {})
-    key = signature(program)
-    if key not in known and len(known) >= TRACES:
-        return plain, RESTLESS
-    if key not in known:
-        with torch.random.fork_rng(devices=[]):
-            try:
-                known[key] = _Methods(program, data, state)
-            except NotCompilable as reason:
-                known[key] = reason
-    methods = known[key]
-    if isinstance(methods, NotCompilable):
-        return plain, str(methods)
+    methods = compiled(program, FILTER, lambda: _Methods(program, data, state))
+    if isinstance(methods, str):
+        return plain, methods
     stepping = CompiledStepping(methods, plain)
     if not stepping.agrees(state[:LANES]):
-        known[key] = NotCompilable("its kernel and its own lines come to different numbers")
-        return plain, str(known[key])
+        return plain, distrust(program, FILTER)
     return stepping, None
 
 

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from steady_ppl.kernel_writer import LANES
-from steady_ppl.method import RESTLESS, TRACES, Method, close, signature
+from steady_ppl.method import Method, close, compiled, distrust
 from steady_ppl.program import Program
-from steady_ppl.scalar_graph import NotCompilable
 
-WORTH_COMPILING = 1000  # rows of trajectories
+ROWS_WORTH_COMPILING = 1000  # of all trajectories together
 Function = Callable[..., Tensor]
-_METHODS: WeakKeyDictionary[Program, dict[Any, Method | NotCompilable]] = WeakKeyDictionary()
 
 
 def on_all_rows(
-    program: Program, name: str, function: Function, arguments: dict[str, Tensor], along: Sequence[str] = ()
+    program: Program,
+    name: str,
+    function: Function,
+    arguments: dict[str, Tensor],
+    along: Sequence[str] = (),
+    kernels: bool | None = None,
 ) -> tuple[Tensor, list[Tensor]] | str | None:
     """A function's value and its Jacobians.
 
@@ -31,6 +32,7 @@ def on_all_rows(
         function: of one row of one trajectory or of many; it returns `(..., V)`.
         arguments: its arguments in order, each `(rows, B)` or `(rows, B, ·)`.
         along: those in which to differentiate, the first ones.
+        kernels: whether a kernel is worth compiling; None: if there are `ROWS_WORTH_COMPILING`.
 
     Returns:
         The value `(rows, B, V)` and the Jacobians `(rows, B, V, ·)`; why there is no kernel; None where it is not
@@ -38,28 +40,22 @@ def on_all_rows(
     """
     first = next(iter(arguments.values()))
     rows, trajectories = first.shape[:2]
-    if rows * trajectories < WORTH_COMPILING or first.device.type != "cpu" or first.dtype != torch.float32:
+    if kernels is None:
+        kernels = rows * trajectories >= ROWS_WORTH_COMPILING
+    if not kernels:
         return None
-    known = _METHODS.setdefault(program, {})
-    key = (name, signature(program))
-    if key not in known and sum(at == name for at, _ in known) >= TRACES:
-        return RESTLESS
-    if key not in known:
-        examples = {at: value[:1, :1].unsqueeze(0).clone() for at, value in arguments.items()}
-        with torch.random.fork_rng(devices=[]):
-            try:
-                known[key] = Method(lambda *values: (function(*values),), examples, {}, along=along)
-            except NotCompilable as reason:
-                known[key] = reason
-    method = known[key]
-    if isinstance(method, NotCompilable):
-        return str(method)
+    if first.device.type != "cpu" or first.dtype != torch.float32:
+        return f"{str(first.dtype).removeprefix('torch.')} on {first.device.type}"
+    name = f"{name} on all rows"
+    examples = {at: value[:1, :1].unsqueeze(0).clone() for at, value in arguments.items()}
+    method = compiled(program, name, lambda: Method(lambda *values: (function(*values),), examples, {}, along=along))
+    if isinstance(method, str):
+        return method
     found = _run(method, arguments, rows, trajectories)
     values, rest = found[..., : method.values], found[..., method.values :]
     plain = function(*(_a_few(value) for value in arguments.values()))
     if not close(_a_few(values), plain):
-        known[key] = NotCompilable("its kernel and its own lines come to different numbers")
-        return str(known[key])
+        return distrust(program, name)
     widths = [arguments[at].shape[-1] for at in along]
     return values, list(rest.unflatten(-1, (method.values, sum(widths))).split(widths, -1)) if along else []
 

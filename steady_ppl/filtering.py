@@ -30,13 +30,20 @@ def run_filter(
     known_start: bool,
     look_ahead: bool = False,
     keep_history: bool = True,
+    kernels: bool | None = None,
 ) -> Filtered:
     """The particle filter at observation weight 1, bootstrap or looking ahead."""
     proposal = None
     if look_ahead:
         proposal = Twist(find_and_smooth(program, data, known_start=known_start))
     return particle_filter(
-        program, data, particles=particles, known_start=known_start, proposal=proposal, keep_history=keep_history
+        program,
+        data,
+        particles=particles,
+        known_start=known_start,
+        proposal=proposal,
+        keep_history=keep_history,
+        kernels=kernels,
     )
 
 
@@ -94,6 +101,7 @@ def log_likelihood(
     known_start: bool,
     every: int = 10,
     look_ahead: bool = False,
+    kernels: bool | None = None,
 ) -> Tensor:
     """Estimate log p(y) of each trajectory, untempered.
 
@@ -104,6 +112,7 @@ def log_likelihood(
         known_start: start at the true first state.
         every: use the measurements of every n-th row only, the first included (10 turns 10 Hz into 1 Hz).
         look_ahead: propose with a view to the later measurements instead of blindly.
+        kernels: see `particle_filter`.
 
     Returns:
         `(B,)`.
@@ -122,7 +131,13 @@ def log_likelihood(
         )
     parts = [
         run_filter(
-            program, part, particles=particles, known_start=known_start, look_ahead=look_ahead, keep_history=False
+            program,
+            part,
+            particles=particles,
+            known_start=known_start,
+            look_ahead=look_ahead,
+            keep_history=False,
+            kernels=kernels,
         ).log_likelihood
         for part in in_parts(thinned, particles, look_ahead=look_ahead)
     ]

@@ -42,6 +42,7 @@ def smooth(
     observation_weight: float = 1.0,
     passes: int = 10,
     tolerance: float = 0.01,
+    kernels: bool | None = None,
 ) -> Lookahead:
     """Move a path to the mode of the posterior and look ahead along it.
 
@@ -53,14 +54,16 @@ def smooth(
         observation_weight: tempers the observations.
         passes: linearisations at most.
         tolerance: stop when no noise moves by more, in standard deviations of its channel.
+        kernels: see `linearize`.
 
     Returns:
         The lookahead along the last path but one, so that its linearization and its means agree.
     """
     for index in range(passes):
-        ahead = look_ahead(
-            linearize(program, data, path, known_start=known_start, observation_weight=observation_weight)
+        linear = linearize(
+            program, data, path, known_start=known_start, observation_weight=observation_weight, kernels=kernels
         )
+        ahead = look_ahead(linear)
         if index == passes - 1:
             break
         moved = means_as_path(ahead, data)
@@ -79,8 +82,25 @@ def find_and_smooth(
     Raises:
         FilterError: the bootstrap filter of the search or the linearised program broke down.
     """
+    ahead = find_and_try(program, data, known_start=known_start, observation_weight=observation_weight)
+    require_found(ahead, data)
+    return ahead
+
+
+def find_and_try(
+    program: Program, data: Trajectories, *, known_start: bool = False, observation_weight: float = 1.0
+) -> Lookahead:
+    """`find_and_smooth` whose log p(y) need not be finite.
+
+    Raises:
+        FilterError: the bootstrap filter of the search broke down.
+    """
     path = find_path(program, data, known_start=known_start, observation_weight=observation_weight)
-    ahead = smooth(program, data, path, known_start=known_start, observation_weight=observation_weight)
+    return smooth(program, data, path, known_start=known_start, observation_weight=observation_weight)
+
+
+def require_found(ahead: Lookahead, data: Trajectories) -> None:
+    """Raise a `FilterError` where the linearised program's log p(y) is not finite."""
     broken = ~torch.isfinite(ahead.log_likelihood)
     if bool(broken.any()):
         label = data.labels[int(broken.nonzero()[0])]
@@ -89,7 +109,6 @@ def find_and_smooth(
             "up, or it cannot be linearised there (--guide bootstrap does not)",
             trajectory=label,
         )
-    return ahead
 
 
 def means_as_path(ahead: Lookahead, data: Trajectories) -> Path:
@@ -161,7 +180,13 @@ def standard_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor
 
 @torch.no_grad()
 def smoother_paths(
-    program: Program, data: Trajectories, ahead: Lookahead, draws: int, *, known_start: bool = False
+    program: Program,
+    data: Trajectories,
+    ahead: Lookahead,
+    draws: int,
+    *,
+    known_start: bool = False,
+    kernels: bool | None = None,
 ) -> Paths:
     """Draws of the linearised posterior as paths of the program.
 
@@ -179,18 +204,21 @@ def smoother_paths(
         program.transition(states[few, few], data.controls[few], data.elapsed[few], data.steps[few])
     event_dims = {site: fn.event_dim for site, fn in (start.distributions | moving.distributions).items()}
     first = torch.Size((draws, 1, trajectories))
+    values, reason = _noise_along(program, data, states, noise, moving, kernels)
     return Paths(
         states=states,
         start={site: broadcast_event(value, first, event_dims[site]) for site, value in start.values.items()},
-        noise=_noise_along(program, data, states, noise, moving),
+        noise=values,
         event_dims=event_dims | {"states": 1},
+        in_plain_torch=reason,
     )
 
 
 def _noise_along(
-    program: Program, data: Trajectories, states: Tensor, noise: Tensor, sites: Recording
-) -> dict[str, Tensor]:
-    """What each site of `transition` draws at given states for standard normal noise, `(M, T, B, ...)`."""
+    program: Program, data: Trajectories, states: Tensor, noise: Tensor, sites: Recording, kernels: bool | None
+) -> tuple[dict[str, Tensor], str | None]:
+    """What each site of `transition` draws at given states for standard normal noise, `(M, T, B, ...)`; and why no
+    kernel served."""
 
     def drawn(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
         seen = Recording()
@@ -204,10 +232,12 @@ def _noise_along(
     arguments = {"state": states[:, :-1], "noise": noise} | {
         name: value.expand(draws, *value.shape) for name, value in given.items()
     }
-    found = on_all_rows(program, "drawn", drawn, {name: value.flatten(0, 1) for name, value in arguments.items()})
+    by_row = {name: value.flatten(0, 1) for name, value in arguments.items()}
+    found = on_all_rows(program, "drawn", drawn, by_row, kernels=kernels)
     values = found[0].unflatten(0, (draws, rows)) if isinstance(found, tuple) else drawn(*arguments.values())
     widths = [fn.event_shape.numel() for fn in sites.distributions.values()]
-    return {
+    by_site = {
         site: part if fn.event_dim else part.squeeze(-1)
         for (site, fn), part in zip(sites.distributions.items(), values.split(widths, -1), strict=True)
     }
+    return by_site, found if isinstance(found, str) else None

@@ -8,13 +8,15 @@ import torch
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import FilterError
-from steady_ppl.particles import WORTH_COMPILING, particle_filter
+from steady_ppl.particles import STEPS_WORTH_COMPILING, particle_filter
 from steady_ppl.paths import Paths
 from steady_ppl.program import Program
 from steady_ppl.proposals import Proposal
 from steady_ppl.sites import masked
 from steady_ppl.tempering import LinearRamp, Tempering
 from steady_ppl.true_paths import true_paths
+
+HUNDREDS = 100  # of E steps are in a training
 
 
 class PathGuide:
@@ -98,7 +100,7 @@ class FilteringGuide(PathGuide):
             known_start=self.known_start,
             resample_below=self.resample_below,
             proposal=proposal,
-            kernels=100 * self.particles * data.time.numel() >= WORTH_COMPILING,  # a training has hundreds of E steps
+            kernels=HUNDREDS * self.particles * data.time.numel() >= STEPS_WORTH_COMPILING,
         )
         self.in_plain_torch = filtered.in_plain_torch or (proposal and self.in_plain_torch) or None
         self.keep(filtered.paths(self.draws), data)
@@ -122,8 +124,8 @@ class SMCGuide(FilteringGuide):
         self,
         program: Program,
         *,
-        particles: int = 300,
-        draws: int = 10,
+        particles: int = 600,
+        draws: int = 64,
         tempering: Tempering | None = None,
         known_start: bool = False,
         resample_below: float = 0.5,

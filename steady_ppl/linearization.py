@@ -8,6 +8,7 @@ residual r(x) for every measurement. Around a path of states x̄ and noise ε̄,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -21,6 +22,7 @@ from steady_ppl.errors import ProgramError
 from steady_ppl.planar_vehicle import wrap
 from steady_ppl.program import Program, names
 from steady_ppl.sites import (
+    AtMean,
     Observing,
     Recording,
     Standardised,
@@ -51,11 +53,11 @@ class Linearization:
 
     Attributes:
         path: what it was taken along.
-        angles: the state's components that live on a circle.
+        angles: the state's components that live on a circle: the declared ones that a whole turn does not change.
         start_offset: `(B, D)` the mean start less the path's, angles on the circle.
         start_turn: `(B, D)` the whole turns that this leaves out.
         start_noise: G₀ `(B, D, C₀)`; zero where the start is known.
-        offset: `(T, B, D)` where the program arrives without noise, less the path's next state.
+        offset: `(T, B, D)` where the program arrives without noise, less the path's next state, angles on the circle.
         state, noise: F `(T, B, D, D)` and G `(T, B, D, C)`.
         residual: r̄ `(T + 1, B, K)`, on the circle where the measurement is an angle; zero where missing.
         measurement: H `(T + 1, B, K, D)`.
@@ -87,6 +89,7 @@ def linearize(
     *,
     known_start: bool = False,
     observation_weight: float = 1.0,
+    kernels: bool | None = None,
 ) -> Linearization:
     """Differentiate the program along a path, all trajectories and times at once.
 
@@ -96,20 +99,22 @@ def linearize(
         path: states and noise of every trajectory.
         known_start: the first state is certain.
         observation_weight: tempers the observations.
+        kernels: differentiate by kernels where they can serve; None: if there are rows enough, see `on_all_rows`.
 
     Raises:
         ProgramError: a site has another distribution, or an operation has no forward derivative.
     """
     states, noise = path.states, path.noise
-    angles = tuple(names(program.states).index(angle) for angle in program.angles)
-    moved = _transition(program, data, states, noise)
+    angles = _on_a_circle(program, data, states[0, :1])
+    moved = _transition(program, data, states, noise, kernels)
     by_state, by_noise = moved.by
-    offset = moved.value - (by_noise @ noise.unsqueeze(-1)).squeeze(-1) - states[1:]
+    offset = (moved.value - (by_noise @ noise.unsqueeze(-1)).squeeze(-1) - states[1:]).double()
+    offset[..., angles] = wrap(offset[..., angles])  # a program may keep its angles on the circle, and so may a path
     start_offset, start_noise = _start(program, data, states[0], known_start)
     start_turn = torch.zeros_like(start_offset, dtype=torch.float64)
     for angle in angles:
         start_turn[:, angle] = start_offset[:, angle].double() - wrap(start_offset[:, angle].double())
-    measured = _measurement(program, data, states)
+    measured = _measurement(program, data, states, kernels)
     residuals, log_sd = measured.value.chunk(2, -1)
     by_measured = -measured.by[0][..., : residuals.shape[-1], :]
     observed = data.observed & torch.isfinite(by_measured).all(-1)  # a bearing to where one stands has no derivative
@@ -120,7 +125,7 @@ def linearize(
         start_offset=start_offset.double() - start_turn,
         start_turn=start_turn,
         start_noise=start_noise.double(),
-        offset=torch.where(data.transitions[..., None], offset, 0.0).double(),
+        offset=torch.where(data.transitions[..., None], offset, 0.0),
         state=torch.where(data.transitions[..., None, None], by_state, 0.0).double(),
         noise=torch.where(data.transitions[..., None, None], by_noise, 0.0).double(),
         residual=torch.where(observed, residuals, 0.0).double(),
@@ -158,14 +163,30 @@ def why_not_linear(program: Program, data: Trajectories, *, known_start: bool = 
     return None
 
 
-def _transition(program: Program, data: Trajectories, states: Tensor, noise: Tensor) -> _Jacobians:
+def _transition(
+    program: Program, data: Trajectories, states: Tensor, noise: Tensor, kernels: bool | None
+) -> _Jacobians:
     def step(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
         with running(*state.shape[:-1]), Standardised(noise):
             return program.transition(state, control, time, step)
 
     along = {"state": states[:-1], "noise": noise}
     given = {"control": data.controls[:-1], "time": data.elapsed[:-1], "step": data.steps}
-    return _jacobians(program, step, along, given)
+    return _jacobians(program, step, along, given, kernels)
+
+
+def _residuals(program: Program, state: Tensor, measurement: Tensor, observed: Tensor) -> Tensor:
+    """Residuals and, beside them, log standard deviations, `(..., 2 K)`."""
+    seen = Recording()
+    with running(*state.shape[:-1]), seen, Observing(measurement, observed):
+        program.observe(state)
+    residuals, log_sds = [], []
+    for site, fn in seen.distributions.items():
+        _, sd = normal_moments(fn, site)
+        difference = as_vector(residual(fn, seen.observed[site]), fn.event_dim)
+        residuals.append(difference)
+        log_sds.append(as_vector(sd.log(), fn.event_dim).expand(difference.shape))
+    return torch.cat(residuals + log_sds, -1)
 
 
 def _start(program: Program, data: Trajectories, first: Tensor, known_start: bool) -> tuple[Tensor, Tensor]:
@@ -180,23 +201,39 @@ def _start(program: Program, data: Trajectories, first: Tensor, known_start: boo
     return began - first, start_noise
 
 
-def _measurement(program: Program, data: Trajectories, states: Tensor) -> _Jacobians:
+def _measurement(program: Program, data: Trajectories, states: Tensor, kernels: bool | None) -> _Jacobians:
     """Of the residuals and, beside them, the log standard deviations."""
 
     def measure(state: Tensor, measurement: Tensor, observed: Tensor) -> Tensor:
-        seen = Recording()
-        with running(*state.shape[:-1]), seen, Observing(measurement, observed):
-            program.observe(state)
-        residuals, log_sds = [], []
-        for site, fn in seen.distributions.items():
-            _, sd = normal_moments(fn, site)
-            difference = as_vector(residual(fn, seen.observed[site]), fn.event_dim)
-            residuals.append(difference)
-            log_sds.append(as_vector(sd.log(), fn.event_dim).expand(difference.shape))
-        return torch.cat(residuals + log_sds, -1)
+        return _residuals(program, state, measurement, observed)
 
     given = {"measurement": data.measurements, "observed": data.observed}
-    return _jacobians(program, measure, {"state": states}, given)
+    return _jacobians(program, measure, {"state": states}, given, kernels)
+
+
+def _on_a_circle(program: Program, data: Trajectories, state: Tensor) -> tuple[int, ...]:
+    """The declared angles of which a whole turn changes neither what is measured nor where the program goes; an angle
+    that a plain normal measures counts its turns. Looked at from one state, `(1, D)`."""
+    angles = [names(program.states).index(angle) for angle in program.angles]
+    turns = state.new_zeros((len(angles) + 1, state.shape[-1]))
+    turns[range(1, len(turns)), angles] = 2 * math.pi
+    states = (state + turns).unsqueeze(1)
+    first = slice(0, 1)
+    measurement = data.measurements[first, first].new_zeros((len(turns), 1, data.measurements.shape[-1]))
+    residuals, log_sd = _residuals(program, states, measurement, torch.ones_like(measurement, dtype=torch.bool)).chunk(
+        2, -1
+    )
+    squares = (residuals / log_sd.exp()).square()  # of no sign: a bearing straight behind is on both ends of its scale
+    same = ((squares - squares[first]).abs() <= 0.01 * (1 + squares)).flatten(1).all(1)
+    if len(data.steps):
+        given = (part[first, first] for part in (data.controls, data.elapsed, data.steps))
+        with running(len(turns), 1), AtMean():
+            moved = program.transition(states, *given)
+        change = moved - states
+        apart = change - change[first]
+        apart[..., angles] = wrap(apart[..., angles])
+        same &= (apart.abs() <= 0.01 * change.abs() + 1e-5 * (1 + states.abs())).flatten(1).all(1)
+    return tuple(angle for angle, periodic in zip(angles, same[1:].tolist(), strict=True) if periodic)
 
 
 def _start_channels(program: Program) -> int:
@@ -216,10 +253,14 @@ class _Jacobians:
 
 
 def _jacobians(
-    program: Program, function: Callable[..., Tensor], along: dict[str, Tensor], given: dict[str, Tensor]
+    program: Program,
+    function: Callable[..., Tensor],
+    along: dict[str, Tensor],
+    given: dict[str, Tensor],
+    kernels: bool | None,
 ) -> _Jacobians:
     """By a kernel where it can serve, else by torch."""
-    found = on_all_rows(program, function.__name__, function, along | given, tuple(along))
+    found = on_all_rows(program, function.__name__, function, along | given, tuple(along), kernels)
     if isinstance(found, tuple):
         return _Jacobians(*found)
     value, by = _derivatives(lambda *inputs: function(*inputs, *given.values()), *along.values())

@@ -9,13 +9,15 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import FilterError
-from steady_ppl.gaussian_smoother import find_and_smooth, means_as_path, smooth, smoother_paths
+from steady_ppl.gaussian_smoother import find_and_try, means_as_path, require_found, smooth, smoother_paths
 from steady_ppl.guides import FilteringGuide, PathGuide
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.program import Program
 from steady_ppl.proposals import Twist
 from steady_ppl.tempering import LinearRamp, Tempering
+
+WORTH_COMPILING = 200  # rows of all trajectories together; a training linearises them hundreds of times
 
 
 class LinearizedGuide(PathGuide):
@@ -78,11 +80,12 @@ class LinearizedGuide(PathGuide):
         part = data.subset(trajectories)
         for label in part.labels:
             self.memory[f"searched/{label}"] = torch.tensor(progress, dtype=torch.float64)
-        ahead = find_and_smooth(
-            self.program, part, known_start=self.known_start, observation_weight=self.tempering(progress)
-        )
+        weight = self.tempering(progress)
+        ahead = find_and_try(self.program, part, known_start=self.known_start, observation_weight=weight)
+        if known is None:
+            require_found(ahead, part)
         found = means_as_path(ahead, part)
-        better = ahead.log_likelihood > (-torch.inf if known is None else known[trajectories])
+        better = ahead.log_likelihood > (-torch.inf if known is None else known[trajectories])  # not where it is a nan
         kept = better.nonzero().flatten().tolist()
         if kept:
             self._remember(Path(found.states[:, kept], found.noise[:, kept]), part.subset(kept))
@@ -96,10 +99,14 @@ class LinearizedGuide(PathGuide):
             known_start=self.known_start,
             observation_weight=self.tempering(progress),
             passes=self.passes,
+            kernels=data.time.numel() >= WORTH_COMPILING,
         )
 
     def _recall(self, kind: str, data: Trajectories) -> Tensor:
-        return torch.stack([self.memory[f"{kind}/{label}"] for label in data.labels], 1).to(data.controls)
+        known = [self.memory[f"{kind}/{label}"] for label in data.labels]
+        if any(len(path) != len(data.time) - (kind == "noise") for path in known):
+            raise ValueError("this guide remembers other drives of the same labels: make a new one for these")
+        return torch.stack(known, 1).to(data.controls)
 
     def _remember(self, path: Path, data: Trajectories) -> None:
         for i, label in enumerate(data.labels):
@@ -127,7 +134,16 @@ class GaussianGuide(LinearizedGuide):
         """
         weight = self.tempering(progress)
         ahead = self.look_ahead(data, progress)
-        self.keep(smoother_paths(self.program, data, ahead, self.draws, known_start=self.known_start), data)
+        paths = smoother_paths(
+            self.program,
+            data,
+            ahead,
+            self.draws,
+            known_start=self.known_start,
+            kernels=data.time.numel() >= WORTH_COMPILING,
+        )
+        self.in_plain_torch = self.in_plain_torch or paths.in_plain_torch
+        self.keep(paths, data)
         return {"observation_weight": weight} | self._figures(ahead)
 
 

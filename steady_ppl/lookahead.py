@@ -164,16 +164,14 @@ def _array(tensor: Tensor) -> recursions.Array:
 
 
 def _windings(linear: Linearization) -> Tensor:
-    """A broad start covers an angle's neighbouring turns, on which the measurements are equally likely."""
-    dimension = linear.start_offset.shape[-1]
-    turns = [linear.start_offset.new_zeros(dimension)]
-    angles = linear.angles if bool(linear.start_noise.any()) else ()
-    for choice in itertools.product((0, -1, 1), repeat=len(angles)):
-        if any(choice):
-            turn = torch.zeros_like(turns[0])
-            turn[list(angles)] = 2 * math.pi * turn.new_tensor(choice)
-            turns.append(turn)
-    return torch.stack(turns)
+    """A broad start covers several turns of an angle, on which the measurements are equally likely: those that begin
+    within four of the start's standard deviations, none first."""
+    spread = linear.start_noise.norm(dim=-1).amax(0).nan_to_num(nan=0.0, posinf=0.0)  # a log p(y) that says so follows
+    choices: list[tuple[int, ...]] = [(0,)] * len(spread)
+    for angle in linear.angles:
+        most = int((math.pi + 4 * float(spread[angle])) / (2 * math.pi))
+        choices[angle] = tuple(sorted(range(-most, most + 1), key=abs))
+    return 2 * math.pi * linear.start_offset.new_tensor(list(itertools.product(*choices)))
 
 
 def _times(matrix: Tensor, vectors: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from steady_ppl.resampling import effective_sample_size, normalise, systematic, 
 from steady_ppl.sites import KnownStart, Recording, Standardised, broadcast_event, running
 from steady_ppl.stepping import Stepping
 
-WORTH_COMPILING = 1_000_000  # steps of particles, which take the program's own lines a second
+STEPS_WORTH_COMPILING = 1_000_000  # steps of particles, which take the program's own lines a second
 OnFrame = Callable[[int, Tensor, Tensor, Tensor], None]
 
 
@@ -56,7 +56,7 @@ def particle_filter(
             checked at its observed rows (at all rows when looking ahead), never at the table's last one.
         proposal: where the noise of start and steps comes from; the program itself when None (the bootstrap filter).
         keep_history: keep what `Filtered.paths` needs.
-        kernels: run compiled methods where they can serve; None: if there is enough to do, see `WORTH_COMPILING`.
+        kernels: run compiled methods where they can serve; None: if there is enough to do, see `STEPS_WORTH_COMPILING`.
         on_frame: called at every row with (row, states `(N, B, D)`, log-weights before, log-weights after), `(N, B)`;
             not when looking ahead.
 
@@ -86,7 +86,7 @@ def particle_filter(
         )
     stepping, reason = Stepping(program, data, observation_weight), None
     if kernels is None:
-        kernels = particles * data.time.numel() >= WORTH_COMPILING
+        kernels = particles * data.time.numel() >= STEPS_WORTH_COMPILING
     if kernels and rows > 1:
         stepping, reason = stepping_for(program, data, state, observation_weight)
     log_weights = state.new_full((trajectories, particles), -math.log(particles), dtype=torch.float64).t()

@@ -21,12 +21,14 @@ class Paths:
         start: value of each site of `initial`, `(M, 1, B, ...)`.
         noise: value of each site of `transition`, `(M, T, B, ...)`.
         event_dims: event dimension of each of these sites.
+        in_plain_torch: why no kernels served in drawing them; None where they did or were not worth it.
     """
 
     states: Tensor
     start: dict[str, Tensor]
     noise: dict[str, Tensor]
     event_dims: dict[str, int]
+    in_plain_torch: str | None = None
 
     def of(self, trajectories: Sequence[int]) -> Paths:
         """The paths of some trajectories."""

@@ -26,10 +26,11 @@ class Constant:
 
 @dataclass(frozen=True)
 class LinearRamp:
-    """From `first` to 1 over the first `share` of the training; the paper ramps from 0.001 over all of it."""
+    """From `first` to 1 over the first `share` of the training; the paper ramps from 0.001 over all of it.
+    A share of 0 is no ramp."""
 
     first: float = 0.001
     share: float = 1.0
 
     def __call__(self, progress: float) -> float:
-        return min(1.0, self.first + (1 - self.first) * progress / self.share)
+        return min(1.0, self.first + (1 - self.first) * progress / self.share) if self.share > 0 else 1.0

@@ -10,8 +10,11 @@ import torch
 
 from steady_ppl.data import Trajectories
 from steady_ppl.filtering import log_likelihood
+from steady_ppl.particles import STEPS_WORTH_COMPILING
 from steady_ppl.program import Program
 from steady_ppl.seeding import seeded
+
+SEVERAL = 10  # validations are in a training
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,7 @@ class Validation:
                 known_start=self.known_start,
                 every=self.every,
                 look_ahead=self.look_ahead,
+                kernels=SEVERAL * self.particles * self.data.time.numel() >= STEPS_WORTH_COMPILING,
             )
         return values.tolist()
 

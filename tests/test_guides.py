@@ -149,6 +149,7 @@ def test_an_m_step_improves_log_p_y_by_at_least_what_q_gains(make_guide):
 def test_the_linear_ramp_goes_from_its_first_weight_to_one():
     ramp = LinearRamp(0.001, share=0.5)
     assert [ramp(p) for p in (0.0, 0.25, 0.5, 0.75, 1.0)] == pytest.approx([0.001, 0.5005, 1.0, 1.0, 1.0])
+    assert LinearRamp(0.001, share=0.0)(0.0) == 1.0
     assert LinearRamp()(0.0) == 0.001 and LinearRamp()(0.5) == pytest.approx(0.5005) and LinearRamp()(1.0) == 1.0
 
 

@@ -181,7 +181,7 @@ def test_a_broad_start_counts_the_neighbouring_turns(hovercraft, bearings):
     found = ahead.linearization
     path = replace(found.path, states=found.path.states + found.start_turn)  # on the turn of its prior
     alone = {}
-    for turns in (0, 1, -1):
+    for turns in (0, 1, -1, 2, -2):  # those that begin within four deviations of π
         single.turns = turns
         alone[turns] = look_ahead(linearize(single, bearings, path)).log_likelihood
     assert (ahead.log_likelihood - alone[0]).min() > 0.01
@@ -195,8 +195,8 @@ def test_whole_turns_of_the_path_change_nothing_from_a_broad_start(hovercraft, b
     turn = 2 * math.pi * (torch.arange(6) == 2).double()
     turned = Path(path.states + turn, path.noise)
     here, there = (look_ahead(linearize(hovercraft, bearings, p)).log_likelihood for p in (path, turned))
-    # a turn that is left out on both sides has a hundredth of the mass: at least 3 prior deviations off
-    torch.testing.assert_close(here, there, rtol=0, atol=0.02)
+    # a turn that is left out on one side has a thousandth of the mass: more than 4 prior deviations off
+    torch.testing.assert_close(here, there, rtol=0, atol=0.002)
 
 
 def test_draws_from_a_broad_start_are_on_the_turns_that_their_masses_say(hovercraft, bearings):
@@ -207,8 +207,10 @@ def test_draws_from_a_broad_start_are_on_the_turns_that_their_masses_say(hovercr
     away = (states[..., 2] - (ahead.means()[0] + ahead.linearization.start_turn)[..., 2]) / (2 * math.pi)
     assert (away.round() == away[:, :1].round())[:, bearings.rows].all()  # the whole drive is on the start's turn
     counted = away[:, 0].round() == ahead.windings[:, None, None, 2] / (2 * math.pi)
-    assert ahead.windings.shape == (3, 6)
-    assert_mean(counted.transpose(0, 1).double(), ahead.winding_masses.exp())
+    assert ahead.windings.shape == (5, 6)
+    masses = ahead.winding_masses.exp()
+    often = masses > 0.005  # fifteen of the draws
+    assert_mean(counted.transpose(0, 1).double()[:, often], masses[often])
 
 
 def began(program, noise: Tensor) -> Tensor:

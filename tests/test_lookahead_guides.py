@@ -207,7 +207,7 @@ def test_a_guide_remembers_its_paths_from_one_refresh_to_the_next(monkeypatch):
         searched.append(data.labels)
         return find_and_smooth(program, data, **settings)
 
-    monkeypatch.setattr("steady_ppl.linearized_guides.find_and_smooth", counting)
+    monkeypatch.setattr("steady_ppl.linearized_guides.find_and_try", counting)
     guide = GaussianGuide(program, draws=4, known_start=True, tempering=Constant())
     guide.refresh(data.subset([0, 1]), 0.0)
     guide.refresh(data.subset([1, 0]), 0.0)
@@ -253,11 +253,45 @@ def test_a_search_that_was_not_needed_may_fail(guide, monkeypatch):
     def fails(*_, **__):
         raise FilterError("no path")
 
-    monkeypatch.setattr("steady_ppl.linearized_guides.find_and_smooth", fails)
+    monkeypatch.setattr("steady_ppl.linearized_guides.find_and_try", fails)
     assert looking.refresh(data, 0.3)["searches_failed"] == 1
     looking.memory["noise/3"].fill_(math.nan)
     with pytest.raises(FilterError, match="no path"):
         looking.refresh(data, 0.3)
+
+
+def test_a_search_that_is_lost_for_one_drive_serves_the_others(monkeypatch):
+    program = example("hovercraft:HovercraftTruth").requires_grad_(False)
+    data = drives(program, 3, 12, gaps=True)
+    looking = GaussianGuide(program, draws=4, known_start=True, tempering=Constant(), search_again=0.5)
+    looking.refresh(data, 0.0)
+    right = {label: looking.memory[f"states/{label}"].clone() for label in data.labels}
+    for label in "12":
+        looking.memory[f"states/{label}"] = right[label] + torch.tensor([0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
+
+    def one_is_lost(*given, **settings):
+        ahead = find_and_smooth(*given, **settings)
+        return replace(
+            ahead, log_likelihood=ahead.log_likelihood * torch.tensor([math.nan, 1.0, 1.0])[: len(ahead.log_likelihood)]
+        )
+
+    monkeypatch.setattr("steady_ppl.linearized_guides.find_and_try", one_is_lost)
+    stays_put = lambda ahead, part: ahead.linearization.path  # noqa: E731
+    monkeypatch.setattr("steady_ppl.linearized_guides.means_as_path", stays_put)
+    looking.refresh(data, 0.5)
+    torch.testing.assert_close(looking.memory["states/2"], right["2"], rtol=0, atol=0.05)
+    assert (looking.memory["states/1"] - right["1"]).abs().max() > 2
+    looking.memory["noise/1"] = torch.full_like(looking.memory["noise/1"], math.nan)
+    with pytest.raises(FilterError, match="trajectory 1: the linearised program's log p"):  # its path is gone
+        looking.refresh(data.subset([0]), 0.6)
+
+
+def test_a_guide_refuses_other_drives_of_the_same_labels():
+    program = example("hovercraft:HovercraftTruth").requires_grad_(False)
+    looking = GaussianGuide(program, draws=4, known_start=True, tempering=Constant())
+    looking.refresh(drives(program, 3, 12), 0.0)
+    with pytest.raises(ValueError, match="remembers other drives of the same labels"):
+        looking.refresh(drives(program, 3, 11), 0.1)
 
 
 # --- training ---------------------------------------------------------------------------------------------------------
