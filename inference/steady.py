@@ -144,6 +144,9 @@ def fit(
     if roots < 10:
         advice = ", or try guide=lookahead" if guide == "bootstrap" else ""
         notes.append(f"of the particles' starts {roots:.0f} survive a drive: raise particles{advice}")
+    blown_up = sum("weights_blown_up" in entry for entry in trained.history)
+    if blown_up:
+        notes.append(f"particles blew up in {blown_up} of {len(trained.history)} logged E steps; they count for nothing")
     if guide == "gaussian" and not trained.interrupted:
         notes += doubts(program, data, known_start, seed)
     return Fit(program, "steady", settings, seed=seed, known_start=known_start, trained=trained, notes=notes)

@@ -105,7 +105,9 @@ class FilteringGuide(PathGuide):
         self.in_plain_torch = filtered.in_plain_torch or (proposal and self.in_plain_torch) or None
         self.keep(filtered.paths(self.draws), data)
         rows = data.observed.any(-1) if proposal is None else data.rows
-        return {"ess": float(filtered.effective_sizes[rows].mean()), "roots": float(filtered.roots.mean())}
+        figures = {"ess": float(filtered.effective_sizes[rows].mean()), "roots": float(filtered.roots.mean())}
+        blown_up = float(filtered.blown_up.sum())
+        return figures | {"weights_blown_up": blown_up} if blown_up else figures
 
 
 class SMCGuide(FilteringGuide):

@@ -64,7 +64,7 @@ def particle_filter(
         The estimate of log p(y) and, with `keep_history`, the genealogy.
 
     Raises:
-        FilterError: every weight is zero or a particle is not finite; names trajectory and time.
+        FilterError: every weight is zero; names trajectory and time.
     """
     rows, trajectories = data.time.shape
     proposal = proposal or Proposal()
@@ -93,6 +93,7 @@ def particle_filter(
     log_weights = log_weights + log_ratio
     log_likelihood = log_weights.new_zeros((rows, trajectories))
     effective_sizes = log_weights.new_full((rows, trajectories), float(particles))
+    blown_up = torch.zeros_like(log_likelihood)
     unmoved = torch.arange(particles, device=state.device).expand(trajectories, -1).t()
     roots = unmoved
     history: list[Tensor] = []
@@ -111,7 +112,11 @@ def particle_filter(
                 future = proposal.log_future(row, state)
                 if ended[row]:
                     future = torch.where(inside[row], future, 0.0)
-            weights, log_likelihood[row] = normalise(log_weights + future)
+            expected = log_weights + future
+            broken = expected.isnan()  # a particle that blew up explains no measurement
+            log_weights = log_weights.masked_fill(broken, -math.inf)
+            weights, log_likelihood[row] = normalise(expected.masked_fill_(broken, -math.inf))
+            blown_up[row] = broken.sum(0)
             log_weights = log_weights - log_likelihood[row]
             effective_sizes[row] = effective_sample_size(weights)
             if row < last and resample_below > 0:
@@ -139,13 +144,14 @@ def particle_filter(
                 noises.setdefault(site, []).append(value)
 
     event_dims = {"states": 1} | {site: fn.event_dim for site, fn in start.distributions.items()} | stepping.event_dims
-    _raise_if_broken(log_likelihood, data)
+    _raise_if_broken(log_likelihood, blown_up, data)
     survivors = torch.zeros_like(log_weights).scatter_(0, roots, 1.0).sum(0)
     return Filtered(
         log_likelihood=log_likelihood.sum(0),
         log_weights=log_weights,
         effective_sizes=effective_sizes,
         roots=survivors,
+        blown_up=blown_up.sum(0),
         states=history,
         start={site: broadcast_event(value, left, event_dims[site]).squeeze(1) for site, value in start.values.items()},
         noise=noises,
@@ -159,18 +165,18 @@ def _given(noise: Tensor) -> Standardised:
     return Standardised(noise.unsqueeze(1))
 
 
-def _raise_if_broken(log_likelihood: Tensor, data: Trajectories) -> None:
+def _raise_if_broken(log_likelihood: Tensor, blown_up: Tensor, data: Trajectories) -> None:
     """Find the first row whose evidence is not finite."""
     broken = ~torch.isfinite(log_likelihood)
     if not bool(broken.any()):
         return
     row, trajectory = (int(i) for i in broken.nonzero()[0])
     label, time = data.labels[trajectory], float(data.elapsed[row, trajectory])
-    impossible = bool(log_likelihood[row, trajectory] == -math.inf)
+    impossible = bool(log_likelihood[row, trajectory] == -math.inf) and not bool(blown_up[: row + 1, trajectory].any())
     what = (
         "every particle's weight is zero: the measurement is impossible under the program"
         if impossible
-        else "a particle is not a number: the program's parameters or states have blown up"
+        else "no particle is left that is a number: the program's parameters or states have blown up"
     )
     raise FilterError(f"trajectory {label} at {time:.3g} s: {what}", trajectory=label, time=time)
 

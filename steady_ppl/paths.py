@@ -59,6 +59,7 @@ class Filtered:
         log_weights: `(N, B)` normalised weights of the last row's particles.
         effective_sizes: `(T + 1, B)` ESS after each observed row (each row when looking ahead), or N.
         roots: `(B,)` how many of the first row's particles still have descendants at the end.
+        blown_up: `(B,)` how many weights were not numbers, summed over rows; they count as zero.
         in_plain_torch: why no kernels served; None where they did or were not asked for.
         states, start, noise, ancestors: the particles' history, a tensor a row; empty when it was not kept.
     """
@@ -67,6 +68,7 @@ class Filtered:
     log_weights: Tensor
     effective_sizes: Tensor
     roots: Tensor
+    blown_up: Tensor
     states: list[Tensor]
     start: dict[str, Tensor]
     noise: dict[str, list[Tensor]]

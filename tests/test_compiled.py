@@ -205,7 +205,7 @@ def test_a_program_that_blows_up_is_said_to_have_done_so():
     data = drives(program, 2, 6)
     controls = data.controls.clone()
     controls[2, 1] = math.inf
-    with pytest.raises(FilterError, match="trajectory 2 at .* not a number"):
+    with pytest.raises(FilterError, match="trajectory 2 at .* that is a number"):
         particle_filter(program, replace(data, controls=controls), particles=64, known_start=True, kernels=True)
 
 

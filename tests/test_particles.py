@@ -220,21 +220,32 @@ def test_an_impossible_measurement_names_trajectory_and_time(even, dtype):
 def test_a_state_that_is_not_a_number_names_trajectory_and_time(cart, even):
     controls = even.controls.clone()
     controls[2, 2] = math.nan  # the velocity of row 3, the position of row 4
-    with pytest.raises(FilterError, match=r"trajectory 3 at 0.4 s: a particle is not a number") as error:
+    with pytest.raises(FilterError, match=r"trajectory 3 at 0.4 s: no particle is left that is a number") as error:
         particle_filter(cart, replace(even, controls=controls, time=even.time + 100.0), particles=20)
     assert error.value.trajectory == "3"
     assert error.value.time == pytest.approx(0.4)
 
 
-def test_a_single_particle_that_is_not_a_number_is_found(cart, even):
+def test_a_single_particle_that_blows_up_explains_nothing_and_is_counted(cart, even):
     class Broken(type(cart)):
         def transition(self, state, control, time, step):
             after = super().transition(state, control, time, step)
             after[5, :, 1] = torch.where(time[:, 1] > 0.55, math.nan, 1.0)[..., None] * after[5, :, 1]
             return after
 
-    with pytest.raises(FilterError, match="trajectory 2 at 0.7 s"):
-        particle_filter(Broken().double().requires_grad_(False), even, particles=20)
+    runs = []
+    for program in (cart, Broken().double().requires_grad_(False)):
+        with seeded("broken"):
+            runs.append(particle_filter(program, even, particles=20, resample_below=0.0))
+    whole, broken = runs
+    assert whole.blown_up.tolist() == [0, 0, 0]
+    assert broken.blown_up[1] > 0 and broken.blown_up[[0, 2]].tolist() == [0, 0]
+    others = torch.arange(20) != 5
+    lost = whole.log_weights[5, 1].exp()  # what the others' share of the evidence lacks
+    torch.testing.assert_close(broken.log_likelihood[1], whole.log_likelihood[1] + (1 - lost).log())
+    torch.testing.assert_close(broken.log_weights[others, 1].exp(), whole.log_weights[others, 1].exp() / (1 - lost))
+    assert float(broken.log_weights[5, 1]) == -math.inf and broken.paths(30).states.isfinite().all()
+    torch.testing.assert_close(broken.log_likelihood[[0, 2]], whole.log_likelihood[[0, 2]])
 
 
 def test_a_parameter_that_is_not_a_number_is_an_error(even):
