@@ -146,7 +146,9 @@ def fit(
         notes.append(f"of the particles' starts {roots:.0f} survive a drive: raise particles{advice}")
     blown_up = sum("weights_blown_up" in entry for entry in trained.history)
     if blown_up:
-        notes.append(f"particles blew up in {blown_up} of {len(trained.history)} logged E steps; they count for nothing")
+        notes.append(
+            f"particles blew up, and count for nothing, in {blown_up} of {len(trained.history)} logged E steps"
+        )
     if guide == "gaussian" and not trained.interrupted:
         notes += doubts(program, data, known_start, seed)
     return Fit(program, "steady", settings, seed=seed, known_start=known_start, trained=trained, notes=notes)
