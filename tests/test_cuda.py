@@ -38,16 +38,18 @@ def test_a_device_estimates_what_the_processor_does(look_ahead):
     assert_mean(((both[0] - level).exp() - (both[1] - level).exp()).t(), 0.0)
 
 
-def test_a_filter_waits_for_the_device_no_more_often_on_a_longer_drive():
+@pytest.mark.parametrize("look_ahead", [False, True])
+def test_a_filter_waits_for_the_device_no_more_often_on_a_longer_drive(look_ahead):
     waits = []
     for rows in (9, 33):
-        filtered(rows, "cuda")
+        filtered(rows, "cuda", look_ahead)
         program, data = problem(rows, "cuda")
+        proposal = Twist(find_and_smooth(program, data, known_start=True)) if look_ahead else None
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             torch.cuda.set_sync_debug_mode("warn")
             try:
-                particle_filter(program, data, particles=500, known_start=True)
+                particle_filter(program, data, particles=500, known_start=True, proposal=proposal)
             finally:
                 torch.cuda.set_sync_debug_mode("default")
         waits.append(sum("synchroniz" in str(warning.message) for warning in caught))
