@@ -1,7 +1,7 @@
 """What an E step costs and how much its gradients scatter: bootstrap, lookahead and Gaussian guides on one problem.
 
     python benchmarks/estep.py            Hov, 16 trajectories at once, a good and a first network: minutes
-    python benchmarks/estep.py --quick    4 trajectories, fewer particles and runs
+    python benchmarks/estep.py --quick    four runs instead of ten
     python benchmarks/estep.py --condition 1hz      also two-landmarks, 1.25deg, 20deg
     python benchmarks/estep.py --leak-free          no true pose: a start from the program's broad prior
 
@@ -56,7 +56,7 @@ def main() -> int:
     parser.add_argument("--leak-free", action="store_true")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    trajectories, particles, runs = (4, 5_000, 10) if arguments.quick else (16, 20_000, 10)
+    trajectories, particles, runs = 16, 20_000, 4 if arguments.quick else 10
     condition, known_start = CONDITIONS[arguments.condition], not arguments.leak_free
     held = known_start and condition == STANDARD
     train, valid, _ = hov(1, condition=condition)
