@@ -31,6 +31,8 @@ from steady_ppl.sites import (
     running,
 )
 
+WORSE = 10.0  # nats
+
 
 @torch.no_grad()
 def smooth(
@@ -46,6 +48,8 @@ def smooth(
 ) -> Lookahead:
     """Move a path to the mode of the posterior and look ahead along it.
 
+    A step after which the measurements are less likely by more than `WORSE` nats is halved.
+
     Args:
         program: with normal noise; see `linearize`.
         data: as returned by `for_program`.
@@ -59,19 +63,36 @@ def smooth(
     Returns:
         The lookahead along the last path but one, so that its linearization and its means agree.
     """
-    for index in range(passes):
-        linear = linearize(
-            program, data, path, known_start=known_start, observation_weight=observation_weight, kernels=kernels
+
+    def look(path: Path) -> Lookahead:
+        return look_ahead(
+            linearize(
+                program, data, path, known_start=known_start, observation_weight=observation_weight, kernels=kernels
+            )
         )
-        ahead = look_ahead(linear)
+
+    accepted, likely = path, torch.full((len(data),), -torch.inf, dtype=torch.float64, device=path.states.device)
+    for index in range(passes):
+        ahead = look(path)
+        worse = ~(ahead.log_likelihood >= likely - WORSE)  # or not a number
+        worse &= torch.isfinite(likely)
         if index == passes - 1:
-            break
-        moved = means_as_path(ahead, data)
+            return look(_either(worse, accepted, path)) if bool(worse.any()) else ahead
+        halfway = Path((accepted.states + path.states) / 2, (accepted.noise + path.noise) / 2)
+        moved = _either(worse, halfway, means_as_path(ahead, data))
         change = torch.nan_to_num((moved.noise - path.noise).abs(), nan=0.0).max()  # of those that have not blown up
+        accepted = _either(worse, accepted, path)
+        likely = torch.where(worse, likely - WORSE, ahead.log_likelihood)  # less each time: it may have been a fluke
         path = moved
         if not bool(change > tolerance):
             break
     return ahead
+
+
+def _either(which: Tensor, one: Path, other: Path) -> Path:
+    """Some trajectories of one path and the rest of another."""
+    chosen = which[:, None]
+    return Path(torch.where(chosen, one.states, other.states), torch.where(chosen, one.noise, other.noise))
 
 
 def find_and_smooth(
@@ -161,7 +182,7 @@ def find_path(
     )
     likely = torch.nan_to_num(ahead.log_likelihood, nan=-torch.inf).view(len(tempering), len(data))
     chosen = likely.argmax(0) * len(data) + torch.arange(len(data), device=likely.device)
-    best = means_as_path(ahead, copies)
+    best = ahead.linearization.path  # whose likelihood is known; a step further may be too far
     return Path(best.states[:, chosen], best.noise[:, chosen])
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from steady_ppl import FilterError, for_program, particle_filter, seeded, simulate
 from steady_ppl.filtering import run_filter
-from steady_ppl.gaussian_smoother import find_path, smooth
+from steady_ppl.gaussian_smoother import find_and_smooth, find_path, smooth
 from steady_ppl.linearization import Path, linearize
 from steady_ppl.lookahead import Lookahead, look_ahead
 from steady_ppl.planar_vehicle import wrap
@@ -242,6 +242,20 @@ def test_a_path_is_found_from_sharp_bearings_without_a_start(every):
     found = smooth(program, data, path).log_likelihood
     best = smooth(program, data, near_the_truth(program, data), passes=30).log_likelihood
     assert (found > best - 0.5).all()  # drives on a wrong path are off by thousands of nats
+
+
+def test_steps_that_go_too_far_are_halved():
+    """A drive past two landmarks under an untrained network: whole steps never settle, and end anywhere from -6987 to
+    140; a bootstrap filter of 20,000 particles says 148."""
+    truth = example("hovercraft:HovercraftTruth", torch.float32).requires_grad_(False)
+    truth.landmarks = truth.landmarks[:2]
+    with seeded(1, "program"):
+        program = example("neural_vehicle:NeuralHovercraft", torch.float32).requires_grad_(False)
+    program.landmarks = truth.landmarks
+    drive = for_program(program, simulate(truth, 16, seed=11)).subset([12])
+    for seed in range(3):
+        with seeded("path", seed):
+            assert float(find_and_smooth(program, drive, known_start=True).log_likelihood) > 140
 
 
 def test_a_found_path_on_the_cart_is_the_exact_mean(cart, uneven):
