@@ -61,7 +61,7 @@ def smooth(
         kernels: see `linearize`.
 
     Returns:
-        The lookahead along the last path but one, so that its linearization and its means agree.
+        The lookahead along the last path that was accepted, so that its linearization and its means agree.
     """
 
     def look(path: Path) -> Lookahead:
@@ -76,17 +76,17 @@ def smooth(
         ahead = look(path)
         worse = ~(ahead.log_likelihood >= likely - WORSE)  # or not a number
         worse &= torch.isfinite(likely)
+        accepted = _either(worse, accepted, path)
         if index == passes - 1:
-            return look(_either(worse, accepted, path)) if bool(worse.any()) else ahead
+            break
         halfway = Path((accepted.states + path.states) / 2, (accepted.noise + path.noise) / 2)
         moved = _either(worse, halfway, means_as_path(ahead, data))
         change = torch.nan_to_num((moved.noise - path.noise).abs(), nan=0.0).max()  # of those that have not blown up
-        accepted = _either(worse, accepted, path)
         likely = torch.where(worse, likely - WORSE, ahead.log_likelihood)  # less each time: it may have been a fluke
         path = moved
         if not bool(change > tolerance):
             break
-    return ahead
+    return look(accepted) if bool(worse.any()) else ahead
 
 
 def _either(which: Tensor, one: Path, other: Path) -> Path:

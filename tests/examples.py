@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from steady_ppl import Trajectories, load_program, seeded, simulate
 from steady_ppl.program import Program, for_program
@@ -53,3 +56,19 @@ def cut(data: Trajectories, rows: int) -> Trajectories:
         lengths=data.lengths.clamp(max=rows),
         states=None if data.states is None else data.states[:rows],
     )
+
+
+def elsewhere(program: Program, data: Trajectories, turn: float) -> tuple[Program, Trajectories, Callable]:
+    """A planar vehicle and its drives in a world turned and moved, and what moves a place, `(..., 2)`, there."""
+    cos, sin, away = math.cos(turn), math.sin(turn), torch.tensor([3.0, -8.0], dtype=torch.float64)
+    rotation = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
+
+    class Elsewhere(type(program)):
+        landmarks = (torch.tensor(program.landmarks, dtype=torch.float64) @ rotation.T + away).tolist()
+
+    def place(there: Tensor) -> Tensor:
+        return there @ rotation.T + away
+
+    states = data.states
+    parts = [place(states[..., :2]), states[..., 2:3] + turn, states[..., 3:5] @ rotation.T, states[..., 5:]]
+    return Elsewhere().double(), replace(data, states=torch.cat(parts, -1)), place

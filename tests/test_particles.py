@@ -9,7 +9,7 @@ from dataclasses import replace
 import pyro
 import pytest
 import torch
-from examples import copies, cut, drives, example
+from examples import copies, cut, drives, elsewhere, example
 from oracles import CartPosterior, assert_mean, cart_parameters, kalman
 
 from steady_ppl import DataError, FilterError, ProgramError, particle_filter, roll_out, seeded
@@ -345,16 +345,8 @@ def hovercraft_evidence(program, data, **settings) -> torch.Tensor:
 
 @pytest.mark.parametrize("turn", [0.5, math.pi, 4.0])
 def test_turning_and_moving_the_world_changes_nothing(hovercraft, bearings, turn):
-    cos, sin, away = math.cos(turn), math.sin(turn), torch.tensor([3.0, -8.0], dtype=torch.float64)
-    rotation = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
-
-    class Elsewhere(type(hovercraft)):
-        landmarks = (torch.tensor(hovercraft.landmarks, dtype=torch.float64) @ rotation.T + away).tolist()
-
-    states = bearings.states
-    place, velocity = states[..., :2] @ rotation.T + away, states[..., 3:5] @ rotation.T
-    moved = replace(bearings, states=torch.cat([place, states[..., 2:3] + turn, velocity, states[..., 5:]], -1))
-    here, there = hovercraft_evidence(hovercraft, bearings), hovercraft_evidence(Elsewhere().double(), moved)
+    program, moved, _ = elsewhere(hovercraft, bearings, turn)
+    here, there = hovercraft_evidence(hovercraft, bearings), hovercraft_evidence(program, moved)
     torch.testing.assert_close(here, there.detach(), rtol=1e-9, atol=1e-9)
 
 
