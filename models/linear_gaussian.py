@@ -19,6 +19,7 @@ class LinearGaussian(Program):
     controls = ("push [N]",)
     measurements = ("position [m]",)
     channels = ("push [m/s²]",)
+    motion = {"push": ("position", "velocity")}
 
     def __init__(self):
         super().__init__()

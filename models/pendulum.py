@@ -23,6 +23,7 @@ class Pendulum(Program):
     measurements = ("angle [rad]",)
     channels = ("torque [rad/s²]",)
     angles = ("angle",)
+    motion = {"torque": ("angle", "rate")}
     step = 0.05
 
     def __init__(self):

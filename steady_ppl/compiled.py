@@ -15,7 +15,7 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.kernel_writer import LANES
 from steady_ppl.method import Method, close, compiled, distrust
-from steady_ppl.program import Program
+from steady_ppl.program import Program, acting_controls
 from steady_ppl.resampling import by_component
 from steady_ppl.scalar_graph import NotCompilable
 from steady_ppl.sites import Observing, Recording, Standardised, running
@@ -97,7 +97,7 @@ class CompiledStepping(Stepping):
         data = plain.data
         self.moving = methods.transition.parameters()
         self.observing = methods.observe.parameters()
-        moved = (data.controls[:-1], data.elapsed[:-1, :, None], data.steps[..., None])
+        moved = (acting_controls(plain.program, data)[:-1], data.elapsed[:-1, :, None], data.steps[..., None])
         self.moved = torch.cat(moved, -1).float().contiguous().numpy()
         weight = torch.as_tensor(self.observation_weight, dtype=torch.float32).expand(data.time.shape).unsqueeze(-1)
         self.measured = torch.cat((data.measurements, data.observed.to(weight), weight), -1).contiguous().numpy()

@@ -19,7 +19,7 @@ from steady_ppl.linearization import Path, linearize
 from steady_ppl.lookahead import Lookahead, look_ahead
 from steady_ppl.particles import particle_filter
 from steady_ppl.paths import Paths
-from steady_ppl.program import Program
+from steady_ppl.program import Program, acting_controls
 from steady_ppl.sites import (
     KnownStart,
     Recording,
@@ -191,7 +191,7 @@ def standard_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor
     """The channel noise of paths in its standard deviations, `(M, T, B, C)`."""
     seen, states = Recording(), paths.states[:, :-1]
     with running(*states.shape[:-1]), seen, Replaying(paths.noise):
-        program.transition(states, data.controls[:-1], data.elapsed[:-1], data.steps)
+        program.transition(states, acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
     parts = []
     for site, fn in seen.distributions.items():
         mean, sd = normal_moments(fn, site)
@@ -249,7 +249,7 @@ def _noise_along(
         return torch.cat([value.expand(*state.shape[:-1], value.shape[-1]) for value in values], -1)
 
     draws, rows = noise.shape[:2]
-    given = {"control": data.controls[:-1], "time": data.elapsed[:-1], "step": data.steps}
+    given = {"control": acting_controls(program, data)[:-1], "time": data.elapsed[:-1], "step": data.steps}
     arguments = {"state": states[:, :-1], "noise": noise} | {
         name: value.expand(draws, *value.shape) for name, value in given.items()
     }

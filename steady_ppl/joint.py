@@ -9,7 +9,7 @@ import pyro.distributions as dist
 from pyro.distributions import constraints
 
 from steady_ppl.data import Trajectories
-from steady_ppl.program import Program
+from steady_ppl.program import Program, acting_controls
 from steady_ppl.sites import KnownStart, Observing, masked
 
 
@@ -38,6 +38,7 @@ class Joint:
             with pyro.plate("first_row", 1, dim=-2), certain:
                 self.program.initial()
             with pyro.plate("interval", rows - 1, dim=-2), masked(data.transitions):
-                self.program.transition(states[..., :-1, :, :], data.controls[:-1], data.elapsed[:-1], data.steps)
+                controls = acting_controls(self.program, data)[:-1]
+                self.program.transition(states[..., :-1, :, :], controls, data.elapsed[:-1], data.steps)
             with pyro.plate("observed_row", rows, dim=-2), Observing(data.measurements, data.observed):
                 self.program.observe(states)

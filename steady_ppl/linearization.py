@@ -20,7 +20,7 @@ from steady_ppl.compiled_rows import on_all_rows
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import ProgramError
 from steady_ppl.planar_vehicle import wrap
-from steady_ppl.program import Program, names
+from steady_ppl.program import Program, acting_controls, names
 from steady_ppl.sites import (
     AtMean,
     Observing,
@@ -171,7 +171,7 @@ def _transition(
             return program.transition(state, control, time, step)
 
     along = {"state": states[:-1], "noise": noise}
-    given = {"control": data.controls[:-1], "time": data.elapsed[:-1], "step": data.steps}
+    given = {"control": acting_controls(program, data)[:-1], "time": data.elapsed[:-1], "step": data.steps}
     return _jacobians(program, step, along, given, kernels)
 
 

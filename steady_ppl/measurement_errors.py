@@ -10,7 +10,7 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.filtering import in_parts
 from steady_ppl.particles import particle_filter, roll_out
-from steady_ppl.program import Program
+from steady_ppl.program import Program, acting_controls
 from steady_ppl.resampling import systematic, take
 from steady_ppl.sites import AtMean, Recording, as_vector, residual, running
 
@@ -87,7 +87,7 @@ def _open_loop(
         *_, state = roll_out(
             program,
             draws[:, :starts],
-            windows(data.controls),
+            windows(acting_controls(program, data)),
             windows(data.elapsed),
             windows(data.steps),
             handler=AtMean(),

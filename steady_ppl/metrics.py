@@ -14,7 +14,7 @@ from steady_ppl.data import Trajectories
 from steady_ppl.filtering import in_parts, run_filter
 from steady_ppl.particles import roll_out
 from steady_ppl.planar_vehicle import wrap
-from steady_ppl.program import Program, error_groups, names
+from steady_ppl.program import Program, acting_controls, error_groups, names
 from steady_ppl.sites import AtMean
 
 Errors = dict[str, float]
@@ -115,8 +115,9 @@ def _end_of_roll_out(
         return torch.stack([values[k : k + starts] for k in range(horizon)])
 
     handler = AtMean() if mean else None
+    controls = windows(acting_controls(program, data))
     for state in roll_out(  # noqa: B007, B020
-        program, state, windows(data.controls), windows(data.elapsed), windows(data.steps), handler=handler
+        program, state, controls, windows(data.elapsed), windows(data.steps), handler=handler
     ):
         pass
     return state

@@ -12,7 +12,7 @@ import torch
 from pyro.distributions import constraints
 from torch import Tensor, nn
 
-from steady_ppl.program import Program
+from steady_ppl.program import Program, names
 
 
 class PlanarVehicle(Program):
@@ -23,6 +23,7 @@ class PlanarVehicle(Program):
     Attributes:
         landmarks: positions that bearings are measured to, m.
         bearing_sd: standard deviation of a bearing, rad.
+        slips: whether the lateral velocity is free; False where the program takes it back within a step.
     """
 
     states = ("x [m]", "y [m]", "heading [rad]", "vx [m/s]", "vy [m/s]", "yaw_rate [rad/s]")
@@ -34,8 +35,10 @@ class PlanarVehicle(Program):
         "velocity": ("vx", "vy"),
         "yaw_rate": ("yaw_rate",),
     }
+    axes: ClassVar = {"translation": ("forward", "lateral"), "yaw": ("yaw",)}  # type: ignore[assignment]
     landmarks: Sequence[Sequence[float]] = ()
     bearing_sd: float = math.radians(5)
+    slips: bool = True
 
     @property
     def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -70,6 +73,14 @@ class PlanarVehicle(Program):
         _, _, heading, vx, vy, yaw_rate = state.unbind(-1)
         cos, sin = heading.cos(), heading.sin()
         return cos * vx + sin * vy, cos * vy - sin * vx, yaw_rate
+
+    def velocities(self, state: Tensor) -> dict[str, Tensor]:
+        """Velocity in the body frame and yaw rate by channel, each `(...)`."""
+        return dict(zip(names(self.channels), self.body_velocity(state), strict=True))
+
+    def positions(self, state: Tensor) -> dict[str, Tensor]:
+        """None: no channel of the body frame has a position in it."""
+        return {}
 
 
 def stack(*components: Tensor) -> Tensor:

@@ -43,6 +43,8 @@ class Program(PyroModule):
         channels: names and units of the noise channels.
         angles: the state components that live on a circle.
         error_groups: what an error is reported for: name → components whose Euclidean norm it is.
+        motion: channel → the state components that are its position and its velocity; the generic effects go by it.
+        priors: parameter's name → its prior, a Pyro distribution over the parameter's value.
         rates: learning rates relative to the recipe's, by the beginning of a parameter's name.
         decays: weight decay relative to the recipe's, by the beginning of a parameter's name; only the matrices of
             `torch.nn.Linear` decay.
@@ -55,6 +57,8 @@ class Program(PyroModule):
     channels: Sequence[str] = ()
     angles: ClassVar[Sequence[str]] = ()
     error_groups: ClassVar[Mapping[str, Sequence[str]]] = {}
+    motion: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    priors: ClassVar[Mapping[str, Any]] = {}
     rates: ClassVar[Mapping[str, float]] = {}
     decays: ClassVar[Mapping[str, float]] = {}
     duration: float = 10.0
@@ -79,6 +83,33 @@ class Program(PyroModule):
     def observe(self, state: Tensor) -> None:
         """Sample the measurement of `state`, without `obs=`: the engine conditions and masks."""
         raise ProgramError(f"program {type(self).__name__} lacks the method observe(self, state)", site="observe")
+
+    def actuators(self, control: Tensor, time: Tensor) -> Tensor:
+        """The controls as they act, `(rows, trajectories, U)`: what lag, delay and wear make of the commands.
+
+        Called with whole trajectories before `transition` sees a row of the result.
+
+        Args:
+            control: the commands, `(rows, trajectories, U)`.
+            time: s since each trajectory's first row, `(rows, trajectories)`.
+        """
+        return control
+
+    @property
+    def axes(self) -> Mapping[str, tuple[str, ...]]:
+        """Channels that one coefficient of a generic effect can belong to, by the name of the group; each channel of
+        `motion` alone unless a program knows better."""
+        return {channel: (channel,) for channel in self.motion}
+
+    def velocities(self, state: Tensor) -> dict[str, Tensor]:
+        """The velocity that each channel accelerates, `(...)`."""
+        order = names(self.states)
+        return {channel: state[..., order.index(velocity)] for channel, (_, velocity) in self.motion.items()}
+
+    def positions(self, state: Tensor) -> dict[str, Tensor]:
+        """The position that each channel moves, `(...)`, where it has one."""
+        order = names(self.states)
+        return {channel: state[..., order.index(position)] for channel, (position, _) in self.motion.items()}
 
     def example_controls(self, time: Tensor) -> Tensor:
         """Controls of simulated drives, `(rows, trajectories, U)` at `time` of `(rows, trajectories)`; zero unless
@@ -117,6 +148,11 @@ def error_groups(program: Program) -> dict[str, tuple[int, ...]]:
     order = names(program.states)
     groups = program.error_groups or {name: (name,) for name in order}
     return {group: tuple(order.index(name) for name in members) for group, members in groups.items()}
+
+
+def acting_controls(program: Program, data: Trajectories) -> Tensor:
+    """The controls of drives as they act on the program, `(T + 1, B, U)`."""
+    return program.actuators(data.controls, data.elapsed)
 
 
 def for_program(program: Program, data: Trajectories) -> Trajectories:

@@ -6,7 +6,7 @@ import torch
 
 from steady_ppl.data import Trajectories
 from steady_ppl.particles import roll_out
-from steady_ppl.program import Program, for_program, names
+from steady_ppl.program import Program, acting_controls, for_program, names
 from steady_ppl.seeding import seeded
 from steady_ppl.sites import Recording, as_vector, broadcast_event, running
 
@@ -46,7 +46,7 @@ def simulate(
         with running(1, drives):
             start = broadcast_event(program.initial(), torch.Size((1, drives)), 1)
         states = [start]
-        controls_over_time = run.controls[:-1].unsqueeze(1)
+        controls_over_time = acting_controls(program, run)[:-1].unsqueeze(1)
         for state in roll_out(
             program, start, controls_over_time, run.elapsed[:-1].unsqueeze(1), run.steps.unsqueeze(1)
         ):

@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
-from steady_ppl.program import Program
+from steady_ppl.program import Program, acting_controls
 from steady_ppl.resampling import take
 from steady_ppl.sites import Observing, Recording, Standardised, running
 
@@ -26,7 +26,7 @@ class Stepping:
 
     def __init__(self, program: Program, data: Trajectories, observation_weight: float | Tensor) -> None:
         self.program, self.data, self.observation_weight = program, data, observation_weight
-        self.steps, self.elapsed = data.steps, data.elapsed
+        self.steps, self.elapsed, self.controls = data.steps, data.elapsed, acting_controls(program, data)
         self.event_dims: dict[str, int] = {}
 
     def transition(
@@ -47,7 +47,7 @@ class Stepping:
             state = take(state, ancestors)
         recording = Recording()
         given = nullcontext() if noise is None else Standardised(noise.unsqueeze(1))
-        control, time, step = self.data.controls[row, None], self.elapsed[row, None], self.steps[row, None]
+        control, time, step = self.controls[row, None], self.elapsed[row, None], self.steps[row, None]
         with running(state.shape[0], 1, state.shape[1]), recording, given:
             moved = self.program.transition(state.unsqueeze(1), control, time, step)
         self.event_dims = {site: fn.event_dim for site, fn in recording.distributions.items()}

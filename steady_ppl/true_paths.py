@@ -9,7 +9,7 @@ from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError, ProgramError
 from steady_ppl.paths import Paths
 from steady_ppl.planar_vehicle import wrap
-from steady_ppl.program import Program, names
+from steady_ppl.program import Program, acting_controls, names
 from steady_ppl.sites import Recording, Replaying, running
 
 
@@ -35,10 +35,12 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
     states = torch.where(data.rows[..., None], states, states[:1])
     before, after = states[:-1], states[1:]
 
+    controls = acting_controls(program, data)[:-1]
+
     def run(noise: dict[str, Tensor]) -> tuple[Tensor, Recording]:
         recording = Recording()
         with running(*before.shape[:-1]), recording, Replaying(noise):
-            after = program.transition(before, data.controls[:-1], data.elapsed[:-1], data.steps)
+            after = program.transition(before, controls, data.elapsed[:-1], data.steps)
         return after, recording
 
     _, probe = run({})
