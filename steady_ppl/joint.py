@@ -18,6 +18,7 @@ class Joint:
 
     The site `states` carries what a guide knows about the states, at density one; with the channel noise that goes with
     them the transitions need no loop over time. Draws, if any, are at dimension −3, rows at −2, trajectories at −1.
+    Priors of the program's parameters are counted once a call.
 
     Args:
         program: the state-space model.
@@ -29,6 +30,8 @@ class Joint:
 
     def __call__(self, data: Trajectories) -> None:
         """The model. `data` is as returned by `for_program`."""
+        for name, prior in self.program.priors.items():
+            pyro.factor(f"prior of {name}", prior.log_prob(getattr(self.program, name)).sum())
         rows, trajectories = data.time.shape
         dimension = len(self.program.states)
         with pyro.plate("trajectory", trajectories, dim=-1):

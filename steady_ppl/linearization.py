@@ -28,9 +28,9 @@ from steady_ppl.sites import (
     Standardised,
     as_vector,
     broadcast_event,
-    normal_moments,
     residual,
     running,
+    tangent_normal,
 )
 
 
@@ -115,10 +115,9 @@ def linearize(
     for angle in angles:
         start_turn[:, angle] = start_offset[:, angle].double() - wrap(start_offset[:, angle].double())
     measured = _measurement(program, data, states, kernels)
-    residuals, log_sd = measured.value.chunk(2, -1)
+    residuals, log_sd, log_density = measured.value.chunk(3, -1)
     by_measured = -measured.by[0][..., : residuals.shape[-1], :]
     observed = data.observed & torch.isfinite(by_measured).all(-1)  # a bearing to where one stands has no derivative
-    log_density = torch.distributions.Normal(0.0, 1.0).log_prob(residuals.new_zeros(())) - log_sd
     return Linearization(
         path=path,
         angles=angles,
@@ -176,17 +175,20 @@ def _transition(
 
 
 def _residuals(program: Program, state: Tensor, measurement: Tensor, observed: Tensor) -> Tensor:
-    """Residuals and, beside them, log standard deviations, `(..., 2 K)`."""
+    """Residuals and, beside them, log standard deviations and log-densities at residual zero, `(..., 3 K)`; where the
+    noise is not normal, of the normal that touches it."""
     seen = Recording()
     with running(*state.shape[:-1]), seen, Observing(measurement, observed):
         program.observe(state)
-    residuals, log_sds = [], []
+    residuals, log_sds, heights = [], [], []
     for site, fn in seen.distributions.items():
-        _, sd = normal_moments(fn, site)
-        difference = as_vector(residual(fn, seen.observed[site]), fn.event_dim)
+        apart = residual(fn, seen.observed[site])
+        sd, height = tangent_normal(fn, apart, site)
+        difference = as_vector(apart, fn.event_dim)
         residuals.append(difference)
         log_sds.append(as_vector(sd.log(), fn.event_dim).expand(difference.shape))
-    return torch.cat(residuals + log_sds, -1)
+        heights.append(as_vector(height, fn.event_dim).expand(difference.shape))
+    return torch.cat(residuals + log_sds + heights, -1)
 
 
 def _start(program: Program, data: Trajectories, first: Tensor, known_start: bool) -> tuple[Tensor, Tensor]:
@@ -202,7 +204,7 @@ def _start(program: Program, data: Trajectories, first: Tensor, known_start: boo
 
 
 def _measurement(program: Program, data: Trajectories, states: Tensor, kernels: bool | None) -> _Jacobians:
-    """Of the residuals and, beside them, the log standard deviations."""
+    """Of all that `_residuals` returns."""
 
     def measure(state: Tensor, measurement: Tensor, observed: Tensor) -> Tensor:
         return _residuals(program, state, measurement, observed)
@@ -220,9 +222,8 @@ def _on_a_circle(program: Program, data: Trajectories, state: Tensor) -> tuple[i
     states = (state + turns).unsqueeze(1)
     first = slice(0, 1)
     measurement = data.measurements[first, first].new_zeros((len(turns), 1, data.measurements.shape[-1]))
-    residuals, log_sd = _residuals(program, states, measurement, torch.ones_like(measurement, dtype=torch.bool)).chunk(
-        2, -1
-    )
+    everywhere = torch.ones_like(measurement, dtype=torch.bool)
+    residuals, log_sd, _ = _residuals(program, states, measurement, everywhere).chunk(3, -1)
     squares = (residuals / log_sd.exp()).square()  # of no sign: a bearing straight behind is on both ends of its scale
     same = ((squares - squares[first]).abs() <= 0.01 * (1 + squares)).flatten(1).all(1)
     if len(data.steps):

@@ -35,7 +35,7 @@ class PlanarVehicle(Program):
         "velocity": ("vx", "vy"),
         "yaw_rate": ("yaw_rate",),
     }
-    axes: ClassVar = {"translation": ("forward", "lateral"), "yaw": ("yaw",)}  # type: ignore[assignment]
+    axes: ClassVar = {"translation": ("forward", "lateral"), "yaw": ("yaw",)}
     landmarks: Sequence[Sequence[float]] = ()
     bearing_sd: float = math.radians(5)
     slips: bool = True
@@ -70,7 +70,7 @@ class PlanarVehicle(Program):
 
     def body_velocity(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Forward and lateral velocity (m/s) and yaw rate (rad/s), each `(...)`."""
-        _, _, heading, vx, vy, yaw_rate = state.unbind(-1)
+        _, _, heading, vx, vy, yaw_rate = state[..., :6].unbind(-1)
         cos, sin = heading.cos(), heading.sin()
         return cos * vx + sin * vy, cos * vy - sin * vx, yaw_rate
 
@@ -81,6 +81,15 @@ class PlanarVehicle(Program):
     def positions(self, state: Tensor) -> dict[str, Tensor]:
         """None: no channel of the body frame has a position in it."""
         return {}
+
+    def earlier(self, state: Tensor, ago: Tensor) -> Tensor:
+        """The pose `ago` seconds before, at its velocity, and the velocity as it is, `(..., 6)`."""
+        return torch.cat([state[..., :3] - ago * state[..., 3:6], state[..., 3:]], -1)
+
+    def ranges(self, state: Tensor) -> Tensor:
+        """Distances from the landmarks, `(..., K)` m."""
+        places = _on_device(self.landmarks, state)
+        return (places - state[..., None, :2]).square().sum(-1).sqrt()
 
 
 def stack(*components: Tensor) -> Tensor:
@@ -127,6 +136,22 @@ class WrappedNormal(dist.Normal):
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
         with torch.no_grad():
             return self.rsample(sample_shape)
+
+
+class WrappedStudentT(dist.StudentT):
+    """Student t on the difference of two angles, wrapped to [−π, π]; its mass beyond half a turn is neglected."""
+
+    support = constraints.real
+
+    def residual(self, value: Tensor) -> Tensor:
+        """`value − loc`, wrapped."""
+        return wrap(value - self.loc)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return dist.StudentT(self.df, torch.zeros_like(self.loc), self.scale).log_prob(self.residual(value))
+
+    def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:
+        return wrap(super().rsample(torch.Size(sample_shape)))
 
 
 def bearings_to(landmarks: Sequence[Sequence[float]] | Tensor, state: Tensor, sd: float | Tensor) -> dist.Independent:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import pyro
 import torch
 from pyro.nn import PyroModule
+from pyro.nn.module import _PyroModuleMeta
 from torch import Tensor
 
 from steady_ppl.errors import ProgramError, SteadyError
@@ -30,7 +31,23 @@ if TYPE_CHECKING:
 _LOADS = itertools.count()
 
 
-class Program(PyroModule):
+class _WithEffects(_PyroModuleMeta):
+    """Adds the effects that a class lists when one of it is made."""
+
+    effects: Sequence[str]
+
+    def __call__(cls, *arguments: Any, **options: Any) -> Any:
+        program = super().__call__(*arguments, **options)
+        if cls.effects:
+            from steady_ppl.effects import attach, chosen_variant, parsed
+
+            for text in cls.effects:
+                name, at, where, value = parsed(text)
+                attach(program, chosen_variant(program, name, at, **where), value)
+        return program
+
+
+class Program(PyroModule, metaclass=_WithEffects):
     """A state-space model as a Pyro program.
 
     A subclass declares its components as "name [unit]" and writes three methods. `...` is any shape, the same for all
@@ -44,10 +61,13 @@ class Program(PyroModule):
         angles: the state components that live on a circle.
         error_groups: what an error is reported for: name → components whose Euclidean norm it is.
         motion: channel → the state components that are its position and its velocity; the generic effects go by it.
+        effects: names of effects that the program has besides what it writes out, see `steady_ppl.effects`.
+        guesses: beginnings of the names of parameters whose declared value is a guess, from which a fit may depart.
         priors: parameter's name → its prior, a Pyro distribution over the parameter's value.
         rates: learning rates relative to the recipe's, by the beginning of a parameter's name.
         decays: weight decay relative to the recipe's, by the beginning of a parameter's name; only the matrices of
             `torch.nn.Linear` decay.
+        resting: state components that start at zero in every drive and are in no table.
         duration, step: of a simulated trajectory, s.
     """
 
@@ -58,9 +78,12 @@ class Program(PyroModule):
     angles: ClassVar[Sequence[str]] = ()
     error_groups: ClassVar[Mapping[str, Sequence[str]]] = {}
     motion: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    effects: ClassVar[Sequence[str]] = ()
+    guesses: ClassVar[Sequence[str]] = ()
     priors: ClassVar[Mapping[str, Any]] = {}
     rates: ClassVar[Mapping[str, float]] = {}
     decays: ClassVar[Mapping[str, float]] = {}
+    resting: Sequence[str] = ()
     duration: float = 10.0
     step: float = 0.1
 
@@ -111,6 +134,29 @@ class Program(PyroModule):
         order = names(self.states)
         return {channel: state[..., order.index(position)] for channel, (position, _) in self.motion.items()}
 
+    def earlier(self, state: Tensor, ago: Tensor) -> Tensor:
+        """The state `ago` seconds before, at its velocity, `(..., D)`."""
+        order = names(self.states)
+        moved = list(state.unbind(-1))
+        for position, velocity in self.motion.values():
+            if position and velocity:
+                moved[order.index(position)] = moved[order.index(position)] - ago * state[..., order.index(velocity)]
+        return torch.stack(torch.broadcast_tensors(*moved), -1)
+
+    def control_index(self, name: str) -> int:
+        """Which column of `control` a control has."""
+        return names(self.controls).index(name)
+
+    def chosen_controls(self, chosen: Sequence[str], like: Tensor) -> Tensor:
+        """One for the controls that are named and zero for the others, `(U,)`."""
+        return like.new_tensor([float(name in chosen) for name in names(self.controls)])
+
+    def with_effect(self, effect: Any, value: Any = None, **where: Any) -> Program:
+        """A copy with a physical effect added, its coefficient a learnable parameter; see `effects.attach`."""
+        from steady_ppl.effects import with_effect
+
+        return with_effect(self, effect, value, **where)
+
     def example_controls(self, time: Tensor) -> Tensor:
         """Controls of simulated drives, `(rows, trajectories, U)` at `time` of `(rows, trajectories)`; zero unless
         a program knows better."""
@@ -158,6 +204,9 @@ def acting_controls(program: Program, data: Trajectories) -> Tensor:
 def for_program(program: Program, data: Trajectories) -> Trajectories:
     """The columns that the program reads, in its order, its precision and on its device."""
     chosen = data.select(names(program.controls), names(program.measurements), names(program.states))
+    if chosen.states is not None and program.resting:
+        resting = [names(program.states).index(name) for name in names(program.resting)]
+        chosen.states[0][..., resting] = 0.0
     parameter = next(program.parameters(), None)
     if parameter is None:
         return chosen.to(torch.get_default_dtype())

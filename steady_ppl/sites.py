@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, cast
@@ -129,13 +130,15 @@ class KnownStart(Messenger):
         self.state = state
 
     def _pyro_sample(self, message: Any) -> None:
-        if tuple(message["fn"].event_shape) != (self.state.shape[-1],):
+        width = message["fn"].event_shape.numel()
+        whole = message["fn"].event_dim == 1 and width <= self.state.shape[-1]
+        if not whole or bool((self.state[..., width:] != 0).any()):
             raise ProgramError(
                 f"a known start needs initial() to sample the whole state as one site of event shape "
                 f"({self.state.shape[-1]},); site {message['name']!r} has {tuple(message['fn'].event_shape)}",
                 site=message["name"],
             )
-        message["fn"] = dist.Delta(self.state, event_dim=1)
+        message["fn"] = dist.Delta(self.state[..., :width], event_dim=1)  # what is left rests
 
 
 class Replaying(Messenger):
@@ -264,6 +267,29 @@ def normal_moments(fn: Any, site: str) -> tuple[Tensor, Tensor]:
             site=site,
         )
     return base.loc, base.scale
+
+
+def tangent_normal(fn: Any, residual: Tensor, site: str) -> tuple[Tensor, Tensor]:
+    """The normal that touches a measurement site's log-density at a residual from below, with the same slope.
+
+    A normal is its own; a Student t's is wider the farther out it is touched (Lange, Little and Taylor 1989).
+
+    Returns:
+        Standard deviation and log-density at residual zero, each as `residual`.
+
+    Raises:
+        ProgramError: the site is neither normal nor Student t.
+    """
+    base = fn
+    while isinstance(base, dist.Independent | dist.MaskedDistribution | dist.ExpandedDistribution):
+        base = base.base_dist
+    if not isinstance(base, dist.StudentT) or fn.event_dim > 1:
+        _, sd = normal_moments(fn, site)
+        return sd, -sd.log() - 0.5 * math.log(2 * math.pi)
+    squares = (residual / base.scale).square()
+    sd = base.scale * ((base.df + squares) / (base.df + 1)).sqrt()
+    density = dist.StudentT(base.df, torch.zeros_like(residual), base.scale).log_prob(residual)
+    return sd, density + 0.5 * (residual / sd).square()
 
 
 def as_vector(value: Tensor, event_dim: int) -> Tensor:

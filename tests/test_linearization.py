@@ -272,6 +272,11 @@ class HeavyTailedSensor(Cart):
         pyro.sample("range", dist.StudentT(3.0, state[..., 0], self.measurement_sd))
 
 
+class Saturating(Cart):
+    def observe(self, state):
+        pyro.sample("range", dist.Laplace(state[..., 0], self.measurement_sd))
+
+
 class Correlated(Cart):
     measurements = ("position [m]", "velocity [m/s]")
 
@@ -289,7 +294,7 @@ class UncertainStart(Cart):
     ("program", "site", "distribution"),
     [
         (HeavyTailed, "kick", "StudentT"),
-        (HeavyTailedSensor, "range", "StudentT"),
+        (Saturating, "range", "Laplace"),
         (Correlated, "both", "MultivariateNormal"),
         (UncertainStart, "start", "Laplace"),
     ],
@@ -302,6 +307,22 @@ def test_noise_that_is_not_normal_and_independent_is_refused_by_name(program, si
         linearize(refused, data, path)
     assert error.value.site == site
     assert why_not_linear(refused, data) == str(error.value)
+
+
+def test_a_student_t_sensor_is_linearised_by_the_normal_that_touches_it():
+    program = HeavyTailedSensor().double().requires_grad_(False)
+    data = drives(program, 2, 6)
+    linear = linearize(program, data, near_the_truth(program, data))
+    sd = float(program.measurement_sd)
+    exact = torch.distributions.StudentT(3.0, 0.0, sd)
+    residuals = linear.residual.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(exact.log_prob(residuals).sum(), residuals)
+    assert torch.allclose(-linear.precision * linear.residual, slope)
+    touching = linear.log_scale - 0.5 * (linear.precision * linear.residual**2).sum(-1)
+    assert torch.allclose(touching, exact.log_prob(linear.residual).sum(-1))
+    elsewhere = linear.residual + torch.linspace(-3, 3, 31)[:, None, None, None]
+    below = linear.log_scale[..., None] - 0.5 * linear.precision * elsewhere**2
+    assert bool((below <= exact.log_prob(elsewhere) + 1e-6).all())
 
 
 def test_a_known_start_needs_no_normal_prior():

@@ -1,0 +1,173 @@
+"""What an effect does to a program's sites: move their means, widen them, give them tails.
+
+with pushed(self, {"forward": -c * velocity}):
+    return super().transition(state, control, time, step)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import pyro.distributions as dist
+import torch
+from pyro.poutine.messenger import Messenger
+from torch import Tensor
+
+from steady_ppl.planar_vehicle import WrappedNormal, WrappedStudentT
+from steady_ppl.program import Program, names
+from steady_ppl.sites import as_vector, normal_moments
+
+Change = Callable[[Any, slice], Any]
+
+
+class Altering(Messenger):
+    """Replace the distribution of each site that a method of a program samples.
+
+    Args:
+        change: (distribution, which columns of the channels or measurements it has) → distribution.
+    """
+
+    def __init__(self, change: Change) -> None:
+        super().__init__()
+        self.change, self.column = change, 0
+
+    def __enter__(self) -> Altering:
+        self.column = 0
+        super().__enter__()
+        return self
+
+    def _pyro_sample(self, message: Any) -> None:
+        width = message["fn"].event_shape.numel()
+        columns = slice(self.column, self.column + width)
+        self.column += width
+        message["fn"] = self.change(message["fn"], columns)
+
+
+def pushed(program: Program, pushes: Mapping[str, Tensor]) -> Altering:
+    """Add to the means of a program's channels while its `transition` runs.
+
+    Args:
+        pushes: channel → what is added, `(...)`, in the channel's unit.
+    """
+    order = names(program.channels)
+
+    def change(fn: Any, columns: slice) -> Any:
+        mean, _ = normal_moments(fn, "channel")
+        return _moved(fn, lambda loc: loc + _columns(pushes, order[columns], 0.0, fn.event_dim, mean))
+
+    return Altering(change)
+
+
+def widened(program: Program, factors: Mapping[str, Tensor]) -> Altering:
+    """Multiply the standard deviations of a program's channels while its `transition` runs.
+
+    Args:
+        factors: channel → factor, `(...)`.
+    """
+    order = names(program.channels)
+
+    def change(fn: Any, columns: slice) -> Any:
+        mean, _ = normal_moments(fn, "channel")
+        return _rescaled(fn, _columns(factors, order[columns], 1.0, fn.event_dim, mean))
+
+    return Altering(change)
+
+
+def misread(program: Program, change: Callable[[Tensor], Tensor]) -> Altering:
+    """Change what is measured on average while a program's `observe` runs.
+
+    Args:
+        change: of the mean measurement, `(..., K)`, on the circle where the measurement is an angle.
+    """
+
+    def at_site(fn: Any, columns: slice) -> Any:
+        def moved(loc: Tensor) -> Tensor:
+            reading = -_base(fn).residual(torch.zeros_like(loc)) if hasattr(_base(fn), "residual") else loc
+            reading = as_vector(reading, fn.event_dim)
+            whole = reading.new_zeros((*reading.shape[:-1], len(program.measurements)))
+            whole = torch.cat([whole[..., : columns.start], reading, whole[..., columns.stop :]], -1)
+            changed = change(whole)[..., columns]
+            return changed if fn.event_dim else changed.squeeze(-1)
+
+        return _moved(fn, moved)
+
+    return Altering(at_site)
+
+
+def blurred(factors: Tensor) -> Altering:
+    """Multiply the measurements' standard deviations by factors `(..., K)` while a program's `observe` runs."""
+
+    def change(fn: Any, columns: slice) -> Any:
+        chosen = factors[..., columns]
+        return _rescaled(fn, chosen if fn.event_dim else chosen.squeeze(-1))
+
+    return Altering(change)
+
+
+def heavy_tailed(share: Tensor) -> Altering:
+    """Give the measurements' noise the tails of a Student t of 1/`share` degrees of freedom, its scale the normal's."""
+
+    def change(fn: Any, columns: slice) -> Any:
+        base = _base(fn)
+        kind = WrappedStudentT if isinstance(base, WrappedNormal) else dist.StudentT
+        return kind((1 / share).expand(base.loc.shape), base.loc, base.scale).to_event(fn.event_dim)
+
+    return Altering(change)
+
+
+class Coloured(Altering):
+    """Let a share of each channel's last deviation stay, and keep the new deviations, `(..., C)`.
+
+    Args:
+        shares: channel → share.
+        last: the channels' last deviations, `(..., C)`.
+    """
+
+    def __init__(self, program: Program, shares: Mapping[str, Tensor], last: Tensor) -> None:
+        order = names(program.channels)
+        share = torch.stack(torch.broadcast_tensors(*(shares.get(name, last.new_zeros(())) for name in order)), -1)
+        super().__init__(self._change)
+        self.pushes, self.factors = share * last, (1 - share.square()).sqrt()
+        self.deviations: list[Tensor] = []
+
+    def _change(self, fn: Any, columns: slice) -> Any:
+        pushes, factors = self.pushes[..., columns], self.factors[..., columns]
+        if not fn.event_dim:
+            pushes, factors = pushes.squeeze(-1), factors.squeeze(-1)
+        return _moved(_rescaled(fn, factors), lambda loc: loc + pushes)
+
+    def _pyro_post_sample(self, message: Any) -> None:
+        fn = message["fn"]
+        width = fn.event_shape.numel()
+        mean, _ = normal_moments(fn, message["name"])
+        value = as_vector(message["value"] - mean, fn.event_dim)
+        self.deviations.append(value + self.pushes[..., self.column - width : self.column])
+
+
+def _base(fn: Any) -> Any:
+    while isinstance(fn, dist.Independent | dist.MaskedDistribution | dist.ExpandedDistribution):
+        fn = fn.base_dist
+    return fn
+
+
+def _moved(fn: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    base = _base(fn)
+    if isinstance(base, dist.StudentT):
+        return type(base)(base.df, change(base.loc), base.scale).to_event(fn.event_dim)
+    return type(base)(change(base.loc), base.scale).to_event(fn.event_dim)
+
+
+def _rescaled(fn: Any, factor: Tensor) -> Any:
+    base = _base(fn)
+    if isinstance(base, dist.StudentT):
+        return type(base)(base.df, base.loc, base.scale * factor).to_event(fn.event_dim)
+    return type(base)(base.loc, base.scale * factor).to_event(fn.event_dim)
+
+
+def _columns(
+    values: Mapping[str, Tensor], wanted: tuple[str, ...], missing: float, event_dim: int, like: Tensor
+) -> Any:
+    """The values of a site's channels, `(...)` or side by side `(..., C)`."""
+    found = [values.get(name, like.new_tensor(missing)) for name in wanted]
+    return torch.stack(torch.broadcast_tensors(*found), -1) if event_dim else found[0]

@@ -1,0 +1,237 @@
+"""What lies between the command and the force: gains, knees, delays, wear."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+from steady_ppl.actuation import delayed, lagged
+from steady_ppl.data import Trajectories
+from steady_ppl.effects.declaration import Effect
+from steady_ppl.effects.planar_forces import not_planar
+from steady_ppl.program import Program, names, units
+
+
+def _has(*wanted: str) -> Any:
+    def lacks(program: Program) -> str | None:
+        if set(wanted) <= set(names(program.controls)):
+            return None
+        return f"there are no controls {' and '.join(wanted)}"
+
+    return lacks
+
+
+def _no_controls(program: Program) -> str | None:
+    return None if program.controls else "the program has no controls"
+
+
+def _groups(program: Program) -> list[dict[str, Any]]:
+    """All controls together and, where their units differ, each alone."""
+    order = names(program.controls)
+    together = [{"controls": order}]
+    if len(set(units(program.controls))) == 1:
+        return together
+    return together + [{"controls": (name,), "at": name} for name in order]
+
+
+def _everywhere(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+    """All controls together and, where their units differ, each alone."""
+    return _groups(program)
+
+
+def _per_unit(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+    """The coefficient has a control's unit: together where they share one, else each alone."""
+    groups = _groups(program)
+    return groups if len(groups) == 1 else groups[1:]
+
+
+def _knees(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+    choices = []
+    for group in _per_unit(program, data):
+        knees = [0.6]
+        if data is not None:
+            columns = [data.control_names.index(name) for name in group["controls"]]
+            sizes = data.controls[..., columns][data.rows].abs().double().flatten()
+            sizes = sizes[sizes > 0.02 * sizes.max()]
+            knees = sizes.quantile(sizes.new_tensor([0.4, 0.6, 0.75, 0.88])).tolist() if len(sizes) else knees
+        choices += [{**group, "knee": float(f"{knee:.3g}")} for knee in knees]
+    return choices
+
+
+def _single(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+    return [{"controls": (name,), "at": name} for name in names(program.controls)]
+
+
+def _lacks_single(program: Program) -> str | None:
+    if {"left", "right"} == set(names(program.controls)):
+        return "of two thrusts it is the asymmetry, up to mass and inertia"
+    return _no_controls(program)
+
+
+def thrust_asymmetry(self, control, time, c):
+    return control * (1 + c * self.chosen_controls(("right",), control))
+
+
+def one_gain(self, control, time, c, controls):
+    return control * (1 + c * self.chosen_controls(controls, control))
+
+
+def speed_dependent_gain(self, state, control, time, c):
+    forward, lateral, _ = self.body_velocity(state)
+    speed = (forward**2 + lateral**2 + 1e-12).sqrt()
+    return control * (1 - c * speed).unsqueeze(-1)
+
+
+def thrust_saturation(self, control, time, c, controls, knee):
+    beyond = control.sign() * (control.abs() - knee).relu()
+    return control - c * self.chosen_controls(controls, control) * beyond
+
+
+def dead_zone(self, control, time, c, controls):
+    lost = torch.minimum(torch.maximum(control, -c), c)
+    return control - self.chosen_controls(controls, control) * lost
+
+
+def curvature_steering(self, state, control, time, c):
+    speed, turn = control[..., self.control_index("speed")], control[..., self.control_index("turn")]
+    forward, _, _ = self.body_velocity(state)
+    asked = turn * speed * forward / (speed**2 + 0.05**2)
+    return control + c * (asked - turn).unsqueeze(-1) * self.chosen_controls(("turn",), control)
+
+
+def actuator_lag(self, control, time, c, controls):
+    return control + self.chosen_controls(controls, control) * (lagged(control, time, c) - control)
+
+
+def actuator_delay(self, control, time, c, controls):
+    return control + self.chosen_controls(controls, control) * (delayed(control, time, c) - control)
+
+
+def battery_sag(self, control, time, c):
+    return control * (1 - c * time / self.duration).unsqueeze(-1)
+
+
+ACTUATORS = [
+    Effect(
+        name="thrust_asymmetry",
+        form="history",
+        equation=r"u_\mathrm{right} \to (1 + c)\,u_\mathrm{right}",
+        text="right → (1 + c) right",
+        unit="1",
+        feels="pulls to one side, the more the harder it is driven",
+        function=thrust_asymmetry,
+        typical=0.05,
+        limit=0.5,
+        lacks=_has("left", "right"),
+    ),
+    Effect(
+        name="gain_error",
+        form="history",
+        equation=r"u \to (1 + c)\,u",
+        text="u → (1 + c) u of one control",
+        unit="1",
+        feels="does more (or less) than it is told",
+        function=one_gain,
+        typical=0.08,
+        limit=1.0,
+        choices=_single,
+        lacks=_lacks_single,
+    ),
+    Effect(
+        name="speed_dependent_gain",
+        form="command",
+        equation=r"u \to (1 - c\,|v|)\,u",
+        text="u → (1 - c |v|) u",
+        unit="s/m",
+        feels="propellers pull less the faster it goes",
+        function=speed_dependent_gain,
+        typical=0.1,
+        limit=1.0,
+        lacks=not_planar,
+    ),
+    Effect(
+        name="thrust_saturation",
+        form="history",
+        equation=r"u \to u - c\,\mathrm{sign}(u)\max(|u| - u_0, 0)",
+        text="u → u - c sign(u) max(|u| - knee, 0)",
+        unit="1",
+        feels="full commands give little more than half ones",
+        function=thrust_saturation,
+        profiled=("knee",),
+        typical=0.45,
+        limit=1.0,
+        choices=_knees,
+        lacks=_no_controls,
+    ),
+    Effect(
+        name="dead_zone",
+        form="history",
+        equation=r"u \to \mathrm{sign}(u)\max(|u| - c, 0)",
+        text="u → sign(u) max(|u| - c, 0)",
+        unit="of the control",
+        feels="small commands do nothing",
+        function=dead_zone,
+        typical=0.2,
+        limit=1.0,
+        sign=1,
+        probes=(0.05, 0.15, 0.3),
+        choices=_per_unit,
+        lacks=_no_controls,
+    ),
+    Effect(
+        name="actuator_lag",
+        form="history",
+        equation=r"\dot u_\mathrm{acting} = (u - u_\mathrm{acting}) / c",
+        text="du_acting/dt = (u - u_acting) / c",
+        unit="s",
+        feels="builds up what it is told, and lets go of it as slowly",
+        function=actuator_lag,
+        typical=0.25,
+        limit=2.0,
+        sign=1,
+        probes=(0.1, 0.3, 0.6),
+        choices=_everywhere,
+        lacks=_no_controls,
+    ),
+    Effect(
+        name="actuator_delay",
+        form="history",
+        equation=r"u_\mathrm{acting}(t) = u(t - c)",
+        text="u_acting(t) = u(t - c)",
+        unit="s",
+        feels="does all that it is told, later",
+        function=actuator_delay,
+        typical=0.2,
+        limit=2.0,
+        sign=1,
+        probes=(0.1, 0.2, 0.4),
+        choices=_everywhere,
+        lacks=_no_controls,
+    ),
+    Effect(
+        name="battery_sag",
+        form="history",
+        equation=r"u \to (1 - c\,t / T)\,u",
+        text="u → (1 - c t/T) u, T a drive's length",
+        unit="1",
+        feels="weaker towards the end of every drive",
+        function=battery_sag,
+        typical=0.25,
+        limit=1.0,
+        lacks=_no_controls,
+    ),
+    Effect(
+        name="curvature_steering",
+        form="command",
+        equation=r"u_\mathrm{turn} \to (1 - c)\,u_\mathrm{turn} + c\,u_\mathrm{turn}\,v / u_\mathrm{speed}",
+        text="turn → (1 - c) turn + c (turn / speed) v",
+        unit="1",
+        feels="steers a curve, not a turn rate: turns slower while it is slower than it is told",
+        function=curvature_steering,
+        typical=0.5,
+        limit=2.0,
+        lacks=_has("speed", "turn"),
+    ),
+]

@@ -1,0 +1,207 @@
+"""What an effect is: a name, an equation, and a function that says how it acts on a program.
+
+The function is written like a method of the program (`self` is the program, shapes as in `transition` and `observe`)
+with the coefficient as `c`; it has one `return`, at its end. The form says what it takes and returns:
+
+    push       (self, state, control, time, step, c)   adds to channels' means: {channel: (...)}; may ask for `mean`
+    command    (self, state, control, time, c)         the control that acts, (..., U)
+    history    (self, control, time, c)                the same of whole trajectories, (rows, trajectories, U)
+    measured   (self, state, measured, c)              what is measured on average, (..., K)
+    viewpoint  (self, state, c)                        the state that is measured, (..., D)
+    spread     (self, state, control, time, c)         factors on channels' standard deviations: {channel: (...)}
+    blur       (self, state, c)                        factors on the measurements' standard deviations, (..., K)
+    tails      (self, c)                               one over the degrees of freedom of the measurement noise
+    colour     (self, c)                               share of a channel's last deviation that stays: {channel: (...)}
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import UsageError
+from steady_ppl.program import Program, names
+from steady_ppl.sites import AtMean, Recording, as_vector
+
+VERDICTS = {
+    "push": "dynamics",
+    "command": "actuator",
+    "history": "actuator",
+    "measured": "sensor",
+    "viewpoint": "sensor",
+    "spread": "noise",
+    "blur": "noise",
+    "tails": "noise",
+    "colour": "noise",
+}
+Choices = Callable[[Program, Trajectories | None], Sequence[Mapping[str, Any]]]
+
+
+def one_choice(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+    """An effect that acts in one way only."""
+    return [{}]
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """A physical effect that a program may lack.
+
+    Attributes:
+        name: as users write it.
+        form: how it acts, see the module.
+        equation: in LaTeX.
+        text: the equation in plain text.
+        unit: of the coefficient.
+        feels: what it feels like on the vehicle, in a line.
+        function: how it acts.
+        typical: a coefficient that is clearly felt; `(k,)` values for a vector.
+        limit: magnitudes beyond this are not physical; a normal prior has this standard deviation.
+        sign: of the coefficient where physics fixes it, else 0.
+        null: the coefficient at which the effect is absent.
+        components: names of a vector coefficient's components.
+        probes: finite coefficients at which it is screened as well, for effects that do not grow in proportion.
+        choices: what else it depends on, one mapping of the function's further arguments a choice: which channels,
+            controls or component, called `at`, and knees, widths or places.
+        profiled: the arguments among these that are knees, widths or places.
+        lacks: why it does not apply to a program, or None.
+    """
+
+    name: str
+    form: str
+    equation: str
+    text: str
+    unit: str
+    feels: str
+    function: Callable[..., Any]
+    typical: float | tuple[float, ...]
+    limit: float
+    sign: int = 0
+    null: float = 0.0
+    components: tuple[str, ...] = ()
+    probes: tuple[float, ...] = ()
+    choices: Choices = one_choice
+    profiled: tuple[str, ...] = ()
+    lacks: Callable[[Program], str | None] = field(default=lambda program: None)
+
+    def __post_init__(self) -> None:
+        if self.form not in VERDICTS:
+            raise UsageError(f"effect {self.name}: no form {self.form!r}; there are {', '.join(VERDICTS)}")
+        if "c" not in inspect.signature(self.function).parameters:
+            raise UsageError(f"effect {self.name}: its function takes no coefficient c")
+
+    @property
+    def verdict(self) -> str:
+        """dynamics, actuator, sensor or noise."""
+        return VERDICTS[self.form]
+
+    @property
+    def size(self) -> int:
+        """How many components the coefficient has."""
+        return max(1, len(self.components))
+
+    def variants(self, program: Program, data: Trajectories | None = None) -> list[Variant]:
+        """All ways in which it could act on a program; knees and places are chosen for `data` where given."""
+        if self.lacks(program):
+            return []
+        return [self.variant(**choice) for choice in self.choices(program, data)]
+
+    def variant(self, at: str = "", **options: Any) -> Variant:
+        """The effect with everything settled but its coefficient."""
+        return Variant(self, at, options)
+
+
+@dataclass(frozen=True, eq=False)
+class Variant:
+    """An effect with everything settled but its coefficient.
+
+    Attributes:
+        effect: which.
+        at: where it acts, if there is a choice.
+        options: the further arguments of its function.
+        called: another name for the coefficient, where a program has a parameter of the effect's name.
+    """
+
+    effect: Effect
+    at: str
+    options: Mapping[str, Any]
+    called: str = ""
+
+    @property
+    def profiled(self) -> dict[str, Any]:
+        """Knees, widths, places."""
+        return {name: self.options[name] for name in self.effect.profiled}
+
+    @property
+    def parameter(self) -> str:
+        """The name of the coefficient among a program's parameters."""
+        return self.called or (f"{self.effect.name}_{self.at}" if self.at else self.effect.name)
+
+    @property
+    def name(self) -> str:
+        """As users write it: the effect and, after a colon, where."""
+        return f"{self.effect.name}:{self.at}" if self.at else self.effect.name
+
+    @property
+    def label(self) -> str:
+        """The name and what was profiled."""
+        said = ", ".join(f"{name} {value:.3g}" for name, value in self.profiled.items())
+        return f"{self.name} ({said})" if said else self.name
+
+    def coefficient(self, value: float | Sequence[float] | Tensor | None, like: Tensor) -> Tensor:
+        """A value as a tensor, the typical one when None.
+
+        Raises:
+            UsageError: it has another number of components.
+        """
+        given = torch.as_tensor(self.effect.typical if value is None else value, dtype=like.dtype, device=like.device)
+        wanted = self.effect.components
+        if given.shape != torch.Size([len(wanted)] if wanted else []):
+            raise UsageError(
+                f"effect {self.effect.name} takes {len(wanted) or 'one'} number{'s' if wanted else ''}"
+                f"{' (' + ', '.join(wanted) + ')' if wanted else ''}, got {given.numel()}"
+            )
+        return given
+
+    def absent(self, like: Tensor) -> Tensor:
+        """The coefficient without the effect."""
+        shape = (self.effect.size,) if self.effect.components else ()
+        return like.new_full(shape, self.effect.null)
+
+    def __call__(self, program: Program, *arguments: Any, c: Tensor) -> Any:
+        """The effect's function with its options."""
+        return self.effect.function(program, *arguments, c=c, **self.options)
+
+    def push(
+        self,
+        program: Program,
+        state: Tensor,
+        control: Tensor,
+        time: Tensor,
+        step: Tensor,
+        c: Tensor,
+        below: Callable[[], Tensor],
+    ) -> dict[str, Tensor]:
+        """What it adds to the channels' means, each `(...)`, around the transition `below`."""
+        more = {"mean": channel_means(program, below)} if self.needs_mean else {}
+        return self.effect.function(program, state, control, time, step, c=c, **more, **self.options)
+
+    @property
+    def needs_mean(self) -> bool:
+        """Whether it depends on what the channels' means are without it."""
+        return "mean" in inspect.signature(self.effect.function).parameters
+
+
+def channel_means(program: Program, below: Callable[[], Tensor]) -> dict[str, Tensor]:
+    """The means of the channels that a transition samples, by name, each `(...)`."""
+    seen = Recording()
+    with poutine.block(), seen, AtMean():
+        below()
+    parts = [as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()]
+    return dict(zip(names(program.channels), torch.cat(parts, -1).unbind(-1), strict=True))

@@ -1,0 +1,126 @@
+"""What the noise can be besides normal, constant and white."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from steady_ppl.data import Trajectories
+from steady_ppl.effects.declaration import Effect
+from steady_ppl.effects.planar_forces import not_planar
+from steady_ppl.planar_vehicle import PlanarVehicle
+from steady_ppl.program import Program, names
+
+
+def _groups(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+    if len(program.axes) <= 1:
+        return [{"channels": names(program.channels)}]
+    return [{"channels": channels, "at": name} for name, channels in program.axes.items()]
+
+
+def _no_channels(program: Program) -> str | None:
+    return None if program.channels else "the program has no noise channels"
+
+
+def _no_commanded_speed(program: Program) -> str | None:
+    if {"speed", "turn"} <= set(names(program.controls)):
+        return not_planar(program)
+    return "the controls are not a speed and a turn rate, which the state could be compared with"
+
+
+def _no_states_left(program: Program) -> str | None:
+    if isinstance(program, PlanarVehicle) or program.motion:
+        return None
+    return "the program does not say which channels move what (`motion`)"
+
+
+def heavy_tails(self, c):
+    return c.clamp(1e-4, 0.49)
+
+
+def range_dependent_noise(self, state, c):
+    return (1 + c * self.ranges(state)).clamp(min=0.05)
+
+
+def process_noise(self, state, control, time, step, c, channels):
+    return dict.fromkeys(channels, c)
+
+
+def command_noise(self, state, control, time, step, c):
+    forward, _, yaw_rate = self.body_velocity(state)
+    speed, turn = control[..., self.control_index("speed")], control[..., self.control_index("turn")]
+    return {"forward": 1 + c * (speed - forward).abs(), "yaw": 1 + c * (turn - yaw_rate).abs()}
+
+
+def coloured_noise(self, c, channels):
+    return {channel: c.clamp(-0.99, 0.99) for channel in channels}
+
+
+NOISES = [
+    Effect(
+        name="heavy_tails",
+        form="tails",
+        equation=r"y \sim t_\nu,\quad c = 1/\nu",
+        text="Student t measurement noise with ν = 1/c degrees of freedom",
+        unit="1",
+        feels="now and then a measurement is far off",
+        function=heavy_tails,
+        typical=1 / 3,
+        limit=0.5,
+        sign=1,
+    ),
+    Effect(
+        name="range_dependent_noise",
+        form="blur",
+        equation=r"\sigma \to \sigma\,(1 + c\,r)",
+        text="σ → σ (1 + c r), r the distance",
+        unit="1/m",
+        feels="far landmarks are seen worse",
+        function=range_dependent_noise,
+        typical=0.1,
+        limit=1.0,
+        sign=1,
+        lacks=not_planar,
+    ),
+    Effect(
+        name="process_noise",
+        form="spread",
+        equation=r"\sigma \to c\,\sigma",
+        text="σ → c σ of a channel",
+        unit="1",
+        feels="rougher (or smoother) than the program says",
+        function=process_noise,
+        typical=2.0,
+        limit=2.0,
+        sign=1,
+        null=1.0,
+        choices=_groups,
+        lacks=_no_channels,
+    ),
+    Effect(
+        name="command_noise",
+        form="spread",
+        equation=r"\sigma \to \sigma\,(1 + c\,|u - v|)",
+        text="σ → σ (1 + c |command - state|)",
+        unit="s/m",
+        feels="erratic while it catches up with its command",
+        function=command_noise,
+        typical=1.0,
+        limit=5.0,
+        sign=1,
+        lacks=_no_commanded_speed,
+    ),
+    Effect(
+        name="coloured_noise",
+        form="colour",
+        equation=r"n_{t+1} = c\,n_t + \sqrt{1 - c^2}\,\sigma\,\varepsilon",
+        text="noise(t+1) = c noise(t) + sqrt(1 - c²) σ ε",
+        unit="1",
+        feels="is pushed for seconds, not shaken",
+        function=coloured_noise,
+        typical=0.6,
+        limit=0.9,
+        choices=_groups,
+        lacks=_no_states_left,
+    ),
+]

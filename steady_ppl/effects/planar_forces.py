@@ -1,0 +1,257 @@
+"""Forces on a vehicle in the plane, in its body frame unless said otherwise."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+from steady_ppl.data import Trajectories
+from steady_ppl.effects.declaration import Effect
+from steady_ppl.planar_vehicle import PlanarVehicle
+from steady_ppl.program import Program, names
+
+
+def not_planar(program: Program) -> str | None:
+    """Why an effect on planar vehicles does not apply."""
+    return None if isinstance(program, PlanarVehicle) else "it acts on vehicles in the plane only"
+
+
+def _needs_slip(program: Program) -> str | None:
+    if isinstance(program, PlanarVehicle) and not program.slips:
+        return "the program holds the lateral velocity at zero"
+    return not_planar(program)
+
+
+def _needs_grip(program: Program) -> str | None:
+    if isinstance(program, PlanarVehicle) and program.slips:
+        return "the lateral velocity is free"
+    return not_planar(program)
+
+
+def _needs_two_thrusters(program: Program) -> str | None:
+    if {"left", "right"} <= set(names(program.controls)):
+        return not_planar(program)
+    return "the controls are not a left and a right thrust"
+
+
+def _drags(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+    return [{"drag": drag} for drag in (0.06, 0.02, 0.2)]
+
+
+def _slips(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+    return [{"lead": lead} for lead in (0.2, 0.0, 0.5)]
+
+
+def _limits(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+    return [{"channels": program.axes["translation"]}, {"channels": program.axes["yaw"], "at": "yaw"}]
+
+
+def _places(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+    """Patches on a grid over where the vehicle was, as far as its landmarks and its start say."""
+    if data is None or data.states is None:
+        landmarks = torch.as_tensor(program.landmarks).double()
+        low, high = 0.5 * landmarks.amin(0), 0.5 * landmarks.amax(0)
+    else:
+        places = data.states[..., :2][torch.isfinite(data.states[..., :2]).all(-1)].double()
+        low, high = places.quantile(0.05, 0), places.quantile(0.95, 0)
+    radius = float((high - low).max()) / 6
+    steps = [torch.linspace(float(low[i]), float(high[i]), 4).tolist() for i in (0, 1)]
+    return [{"x": x, "y": y, "radius": radius} for x, y in itertools.product(*steps)]
+
+
+def slope(self, state, control, time, step, c):
+    x, y = c.unbind(-1)
+    cos, sin = state[..., 2].cos(), state[..., 2].sin()
+    return {"forward": cos * x + sin * y, "lateral": cos * y - sin * x}
+
+
+def wind(self, state, control, time, step, c, drag):
+    x, y = c.unbind(-1)
+    cos, sin = state[..., 2].cos(), state[..., 2].sin()
+    forward, lateral, _ = self.body_velocity(state)
+    along, across = forward - cos * x - sin * y, lateral - cos * y + sin * x
+    return {
+        "forward": -drag * (along * along.abs() - forward * forward.abs()),
+        "lateral": -drag * (across * across.abs() - lateral * lateral.abs()),
+    }
+
+
+def lateral_coupling(self, state, control, time, step, c):
+    left, right = control[..., self.control_index("left")], control[..., self.control_index("right")]
+    return {"lateral": c * (left - right)}
+
+
+def weathervane(self, state, control, time, step, c):
+    forward, lateral, _ = self.body_velocity(state)
+    return {"yaw": -c * forward * lateral}
+
+
+def magnus(self, state, control, time, step, c):
+    forward, _, yaw_rate = self.body_velocity(state)
+    return {"lateral": -c * forward * yaw_rate}
+
+
+def lever_arm(self, state, control, time, step, c, mean):
+    yaw_rate = state[..., 5]
+    return {"forward": c * yaw_rate**2, "lateral": -c * mean["yaw"]}
+
+
+def kinematic_lever_arm(self, state, control, time, step, c):
+    yaw_rate = state[..., 5]
+    return {"lateral": c * yaw_rate / step}
+
+
+def side_slip(self, state, control, time, step, c, lead):
+    _, lateral, yaw_rate = self.body_velocity(state)
+    return {"lateral": -c * (lateral - lead * yaw_rate)}
+
+
+def sticky_patch(self, state, control, time, step, c, x, y, radius):
+    forward, lateral, _ = self.body_velocity(state)
+    inside = (-((state[..., 0] - x) ** 2 + (state[..., 1] - y) ** 2) / (2 * radius**2)).exp()
+    return {"forward": -c * forward * inside, "lateral": -c * lateral * inside}
+
+
+def acceleration_limit(self, state, control, time, step, c, channels, mean):
+    return {channel: torch.minimum(torch.maximum(mean[channel], -c), c) - mean[channel] for channel in channels}
+
+
+PLANAR_FORCES = [
+    Effect(
+        name="slope",
+        form="push",
+        equation=r"\dot v_\mathrm{world} = (c_1, c_2)",
+        text="world-frame acceleration (c₁, c₂)",
+        unit="m/s²",
+        feels="drifts the same way over ground, wherever it points",
+        function=slope,
+        typical=(0.05, -0.03),
+        limit=0.5,
+        components=("x", "y"),
+        lacks=_needs_slip,
+    ),
+    Effect(
+        name="wind",
+        form="push",
+        equation=r"a = -k\,(v - w)\,|v - w| + k\,v\,|v|,\quad w = R^\top(c_1, c_2)",
+        text="a = -k (v-w)|v-w| + k v|v| per axis, w the world-frame wind (c₁, c₂) in the body frame",
+        unit="m/s",
+        feels="slower one way than the other, and more so when fast",
+        function=wind,
+        profiled=("drag",),
+        typical=(1.0, 0.5),
+        limit=10.0,
+        components=("x", "y"),
+        choices=_drags,
+        lacks=_needs_slip,
+    ),
+    Effect(
+        name="lateral_coupling",
+        form="push",
+        equation=r"a_\mathrm{lateral} = c\,(u_\mathrm{left} - u_\mathrm{right})",
+        text="a_lateral = c (left - right)",
+        unit="1/kg",
+        feels="steps sideways when it is told to turn",
+        function=lateral_coupling,
+        typical=0.2,
+        limit=1.0,
+        lacks=_needs_two_thrusters,
+    ),
+    Effect(
+        name="weathervane",
+        form="push",
+        equation=r"a_\mathrm{yaw} = -c\,v_x v_y",
+        text="a_yaw = -c v_x v_y",
+        unit="rad/m²",
+        feels="turns its nose into (or out of) the way it slides",
+        function=weathervane,
+        typical=0.1,
+        limit=1.0,
+        lacks=_needs_slip,
+    ),
+    Effect(
+        name="magnus",
+        form="push",
+        equation=r"a_\mathrm{lateral} = -c\,v_x\,\omega",
+        text="a_lateral = -c v_x ω",
+        unit="1",
+        feels="curves carry it to the inside (or outside)",
+        function=magnus,
+        typical=0.15,
+        limit=2.0,
+        lacks=not_planar,
+    ),
+    Effect(
+        name="lever_arm",
+        form="push",
+        equation=r"a_\mathrm{forward} = c\,\omega^2,\quad a_\mathrm{lateral} = -c\,a_\mathrm{yaw}",
+        text="a_forward = c ω², a_lateral = -c a_yaw",
+        unit="m",
+        feels="the tracked point swings around another one when turning",
+        function=lever_arm,
+        typical=0.15,
+        limit=1.0,
+        lacks=_needs_slip,
+    ),
+    Effect(
+        name="lever_arm",
+        form="push",
+        equation=r"v_y \to c\,\omega",
+        text="v_y = c ω",
+        unit="m",
+        feels="the tracked point swings around the axle that does not slip",
+        function=kinematic_lever_arm,
+        typical=0.1,
+        limit=1.0,
+        lacks=_needs_grip,
+    ),
+    Effect(
+        name="side_slip",
+        form="push",
+        equation=r"a_\mathrm{lateral} = -c\,(v_y - k\,\omega)",
+        text="a_lateral = -c (v_y - k ω)",
+        unit="1/s",
+        feels="sideways motion dies out, that of forward motion does not",
+        function=side_slip,
+        profiled=("lead",),
+        typical=0.2,
+        limit=5.0,
+        sign=1,
+        choices=_slips,
+        lacks=_needs_slip,
+    ),
+    Effect(
+        name="sticky_patch",
+        form="push",
+        equation=r"a = -c\,v\,\exp(-d^2 / 2 r^2)",
+        text="a = -c v exp(-d²/2r²), d the distance from a place",
+        unit="1/s",
+        feels="is braked at one place of the ground",
+        function=sticky_patch,
+        profiled=("x", "y", "radius"),
+        typical=0.5,
+        limit=3.0,
+        sign=1,
+        choices=_places,
+        lacks=not_planar,
+    ),
+    Effect(
+        name="acceleration_limit",
+        form="push",
+        equation=r"|a| \le c",
+        text="|a| ≤ c",
+        unit="m/s²",
+        feels="never jumps off the line, whatever it is told",
+        function=acceleration_limit,
+        typical=0.6,
+        limit=10.0,
+        sign=1,
+        null=float("inf"),
+        probes=(0.1, 0.2, 0.4, 0.8, 1.6, 3.2),
+        choices=_limits,
+        lacks=not_planar,
+    ),
+]

@@ -1,0 +1,125 @@
+"""Which effects there are, which of them a program could lack, and how users name them."""
+
+from __future__ import annotations
+
+import difflib
+from typing import Any
+
+from steady_ppl.effects.actuators import ACTUATORS
+from steady_ppl.effects.declaration import Effect, Variant
+from steady_ppl.effects.forces import FORCES
+from steady_ppl.effects.noise import NOISES
+from steady_ppl.effects.planar_forces import PLANAR_FORCES
+from steady_ppl.effects.sensors import SENSORS
+from steady_ppl.errors import UsageError
+from steady_ppl.program import Program
+
+_EFFECTS: list[Effect] = [*FORCES, *PLANAR_FORCES, *ACTUATORS, *SENSORS, *NOISES]
+
+
+def register(effect: Effect) -> Effect:
+    """Add an effect of one's own to the catalogue; one of the same name and form is replaced."""
+    _EFFECTS[:] = [known for known in _EFFECTS if (known.name, known.form) != (effect.name, effect.form)]
+    _EFFECTS.append(effect)
+    return effect
+
+
+def catalogue(program: Program | None = None) -> list[Effect]:
+    """All effects, or those that a program could have."""
+    return [effect for effect in _EFFECTS if program is None or effect.lacks(program) is None]
+
+
+def not_applicable(program: Program) -> dict[str, str]:
+    """Why each other effect does not apply to a program."""
+    known = {effect.name for effect in catalogue(program)}
+    return {
+        effect.name: reason
+        for effect in _EFFECTS
+        if effect.name not in known and (reason := effect.lacks(program)) is not None
+    }
+
+
+def find(name: str, program: Program) -> Effect:
+    """The effect of a name that applies to a program.
+
+    Raises:
+        UsageError: there is none; the nearest name is suggested.
+    """
+    named = [effect for effect in _EFFECTS if effect.name == name]
+    if not named:
+        near = difflib.get_close_matches(name, [effect.name for effect in _EFFECTS], n=1, cutoff=0.5)
+        meant = f"; did you mean {near[0]}?" if near else ""
+        raise UsageError(f"no effect {name!r}{meant} There are {', '.join(sorted({e.name for e in _EFFECTS}))}")
+    for effect in named:
+        reason = effect.lacks(program)
+        if reason is None:
+            return effect
+    raise UsageError(f"effect {name} does not apply to {type(program).__name__}: {reason}")
+
+
+def parsed(text: str) -> tuple[str, str, dict[str, float], tuple[float, ...] | None]:
+    """`NAME[:AT][:OPTION=NUMBER]...[=NUMBER[,NUMBER]]` as name, place, options and value.
+
+    Raises:
+        UsageError: it reads otherwise.
+    """
+    head, *parts = text.strip().split(":")
+    if not parts:
+        head, _, numbers = head.partition("=")
+        return head, "", {}, _numbers(text, numbers)
+    *middle, last = parts
+    pieces = last.split("=")
+    value: tuple[float, ...] | None = None
+    if len(pieces) == 3 or (len(pieces) == 2 and not _is_option(head, pieces[0])):
+        value = _numbers(text, pieces.pop())
+    at, options = "", {}
+    for part in [*middle, "=".join(pieces)]:
+        option, equals, number = part.partition("=")
+        if equals:
+            found = _numbers(text, number)
+            options[option] = found[0] if found else 0.0
+        else:
+            at = option
+    return head, at, options, value
+
+
+def chosen_variant(program: Program, effect: str | Effect, at: str = "", **options: Any) -> Variant:
+    """An effect with everything settled but its coefficient; what is not said is the first of its choices.
+
+    Raises:
+        UsageError: no such effect or place, or no such option.
+    """
+    if isinstance(effect, str):
+        effect, said, more, value = parsed(effect)
+        if value is not None:
+            raise UsageError(f"the coefficient of {effect} is given apart from its name")
+        at, options = at or said, {**more, **options}
+        effect = find(effect, program)
+    reason = effect.lacks(program)
+    if reason:
+        raise UsageError(f"effect {effect.name} does not apply to {type(program).__name__}: {reason}")
+    unknown = set(options) - set(effect.profiled)
+    if unknown:
+        has = f"it has {', '.join(effect.profiled)}" if effect.profiled else "it has none"
+        raise UsageError(f"effect {effect.name} has no option {sorted(unknown)[0]}: {has}")
+    choices = effect.variants(program)
+    for index, choice in enumerate(choices):
+        if at in (choice.at, str(index)) or (not at and index == 0):
+            return Variant(effect, choice.at, {**choice.options, **options})
+    places = ", ".join(dict.fromkeys(choice.at for choice in choices if choice.at))
+    raise UsageError(
+        f"effect {effect.name} has no place {at!r}: " + (f"it can be at {places}" if places else "there is one only")
+    )
+
+
+def _is_option(name: str, option: str) -> bool:
+    return any(option in effect.profiled for effect in _EFFECTS if effect.name == name)
+
+
+def _numbers(text: str, numbers: str) -> tuple[float, ...] | None:
+    if not numbers:
+        return None
+    try:
+        return tuple(float(number) for number in numbers.split(","))
+    except ValueError:
+        raise UsageError(f"effect {text}: expected NAME or NAME=NUMBER (NUMBER,NUMBER for two components)") from None

@@ -1,0 +1,121 @@
+"""What lies between the vehicle and its measurements: offsets, scales, clocks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from steady_ppl.data import Trajectories
+from steady_ppl.effects.declaration import Effect
+from steady_ppl.effects.planar_forces import not_planar
+from steady_ppl.planar_vehicle import PlanarVehicle
+from steady_ppl.program import Program, names, units
+
+
+def _each(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+    return [{"component": index, "at": name} for index, name in enumerate(names(program.measurements))]
+
+
+def _one_landmark(program: Program) -> str | None:
+    if isinstance(program, PlanarVehicle) and len(program.measurements) == 1:
+        return "there is one landmark: its bias is that of all"
+    return not_planar(program)
+
+
+def _planar(program: Program) -> str | None:
+    return "of a planar vehicle it is bearing_bias or landmark_bias" if isinstance(program, PlanarVehicle) else None
+
+
+def _units_differ(program: Program) -> str | None:
+    same = len(set(units(program.measurements))) == 1
+    return None if same else "the measurements have different units"
+
+
+def _no_motion(program: Program) -> str | None:
+    if isinstance(program, PlanarVehicle) or any(p and v for p, v in program.motion.values()):
+        return None
+    return "no state component is known to be the velocity of another (`motion`)"
+
+
+def common_bias(self, state, measured, c):
+    return measured + c
+
+
+def one_bias(self, state, measured, c, component):
+    bias = measured.new_zeros(measured.shape[-1])
+    bias[component] = 1.0
+    return measured + c * bias
+
+
+def sensor_scale(self, state, measured, c):
+    return measured * (1 + c)
+
+
+def clock_offset(self, state, c):
+    return self.earlier(state, c)
+
+
+SENSORS = [
+    Effect(
+        name="bearing_bias",
+        form="measured",
+        equation=r"y \to y + c",
+        text="y → y + c, every bearing",
+        unit="rad",
+        feels="the sensor is screwed on askew",
+        function=common_bias,
+        typical=0.035,
+        limit=0.5,
+        lacks=not_planar,
+    ),
+    Effect(
+        name="landmark_bias",
+        form="measured",
+        equation=r"y_i \to y_i + c",
+        text="y_i → y_i + c, one landmark",
+        unit="rad",
+        feels="one landmark is not where the map has it",
+        function=one_bias,
+        typical=0.06,
+        limit=0.5,
+        choices=_each,
+        lacks=_one_landmark,
+    ),
+    Effect(
+        name="sensor_bias",
+        form="measured",
+        equation=r"y_i \to y_i + c",
+        text="y_i → y_i + c, one measurement",
+        unit="of the measurement",
+        feels="reads too much (or too little) by the same amount",
+        function=one_bias,
+        typical=0.05,
+        limit=1.0,
+        choices=_each,
+        lacks=_planar,
+    ),
+    Effect(
+        name="sensor_scale",
+        form="measured",
+        equation=r"y \to (1 + c)\,y",
+        text="y → (1 + c) y",
+        unit="1",
+        feels="reads a few per cent too much, at any size",
+        function=sensor_scale,
+        typical=0.03,
+        limit=0.3,
+        lacks=_units_differ,
+    ),
+    Effect(
+        name="clock_offset",
+        form="viewpoint",
+        equation=r"y(t) \to y(t - c)",
+        text="y(t) → y(t - c)",
+        unit="s",
+        feels="measurements show where it was a moment ago",
+        function=clock_offset,
+        typical=0.12,
+        limit=1.0,
+        lacks=_no_motion,
+    ),
+]
