@@ -21,6 +21,7 @@ class Hovercraft(PlanarVehicle):
     controls = ("left [N]", "right [N]")
     landmarks = ((12.0, -8.0), (-6.0, -4.0), (-4.0, 10.0), (6.0, 7.0))
     rates = {"noise": 3.0}
+    guesses = ("noise",)
 
     def __init__(self):
         super().__init__()

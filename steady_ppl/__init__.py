@@ -9,7 +9,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from steady_ppl.actuation import delayed, lagged
+    from steady_ppl.altering import Coloured, blurred, channel_means, heavy_tailed, misread, pushed, widened
+    from steady_ppl.checking import Check, check
     from steady_ppl.data import Trajectories
+    from steady_ppl.discovery import Discovery, discover
     from steady_ppl.errors import (
         DataError,
         FilterError,
@@ -29,6 +33,8 @@ if TYPE_CHECKING:
     from steady_ppl.paths import Filtered, Paths
     from steady_ppl.planar_vehicle import PlanarVehicle, WrappedNormal, bearings_to, dense, stack, wrap
     from steady_ppl.program import Program, for_program, load_program
+    from steady_ppl.proof_pictures import open_loop_picture
+    from steady_ppl.proving import Proof, prove
     from steady_ppl.seeding import seeded
     from steady_ppl.simulation import simulate
     from steady_ppl.table import read_table, write_table
@@ -37,7 +43,11 @@ if TYPE_CHECKING:
     from steady_ppl.validation import Validation
 
 _HOMES = {
+    "actuation": ("delayed", "lagged"),
+    "altering": ("Coloured", "blurred", "channel_means", "heavy_tailed", "misread", "pushed", "widened"),
+    "checking": ("Check", "check"),
     "data": ("Trajectories",),
+    "discovery": ("Discovery", "discover"),
     "errors": ("DataError", "FilterError", "ProgramError", "RunError", "SteadyError", "TrainingError", "UsageError"),
     "filtering": ("log_likelihood", "neglected", "run_filter", "smoothed_states"),
     "fit": ("Fit",),
@@ -49,6 +59,8 @@ _HOMES = {
     "paths": ("Filtered", "Paths"),
     "planar_vehicle": ("PlanarVehicle", "WrappedNormal", "bearings_to", "dense", "stack", "wrap"),
     "program": ("Program", "for_program", "load_program"),
+    "proof_pictures": ("open_loop_picture",),
+    "proving": ("Proof", "prove"),
     "seeding": ("seeded",),
     "simulation": ("simulate",),
     "tempering": ("Constant", "LinearRamp"),
@@ -61,6 +73,8 @@ __all__ = sorted(_HOME)  # pyright: ignore
 
 
 def __getattr__(name: str) -> Any:
+    if name == "effects":
+        return import_module("steady_ppl.effects")
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"steady_ppl.{_HOME[name]}"), name)

@@ -14,11 +14,11 @@ def lagged(control: Tensor, time: Tensor, constant: Tensor) -> Tensor:
         time: `(rows, trajectories)` s.
         constant: the time constant, s; none if it is not positive.
     """
-    constant = torch.as_tensor(constant, dtype=control.dtype, device=control.device).clamp(min=1e-4)
+    constant = torch.as_tensor(constant, dtype=control.dtype, device=control.device).clamp(min=0.0)
     steps = torch.cat([time[1:] - time[:-1], time[-1:] - time[-2:-1]]).unsqueeze(-1) if len(time) > 1 else None
     if steps is None:
         return control
-    stays = (-steps / constant).exp()
+    stays = (-steps / constant.clamp(min=1e-6)).exp()
     share = constant / steps * (1 - stays)
     at, means = control[0], []
     for row in range(len(control)):
@@ -44,7 +44,7 @@ def delayed(control: Tensor, time: Tensor, delay: Tensor) -> Tensor:
     total = torch.cat([torch.zeros_like(held[:1]), held.cumsum(0)])  # the control's integral from the first row
 
     ago = (edges - delay).contiguous()
-    row = torch.searchsorted(edges.t().contiguous(), ago.t().contiguous(), right=True).t() - 1
+    row = torch.searchsorted(edges.t().contiguous(), ago.t().contiguous()).t() - 1  # the one before, on an edge
     row = row.clamp(0, len(control) - 1)
     wide = row.unsqueeze(-1).expand(*row.shape, control.shape[-1])
     since = (ago - edges.gather(0, row)).unsqueeze(-1)  # negative before the first row, whose control was held

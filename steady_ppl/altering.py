@@ -11,12 +11,13 @@ from typing import Any
 
 import pyro.distributions as dist
 import torch
+from pyro import poutine
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.planar_vehicle import WrappedNormal, WrappedStudentT
 from steady_ppl.program import Program, names
-from steady_ppl.sites import as_vector, normal_moments
+from steady_ppl.sites import AtMean, Recording, as_vector, normal_moments
 
 Change = Callable[[Any, slice], Any]
 
@@ -137,12 +138,32 @@ class Coloured(Altering):
             pushes, factors = pushes.squeeze(-1), factors.squeeze(-1)
         return _moved(_rescaled(fn, factors), lambda loc: loc + pushes)
 
+    def beside(self, state: Tensor) -> Tensor:
+        """A state and the new deviations side by side, `(..., D + C)`."""
+        deviations = torch.cat(self.deviations, -1)
+        left = torch.broadcast_shapes(state.shape[:-1], deviations.shape[:-1])
+        return torch.cat([state.expand(*left, -1), deviations.expand(*left, -1)], -1)
+
     def _pyro_post_sample(self, message: Any) -> None:
         fn = message["fn"]
         width = fn.event_shape.numel()
         mean, _ = normal_moments(fn, message["name"])
         value = as_vector(message["value"] - mean, fn.event_dim)
         self.deviations.append(value + self.pushes[..., self.column - width : self.column])
+
+
+def channel_means(program: Program, transition: Callable[..., Tensor], *arguments: Tensor) -> dict[str, Tensor]:
+    """The means of the channels that a transition of some arguments samples, by name, each `(...)`."""
+    seen = Recording()
+    with poutine.block(), seen, AtMean():
+        transition(*arguments)
+    parts = [as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()]
+    return dict(zip(names(program.channels), torch.cat(parts, -1).unbind(-1), strict=True))
+
+
+def by_channel(program: Program, values: Mapping[str, Tensor], missing: float, like: Tensor) -> Tensor:
+    """Values by channel side by side, `(..., C)` as `like`."""
+    return _columns(values, names(program.channels), missing, 1, like).expand_as(like)
 
 
 def _base(fn: Any) -> Any:

@@ -16,6 +16,7 @@ from typing import Annotated, Any
 
 import typer
 
+from steady_ppl import command_check, command_discover, command_effects, command_prove
 from steady_ppl.errors import ComputationError, SteadyError, UsageError
 
 INTERRUPTED = 130  # what typer returns for Ctrl-C
@@ -30,6 +31,11 @@ app = typer.Typer(
 )
 data_app = typer.Typer(help="Published logs to tables.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(data_app, name="data")
+app.command()(command_check.check)
+app.command()(command_discover.discover)
+app.command()(command_effects.add)
+app.command()(command_effects.effects)
+app.command()(command_prove.prove)
 
 
 class Device(StrEnum):
@@ -63,6 +69,10 @@ def simulate(
     trajectories: Annotated[int | None, typer.Option(help="How many drives, 16 when not given.", min=1)] = None,
     seed: Seed = 0,
     controls: Annotated[Path | None, typer.Option(help="Take time, controls and gaps from this table.")] = None,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME[=VALUE]", help="Add a physical effect, see `steady effects`; as often as needed."),
+    ] = None,
 ) -> None:
     """Simulate drives of a program, with measurements and true states."""
     from steady_ppl.simulation import simulate as run
@@ -70,7 +80,7 @@ def simulate(
 
     if controls and trajectories:
         raise UsageError("--controls has as many drives as its table: leave --trajectories out")
-    program = _program(model, seed)
+    program = command_effects.with_effects(_program(model, seed), effect or [], _say)
     like = read_table(controls) if controls else None
     write_table(run(program, trajectories or 16, seed=seed, like=like), out)
 

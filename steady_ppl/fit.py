@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from steady_ppl import effects
 from steady_ppl.checkpoint import read_tensors, write_tensors
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import RunError
@@ -89,6 +90,7 @@ class Fit:
         trained = self.trained
         return {
             "program": program_source(self.program, folder),
+            "effects": effects.record(self.program),
             "recipe": self.recipe,
             "status": "interrupted" if trained is not None and trained.interrupted else "finished",
             "known_start": self.known_start,
@@ -110,6 +112,7 @@ class Fit:
 
         Raises:
             RunError: the folder is no finished run, its program moved, changed, or has other parameters.
+            UsageError: an effect that was added to the program is not registered here.
         """
         folder = Path(folder)
         record = read_record(folder)
@@ -117,6 +120,7 @@ class Fit:
             raise RunError(f"{folder}: its fit has not finished: go on with it by `steady fit … --resume`")
         if not isinstance(program, Program):
             program = _load_recorded(folder, record["program"], program)
+        effects.restore(program, record.get("effects", []))
         tensors, _ = read_tensors(folder / PARAMETERS)
         have = {name: tuple(value.shape) for name, value in program.state_dict().items()}
         found = {name: tuple(value.shape) for name, value in tensors.items()}
@@ -145,7 +149,7 @@ class Fit:
 
 def program_source(program: Program, folder: Path) -> dict[str, str] | None:
     """Class, file relative to the run, and the file's sha256; None where there is no file to load it from."""
-    program_class = type(program)
+    program_class = effects.written_class(program)
     try:
         file = inspect.getsourcefile(program_class)
     except (TypeError, OSError):

@@ -1,4 +1,4 @@
-"""The program along a path, to first order: one forward-mode derivative of its methods as they are written.
+"""The program along a path, to first order: the derivatives of its methods as they are written.
 
 With standard normal noise ε for every latent site the program is a function, x₀ = g(ε) and x' = f(x, ε), with a
 residual r(x) for every measurement. Around a path of states x̄ and noise ε̄, with δ = x − x̄,
@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from steady_ppl.compiled_rows import on_all_rows
 from steady_ppl.data import Trajectories
@@ -102,7 +101,7 @@ def linearize(
         kernels: differentiate by kernels where they can serve; None: if there are rows enough, see `on_all_rows`.
 
     Raises:
-        ProgramError: a site has another distribution, or an operation has no forward derivative.
+        ProgramError: a site has another distribution, or an operation has no derivative.
     """
     states, noise = path.states, path.noise
     angles = _on_a_circle(program, data, states[0, :1])
@@ -210,7 +209,7 @@ def _measurement(program: Program, data: Trajectories, states: Tensor, kernels: 
         return _residuals(program, state, measurement, observed)
 
     given = {"measurement": data.measurements, "observed": data.observed}
-    return _jacobians(program, measure, {"state": states}, given, kernels)
+    return _jacobians(program, measure, {"state": states}, given, kernels, outputs=data.measurements.shape[-1])
 
 
 def _on_a_circle(program: Program, data: Trajectories, state: Tensor) -> tuple[int, ...]:
@@ -259,33 +258,40 @@ def _jacobians(
     along: dict[str, Tensor],
     given: dict[str, Tensor],
     kernels: bool | None,
+    outputs: int | None = None,
 ) -> _Jacobians:
-    """By a kernel where it can serve, else by torch."""
+    """By a kernel where it can serve, else by torch, which differentiates the first `outputs` components only."""
     found = on_all_rows(program, function.__name__, function, along | given, tuple(along), kernels)
     if isinstance(found, tuple):
         return _Jacobians(*found)
-    value, by = _derivatives(lambda *inputs: function(*inputs, *given.values()), *along.values())
+    value, by = _derivatives(lambda *inputs: function(*inputs, *given.values()), *along.values(), outputs=outputs)
     return _Jacobians(value, by, found)
 
 
-def _derivatives(function: Callable[..., Tensor], *inputs: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """A function's value `(..., D)` and its Jacobians `(..., D, ·)` in each input `(..., ·)`; rows, trajectories and
-    whatever else is on the left do not mix."""
-    widths = [value.shape[-1] for value in inputs]
-    directions = sum(widths)
-    duals, first = [], 0
-    with forward_ad.dual_level():
-        for value, width in zip(inputs, widths, strict=True):
-            tangent = value.new_zeros((directions, *value.shape))
-            index = torch.arange(width, device=value.device)
-            tangent[first + index, ..., index] = 1.0
-            duals.append(forward_ad.make_dual(value.expand_as(tangent).contiguous(), tangent))
-            first += width
-        try:
-            primal, derivative = forward_ad.unpack_dual(function(*duals))
-        except NotImplementedError as error:
-            why = str(error).splitlines()[0]
-            raise ProgramError(f"the program cannot be linearised: {why} (--guide bootstrap takes any)") from error
-        if derivative is None:
-            derivative = torch.zeros_like(primal)
-        return primal[0].clone(), list(derivative.movedim(0, -1).clone().split(widths, -1))
+def _derivatives(
+    function: Callable[..., Tensor], *inputs: Tensor, outputs: int | None = None
+) -> tuple[Tensor, list[Tensor]]:
+    """A function's value `(..., V)` and the Jacobians `(..., V, ·)` of its first `outputs` components in each input
+    `(..., ·)`; rows and trajectories on the left do not mix, so that a sum's gradient has them all."""
+    leaves = [value.detach().clone().requires_grad_() for value in inputs]
+    with torch.enable_grad():
+        value = function(*leaves)
+        components = value.unbind(-1)[:outputs]
+        rows = []
+        for index, component in enumerate(components):
+            if component.requires_grad:
+                last = index == len(components) - 1
+                rows.append(_gradients(component, leaves, not last))
+            else:
+                rows.append([torch.zeros_like(leaf) for leaf in leaves])
+    by = [torch.stack([row[i] for row in rows], -2) for i in range(len(leaves))]
+    return value.detach(), by
+
+
+def _gradients(component: Tensor, leaves: list[Tensor], again: bool) -> list[Tensor]:
+    try:
+        found = torch.autograd.grad(component.sum(), leaves, retain_graph=again, allow_unused=True)
+    except (NotImplementedError, RuntimeError) as error:
+        why = str(error).splitlines()[0]
+        raise ProgramError(f"the program cannot be linearised: {why} (--guide bootstrap takes any)") from error
+    return [torch.zeros_like(leaf) if part is None else part.detach() for leaf, part in zip(leaves, found, strict=True)]

@@ -84,15 +84,23 @@ class Lookahead:
         states, noise = self._forward(start, _times(self.steps.factor, random), turns)
         return start, states + (turns + self.linearization.start_turn).unsqueeze(1), noise
 
-    def covariances(self) -> Tensor:
-        """Posterior covariances of the states on the path's own turn, `(T + 1, B, D, D)`."""
+    def covariances(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Posterior covariances on the path's own turn: of the states, `(T + 1, B, D, D)`, of the noise of each
+        interval, `(T, B, C, C)`, and of the state that it moves with it, `(T, B, D, C)`."""
         linear, steps = self.linearization, self.steps
         spread = linear.start_noise @ self.starts.factor[0]
-        covariances = [spread @ spread.mT]
-        for forward, noise, gain, factor in zip(linear.state, linear.noise, steps.gain, steps.factor, strict=True):
-            moved, spread = forward - noise @ gain, noise @ factor
-            covariances.append(moved @ covariances[-1] @ moved.mT + spread @ spread.mT)
-        return torch.stack(covariances)
+        rows, (trajectories, dimension, channels) = len(linear.offset) + 1, linear.noise.shape[1:]
+        shapes = ((dimension, dimension), (channels, channels), (dimension, channels))
+        lengths = (rows, rows - 1, rows - 1)
+        found = [
+            torch.empty(length, trajectories, *shape, dtype=linear.offset.dtype)
+            for length, shape in zip(lengths, shapes, strict=True)
+        ]
+        found[0][0] = spread @ spread.mT
+        given = _arrays((linear.state, linear.noise, steps.gain, steps.factor))
+        recursions.covariances(*given, _arrays(found))  # type: ignore[call-arg]
+        states, noises, across = (part.to(linear.offset.device) for part in found)
+        return states, noises, across
 
     def _forward(self, start: Tensor, random: Tensor, turns: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
         """States and noise of the linearised program for standard normals; `start` is the start's noise itself."""

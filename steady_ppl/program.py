@@ -62,12 +62,13 @@ class Program(PyroModule, metaclass=_WithEffects):
         error_groups: what an error is reported for: name → components whose Euclidean norm it is.
         motion: channel → the state components that are its position and its velocity; the generic effects go by it.
         effects: names of effects that the program has besides what it writes out, see `steady_ppl.effects`.
+        attached: coefficient's name → the effect that a program written by `steady add` has, as users write it.
         guesses: beginnings of the names of parameters whose declared value is a guess, from which a fit may depart.
         priors: parameter's name → its prior, a Pyro distribution over the parameter's value.
         rates: learning rates relative to the recipe's, by the beginning of a parameter's name.
         decays: weight decay relative to the recipe's, by the beginning of a parameter's name; only the matrices of
             `torch.nn.Linear` decay.
-        resting: state components that start at zero in every drive and are in no table.
+        resting: state components that start at zero in every drive; a table need not have them.
         duration, step: of a simulated trajectory, s.
     """
 
@@ -79,6 +80,7 @@ class Program(PyroModule, metaclass=_WithEffects):
     error_groups: ClassVar[Mapping[str, Sequence[str]]] = {}
     motion: ClassVar[Mapping[str, tuple[str, str]]] = {}
     effects: ClassVar[Sequence[str]] = ()
+    attached: ClassVar[Mapping[str, Any]] = {}
     guesses: ClassVar[Sequence[str]] = ()
     priors: ClassVar[Mapping[str, Any]] = {}
     rates: ClassVar[Mapping[str, float]] = {}

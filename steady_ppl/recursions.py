@@ -191,3 +191,63 @@ def roll_out(moved: Array, pushed: Array, deviations: Array) -> None:
                     for j in range(dimension):
                         entry += moved[t, b, i, j] * deviations[m, t, b, j]
                     deviations[m, t + 1, b, i] = entry
+
+
+@njit(cache=True, error_model="numpy")
+def covariances(state: Array, noise: Array, gain: Array, factor: Array, found: tuple[Array, Array, Array]) -> None:
+    """Posterior covariances of δ' = F δ + G ε with ε ~ N(shift − gain δ, factor factorᵀ).
+
+    Args:
+        state, noise: F `(T, B, D, D)` and G `(T, B, D, C)`.
+        gain, factor: `(T, B, C, D)` and `(T, B, C, C)`.
+        found: of the states, `(T + 1, B, D, D)`, the first given; filled, as are those of the noise with itself,
+            `(T, B, C, C)`, and of each state with the noise that moves it, `(T, B, D, C)`.
+    """
+    states, noises, across = found
+    intervals, trajectories, dimension, channels = noise.shape
+    moved = np.zeros((dimension, dimension))
+    spread = np.zeros((dimension, channels))
+    half = np.zeros((dimension, dimension))
+    for t in range(intervals):
+        for b in range(trajectories):
+            now = states[t, b]
+            for i in range(dimension):
+                for a in range(channels):
+                    entry = 0.0
+                    for j in range(dimension):
+                        entry -= now[i, j] * gain[t, b, a, j]
+                    across[t, b, i, a] = entry
+            for a in range(channels):
+                for c in range(channels):
+                    entry = 0.0
+                    for k in range(channels):
+                        entry += factor[t, b, a, k] * factor[t, b, c, k]
+                    for j in range(dimension):
+                        entry -= gain[t, b, a, j] * across[t, b, j, c]
+                    noises[t, b, a, c] = entry
+            for i in range(dimension):
+                for j in range(dimension):
+                    entry = state[t, b, i, j]
+                    for a in range(channels):
+                        entry -= noise[t, b, i, a] * gain[t, b, a, j]
+                    moved[i, j] = entry
+                for k in range(channels):
+                    entry = 0.0
+                    for a in range(channels):
+                        entry += noise[t, b, i, a] * factor[t, b, a, k]
+                    spread[i, k] = entry
+            for i in range(dimension):
+                for j in range(dimension):
+                    entry = 0.0
+                    for k in range(dimension):
+                        entry += moved[i, k] * now[k, j]
+                    half[i, j] = entry
+            for i in range(dimension):
+                for j in range(i + 1):
+                    entry = 0.0
+                    for k in range(dimension):
+                        entry += half[i, k] * moved[j, k]
+                    for k in range(channels):
+                        entry += spread[i, k] * spread[j, k]
+                    states[t + 1, b, i, j] = entry
+                    states[t + 1, b, j, i] = entry

@@ -76,10 +76,11 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
     if len(start.values) != 1:
         raise ProgramError("supervised learning needs initial() to sample the whole state as one site", site="initial")
     (site,) = start.values
+    width = start.distributions[site].event_shape.numel()  # other states rest at the start
     event_dims = {s: fn.event_dim for s, fn in (start.distributions | probe.distributions).items()} | {"states": 1}
     return Paths(
         states=states[None],
-        start={site: states[None, :1]},
+        start={site: states[None, :1, :, :width]},
         noise={s: value[None] for s, value in noise.items()},
         event_dims=event_dims,
     )

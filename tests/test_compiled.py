@@ -213,7 +213,7 @@ class Switching(HovercraftTruth):
     """Reads a number out of a parameter."""
 
     def transition(self, state, control, time, step):
-        return super().transition(state, control * (2 if float(self.mass) > 1 else 1), time, step)
+        return super().transition(state, control * (2 if float(self.mass.detach()) > 1 else 1), time, step)
 
 
 class Stale(HovercraftTruth):

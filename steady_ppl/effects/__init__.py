@@ -1,19 +1,37 @@
 """Physical effects that a program may lack: what they are, which apply, and how to add one."""
 
-from steady_ppl.effects.attach import attach, attached, with_effect
+from steady_ppl.effects.attach import (
+    added,
+    attach,
+    attached,
+    coefficient,
+    record,
+    restore,
+    set_coefficient,
+    with_effect,
+    written_class,
+)
 from steady_ppl.effects.declaration import Effect, Variant
 from steady_ppl.effects.registry import catalogue, chosen_variant, find, not_applicable, parsed, register
+from steady_ppl.effects.writing import write_program
 
 __all__ = [
     "Effect",
     "Variant",
+    "added",
     "attach",
     "attached",
     "catalogue",
     "chosen_variant",
+    "coefficient",
     "find",
     "not_applicable",
     "parsed",
+    "record",
     "register",
+    "restore",
+    "set_coefficient",
     "with_effect",
+    "write_program",
+    "written_class",
 ]

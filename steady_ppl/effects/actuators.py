@@ -162,6 +162,7 @@ ACTUATORS = [
         profiled=("knee",),
         typical=0.45,
         limit=1.0,
+        sign=1,
         choices=_knees,
         lacks=_no_controls,
     ),
@@ -220,6 +221,7 @@ ACTUATORS = [
         function=battery_sag,
         typical=0.25,
         limit=1.0,
+        sign=1,
         lacks=_no_controls,
     ),
     Effect(

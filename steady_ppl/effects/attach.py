@@ -14,9 +14,9 @@ from pyro.distributions import constraints
 from pyro.nn import PyroParam
 from torch import Tensor
 
-from steady_ppl.altering import Coloured, blurred, heavy_tailed, misread, pushed, widened
+from steady_ppl.altering import Coloured, blurred, channel_means, heavy_tailed, misread, pushed, widened
 from steady_ppl.effects.declaration import Effect, Variant
-from steady_ppl.effects.registry import chosen_variant
+from steady_ppl.effects.registry import chosen_variant, is_known
 from steady_ppl.errors import UsageError
 from steady_ppl.program import Program, names
 
@@ -24,7 +24,10 @@ Methods = dict[str, Any]
 
 
 def with_effect(
-    program: Program, effect: str | Effect | Variant, value: float | Sequence[float] | None = None, **options: Any
+    program: Program,
+    effect: str | Effect | Variant,
+    value: float | Sequence[float] | Tensor | None = None,
+    **options: Any,
 ) -> Program:
     """A copy of a program with an effect, its coefficient a learnable parameter called `effect` or `effect_where`.
 
@@ -48,23 +51,88 @@ def attach(program: Program, variant: Variant, value: float | Sequence[float] | 
     if hasattr(program, variant.parameter):  # a parameter of its own that has nothing to do with it
         variant = replace(variant, called=f"{variant.parameter}_effect")
     name, effect = variant.parameter, variant.effect
-    like = next(program.parameters(), torch.zeros(()))
-    scaled = effect.null != 0  # a factor or a limit is positive
-    constraint = constraints.positive if scaled else constraints.real
+    start = _start(variant, value, next(program.parameters(), torch.zeros(())))
     base = type(program)
     title = "".join(part.capitalize() for part in name.split("_"))
-    about = {"__module__": base.__module__, "__doc__": base.__doc__, "attached": (*attached(program), variant)}
+    about = {"__module__": base.__module__, "__doc__": base.__doc__, "attached": {name: variant}}
     program.__class__ = type(f"{base.__name__}With{title}", (base,), {**about, **_AROUND[effect.form](base, variant)})
     with pyro.settings.context(module_local_params=True):
-        setattr(program, name, PyroParam(variant.coefficient(value, like), constraint))
-    prior = dist.Normal(1.0 if effect.null == 1 else 0.0, effect.limit)
-    program.priors = {**program.priors, name: prior}  # type: ignore[misc]
+        setattr(program, name, PyroParam(start, _constraint(effect)))
+    program.priors = {**program.priors, name: prior(effect)}  # type: ignore[misc]
     return program
 
 
+def set_coefficient(program: Program, variant: Variant, value: float | Sequence[float] | Tensor) -> Program:
+    """Give the coefficient of an effect that a program has another value."""
+    setattr(program, variant.parameter, _start(variant, value, coefficient(program, variant)))
+    return program
+
+
+def _constraint(effect: Effect) -> constraints.Constraint:
+    return constraints.positive if effect.null != 0 else constraints.real  # a factor or a limit is positive
+
+
+def _start(variant: Variant, value: float | Sequence[float] | Tensor | None, like: Tensor) -> Tensor:
+    """A value of the coefficient that can be one."""
+    effect, start = variant.effect, variant.coefficient(value, like.detach())
+    if not bool((_constraint(effect).check(start) & (start.isfinite() | (start == effect.null))).all()):
+        expected = "a positive number" if effect.null != 0 else "finite numbers"
+        raise UsageError(f"effect {effect.name} takes {expected}, got {start.tolist()}")
+    return start
+
+
+def prior(effect: Effect) -> Any:
+    """The prior of an effect's coefficient: its own, or a normal as wide as is physical."""
+    if effect.prior is not None:
+        return effect.prior
+    return dist.Normal(1.0 if effect.null == 1 else 0.0, effect.limit)
+
+
+def added(program: Program) -> tuple[Variant, ...]:
+    """The effects that were added to a program and are not in its file, in their order."""
+    return tuple(which for _, which in _effects(program) if isinstance(which, Variant))
+
+
 def attached(program: Program) -> tuple[Variant, ...]:
-    """The effects that were added to a program, in their order."""
-    return getattr(program, "attached", ())
+    """The effects that were added to a program or written out in its file, in their order.
+
+    One that a file names but that nobody has registered here is left out: nothing proposes it.
+    """
+    return tuple(
+        which if isinstance(which, Variant) else replace(chosen_variant(program, which), called=parameter)
+        for parameter, which in _effects(program)
+        if isinstance(which, Variant) or is_known(which)
+    )
+
+
+def _effects(program: Program) -> list[tuple[str, str | Variant]]:
+    classes = reversed(type(program).__mro__)
+    return [item for one in classes for item in vars(one).get("attached", {}).items()]
+
+
+def written_class(program: Program) -> type[Program]:
+    """The class of a program as its file has it, without the effects that were added."""
+    return next(
+        one for one in type(program).__mro__ if not any(map(_is_variant, vars(one).get("attached", {}).values()))
+    )
+
+
+def _is_variant(which: str | Variant) -> bool:
+    return isinstance(which, Variant)
+
+
+def record(program: Program) -> list[str]:
+    """The effects that were added to a program, as `restore` reads them."""
+    return [variant.written for variant in added(program)]
+
+
+def restore(program: Program, effects: Sequence[str]) -> Program:
+    """Add the effects of a record that the program does not have yet to this very program."""
+    have = [variant.written for variant in attached(program)]
+    for text in effects:
+        if text not in have:
+            attach(program, chosen_variant(program, text))
+    return program
 
 
 def coefficient(program: Program, variant: Variant) -> Tensor:
@@ -77,7 +145,8 @@ def _push(base: Any, variant: Variant) -> Methods:
         def below():
             return base.transition(self, state, control, time, step)
 
-        with pushed(self, variant.push(self, state, control, time, step, coefficient(self, variant), below)):
+        mean = channel_means(self, below) if variant.needs_mean else {}
+        with pushed(self, variant.push(self, state, control, time, step, coefficient(self, variant), mean)):
             return below()
 
     return {"transition": transition}
@@ -155,16 +224,20 @@ def _colour(base: Any, variant: Variant) -> Methods:
         colouring = Coloured(self, variant(self, c=coefficient(self, variant)), last)
         with colouring:
             state = base.transition(self, state, control, time, step)
-        deviations = torch.cat(colouring.deviations, -1)
-        left = torch.broadcast_shapes(state.shape[:-1], deviations.shape[:-1])
-        return torch.cat([state.expand(*left, -1), deviations.expand(*left, -1)], -1)
+        return colouring.beside(state)
 
     def observe(self, state):
         return base.observe(self, split(self, state)[0])
 
-    deviations = tuple(f"deviation_{name}" for name in names(base.channels))
+    deviations = deviation_names(names(base.channels), names(base.states), variant)
     methods = {"initial": initial, "transition": transition, "observe": observe}
     return methods | {"states": (*base.states, *deviations), "resting": (*base.resting, *deviations)}
+
+
+def deviation_names(channels: Sequence[str], states: Sequence[str], variant: Variant) -> tuple[str, ...]:
+    """Names of the states that a coloured noise adds to a program, which may have those of another one."""
+    plain = tuple(f"deviation_{name}" for name in channels)
+    return tuple(f"deviation_{variant.at}_{name}" for name in channels) if set(plain) & set(states) else plain
 
 
 _AROUND: dict[str, Callable[[Any, Variant], Methods]] = {

@@ -19,16 +19,15 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import torch
-from pyro import poutine
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import UsageError
-from steady_ppl.program import Program, names
-from steady_ppl.sites import AtMean, Recording, as_vector
+from steady_ppl.program import Program
 
 VERDICTS = {
     "push": "dynamics",
@@ -70,6 +69,7 @@ class Effect:
         choices: what else it depends on, one mapping of the function's further arguments a choice: which channels,
             controls or component, called `at`, and knees, widths or places.
         profiled: the arguments among these that are knees, widths or places.
+        prior: of the coefficient, a Pyro distribution; normal with standard deviation `limit` when None.
         lacks: why it does not apply to a program, or None.
     """
 
@@ -88,6 +88,7 @@ class Effect:
     probes: tuple[float, ...] = ()
     choices: Choices = one_choice
     profiled: tuple[str, ...] = ()
+    prior: Any = None
     lacks: Callable[[Program], str | None] = field(default=lambda program: None)
 
     def __post_init__(self) -> None:
@@ -149,6 +150,11 @@ class Variant:
         return f"{self.effect.name}:{self.at}" if self.at else self.effect.name
 
     @property
+    def written(self) -> str:
+        """The name and what was profiled, as users write it: `thrust_saturation:knee=0.6`."""
+        return ":".join([self.name, *(f"{name}={value!r}" for name, value in self.profiled.items())])
+
+    @property
     def label(self) -> str:
         """The name and what was profiled."""
         said = ", ".join(f"{name} {value:.3g}" for name, value in self.profiled.items())
@@ -162,6 +168,8 @@ class Variant:
         """
         given = torch.as_tensor(self.effect.typical if value is None else value, dtype=like.dtype, device=like.device)
         wanted = self.effect.components
+        if not wanted and given.shape == (1,):
+            given = given[0]
         if given.shape != torch.Size([len(wanted)] if wanted else []):
             raise UsageError(
                 f"effect {self.effect.name} takes {len(wanted) or 'one'} number{'s' if wanted else ''}"
@@ -186,22 +194,13 @@ class Variant:
         time: Tensor,
         step: Tensor,
         c: Tensor,
-        below: Callable[[], Tensor],
+        mean: Mapping[str, Tensor],
     ) -> dict[str, Tensor]:
-        """What it adds to the channels' means, each `(...)`, around the transition `below`."""
-        more = {"mean": channel_means(program, below)} if self.needs_mean else {}
+        """What it adds to the channels' means, each `(...)`; `mean` is what they are without it, where it asks."""
+        more = {"mean": mean} if self.needs_mean else {}
         return self.effect.function(program, state, control, time, step, c=c, **more, **self.options)
 
-    @property
+    @cached_property
     def needs_mean(self) -> bool:
         """Whether it depends on what the channels' means are without it."""
         return "mean" in inspect.signature(self.effect.function).parameters
-
-
-def channel_means(program: Program, below: Callable[[], Tensor]) -> dict[str, Tensor]:
-    """The means of the channels that a transition samples, by name, each `(...)`."""
-    seen = Recording()
-    with poutine.block(), seen, AtMean():
-        below()
-    parts = [as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()]
-    return dict(zip(names(program.channels), torch.cat(parts, -1).unbind(-1), strict=True))

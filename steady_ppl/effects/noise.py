@@ -34,8 +34,16 @@ def _no_states_left(program: Program) -> str | None:
     return "the program does not say which channels move what (`motion`)"
 
 
+def _nothing_measured(program: Program) -> str | None:
+    return None if program.measurements else "the program measures nothing"
+
+
 def heavy_tails(self, c):
-    return c.clamp(1e-4, 0.49)
+    return c.clamp(0.005, 0.49)
+
+
+def measurement_noise(self, state, c):
+    return c.expand(*state.shape[:-1], len(self.measurements))
 
 
 def range_dependent_noise(self, state, c):
@@ -68,6 +76,20 @@ NOISES = [
         typical=1 / 3,
         limit=0.5,
         sign=1,
+    ),
+    Effect(
+        name="measurement_noise",
+        form="blur",
+        equation=r"\sigma \to c\,\sigma",
+        text="σ → c σ of every measurement",
+        unit="1",
+        feels="sees worse (or better) than its data sheet says",
+        function=measurement_noise,
+        typical=1.5,
+        limit=2.0,
+        sign=1,
+        null=1.0,
+        lacks=_nothing_measured,
     ),
     Effect(
         name="range_dependent_noise",

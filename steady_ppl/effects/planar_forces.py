@@ -57,8 +57,8 @@ def _places(program: Program, data: Trajectories | None) -> Sequence[Mapping[str
     else:
         places = data.states[..., :2][torch.isfinite(data.states[..., :2]).all(-1)].double()
         low, high = places.quantile(0.05, 0), places.quantile(0.95, 0)
-    radius = float((high - low).max()) / 6
-    steps = [torch.linspace(float(low[i]), float(high[i]), 4).tolist() for i in (0, 1)]
+    radius = float((high - low).max()) / 5
+    steps = [torch.linspace(float(low[i]), float(high[i]), 3).tolist() for i in (0, 1)]
     return [{"x": x, "y": y, "radius": radius} for x, y in itertools.product(*steps)]
 
 

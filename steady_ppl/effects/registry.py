@@ -39,6 +39,11 @@ def not_applicable(program: Program) -> dict[str, str]:
     }
 
 
+def is_known(text: str) -> bool:
+    """Whether there is an effect of the name that `NAME[:AT]…` begins with."""
+    return parsed(text)[0] in [effect.name for effect in _EFFECTS]
+
+
 def find(name: str, program: Program) -> Effect:
     """The effect of a name that applies to a program.
 
@@ -48,8 +53,8 @@ def find(name: str, program: Program) -> Effect:
     named = [effect for effect in _EFFECTS if effect.name == name]
     if not named:
         near = difflib.get_close_matches(name, [effect.name for effect in _EFFECTS], n=1, cutoff=0.5)
-        meant = f"; did you mean {near[0]}?" if near else ""
-        raise UsageError(f"no effect {name!r}{meant} There are {', '.join(sorted({e.name for e in _EFFECTS}))}")
+        meant = f"did you mean {near[0]}? " if near else ""
+        raise UsageError(f"no effect {name!r}: {meant}there are {', '.join(sorted({e.name for e in _EFFECTS}))}")
     for effect in named:
         reason = effect.lacks(program)
         if reason is None:
@@ -65,8 +70,8 @@ def parsed(text: str) -> tuple[str, str, dict[str, float], tuple[float, ...] | N
     """
     head, *parts = text.strip().split(":")
     if not parts:
-        head, _, numbers = head.partition("=")
-        return head, "", {}, _numbers(text, numbers)
+        head, equals, numbers = head.partition("=")
+        return head, "", {}, _numbers(text, numbers) if equals else None
     *middle, last = parts
     pieces = last.split("=")
     value: tuple[float, ...] | None = None
@@ -76,8 +81,9 @@ def parsed(text: str) -> tuple[str, str, dict[str, float], tuple[float, ...] | N
     for part in [*middle, "=".join(pieces)]:
         option, equals, number = part.partition("=")
         if equals:
-            found = _numbers(text, number)
-            options[option] = found[0] if found else 0.0
+            (options[option],) = _numbers(text, number, most=1)
+        elif at:
+            raise UsageError(f"effect {text}: it is at {at} or at {option}, not at both")
         else:
             at = option
     return head, at, options, value
@@ -116,10 +122,11 @@ def _is_option(name: str, option: str) -> bool:
     return any(option in effect.profiled for effect in _EFFECTS if effect.name == name)
 
 
-def _numbers(text: str, numbers: str) -> tuple[float, ...] | None:
-    if not numbers:
-        return None
+def _numbers(text: str, numbers: str, most: int | None = None) -> tuple[float, ...]:
     try:
-        return tuple(float(number) for number in numbers.split(","))
+        found = tuple(float(number) for number in numbers.split(","))
     except ValueError:
-        raise UsageError(f"effect {text}: expected NAME or NAME=NUMBER (NUMBER,NUMBER for two components)") from None
+        found = ()
+    if not found or len(found) > (most or len(found)):
+        raise UsageError(f"effect {text}: expected NAME or NAME=NUMBER (NUMBER,NUMBER for two components)")
+    return found

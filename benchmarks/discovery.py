@@ -1,0 +1,173 @@
+"""How often `discover` is right: the development benchmark, and its rivals on the same tables.
+
+    python benchmarks/discovery.py [--quick] [--rivals] [--results FILE] [--workers 2]
+
+Every set is one line of the results file; sets that are there already are left out, so that it can be interrupted and
+gone on with. The table of scores is printed at the end and written beside the results (`.md`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+import torch
+from discovery_scores import rivals_table, scores_table
+from discovery_sets import BenchmarkSet, benchmark_sets, owner, quick, tables
+
+from steady_ppl import for_program
+from steady_ppl.discovery import Discovery, discover
+from steady_ppl.discovery.discovery_report import ranked
+from steady_ppl.discovery.refits import Refit, refit_with
+from steady_ppl.effects import chosen_variant, parsed
+from steady_ppl.proving import prove
+
+RESULTS = Path(__file__).parent / "results" / "discovery.jsonl"
+RIVAL_SETS, BRUTE_SETS = 140, 40
+
+
+def judged(chosen: BenchmarkSet) -> dict[str, Any]:
+    """A set's record."""
+    torch.set_num_threads(1)
+    train, valid, test = tables(chosen)
+    began = time.perf_counter()
+    found = discover(owner(chosen.known), train, valid, known_start=True, withheld=chosen.withheld, seed=chosen.seed)
+    seconds = time.perf_counter() - began
+    figures = found.figures
+    record = {
+        "set": chosen.name,
+        "stratum": chosen.stratum,
+        "effects": list(chosen.effects),
+        "withheld": list(chosen.withheld),
+        "seed": chosen.seed,
+        "seconds": round(seconds, 1),
+        "verdict": figures["verdict"],
+        "p_value": figures["p_value"],
+        "class": figures["class"],
+        "confidence": figures["confidence"],
+        "ranking": [t.variant.name for t in ranked(found) if not (t.is_curve or t.departure)][:5],
+        "found": [
+            {
+                key: one[key]
+                for key in ("effect", "kind", "class", "coefficient", "interval_90", "heldout_gain", "options")
+            }
+            for one in figures["effects"]
+        ],
+        "gain": found.search.gain,
+        "shape": found.search.curve.variant.at if found.search.curve else None,
+        "curve_gain": max((c.total for c in found.search.curves if isinstance(c.refit, Refit)), default=None),
+        "rounds": [one["p_value"] for one in figures["rounds"]],
+        "converged": found.search.base.converged,
+    }
+    if chosen.stratum != "clean":
+        record |= _improvement(chosen, found, test)
+    return _plain(record)
+
+
+def _improvement(chosen: BenchmarkSet, found: Discovery, test: Any) -> dict[str, Any]:
+    """3-s open-loop errors on the locked drives, before, after and of the true structure fitted alike."""
+    oracle: Refit | str = found.search.base
+    for text in chosen.effects:
+        name, at, options, value = parsed(text)
+        if isinstance(oracle, Refit):
+            variant = chosen_variant(found.search.base.program, name, at, **options)
+            oracle = refit_with(oracle, variant, value, known_start=True)
+    rows: dict[str, Any] = {"before": found.before.program, "after": found.after.program}
+    if found.shape is not None and found.search.curve and isinstance(found.search.curve.refit, Refit):
+        rows["after"] = found.search.curve.refit.program
+    rows["oracle"] = found.before.program if isinstance(oracle, str) else oracle.program
+    proof = prove(rows, for_program(owner(), test), known_start=True, with_constant_velocity=False)
+    errors = {}
+    for row in proof.figures["rows"]:
+        (measured,) = row["measurement"].values()
+        errors[row["row"]] = {
+            "open_loop_3s": measured.get("3 s"),
+            "location_3s": row["state"]["location"].get("3 s"),
+            "log_likelihood": row["log_likelihood"],
+        }
+    gain = None if isinstance(oracle, str) else float((oracle.held_out - found.search.base.held_out).sum())
+    return {"errors": errors, "oracle_gain": gain}
+
+
+def rivals_of(chosen: BenchmarkSet, brute: bool) -> dict[str, Any]:
+    """The rankings of all rivals on a set."""
+    from discovery_rivals import RIVALS, fitted
+
+    torch.set_num_threads(1)
+    made, program = tables(chosen), owner(chosen.known)
+    base = fitted(made, program, True)
+    found = {}
+    for name, rival in RIVALS.items():
+        if name != "brute force" or brute:
+            for called, ranking in rival(made, program, known_start=True, withheld=chosen.withheld, base=base).items():
+                found[called] = {
+                    "first": list(ranking.effects[:3]),
+                    "detected": ranking.detected,
+                    "seconds": round(ranking.seconds, 1),
+                }
+    return _plain({"set": chosen.name, "stratum": chosen.stratum, "effects": list(chosen.effects), "rivals": found})
+
+
+def _plain(value: Any) -> Any:
+    """Ready for JSON: figures to five digits, None where there is none."""
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, float):
+        return float(f"{value:.5g}") if math.isfinite(value) else None
+    return value
+
+
+def _run(work: Any, chosen: list[tuple[Any, ...]], file: Path, workers: int) -> list[dict[str, Any]]:
+    """Records of the file and of everything that is not in it yet, appended as it is done."""
+    file.parent.mkdir(exist_ok=True)
+    done = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    there = {record["set"] for record in done}
+    left = [arguments for arguments in chosen if arguments[0].name not in there]
+    began = time.perf_counter()
+    with ProcessPoolExecutor(workers) as pool, file.open("a") as out:
+        running = {pool.submit(work, *arguments): arguments[0].name for arguments in left}
+        for count, future in enumerate(as_completed(running), 1):
+            try:
+                record = future.result()
+            except Exception as error:
+                record = {"set": running[future], "failed": f"{type(error).__name__}: {error}"}
+            done.append(record)
+            out.write(json.dumps(record) + "\n")
+            out.flush()
+            each = (time.perf_counter() - began) / count
+            print(f"{count}/{len(left)} {record['set']}  {each * (len(left) - count) / 60:.0f} min left", flush=True)
+    wanted = {arguments[0].name for arguments in chosen}
+    return [record for record in done if record["set"] in wanted]
+
+
+def main() -> None:
+    """Run what is left and print the scores."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="a few sets of every kind, in about five minutes")
+    parser.add_argument("--rivals", action="store_true", help="the rivals as well")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--workers", type=int, default=2)
+    options = parser.parse_args()
+    sets = quick() if options.quick else benchmark_sets()
+    records = _run(judged, [(one,) for one in sets], options.results, options.workers)
+    text = scores_table(records)
+    if options.rivals:
+        named = [one for one in sets if one.stratum in ("single", "clean")]
+        chosen = named[:: max(1, len(named) // RIVAL_SETS)][:RIVAL_SETS]
+        every = max(1, len(chosen) // BRUTE_SETS)
+        work = [(one, index % every == 0) for index, one in enumerate(chosen)]
+        beside = options.results.with_name(options.results.stem + "-rivals.jsonl")
+        text += "\n" + rivals_table(records, _run(rivals_of, work, beside, options.workers))
+    options.results.with_suffix(".md").write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,172 @@
+"""The picture of a check: predictions of one drive, errors against references, and where and when they stand out."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from steady_ppl.check_report import unit_of, verdict
+from steady_ppl.program import names, units
+from steady_ppl.reference_motion import Reference
+
+if TYPE_CHECKING:
+    from steady_ppl.checking import Check
+
+MEASURED, NEAR, FAR, REFERENCE, FLOOR = "black", "#0072b2", "#d55e00", "#cc79a7", "#009e73"
+COMPONENTS = 4  # panels at most
+WIDTH = 165  # letters of a line over the whole width
+
+
+def check_picture(found: Check) -> Figure:
+    """One figure of everything; made without pyplot's list of figures, so that nothing needs to be closed."""
+    shown = min(COMPONENTS, len(names(found.program.measurements)))
+    figure = Figure(figsize=(13, 2.2 * max(shown, 3) + 1.3), layout="constrained")
+    left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1.25, 1), squeeze=False))
+    drive = representative(found)
+    panels = left.subplots(shown, 1, sharex=True, squeeze=False)[:, 0]
+    for component, axes in enumerate(panels):
+        predictions(found, drive, component, axes)
+    panels[0].set_title(f"measured and predicted, drive {found.data.labels[drive]}", fontsize=9)
+    panels[-1].set_xlabel("time [s]", fontsize=8)
+    left.legend(*panels[0].get_legend_handles_labels(), fontsize=8, ncols=3, loc="outside lower center")
+    figure.suptitle("\n".join(textwrap.wrap(verdict(found), WIDTH)), fontsize=10)
+    strips, regime, against = right.subplots(3, 1, height_ratios=(1.2, 1, 1))
+    where_and_when(found, strips)
+    regime_panel(found, regime)
+    against_references(found, against)
+    return figure
+
+
+def representative(found: Check) -> int:
+    """The drive of the strongest finding that names one, else the one that is predicted worst over the longest time."""
+    for finding in found.misfit.significant:
+        if "drive" in finding.cell.where:
+            return int(finding.cell.where["drive"])
+    far = found.predictions[max(found.predictions)]
+    total = far.standardised.square().sum((0, 2)) / far.observed.sum((0, 2)).clamp(min=1)
+    return int(total.argmax())
+
+
+def predictions(found: Check, drive: int, component: int, axes: Axes) -> None:
+    """Measured against the nearest and the farthest prediction, with 90 % bands."""
+    data = found.data
+    time = data.elapsed[:, drive].numpy(force=True)
+    seen = data.observed[:, drive, component].numpy(force=True)
+    measured = np.where(seen, data.measurements[:, drive, component].double().numpy(force=True), np.nan)
+    last = list(found.horizons)[-1]
+    for name, color in {"one step": NEAR, last: FAR}.items():
+        horizon = found.horizons[name]
+        if name == last and len(found.horizons) == 1:
+            continue
+        prediction = found.predictions[horizon]
+        error = prediction.error[:, drive, component].numpy(force=True)
+        there = prediction.observed[:, drive, component].numpy(force=True)
+        center = np.where(there, measured[horizon:] - error, np.nan)
+        half = 1.645 * np.sqrt(np.where(there, prediction.variance[:, drive, component].numpy(force=True), np.nan))
+        center = _broken(center, half)
+        axes.fill_between(time[horizon:], center - half, center + half, color=color, alpha=0.18, lw=0)
+        axes.plot(time[horizon:], center, color=color, lw=1, label=f"{name} ahead, 90 % band")
+    axes.plot(time, measured, ".", color=MEASURED, ms=3, label="measured")
+    name, unit = names(found.program.measurements)[component], units(found.program.measurements)[component]
+    axes.set_ylabel(f"{name} [{unit}]" if unit else name, fontsize=8)
+
+
+def _broken(values: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """A line that does not cross the whole circle where an angle comes round."""
+    jumps = np.abs(np.diff(values, prepend=values[:1])) > np.maximum(np.pi, 3 * np.nan_to_num(half))
+    return np.where(jumps, np.nan, values)
+
+
+def where_and_when(found: Check, axes: Axes) -> None:
+    """The strongest residual of every drive and strip of time."""
+    cells = [(i, cell) for i, cell in enumerate(found.misfit.cells) if cell.map == "drive and time"]
+    axes.set_title("where and when: strongest mean residual of each drive and strip", fontsize=9)
+    if not cells:
+        axes.text(0.5, 0.5, "too few rows for strips", ha="center", va="center", transform=axes.transAxes)
+        axes.set_axis_off()
+        return
+    starts = sorted({cell.where["time"] for _, cell in cells})
+    grid = np.full((len(found.data), len(starts)), np.nan)
+    for i, cell in cells:
+        at = cell.where["drive"], starts.index(cell.where["time"])
+        z = found.misfit.z[i]
+        if not abs(z) <= abs(np.nan_to_num(grid[at])):
+            grid[at] = z
+    edges = [start for start, _ in starts] + [starts[-1][1]]
+    mesh = axes.pcolormesh(edges, np.arange(len(grid) + 1) + 0.5, grid, cmap="RdBu_r", vmin=-6, vmax=6)
+    for finding in found.misfit.significant:
+        if finding.cell.map == "drive and time":
+            start, end = finding.cell.where["time"]
+            axes.plot((start + end) / 2, finding.cell.where["drive"] + 1, "k*", ms=5)
+    step = max(1, len(grid) // 8)
+    axes.set_yticks(np.arange(1, len(grid) + 1, step), found.data.labels[::step], fontsize=7)
+    axes.set_xlabel("time [s]  (★ significant)", fontsize=8)
+    axes.set_ylabel("drive", fontsize=8)
+    axes.figure.colorbar(mesh, ax=axes).set_label("simulated sd", fontsize=8)
+
+
+def regime_panel(found: Check, axes: Axes) -> None:
+    """The mean residual over the ranges of the variable in which it stands out most."""
+    cells = [(i, cell) for i, cell in enumerate(found.misfit.cells) if cell.map == "regime"]
+    if not cells:
+        axes.set_axis_off()
+        return
+    _, strongest = max(cells, key=lambda pair: abs(found.misfit.z[pair[0]]))
+    ((variable, _),) = strongest.where.items()
+    chosen = [(i, c) for i, c in cells if c.residual == strongest.residual and variable in c.where]
+    ranges = [cell.where[variable] for _, cell in chosen]
+    for (low, high), (i, _) in zip(ranges, chosen, strict=True):
+        axes.fill_between([low, high], -2, 2, color="0.85", lw=0)
+        axes.plot([low, high], [found.misfit.z[i]] * 2, color=NEAR, lw=3, solid_capstyle="butt")
+    stand_out = [f.cell for f in found.misfit.significant if f.cell.map == "regime"]
+    for low, high, z in [(*cell.where[variable], found.misfit.z[i]) for i, cell in chosen if cell in stand_out]:
+        axes.plot((low + high) / 2, z, "k*", ms=6)
+    axes.axhline(0, color="black", lw=0.6)
+    unit = unit_of(found, variable)
+    axes.set_xlabel(f"{variable} [{unit}]" if unit else variable, fontsize=8)
+    axes.set_ylabel("simulated sd", fontsize=8)
+    what = "in which regime" if stand_out else "strongest regime, not significant"
+    axes.set_title(f"{what}: mean residual of {_subject(found, strongest.residual)} (grey: ±2)", fontsize=9)
+
+
+def _subject(found: Check, residual: int) -> str:
+    name = found.residuals[residual]
+    return name if residual < len(names(found.program.measurements)) else f"{name} acceleration"
+
+
+def against_references(found: Check, axes: Axes) -> None:
+    """Errors over the noise floor, root mean square over the components, against the time ahead."""
+    step = float(found.data.steps[found.data.transitions].median())
+    seconds = [horizon * step for horizon in found.horizons.values()]
+    lines: dict[str, Any] = {"program": (NEAR, "o-", []), "last measurement": ("0.5", "s:", [])}
+    if isinstance(found.reference, Reference):
+        lines["constant velocity"] = (REFERENCE, "^--", [])
+    for horizon in found.horizons.values():
+        floor = found.floor[horizon].mean(0)
+        ours = found.predictions[horizon]
+        lines["program"][2].append(_relative(ours.error, ours.observed, floor))
+        lines["last measurement"][2].append(_relative(*found.held[horizon], floor))
+        if isinstance(found.reference, Reference):
+            theirs = found.reference.predictions[horizon]
+            lines["constant velocity"][2].append(_relative(theirs.error, theirs.observed, floor))
+    axes.axhline(1, color=FLOOR, lw=1.5, label="noise alone")
+    for name, (color, style, values) in lines.items():
+        axes.plot(seconds, values, style, color=color, label=name, ms=4)
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.set_title("against references: root mean square error over all measurements", fontsize=9)
+    axes.set_xlabel("predicted ahead [s]", fontsize=8)
+    axes.set_ylabel("RMSE / noise alone", fontsize=8)
+    axes.legend(fontsize=7)
+
+
+def _relative(error: Any, there: Any, floor: np.ndarray) -> float:
+    error, there = error.numpy(force=True), there.numpy(force=True)
+    square = np.where(there, error, 0.0) ** 2
+    means = square.sum((0, 1)) / np.maximum(there.sum((0, 1)), 1)
+    known = (there.sum((0, 1)) > 0) & (floor > 0)
+    return float(np.sqrt((means[known] / floor[known] ** 2).mean())) if known.any() else np.nan

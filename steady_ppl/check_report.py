@@ -1,0 +1,263 @@
+"""What `check` found, in words, as a plain dict and as a table of text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from steady_ppl.misfit_maps import Cell, Finding
+from steady_ppl.program import names, units
+from steady_ppl.reference_motion import ABOUT, Reference
+
+if TYPE_CHECKING:
+    from steady_ppl.checking import Check
+
+SHOWN = 8  # findings in the table
+WHO = {
+    "sensor": "the sensor is at fault",
+    "actuator": "the actuators are at fault",
+    "dynamics": "the dynamics are at fault",
+    "noise": "its noise is at fault",
+    "parameters": "its own parameters do not suit these drives",
+    "cannot tell": "these drives cannot tell what is at fault",
+}
+
+
+def figures(found: Check) -> dict[str, Any]:
+    """Everything as a plain dict; every figure is finite, None where there is none."""
+    blame, misfit, reference = found.blame, found.misfit, found.reference
+    loses = lost_horizons(found)
+    about: dict[str, Any] = {"what": ABOUT, "why_not": reference if isinstance(reference, str) else None}
+    if isinstance(reference, Reference):
+        about |= {"noise": list(reference.scales), "log_likelihood": reference.log_likelihood}
+    return {
+        "verdict": verdict(found),
+        "who": blame.kind,
+        "p_value": blame.p_value,
+        "program": type(found.program).__name__,
+        "trajectories": len(found.data),
+        "simulations": len(misfit.simulated),
+        "measurements": {name: _component(found, i) for i, name in enumerate(names(found.program.measurements))},
+        "constant_velocity": about | {"loses_to_it": loses},
+        "findings": [
+            {
+                "text": sentence(found, finding),
+                "map": finding.cell.map,
+                "residual": found.residuals[finding.cell.residual],
+                "where": {key: _plain(found, key, value) for key, value in finding.cell.where.items()},
+                "count": finding.cell.count,
+                "mean": finding.cell.mean,
+                "z": finding.z,
+                "p_value": finding.p_value,
+            }
+            for finding in misfit.significant
+        ],
+        "cells": len(misfit.cells),
+        "evidence": {
+            "p_values": {
+                "mean": blame.mean_p_value,
+                "parameters": blame.parameters_p_value,
+                "noise": blame.noise_p_value,
+                "maps": misfit.p_value,
+            },
+            "explained_nats": blame.explained,
+            "directions": [{"kind": kind, "direction": name, "z": z} for kind, name, z in blame.evidence],
+            "parameters": blame.parameters,
+            "noise": blame.noise,
+            "scatter": {
+                name: ratio
+                for name, ratio in zip(found.residuals, misfit.dispersion.tolist(), strict=True)
+                if math.isfinite(ratio)
+            },
+        },
+        "notes": found.notes,
+    }
+
+
+def _component(found: Check, index: int) -> dict[str, Any]:
+    """Errors of one measurement component by horizon, in its unit."""
+    horizons: dict[str, Any] = {}
+    for name, horizon in found.horizons.items():
+        prediction = found.predictions[horizon]
+        seen = prediction.observed[..., index]
+        count = int(seen.sum())
+        if not count:
+            continue
+        reference = None
+        if isinstance(found.reference, Reference):
+            theirs = found.reference.predictions[horizon]
+            reference = _rms(theirs.error[..., index], theirs.observed[..., index])
+        error, both = found.held[horizon]
+        floor = torch.from_numpy(found.floor[horizon][:, index]).double()
+        horizons[name] = {
+            "rmse": _rms(prediction.error[..., index], seen),
+            "noise_floor": float(floor.mean()),
+            "noise_floor_90": [float(floor.quantile(0.05)), float(floor.quantile(0.95))],
+            "constant_velocity": reference,
+            "last_measurement": _rms(error[..., index], both[..., index]),
+            "predicted_sd": float(prediction.variance[..., index][seen].mean().sqrt()),
+            "coverage_90": float(prediction.covered()[..., index].sum()) / count,
+            "count": count,
+        }
+    return {"unit": units(found.program.measurements)[index], "horizons": horizons}
+
+
+def _rms(error: Tensor, there: Tensor) -> float | None:
+    return float(error[there].double().square().mean().sqrt()) if bool(there.any()) else None
+
+
+def lost_horizons(found: Check) -> list[str]:
+    """Horizons at which the program predicts worse than the vehicle that keeps its velocity: the mean difference over
+    drives of the squared errors is above zero by 1.6 of its standard errors."""
+    if isinstance(found.reference, str):
+        return []
+    lost = []
+    for name, horizon in found.horizons.items():
+        ours, theirs = found.predictions[horizon], found.reference.predictions[horizon]
+        there = ours.observed & theirs.observed
+        scale = torch.where(there, theirs.error, 0.0).square().sum((0, 1)) / there.sum((0, 1)).clamp(min=1)
+        worse = torch.where(there, (ours.error.square() - theirs.error.square()) / scale.clamp(min=1e-300), 0.0)
+        of_drive = worse.sum((0, 2))[there.any(-1).any(0)]
+        error = float(of_drive.std()) / math.sqrt(len(of_drive)) if len(of_drive) > 1 else 0.0
+        if len(of_drive) and float(of_drive.mean()) > 1.645 * error:
+            lost.append(name)
+    return lost
+
+
+def verdict(found: Check) -> str:
+    """One sentence, `steady check`'s first line."""
+    blame = found.blame
+    if blame.kind == "nothing found":
+        drives, alone = len(found.data), len(found.misfit.significant)
+        where = "in no place, time or regime more than" if not alone else "over all tests no more than"
+        said = (
+            f"Nothing found: on {'this drive' if drives == 1 else f'these {drives} drives'} the program errs {where} "
+        )
+        said += "on simulated drives of its own, which is no proof"
+        said += f" ({alone} of {len(found.misfit.cells)} cells would stand out by themselves)" if alone else ""
+        said += "; `steady discover` says what could not have been seen"
+    else:
+        said = f"The program does not explain these drives: {WHO[blame.kind]}{_most_clearly(found)}; "
+        if blame.parameters_misfit and blame.kind != "parameters":
+            said += f"its own parameters do not suit them either{_parameters(found)}: fit it again first; "
+        said += {
+            "parameters": "fit it again before anything else is believed",
+            "noise": "the effects of kind noise in `steady discover` say in which way",
+        }.get(blame.kind, "`steady discover` tests the physical effects by name")
+    loses = lost_horizons(found)
+    if loses:
+        said += f"; it predicts worse than a vehicle that just keeps its velocity ({', '.join(loses)} ahead)"
+    return said + "."
+
+
+def _most_clearly(found: Check) -> str:
+    blame = found.blame
+    if blame.kind == "parameters":
+        return _parameters(found)
+    if blame.kind == "noise":
+        name = max(blame.noise, key=lambda name: abs(blame.noise[name]))
+        return f", most clearly the {name}, {'more' if blame.noise[name] > 0 else 'less'} than the program says"
+    if blame.evidence and blame.kind != "cannot tell":
+        _, name, z = blame.evidence[0]
+        return f", most clearly the {name} (score {z:+.1f} standard deviations)"
+    close = sorted(blame.explained, key=lambda kind: -blame.explained[kind])[:2]
+    if blame.kind == "cannot tell" and len(close) == 2 and min(blame.explained[kind] for kind in close) > 3:
+        return f" ({close[0]} and {close[1]} explain them nearly alike)"
+    return ""
+
+
+def _parameters(found: Check) -> str:
+    alike = [f"{name} ({'more' if z > 0 else 'less'} is asked for)" for name, z in found.blame.closest_parameters]
+    return f", most clearly {' or '.join(alike)}"
+
+
+def sentence(found: Check, finding: Finding) -> str:
+    """A finding in words."""
+    cell = finding.cell
+    name, more = found.residuals[cell.residual], finding.z > 0
+    where = place(found, cell)
+    measurements = names(found.program.measurements)
+    if cell.map == "memory":
+        return f"the misfit of {name} {'is the same' if more else 'changes its sign'} {where}"
+    if cell.map == "lag":
+        return f"the misfit of {name} goes {'with' if more else 'against'} {where}"
+    if cell.residual >= len(measurements):
+        return f"{name} acceleration {'above' if more else 'below'} the program's{where}"
+    unit = units(found.program.measurements)[cell.residual]
+    size = f"{abs(cell.mean or 0.0):.2g} {unit} ".replace("  ", " ")
+    return f"{name} measured {size}{'above' if (cell.mean or 0.0) > 0 else 'below'} its prediction{where}"
+
+
+def place(found: Check, cell: Cell) -> str:
+    """Where a cell is, in words with units."""
+    seconds = float(found.data.steps[found.data.transitions].median())
+    if cell.map == "memory":
+        return f"{cell.where['lag'] * seconds:.2g} s later"
+    if cell.map == "lag":
+        ((name, lag),) = cell.where.items()
+        return f"the {name} {f'{lag * seconds:.2g} s before' if lag else 'at the same time'}"
+    words = []
+    for key, value in cell.where.items():
+        if key == "drive":
+            words.append(f"on drive {found.data.labels[value]}")
+        elif key == "time":
+            words.append(f"between {value[0]:.1f} and {value[1]:.1f} s")
+        else:
+            word = "while" if not any(w.startswith("while") for w in words) else "and"
+            words.append(f"{word} {key} is between {value[0]:.3g} and {value[1]:.3g} {unit_of(found, key)}".rstrip())
+    return "".join(f" {word}" for word in words)
+
+
+def unit_of(found: Check, variable: str) -> str:
+    """Of a control, a state component, or a channel's velocity; empty where it is not declared."""
+    program = found.program
+    for declared in (program.controls, program.states):
+        if variable in names(declared):
+            return units(declared)[names(declared).index(variable)]
+    channel = variable.removesuffix(" velocity")
+    if channel in names(program.channels):
+        return units(program.channels)[names(program.channels).index(channel)].replace("/s²", "/s")
+    return ""
+
+
+def _plain(found: Check, key: str, value: Any) -> Any:
+    return found.data.labels[value] if key == "drive" else list(value) if isinstance(value, tuple) else value
+
+
+def as_text(content: Mapping[str, Any]) -> str:
+    """The figures as text: the verdict, a table of errors, and the strongest findings."""
+    lines = [content["verdict"], ""]
+    header = ["", "ahead", "RMSE", "noise alone", "constant velocity", "last measurement", "in 90 % band"]
+    table = [header]
+    for name, component in content["measurements"].items():
+        for horizon, row in component["horizons"].items():
+            keys = ("rmse", "noise_floor", "constant_velocity", "last_measurement")
+            cells = ["–" if row[key] is None else f"{row[key]:.4g}" for key in keys]
+            label = f"{name} [{component['unit']}]" if component["unit"] else name
+            table.append([label, horizon, *cells, f"{row['coverage_90']:.1%}"])
+    widths = [max(len(row[i]) for row in table) for i in range(len(header))]
+    for row in table:
+        first, *rest = (
+            cell.ljust(w) if i < 2 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))
+        )
+        lines.append("  ".join([first, *rest]).rstrip())
+    scatter = content["evidence"]["scatter"]
+    lines += ["", "mean squares over those of simulated drives (nearly blind to a missing effect): "]
+    lines[-1] += ", ".join(f"{name} {value:.2f}" for name, value in scatter.items())
+    shown = strongest(content["findings"])
+    total, cells = len(content["findings"]), content["cells"]
+    lines += ["", f"{total} of {cells} cells are outside their simulated bands (false discoveries held at 5 %)"]
+    lines += [f"  {finding['z']:+6.1f} sd  {finding['text']}" for finding in shown]
+    return "\n".join(lines + [f"note: {note}" for note in content["notes"]])
+
+
+def strongest(findings: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The strongest findings, one of a map, residual and variables each."""
+    kept: dict[Any, dict[str, Any]] = {}
+    for finding in findings:
+        kept.setdefault((finding["map"], finding["residual"], tuple(finding["where"])), finding)
+    return list(kept.values())[:SHOWN]

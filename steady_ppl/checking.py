@@ -1,0 +1,275 @@
+"""Compare a fitted program with measurements: where, when and in which regime it fails, and who is at fault.
+
+Nothing here needs the truth. Whatever is computed of the drives is computed in the same way of drives that the fitted
+program makes of the same controls, so that every figure has a band.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from steady_ppl.blame import SCATTER, Blame, blame, scored
+from steady_ppl.check_report import as_text, figures
+from steady_ppl.data import Trajectories
+from steady_ppl.directions import directions
+from steady_ppl.errors import DataError, FilterError, UsageError
+from steady_ppl.fit import Fit
+from steady_ppl.gaussian_smoother import find_and_smooth, smooth
+from steady_ppl.linearization import why_not_linear
+from steady_ppl.misfit_maps import Misfit, Residuals, judge
+from steady_ppl.predictions import Prediction, predict, simulate_again
+from steady_ppl.program import Program, for_program, names
+from steady_ppl.reference_motion import Reference, constant_velocity, last_measurement
+from steady_ppl.seeding import seeded
+from steady_ppl.tracking import Tracked, track
+
+SECONDS = (1.0, 3.0)
+FEWEST = 20  # simulated sets
+PASSES = 4  # linearisations: beside a landmark the truth is far from the mode, where the measured drives' paths lie
+MOST = 4.0  # standard deviations of a single residual; beside a landmark the linearised program knows no more
+
+
+@dataclass(frozen=True)
+class Check:
+    """What `check` found.
+
+    Attributes:
+        program: that was judged.
+        data: the drives, as the program reads them.
+        horizons: name → how many rows ahead, "one step" first.
+        predictions: horizon → measured less predicted.
+        floor: horizon → RMSE of each component in each simulated set, `(M, K)`: what the noise alone would leave.
+        reference: the vehicle that keeps its velocity, or why there is none.
+        held: horizon → measured less last measured, and where both exist.
+        misfit: the maps; every cell with its residual.
+        blame: who is at fault.
+        residuals: names of the measurement components and, after them, of the channels.
+        notes: what was left out.
+    """
+
+    program: Program
+    data: Trajectories
+    horizons: dict[str, int]
+    predictions: dict[int, Prediction]
+    floor: dict[int, np.ndarray]
+    reference: Reference | str
+    held: dict[int, tuple[Tensor, Tensor]]
+    misfit: Misfit
+    blame: Blame
+    residuals: list[str]
+    notes: list[str]
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """Everything as a plain dict, ready for JSON."""
+        return figures(self)
+
+    def __str__(self) -> str:
+        return as_text(self.figures)
+
+
+@torch.no_grad()
+def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0) -> Check:
+    """Compare a fitted program with measurements.
+
+    Args:
+        fit: the program, its noise normal; with its `known_start` the drives' first x. columns are used, nothing else
+            of the truth ever is.
+        data: drives, best those that were not used for the fit.
+        simulations: sets of drives to simulate for the bands.
+        seed: of the simulation.
+
+    Raises:
+        UsageError: the program's noise is not normal, or there are too few simulations.
+        DataError: nothing to compare, or no known start.
+        FilterError: the linearised program broke down.
+
+    Example:
+        >>> import steady_ppl as st  # doctest: +SKIP
+        >>> print(st.check(st.Fit.load("runs/learned"), st.read_table("test.csv")))  # doctest: +SKIP
+    """
+    program = fit.program
+    run = for_program(program, data).without_truth(keep_start=fit.known_start)
+    _require(program, run, fit.known_start, simulations)
+    horizons = _horizons(run)
+    with seeded(seed, "check"):
+        ahead = find_and_smooth(program, run, known_start=fit.known_start)
+        real = track(program, run, ahead.linearization.path, known_start=fit.known_start, passes=1)
+        _, drawn, _ = ahead.draws(simulations)
+        starts = run.known_start.expand(simulations, -1, -1) if fit.known_start else drawn[:, 0]
+        again, truth = simulate_again(program, run, starts, real.noise.shape[-1])
+    near = smooth(program, again, truth, known_start=fit.known_start, passes=PASSES).linearization.path
+    copies = track(program, again, near, known_start=fit.known_start, passes=1)
+    again, copies, sets = _without_broken(again, copies, len(run))
+    rows = list(horizons.values())
+    predictions = predict(program, run, real, rows)
+    simulated = predict(program, again, copies, rows, bands=[1])
+    floor = {horizon: _rmse_of_sets(ahead_of_it, sets) for horizon, ahead_of_it in simulated.items()}
+    ours = replace(_residuals(program, run, real, predictions[1], 1), raw=_array(predictions[1].error))
+    theirs = _residuals(program, again, copies, simulated[1], sets)
+    ours, theirs = _in_own_spreads(ours, theirs)
+    scores = scored(directions(program, run, real), directions(program, again, copies), sets)
+    misfit = judge(
+        ours,
+        theirs,
+        _array(run.elapsed[:-1]),
+        _controls(program, run),
+        _pairs(program, ours),
+        scores.dispersion.mean(-1),
+    )
+    notes = [] if sets == simulations else [f"{simulations - sets} of {simulations} simulated sets blew up"]
+    if not scores.parameter_names:
+        notes.append("the program's own parameters were not looked at one by one: it has none, or a network's")
+    return Check(
+        program=program,
+        data=run,
+        horizons=horizons,
+        predictions=predictions,
+        floor=floor,
+        reference=constant_velocity(program, run, real, rows, known_start=fit.known_start),
+        held=last_measurement(program, run, real.smoothed, rows),
+        misfit=misfit,
+        blame=blame(scores, _scatter(ours, theirs), misfit.p_value),
+        residuals=list(ours.names),
+        notes=notes,
+    )
+
+
+def _require(program: Program, data: Trajectories, known_start: bool, simulations: int) -> None:
+    if simulations < FEWEST:
+        raise UsageError(f"got {simulations} simulations: bands need at least {FEWEST}, and 100 are better")
+    if data.time.shape[0] < 2 or not bool(data.observed[1:].any()):
+        raise DataError("nothing to compare: no trajectory has a measurement after its first row")
+    if known_start:
+        _ = data.known_start
+    why = why_not_linear(program, data, known_start=known_start)
+    if why is not None:
+        raise UsageError(f"check needs a program that can be linearised: {why.split(': looking')[0]}")
+
+
+def _horizons(data: Trajectories) -> dict[str, int]:
+    """Name → rows, those that fit into the longest drive."""
+    step = float(data.steps[data.transitions].median())
+    rows = {f"{seconds:g} s": round(seconds / step) for seconds in SECONDS}
+    return {"one step": 1} | {name: count for name, count in rows.items() if 1 < count < data.time.shape[0]}
+
+
+def _without_broken(data: Trajectories, tracked: Tracked, drives: int) -> tuple[Trajectories, Tracked, int]:
+    """Leave out the simulated sets of which a drive blew up."""
+    whole = torch.isfinite(tracked.log_likelihood).view(-1, drives).all(1)
+    if int(whole.sum()) < FEWEST:
+        raise FilterError(
+            f"{int((~whole).sum())} of {len(whole)} simulated sets blew up: the fitted program does not even explain "
+            "drives of its own"
+        )
+    if bool(whole.all()):
+        return data, tracked, len(whole)
+    kept = whole.repeat_interleave(drives).nonzero().flatten()
+    again = data.subset(kept)
+    return again, track_of(tracked, kept), int(whole.sum())
+
+
+def track_of(tracked: Tracked, kept: Tensor) -> Tracked:
+    """Some of the drives."""
+    linear = tracked.linearization
+    path = replace(linear.path, states=linear.path.states[:, kept], noise=linear.path.noise[:, kept])
+    by_row = ("offset", "state", "noise", "residual", "measurement", "precision", "log_scale")
+    by_drive = ("start_offset", "start_turn", "start_noise")
+    parts: dict[str, Any] = {name: getattr(linear, name)[:, kept] for name in by_row}
+    parts |= {name: getattr(linear, name)[kept] for name in by_drive}
+    own = ("states", "covariances", "smoothed", "noise", "arrival", "reading")
+    return replace(
+        tracked,
+        linearization=replace(linear, path=path, **parts),
+        log_likelihood=tracked.log_likelihood[kept],
+        **{name: getattr(tracked, name)[:, kept] for name in own},
+    )
+
+
+def _residuals(program: Program, data: Trajectories, tracked: Tracked, ahead: Prediction, sets: int) -> Residuals:
+    """The standardised one-step errors of the measurements and the scores of the channels, with what they are sorted
+    by: state components, velocities in the channels' own frame and positions."""
+    values = torch.cat([ahead.standardised, tracked.noise], -1)
+    there = torch.cat([ahead.observed, data.transitions.unsqueeze(-1).expand_as(tracked.noise)], -1)
+    states = tracked.path(data).states[:-1]
+    variables = {name: states[..., i] for i, name in enumerate(names(program.states))}
+    for angle in program.angles:
+        variables[angle] = torch.remainder(variables[angle] + torch.pi, 2 * torch.pi) - torch.pi
+    for name, velocity in program.velocities(states).items():
+        if not any(torch.equal(velocity, value) for value in variables.values()):
+            variables[f"{name} velocity"] = velocity
+    channels = names(program.channels)
+    if len(channels) != tracked.noise.shape[-1]:
+        channels = tuple(f"channel {i + 1}" for i in range(tracked.noise.shape[-1]))
+    return Residuals(
+        names=[*names(program.measurements), *channels],
+        values=_by_set(torch.where(there, values, 0.0), sets),
+        there=_by_set(there, sets),
+        variables={name: _by_set(value, sets) for name, value in variables.items()},
+    )
+
+
+def _in_own_spreads(real: Residuals, simulated: Residuals) -> tuple[Residuals, Residuals]:
+    """Divide every residual by the root mean square, at its interval and drive, of all sets: a score is small where few
+    measurements follow, however wrong the program is. The real set is one of them, or its tails would be heavier than
+    those of the sets that its scale was taken from."""
+    squares = (real.values**2).sum(0) + (simulated.values**2).sum(0)
+    count = real.there.sum(0) + simulated.there.sum(0)
+    scale = np.sqrt(squares / np.maximum(count, 1))
+    typical = np.sqrt((scale**2).mean((0, 1)))
+    told = (scale > 0.05 * typical) & (count > 1)
+    scale = np.where(told, scale, 1.0)
+    found = []
+    for part in (real, simulated):
+        there = part.there & told
+        found.append(replace(part, values=np.where(there, part.values / scale, 0.0).clip(-MOST, MOST), there=there))
+    return found[0], found[1]
+
+
+def _pairs(program: Program, residuals: Residuals) -> list[tuple[str, str]]:
+    """Pairs of variables that make a map: error groups of two, velocities in the channels' frame, phase planes."""
+    groups = [tuple(group) for group in program.error_groups.values() if len(group) == 2]
+    moving = [name for name in residuals.variables if name.endswith(" velocity")]
+    phases = [tuple(pair) for pair in program.motion.values()]
+    if len(names(program.states)) <= 3 and not groups + phases:
+        phases = list(itertools.combinations(names(program.states), 2))
+    chosen: Sequence[Any] = groups + list(itertools.combinations(moving, 2)) + phases
+    return [pair for pair in dict.fromkeys(chosen) if all(name in residuals.variables for name in pair)]
+
+
+def _scatter(real: Residuals, simulated: Residuals) -> dict[str, np.ndarray]:
+    """Mean squares of every residual, and the fourth power of the measurements' as a sign of tails; of every set."""
+    values = np.concatenate([real.values, simulated.values])
+    count = np.maximum(np.concatenate([real.there, simulated.there]).sum((1, 2)), 1)
+    squares = (values**2).sum((1, 2)) / count
+    told = [i for i in range(len(real.names)) if real.there[..., i].any()]
+    found = {f"{SCATTER}{real.names[i]}": squares[:, i] for i in told}
+    fourth = (values**4).sum((1, 2)) / count
+    tails = np.log(fourth / np.maximum(squares, 1e-12) ** 2 + 1e-12)
+    return found | {f"tails of {real.names[i]}": tails[:, i] for i in told}
+
+
+def _rmse_of_sets(prediction: Prediction, sets: int) -> np.ndarray:
+    """Root mean square of each component's error in each set, `(M, K)`."""
+    error, there = (values.unflatten(1, (sets, -1)) for values in (prediction.error, prediction.observed))
+    return _array((torch.where(there, error, 0.0).square().sum((0, 2)) / there.sum((0, 2)).clamp(min=1)).sqrt())
+
+
+def _controls(program: Program, data: Trajectories) -> dict[str, np.ndarray]:
+    return {name: _array(data.controls[:-1, :, i].double()) for i, name in enumerate(names(program.controls))}
+
+
+def _by_set(values: Tensor, sets: int) -> np.ndarray:
+    """`(T, M · B, ...)` to `(M, T, B, ...)`."""
+    return _array(values.unflatten(1, (sets, -1)).transpose(0, 1))
+
+
+def _array(values: Tensor) -> np.ndarray:
+    return values.numpy(force=True)

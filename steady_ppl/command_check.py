@@ -1,0 +1,36 @@
+"""`steady check`: compare a run with measurements."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def check(
+    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    table: Annotated[Path, typer.Argument(help="Drives to compare with, best others than those of the fit.")],
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Draw the picture into this file, for example .png.")] = None,
+    simulations: Annotated[int, typer.Option(help="Simulated sets for the bands.", min=20)] = 100,
+    program: Annotated[str | None, typer.Option(help="The program, if its file moved or changed.")] = None,
+    seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+) -> None:
+    """Compare a run with measurements: where, when and in which regime it fails, and who is at fault."""
+    from steady_ppl.checking import check as compare
+    from steady_ppl.command_line import _write_json
+    from steady_ppl.fit import Fit
+    from steady_ppl.picture_files import require_picture, write_picture
+    from steady_ppl.table import read_table
+
+    require_picture(picture)
+    found = compare(Fit.load(run, program), read_table(table), simulations=simulations, seed=seed)
+    figures = found.figures
+    if json_file is not None:
+        _write_json(json_file, {"run": str(run), **figures})
+    if picture is not None:
+        from steady_ppl.check_pictures import check_picture
+
+        write_picture(check_picture(found), picture)
+    print(found)

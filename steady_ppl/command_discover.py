@@ -1,0 +1,70 @@
+"""`steady discover`: which effect is missing."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from steady_ppl.errors import RunError, UsageError
+
+
+def discover(
+    source: Annotated[str, typer.Argument(metavar="RUN|MODEL", help="A run folder, or a program to fit first.")],
+    table: Annotated[Path, typer.Argument(help="Drives to test and fit.")],
+    valid: Annotated[
+        Path | None, typer.Option(help="Drives to choose by; every second drive of TABLE when not given.")
+    ] = None,
+    known_start: Annotated[
+        bool, typer.Option(help="Give the first row's x. columns as the exact start; a RUN knows its own setting.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="Run folder for the improved fit.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Draw what was found into this file, for example .png.")] = None,
+    simulations: Annotated[int, typer.Option(help="Simulated sets for the calibration.", min=50)] = 200,
+    program: Annotated[str | None, typer.Option(help="The run's program, if its file moved or changed.")] = None,
+    seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite an existing run.")] = False,
+) -> None:
+    """Learn which physical effect a program lacks: none, one by name, several, or a curve that has no name."""
+    from steady_ppl.command_line import _program, _say, _write_json
+    from steady_ppl.discovery import discover as search
+    from steady_ppl.fit import Fit
+    from steady_ppl.picture_files import require_picture, write_picture
+    from steady_ppl.table import read_table
+
+    is_run = Path(source).is_dir()
+    if program and not is_run:
+        raise UsageError("--program names the program of a RUN: leave it out")
+    if out is not None and out.exists() and not force:
+        raise RunError(f"{out} exists: choose another folder, or --force to overwrite")
+    require_picture(picture)
+    given: Any = Fit.load(source, program) if is_run else _program(source, seed)
+    found = search(
+        given,
+        read_table(table),
+        read_table(valid) if valid else None,
+        known_start=known_start or None,
+        simulations=simulations,
+        seed=seed,
+        report=_progress,
+    )
+    if json_file is not None:
+        _write_json(json_file, {"source": source, **found.figures})
+    if picture is not None:
+        from steady_ppl.discovery.pictures import discovery_picture
+
+        write_picture(discovery_picture(found), picture)
+    print(found)
+    if out is not None:
+        found.after.save(out, force=force)
+        for note in found.after.notes:
+            _say(note)
+        print(f"{out}: {found.after.program}")
+
+
+def _progress(text: str) -> None:
+    if sys.stderr.isatty():
+        print(f"\r\x1b[K{text} …", end="", file=sys.stderr, flush=True)

@@ -1,0 +1,74 @@
+"""`steady prove`: the table of before and after on drives that were not used."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from steady_ppl.errors import UsageError
+
+
+def prove(
+    arguments: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN... TABLE", help="Run folders, the one before first, then drives not used for any."),
+    ],
+    truth: Annotated[str | None, typer.Option(help="The program that made the drives, if it is known.")] = None,
+    oracle: Annotated[Path | None, typer.Option(help="A run of the true structure, fitted like the others.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Draw the errors into this file, for example .png.")] = None,
+    program: Annotated[
+        list[str] | None,
+        typer.Option(help="The program, if its file moved or changed; once for each RUN and the oracle, in order."),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+) -> None:
+    """Prove that runs are better than the first one: log p(y), open-loop errors and noise, with paired intervals."""
+    from steady_ppl.command_line import _program, _write_json
+    from steady_ppl.fit import Fit
+    from steady_ppl.picture_files import require_picture, write_picture
+    from steady_ppl.proving import prove as judge
+    from steady_ppl.table import read_table
+
+    *runs, table = arguments
+    if not runs:
+        raise UsageError("prove needs at least one RUN and then a TABLE")
+    require_picture(picture)
+    labels = _labels(runs) | ({"oracle": oracle} if oracle else {})
+    if program and len(program) != len(labels):
+        raise UsageError(f"--program is given {len(program)} times for {len(labels)} runs: name one for each, in order")
+    sources: Sequence[str | None] = program or [None] * len(labels)
+    rows: dict[str, Any] = {
+        label: Fit.load(run, source) for (label, run), source in zip(labels.items(), sources, strict=True)
+    }
+    if truth is not None:
+        rows["truth"] = _program(truth, seed)
+    found = judge(rows, read_table(table), truth="truth" if truth is not None else None, seed=seed)
+    if json_file is not None:
+        _write_json(json_file, {"runs": {label: str(run) for label, run in labels.items()}, **found.figures})
+    if picture is not None:
+        from matplotlib.figure import Figure
+
+        from steady_ppl.proof_pictures import open_loop_picture
+
+        figure = Figure(figsize=(6, 4), layout="constrained")
+        open_loop_picture(found, axes=figure.subplots())
+        write_picture(figure, picture)
+    print(found)
+
+
+def _labels(runs: Sequence[Path]) -> dict[str, Path]:
+    """Names of the rows: the folders', or the whole paths where these are alike or belong to another row."""
+    names = [run.name for run in runs]
+    taken = {"oracle", "truth"}
+    if len(set(names)) == len(names) and not taken & set(names):
+        return dict(zip(names, runs, strict=True))
+    labels = {str(run): run for run in runs}
+    if len(labels) < len(runs) or taken & labels.keys():
+        raise UsageError(
+            f"the runs {', '.join(map(str, runs))} cannot be told apart by name, or are called as another row"
+        )
+    return labels

@@ -1,0 +1,88 @@
+"""Scores of drives that the fitted program makes itself: their spread is the information, their mean the bias."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.discovery.columns import PART, Column, Scoring
+from steady_ppl.gaussian_smoother import smooth
+from steady_ppl.linearization import Path
+from steady_ppl.lookahead import Lookahead
+from steady_ppl.predictions import simulate_again
+from steady_ppl.program import Program
+from steady_ppl.scores import Element, parameter_scores, smoothed
+from steady_ppl.seeding import seeded
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """Scores of simulated sets of drives.
+
+    Attributes:
+        scores: `(S, B, N)`, of the parameters first and then of the columns.
+        log_likelihood: `(S, B)`.
+    """
+
+    scores: Tensor
+    log_likelihood: Tensor
+
+    @cached_property
+    def information(self) -> Tensor:
+        """Covariance of a set's summed scores, `(N, N)`, from the spread of each drive's among the sets."""
+        apart = self.scores - self.scores.mean(0)
+        return torch.einsum("sbi,sbj->ij", apart, apart) / (len(apart) - 1)
+
+
+def scores_along(
+    program: Program, data: Trajectories, ahead: Lookahead, parts: Sequence[Element], columns: Sequence[Column]
+) -> Tensor:
+    """Scores of parameters and columns, `(B, N)`."""
+    at = smoothed(ahead, data)
+    scoring = Scoring(program, data, at)
+    return torch.cat([parameter_scores(program, data, at, list(parts)), *(scoring(column) for column in columns)], -1)
+
+
+@torch.no_grad()
+def simulate_scores(
+    program: Program,
+    data: Trajectories,
+    starts: Tensor,
+    parts: Sequence[Element],
+    columns: Sequence[Column],
+    *,
+    sets: int,
+    known_start: bool,
+    seed: int,
+    passes: int = 2,
+) -> Simulated:
+    """Simulate drives with the same controls and gaps from the same starts, and score them at the same parameters.
+
+    Args:
+        program: fitted.
+        data: as returned by `for_program`.
+        starts: where each drive begins, `(B, D)`.
+        parts, columns: what is scored.
+        sets: how many times all drives are simulated.
+        known_start: the first state is certain.
+        seed: the same seed gives the same scores.
+        passes: linearisations; they begin at the true path.
+    """
+    channels = len(program.channels)
+    with seeded(seed, "bootstrap"):
+        drives, path = simulate_again(program, data, starts.expand(sets, *starts.shape), channels)
+    scores, likely = [], []
+    for first in range(0, len(drives), PART):
+        index = torch.arange(first, min(first + PART, len(drives)))
+        part = drives.subset(index)
+        ahead = smooth(
+            program, part, Path(path.states[:, index], path.noise[:, index]), known_start=known_start, passes=passes
+        )
+        scores.append(scores_along(program, part, ahead, parts, columns))
+        likely.append(ahead.log_likelihood)
+    return Simulated(torch.cat(scores).unflatten(0, (sets, len(data))), torch.cat(likely).view(sets, len(data)))

@@ -1,0 +1,228 @@
+"""Candidates that are worth fitting, and where their fits begin."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from steady_ppl.discovery.bootstrap import scores_along, simulate_scores
+from steady_ppl.discovery.columns import Column, columns_of
+from steady_ppl.discovery.curves import curves
+from steady_ppl.discovery.declared_noise import departures
+from steady_ppl.discovery.refits import Refit, refit_with
+from steady_ppl.discovery.screening import LEVEL, Screened, Tested, screen
+from steady_ppl.effects import Variant, attached, catalogue
+from steady_ppl.gaussian_smoother import smooth
+from steady_ppl.program import Program
+from steady_ppl.scores import Element, elements, smoothed, typical_spreads
+
+LEADERS, ALIKE = 6, 0.85  # how many are refitted, and those as well whose columns correlate so much with the first
+PROMISING = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
+NEAR = 6.0  # nats behind the best place on the first fold, with which another is not worth fitting on the second
+LINEAR = ("push", "command", "history", "measured", "viewpoint")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a search was told.
+
+    Attributes:
+        known_start: the first states are certain.
+        seed: of the simulated sets.
+        withheld: names of effects that are left out of the catalogue.
+    """
+
+    known_start: bool
+    seed: int = 0
+    withheld: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Screening:
+    """Tests of a program, and what the refits need of them.
+
+    Attributes:
+        tests: of all candidates.
+        parameters: the program's learnable numbers, in the order of `information`.
+        information: of parameters and one candidate, by the candidate; the parameters' alone by "".
+    """
+
+    tests: Screened
+    parameters: list[Element]
+    information: Mapping[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A candidate that was fitted.
+
+    Attributes:
+        tested: its score test.
+        refit: the program with it, or why there is none.
+        gain: held-out log p(y) above that of the program without, nats, `(B,)`.
+    """
+
+    tested: Tested
+    refit: Refit | str
+    gain: Tensor
+
+    @property
+    def variant(self) -> Variant:
+        """The effect."""
+        return self.tested.variant
+
+    @property
+    def total(self) -> float:
+        """Held-out gain of all drives, nats; extrapolated where one fold was enough to see that it leads nowhere."""
+        folds = 2 if isinstance(self.refit, Refit) and len(self.refit.programs) == 1 else 1
+        return folds * float(self.gain.sum())
+
+    @property
+    def against_its_sign(self) -> bool:
+        """Whether physics gives the coefficient the other sign: then it is a symptom, not an effect."""
+        sign = self.variant.effect.sign
+        if not sign or not isinstance(self.refit, Refit):
+            return False
+        return sign * float(self.refit.coefficient(self.variant)) < 0
+
+
+@torch.no_grad()
+def screen_program(now: Refit, declared: Program, settings: Settings, *, sets: int, seed: int) -> Screening:
+    """Test every candidate that a fitted program does not have.
+
+    Args:
+        now: the fitted program; the drives of its first fold are tested.
+        declared: as it was before it was fitted.
+        settings: of the search.
+        sets: simulated sets.
+        seed: of them.
+    """
+    program, fold = now.program, now.folds[0]
+    parts = elements(program)
+    there = {variant.name for variant in attached(program)}
+    seen = replace(fold.drives, states=fold.path.states)
+    ahead = smooth(program, fold.drives, fold.path, known_start=settings.known_start, passes=3, tolerance=0.01)
+    away = departures(declared, program, fold.drives, fold.path.states, parts)
+    away = [departure for departure in away if departure.variant.name not in there]
+    skip = there | {departure.variant.name for departure in away}
+    variants = [
+        variant
+        for effect in catalogue(program)
+        if effect.name not in settings.withheld
+        for variant in effect.variants(program, seen)
+        if variant.name not in skip
+    ]
+    if "process_noise" in settings.withheld:
+        away = []
+    spread, sharpness = typical_spreads(program, fold.drives, smoothed(ahead, fold.drives))
+    columns = columns_of([*variants, *curves(program, seen, spread, sharpness)])
+    observed = scores_along(program, fold.drives, ahead, parts, columns)
+    simulated = simulate_scores(
+        program,
+        fold.drives,
+        fold.path.states[0],
+        parts,
+        columns,
+        sets=sets,
+        known_start=settings.known_start,
+        seed=seed,
+    )
+    information, first = {"": simulated.information[: len(parts), : len(parts)]}, len(parts)
+    for column in columns:
+        index = [*range(len(parts)), *range(first, first + column.size)]
+        information[_key(column)] = simulated.information[index][:, index]
+        first += column.size
+    return Screening(screen(observed, simulated, len(parts), columns, away), parts, information)
+
+
+def leaders(screened: Screened, first: bool) -> list[Tested]:
+    """Those to fit: the best tests and the aliases of the first; in later rounds those that are nearly significant
+    themselves, the best in any case."""
+    alive = [(i, t) for i, t in enumerate(screened.tested) if not (t.untestable or t.departure or t.is_curve)]
+    if not alive:
+        return []
+    top = alive[0][0]
+    few = [one for k, one in enumerate(alive[:LEADERS]) if first or k == 0 or one[1].p_value < LEVEL / 5]
+    return [tested for i, tested in alive if (i, tested) in few or float(screened.alike[top, i]) > ALIKE]
+
+
+def fitted(now: Refit, tested: Tested, screening: Screening, settings: Settings, worth: float = -math.inf) -> Candidate:
+    """The program with a candidate.
+
+    Args:
+        now: the program without.
+        tested: the candidate.
+        screening: that tested it.
+        settings: of the search.
+        worth: what the first fold's drives must gain for the others to be fitted as well, nats.
+    """
+    effect = tested.variant.effect
+    known = screening.information[_key(tested.column)] if effect.null == 0 and effect.form in LINEAR else None
+    start = _start(tested)
+
+    def fit(share: float) -> Candidate:
+        value = [share * one for one in start] if isinstance(start, list) else share * start
+        refit = refit_with(now, tested.variant, value, known_start=settings.known_start, information=known, worth=worth)
+        return judged(now, tested, refit)
+
+    candidate = fit(1.0)
+    lost = isinstance(candidate.refit, str) or _gain_of_first_fold(now, candidate.refit) < 0
+    return fit(0.1) if lost and known is not None and tested.statistic > PROMISING else candidate
+
+
+def at_its_best_place(now: Refit, candidate: Candidate, settings: Settings) -> Candidate:
+    """A candidate with the knee, width or place at which it gains most."""
+    if isinstance(candidate.refit, str) or not candidate.variant.profiled:
+        return candidate
+    fold, best = now.folds[0], candidate
+    seen = replace(fold.drives, states=fold.path.states)
+    start = candidate.refit.coefficient(candidate.variant)
+    least = float(now.maxima[0].log_likelihood.sum())
+    for variant in candidate.variant.effect.variants(now.program, seen):
+        if variant.name == candidate.variant.name and variant.label != candidate.variant.label:
+            assert isinstance(best.refit, Refit)
+            worth = float(best.refit.maxima[0].log_likelihood.sum()) - least - NEAR
+            refit = refit_with(now, variant, start, known_start=settings.known_start, worth=worth)
+            other = judged(
+                now, replace(candidate.tested, column=replace(candidate.tested.column, variant=variant)), refit
+            )
+            if (
+                isinstance(refit, Refit)
+                and len(refit.programs) == len(best.refit.programs)
+                and other.total > best.total
+            ):
+                best = other
+    return best
+
+
+def judged(now: Refit, tested: Tested, refit: Refit | str) -> Candidate:
+    """A fit and what it gains over the program without."""
+    if isinstance(refit, str):
+        return Candidate(tested, refit, torch.full_like(now.held_out, -math.inf))
+    return Candidate(tested, refit, refit.held_out - now.held_out[: len(refit.held_out)])
+
+
+def _gain_of_first_fold(now: Refit, refit: Refit) -> float:
+    return float((refit.maxima[0].log_likelihood - now.maxima[0].log_likelihood).sum())
+
+
+def _start(tested: Tested) -> Any:
+    """Where the coefficient begins: a scoring step from its absence, or near the probe that told most."""
+    effect, probe = tested.variant.effect, tested.column.probe
+    step = float(tested.coefficient[0])
+    if probe is not None:
+        return probe * min(max(step / probe, 0.3), 1.5) if math.isfinite(effect.null) else probe
+    if effect.components:
+        return (effect.null + tested.coefficient).tolist()
+    if effect.form == "tails":
+        return min(max(step, 0.02), 0.45)
+    return max(effect.null + step, 0.2) if effect.null == 1 else effect.null + step
+
+
+def _key(column: Column) -> str:
+    return f"{column.variant.label} {column.probe}"

@@ -1,0 +1,241 @@
+"""The score of every effect of the catalogue at a program that has none of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from steady_ppl.altering import by_channel
+from steady_ppl.data import Trajectories
+from steady_ppl.discovery.curves import by_height, over_reading, over_state, variables
+from steady_ppl.effects import Variant
+from steady_ppl.program import Program, acting_controls, names
+from steady_ppl.scores import Smoothed, channel_moments, measured
+
+PART = 400  # trajectories at a time
+
+
+@dataclass(frozen=True)
+class Column:
+    """A candidate's scores.
+
+    Attributes:
+        variant: the effect.
+        probe: the finite coefficient that was tried, None for the derivative where the effect is absent.
+    """
+
+    variant: Variant
+    probe: float | None = None
+
+    @property
+    def size(self) -> int:
+        """How many numbers its coefficient has."""
+        return self.variant.effect.size
+
+
+def columns_of(variants: Sequence[Variant]) -> list[Column]:
+    """One column a variant, or one for each of its probes."""
+    return [Column(v, probe) for v in variants for probe in (v.effect.probes or (None,))]
+
+
+class Scoring:
+    """Scores of columns along a smoothed program.
+
+    Args:
+        program: without the candidates.
+        data: as returned by `for_program`.
+        at: of the program on these drives.
+    """
+
+    def __init__(self, program: Program, data: Trajectories, at: Smoothed) -> None:
+        self.program, self.data, self.at = program, data, at
+        self.controls = acting_controls(program, data)
+        self.means, spread = channel_moments(program, data, at.channels.points, self.controls)
+        self.spread = spread[0]
+        self.here = measured(program, at.measurements.points)
+        self._points: dict[int, Tensor] = {}
+        self._values: dict[int, dict[str, Tensor]] = {}
+
+    def __call__(self, column: Column) -> Tensor:
+        """Scores of a column, `(B, size)`, in double precision."""
+        form = column.variant.effect.form
+        if column.variant.effect.function is over_state:
+            return self._curve_of_channel(column.variant)
+        if column.variant.effect.function is over_reading:
+            return self._curve_of_readings(column.variant)
+        parts = [_FORMS[form](self, column.variant, c, width) for c, width in self._differences(column)]
+        return torch.stack(parts, -1).double()
+
+    def _differences(self, column: Column) -> Iterator[tuple[tuple[Tensor, Tensor], float]]:
+        """For each number of the coefficient two coefficients and how far they are apart."""
+        variant, like = column.variant, self.spread
+        absent = variant.absent(like)
+        if column.probe is not None:
+            reach = 1.0 if not torch.isfinite(absent) else abs(column.probe - float(absent))
+            yield (torch.as_tensor(column.probe).to(like), absent), reach
+            return
+        size = variant.effect.size
+        typical = torch.as_tensor(variant.effect.typical).to(like).flatten()
+        steps = 0.05 * torch.where(typical == 0, typical.abs().max(), typical.abs())
+        for index in range(size):
+            by = torch.zeros(size).to(like)
+            by[index] = steps[index]
+            by = by.reshape(absent.shape)
+            yield (absent + by, absent - by), 2 * float(steps[index])
+
+    def _push(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
+        values = [value for value in c if bool(torch.isfinite(value).all())]
+        odd = len(values) == 2 and self._is_odd(variant, values)
+        if odd:
+            values, width = values[:1], width / 2
+        total = self.at.states.new_zeros(len(self.data))
+        for index, channel in enumerate(names(self.program.channels)):
+            if channel not in self._channels(variant, values[0]):
+                continue
+            pushes = [self._pushed(variant, value, index)[channel] for value in values]
+            change = pushes[0] if len(pushes) == 1 else pushes[0] - pushes[1]
+            slope = (change / (width * self.spread[..., index])).expand(3, *self.spread.shape[:2])
+            total = total + self.at.channels.of_component(index, slope).sum(0)
+        return total
+
+    def _curve_of_readings(self, variant: Variant) -> Tensor:
+        """Scores of the heights at the knots of a curve that is added to some readings, `(B, K)`."""
+        at, knots, circular = self.at.measurements, variant.options["knots"], variant.options["circular"]
+        count = self.reading.shape[-1]
+        found = []
+        for index, name in enumerate(names(self.program.measurements)):
+            if name in variant.options["chosen"]:
+                values = self.reading[[0, 1 + index, 1 + count + index], ..., index]
+                found.append(by_height(values, at.weights(index) * self.at.sharpness[..., index], knots, circular))
+        return torch.stack(found).sum(0)
+
+    def _curve_of_channel(self, variant: Variant) -> Tensor:
+        """Scores of the heights at the knots of a curve that is added to a channel, `(B, K)`."""
+        index = names(self.program.channels).index(variant.options["channel"])
+        variable, knots = variant.options["variable"], variant.options["knots"]
+        weights = self.at.channels.weights(index) / self.spread[..., index]
+        return by_height(self._variables(index)[variable], weights, knots, variable in self.program.angles)
+
+    def _variables(self, index: int) -> dict[str, Tensor]:
+        """What curves may depend on, at the points of one channel, each `(3, T, B)`."""
+        if index not in self._values:
+            given = (self._around(index), self.controls[:-1], self.data.elapsed[:-1])
+            found = variables(self.program, *given, self._means_around(index))
+            self._values[index] = {name: value.expand(3, *self.spread.shape[:2]) for name, value in found.items()}
+        return self._values[index]
+
+    def _means_around(self, index: int) -> dict[str, Tensor]:
+        count = self.means.shape[-1]
+        at = [0, 1 + index, 1 + count + index]
+        return {name: self.means[at, ..., k] for k, name in enumerate(names(self.program.channels))}
+
+    def _pushed(self, variant: Variant, value: Tensor, index: int, few: bool = False) -> dict[str, Tensor]:
+        """At the points of one channel; of `few`, of the first drive only."""
+        points, given = self._around(index), (self.controls[:-1], self.data.elapsed[:-1], self.data.steps)
+        means = self._means_around(index) if variant.needs_mean else {}
+        if few:
+            points, given = points[:1, :, :1], (given[0][:, :1], given[1][:, :1], given[2][:, :1])
+            means = {name: mean[:1, :, :1] for name, mean in means.items()}
+        return variant.push(self.program, points, *given, value, means)
+
+    def _channels(self, variant: Variant, value: Tensor) -> set[str]:
+        return set(self._pushed(variant, value, 0, few=True))
+
+    def _is_odd(self, variant: Variant, values: list[Tensor]) -> bool:
+        """Whether the push only changes its sign with the coefficient, as far as one drive shows."""
+        first, second = (self._pushed(variant, value, 0, few=True) for value in values)
+        return all(bool((first[name] == -second[name]).all()) for name in first)
+
+    def _around(self, index: int) -> Tensor:
+        if index not in self._points:
+            self._points[index] = self.at.channels.around(index)
+        return self._points[index]
+
+    def _command(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
+        control, time = self.controls[:-1], self.data.elapsed[:-1]
+        points = self.at.channels.points
+        changed = [variant(self.program, points, control, time, c=value) for value in c]
+        return self._of_control(changed[0] - changed[1], width)
+
+    def _history(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
+        changed = [variant(self.program, self.controls, self.data.elapsed, c=value)[:-1] for value in c]
+        return ((changed[0] - changed[1]) * self.of_control).sum((0, -1)) / width
+
+    def _of_control(self, change: Tensor, width: float) -> Tensor:
+        slope = (self.by_control * change.movedim(-1, 0).unsqueeze(-1)).sum(0)
+        return self.at.channels.of_mean(slope / (width * self.spread))
+
+    @cached_property
+    def of_control(self) -> Tensor:
+        """Scores of the acting controls, row by row, `(T, B, U)`."""
+        return torch.stack([self.at.channels.by_row(slope / self.spread) for slope in self.by_control], -1)
+
+    @cached_property
+    def by_control(self) -> Tensor:
+        """Derivatives of the channels' means in the acting controls, `(U, P, T, B, C)`."""
+        found = []
+        for index in range(self.controls.shape[-1]):
+            step = 0.02 * float(self.controls[..., index].abs().max()) or 0.02
+            up, down = self.controls.clone(), self.controls.clone()
+            up[..., index] += step
+            down[..., index] -= step
+            means = [channel_moments(self.program, self.data, self.at.channels.points, u)[0] for u in (up, down)]
+            found.append((means[0] - means[1]) / (2 * step))
+        return torch.stack(found)
+
+    @cached_property
+    def reading(self) -> Tensor:
+        """What is measured on average at the measurements' points, `(P, T + 1, B, K)`."""
+        return self.here.reading
+
+    def _measured(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
+        points, reading = self.at.measurements.points, self.reading
+        changed = [variant(self.program, points, reading, c=value) for value in c]
+        return self.at.measurements.of_mean((changed[0] - changed[1]) * self.at.sharpness / width)
+
+    def _viewpoint(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
+        points = self.at.measurements.points
+        seen = [measured(self.program, variant(self.program, points, c=value)) for value in c]
+        return self.at.measurements.of_mean(seen[1].shift(seen[0]) * self.at.sharpness / width)
+
+    def _spread(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
+        given = (self.at.states[:-1], self.controls[:-1], self.data.elapsed[:-1], self.data.steps)
+        factors = [by_channel(self.program, variant(self.program, *given, c=value), 1.0, self.spread) for value in c]
+        return self.at.channels.of_spread((factors[0] / factors[1]).log() / width)
+
+    def _blur(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
+        factors = [variant(self.program, self.at.states, c=value) for value in c]
+        return self.at.measurements.of_spread((factors[0] / factors[1]).log() / width)
+
+    def _tails(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
+        """Of 1/ν at zero: (z⁴ − 2 z² − 1) / 4, its posterior mean."""
+        at = self.at.measurements
+        squares = at.mean.square()
+        fourth = squares.square() + 6 * squares * at.variance + 3 * at.variance.square()
+        score = (fourth - 2 * (squares + at.variance) - 1) / 4
+        return torch.where(at.present, score, 0.0).sum((0, -1))
+
+    def _colour(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
+        """Of the share of the last deviation that stays, at zero: E[ε(t) ε(t − 1)], in the spreads' ratio."""
+        at = self.at.channels
+        product = at.mean[1:] * at.mean[:-1] + self.at.lag[1:]
+        ratio = self.spread[:-1] / self.spread[1:]
+        chosen = self.spread.new_tensor([float(n in variant.options["channels"]) for n in names(self.program.channels)])
+        return torch.where(at.present[1:], product * ratio * chosen, 0.0).sum((0, -1))
+
+
+_FORMS: dict[str, Callable[[Scoring, Variant, tuple[Tensor, Tensor], float], Tensor]] = {
+    "push": Scoring._push,
+    "command": Scoring._command,
+    "history": Scoring._history,
+    "measured": Scoring._measured,
+    "viewpoint": Scoring._viewpoint,
+    "spread": Scoring._spread,
+    "blur": Scoring._blur,
+    "tails": Scoring._tails,
+    "colour": Scoring._colour,
+}

@@ -1,0 +1,179 @@
+"""What no catalogue has: a curve of some variable that a channel or a measurement lacks.
+
+Piecewise linear between knots, with a Gaussian-process prior (a normal over the heights at the knots, whose correlation
+falls with their distance), so that it bends only where the drives ask for it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from steady_ppl.altering import channel_means
+from steady_ppl.data import Trajectories
+from steady_ppl.effects import Effect, Variant
+from steady_ppl.predictions import on_a_circle
+from steady_ppl.program import Program, acting_controls, names, units
+
+KNOTS = 7
+REACH = 0.4  # of the variable's range over which heights are alike
+TALL = 1.5  # prior standard deviation of the heights, in the noise's
+NAME = "curve"
+
+
+@torch.no_grad()
+def curves(program: Program, data: Trajectories, spread: Tensor, sharpness: Tensor) -> list[Variant]:
+    """All curves that are looked at: every channel over every variable, every measurement over its own reading.
+
+    Args:
+        program: without them.
+        data: with the states along which they are looked at.
+        spread: standard deviations of the channels, `(C,)`.
+        sharpness: of the measurements, `(K,)`.
+    """
+    assert data.states is not None
+    given = (data.states[:-1], acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
+    mean = channel_means(program, program.transition, *given)
+    found = []
+    for variable, values in variables(program, *given[:3], mean).items():
+        seen = values.expand(data.transitions.shape)[data.transitions]
+        knots = knots_of(seen, variable in program.angles)
+        if knots is None:
+            continue
+        for index, channel in enumerate(names(program.channels)):
+            unit = units(program.channels)[index]
+            effect = _effect("push", variable, knots, float(spread[index]), unit, variable in program.angles)
+            found.append(effect.variant(at=f"{channel}~{variable}", channel=channel, variable=variable, knots=knots))
+    return found + _of_readings(program, data, sharpness)
+
+
+def variables(
+    program: Program, state: Tensor, control: Tensor, time: Tensor, mean: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """Everything that a curve may depend on, by name, each `(...)`: state components, velocities in the channels' own
+    frame and their products, controls, what the program makes of them, and time."""
+    found = {name: state[..., i] for i, name in enumerate(names(program.states)) if name not in program.resting}
+    moving = {f"{channel} velocity": value for channel, value in program.velocities(state).items()}
+    named = {f"{channel} velocity": velocity for channel, (_, velocity) in program.motion.items()}
+    found |= {name: value for name, value in moving.items() if name not in named and name != "yaw velocity"}
+    for one, other in itertools.combinations(moving, 2):
+        found[f"{one} × {other}"] = moving[one] * moving[other]
+    found |= {name: control[..., i] for i, name in enumerate(names(program.controls))}
+    found |= {f"commanded {channel}": value for channel, value in mean.items()}
+    return found | {"time": time}
+
+
+def unit_of(program: Program, variable: str) -> str:
+    """Of a variable, as far as the program declares it."""
+    for declared in (program.states, program.controls, program.measurements):
+        if variable in names(declared):
+            return units(declared)[names(declared).index(variable)]
+    if variable == "time":
+        return "s"
+    of_channel = dict(zip(names(program.channels), units(program.channels), strict=True))
+    parts = [part.strip() for part in variable.split("×")]
+    found = [of_channel.get(part.removeprefix("commanded ").removesuffix(" velocity"), "") for part in parts]
+    if variable.startswith("commanded "):
+        return found[0]
+    return " · ".join(unit.replace("/s²", "/s") for unit in found)
+
+
+def knots_of(values: Tensor, circular: bool) -> tuple[float, ...] | None:
+    """Where a curve bends, from the smallest to the largest value but for the outermost hundredths; a whole turn for an
+    angle; None where the variable does not vary."""
+    if circular:
+        return tuple(-math.pi + 2 * math.pi * k / KNOTS for k in range(KNOTS))
+    every = values[:: max(1, len(values) // 100_000)]
+    low, high = (float(q) for q in torch.quantile(every, torch.tensor([0.01, 0.99]).to(every)))
+    if not math.isfinite(high - low) or high - low < 1e-6 * max(1.0, abs(high)):
+        return None
+    return tuple(low + (high - low) * k / (KNOTS - 1) for k in range(KNOTS))
+
+
+def between(values: Tensor, knots: Sequence[float], circular: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """The knots before and behind some values, and how far values are from the one to the other, each `(...)`; beyond
+    the outermost knots a curve is constant."""
+    count = len(knots)
+    place = (values - knots[0]) / (knots[1] - knots[0])
+    place = torch.remainder(place, count) if circular else place.clamp(0, count - 1)
+    before = place.detach().nan_to_num().floor().clamp(0, count - 1 if circular else count - 2).long()
+    return before, (before + 1) % count, place - before
+
+
+def height(values: Tensor, knots: Sequence[float], circular: bool, c: Tensor) -> Tensor:
+    """The curve of heights `c` `(K,)` at some values, `(...)`."""
+    before, behind, share = between(values, knots, circular)
+    return (1 - share) * c[before] + share * c[behind]
+
+
+def by_height(values: Tensor, weights: Tensor, knots: Sequence[float], circular: bool) -> Tensor:
+    """The derivative in the heights of the sum of a curve's values times `weights`, `(..., B)`; `(B, K)`."""
+    before, behind, share = between(values, knots, circular)
+    drives, count = values.shape[-1], len(knots)
+    drive = count * torch.arange(drives)
+    found = weights.new_zeros(drives * count, dtype=torch.float64)
+    for knot, part in ((before, 1 - share), (behind, share)):
+        found += torch.bincount((drive + knot).flatten(), (weights * part).flatten().double(), drives * count)
+    return found.view(drives, count)
+
+
+def over_state(self, state, control, time, step, c, mean, channel, variable, knots):
+    """A curve that adds to a channel."""
+    value = variables(self, state, control, time, mean)[variable]
+    return {channel: height(value, knots, variable in self.angles, c)}
+
+
+def over_reading(self, state, measured, c, chosen, circular, knots):
+    """A curve that adds to measurements, of what they read."""
+    change = height(measured, knots, circular, c)
+    return measured + change * torch.tensor([float(name in chosen) for name in names(self.measurements)]).to(measured)
+
+
+def _effect(form: str, variable: str, knots: Sequence[float], spread: float, unit: str, circular: bool) -> Effect:
+    covariance = TALL**2 * spread**2 * _correlation(knots, circular)
+    return Effect(
+        name=NAME,
+        form=form,
+        equation=rf"f(\text{{{variable}}})",
+        text=f"a curve over {variable}, straight between knots",
+        unit=unit,
+        feels="something that is in no catalogue",
+        function=over_state if form == "push" else over_reading,
+        typical=tuple(spread for _ in knots),
+        limit=TALL * spread,
+        components=tuple(f"{knot:.3g}" for knot in knots),
+        prior=dist.MultivariateNormal(torch.zeros(len(knots)), covariance_matrix=covariance.float()),
+    )
+
+
+def _correlation(knots: Sequence[float], circular: bool) -> Tensor:
+    at = torch.tensor(knots, dtype=torch.float64)
+    apart = (at.unsqueeze(1) - at).abs()
+    reach = REACH * (knots[-1] - knots[0])
+    if circular:
+        apart, reach = 2 * (apart / 2).sin().abs(), 1.0
+    return torch.exp(-0.5 * (apart / reach) ** 2) + 1e-3 * torch.eye(len(knots)).double()
+
+
+def _of_readings(program: Program, data: Trajectories, sharpness: Tensor) -> list[Variant]:
+    """Curves over what is read, of each measurement alone and, if all are angles, of all together."""
+    assert data.states is not None
+    found, order = [], names(program.measurements)
+    turning = on_a_circle(program, data, data.states)
+    groups = [(name,) for name in order] + ([order] if len(order) > 1 and bool(turning.all()) else [])
+    for group in groups:
+        index = order.index(group[0])
+        circular = bool(turning[index])
+        knots = knots_of(data.measurements[..., index][data.observed[..., index]], circular)
+        if knots is None:
+            continue
+        at = group[0] if len(group) == 1 else "all"
+        unit = units(program.measurements)[index]
+        effect = _effect("measured", f"reading of {at}", knots, float(sharpness[index]), unit, circular)
+        found.append(effect.variant(at=f"{at}~reading", chosen=group, circular=circular, knots=knots))
+    return found

@@ -1,0 +1,183 @@
+"""Learn which physical effect a program lacks, from measurements alone."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from steady_ppl.data import Trajectories
+from steady_ppl.discovery.discovery_report import as_text, figures
+from steady_ppl.discovery.finding import Finding, Shape, findings, shape_of
+from steady_ppl.discovery.next_run import NextRun, next_run
+from steady_ppl.discovery.refits import Refit
+from steady_ppl.discovery.requirements import require
+from steady_ppl.discovery.search import Search, search
+from steady_ppl.fit import Fit
+from steady_ppl.program import Program, for_program
+from steady_ppl.proving import Proof, prove
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """What `discover` found.
+
+    Attributes:
+        search: everything that was tested and fitted.
+        findings: the effects that are missing, the one that brings most first; empty where none or a curve is.
+        shape: the curve where no effect of the catalogue explains the drives.
+        next_run: controls that would separate the first finding's class; None where it has one member.
+        proof: the program before and after on the validation drives, by the fits to the training drives.
+        before, after: the programs, fitted to all drives; equal where nothing was found.
+        notes: what was left out or is not as it seems.
+    """
+
+    search: Search
+    findings: list[Finding]
+    shape: Shape | None
+    next_run: NextRun | None
+    proof: Proof
+    before: Fit
+    after: Fit
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def verdict(self) -> str:
+        """none, dynamics, actuator, sensor, noise or other."""
+        if self.shape is not None:
+            return "other"
+        return self.findings[0].kind if self.findings else "none"
+
+    @property
+    def p_value(self) -> float:
+        """Family-wise: how often drives of the fitted program would look as wrong somewhere."""
+        return self.search.rounds[0].screening.tests.p_value
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """Everything as a plain dict, ready for JSON."""
+        return figures(self)
+
+    def __str__(self) -> str:
+        return as_text(self)
+
+
+def discover(
+    program: Program | Fit,
+    train: Trajectories,
+    valid: Trajectories | None = None,
+    *,
+    known_start: bool | None = None,
+    declared: Program | None = None,
+    simulations: int = 200,
+    withheld: Sequence[str] = (),
+    seed: int = 0,
+    report: Callable[[str], None] = lambda text: None,
+) -> Discovery:
+    """Find the physical effects that a program lacks.
+
+    Every effect of the catalogue is tested at once and the test calibrated by simulated drives; the leaders are fitted
+    and chosen by log p(y) of drives that they were not fitted to; so on until the tests are quiet.
+
+    Args:
+        program: a program or a fit of one, with normal noise and at most some dozens of learnable numbers; it is not
+            changed, and fitted first.
+        train: drives to test and fit.
+        valid: drives to choose by; every second drive of `train` when None.
+        known_start: take the first row's x. columns as the exact start; a fit's own setting when None.
+        declared: the program with the noise scales that its owner believes; the program's class afresh when a fit is
+            given, else `program`.
+        simulations: sets of drives for the calibration, at least 50.
+        withheld: names of effects to leave out of the catalogue.
+        seed: of the simulated sets.
+        report: told what is done.
+
+    Raises:
+        UsageError: a network, a program that cannot be linearised, or too few simulations.
+        DataError: too few drives, no known start, or controls that identify nothing.
+        FilterError: the program cannot be fitted.
+
+    Example:
+        >>> import steady_ppl as st  # doctest: +SKIP
+        >>> print(st.discover(st.load_program("mine.py"), st.read_table("drives.csv")))  # doctest: +SKIP
+    """
+    if isinstance(program, Fit):
+        known_start = program.known_start if known_start is None else known_start
+        declared = declared or _as_written(program.program)
+        program = program.program
+    known_start = bool(known_start)
+    declared = copy.deepcopy(declared or program)
+    notes: list[str] = []
+    if valid is None:
+        valid = train.subset(range(1, len(train), 2))
+        train = train.subset(range(0, len(train), 2))
+        notes.append(f"no validation drives were given: {len(valid)} of the {len(train) + len(valid)} drives were kept")
+    drives = [for_program(program, table).without_truth(keep_start=known_start) for table in (train, valid)]
+    require(program, drives[0], drives[1], known_start, simulations)
+    found = search(
+        program,
+        drives[0],
+        drives[1],
+        known_start=known_start,
+        declared=declared,
+        sets=simulations,
+        seed=seed,
+        withheld=withheld,
+        report=report,
+    )
+    report("comparing before and after")
+    shape = shape_of(found, program)
+    effects = [] if shape else findings(found)
+    final = found.base if shape or found.rounds[0].quiet else found.final
+    settings = {"simulations": simulations, "seed": seed}
+    fits = [Fit(_mean(refit), "discover", settings, seed, known_start) for refit in (found.base, final)]
+    return Discovery(
+        search=found,
+        findings=effects,
+        shape=shape,
+        next_run=next_run(found, known_start, seed) if effects and len(effects[0].alike) > 1 else None,
+        proof=_proof(found, shape is not None, drives[1], known_start, seed),
+        before=fits[0],
+        after=fits[1],
+        notes=notes + _notes(found),
+    )
+
+
+def _as_written(program: Program) -> Program:
+    with torch.random.fork_rng():
+        return type(program)()
+
+
+def _mean(refit: Refit) -> Program:
+    """The folds' parameters averaged where they are learned: nearly what a fit to all drives together gives."""
+    mean = copy.deepcopy(refit.programs[0])
+    weights = [len(fold.drives) for fold in refit.folds]
+    for name, parameter in mean.named_parameters():
+        if parameter.requires_grad:
+            parts = [w * dict(p.named_parameters())[name].data for w, p in zip(weights, refit.programs, strict=True)]
+            parameter.data.copy_(torch.stack(parts).sum(0) / sum(weights))
+    return mean
+
+
+def _proof(found: Search, is_curve: bool, valid: Trajectories, known_start: bool, seed: int) -> Proof:
+    after: Any = found.curve.refit if is_curve and found.curve else found.final
+    rows = {"before": found.base.program, "after": after.program}
+    return prove(rows, valid, known_start=known_start, with_constant_velocity=False, seed=seed)
+
+
+def _notes(found: Search) -> list[str]:
+    notes = []
+    if not found.base.converged:
+        notes.append("the program's own fit has not converged: the ranking is not to be trusted")
+    statistic, count = found.rounds[0].screening.tests.fitted
+    if count and statistic > 5 * count + 10:
+        notes.append(f"the fitted parameters' own score is large ({statistic:.0f} on {count}): the fit is at a bound")
+    if not found.rounds[-1].quiet and found.found:
+        notes.append("something is left that no effect of the catalogue brings: the tests were not quiet at the end")
+    for candidate in found.rounds[0].candidates:
+        if candidate.against_its_sign and candidate.total > 0:
+            notes.append(f"{candidate.variant.label} would help with a sign that physics rules out: a symptom")
+    return notes

@@ -1,0 +1,229 @@
+"""What `discover` found as a plain dict and as text."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from steady_ppl.discovery.candidates import Candidate
+from steady_ppl.discovery.finding import Finding, gain_interval
+from steady_ppl.discovery.screening import LEVEL, Tested
+
+if TYPE_CHECKING:
+    from steady_ppl.discovery.discovery import Discovery
+
+WIDTH, SHOWN = 100, 12
+IN_WORDS = {
+    "none": "No effect is missing as far as these drives can tell",
+    "dynamics": "The dynamics lack",
+    "actuator": "The actuators lack",
+    "sensor": "The sensor has",
+    "noise": "The noise is not as declared:",
+    "other": "Something is missing that is in no catalogue",
+}
+
+
+def figures(found: Discovery) -> dict[str, Any]:
+    """Everything as a plain dict; every figure is finite, None where there is none."""
+    first = found.findings[0] if found.findings else None
+    rows = {row["row"]: row for row in found.proof.figures["rows"]}
+    return {
+        "verdict": found.verdict,
+        "sentence": sentence(found),
+        "p_value": found.p_value,
+        "level": LEVEL,
+        "effect": first.variant.name if first else None,
+        "class": first.alike if first else [],
+        "confidence": first.confidence if first else None,
+        "effects": [_finding(finding) for finding in found.findings],
+        "candidates": [_candidate(found, tested) for tested in ranked(found)],
+        "shape": vars(found.shape) if found.shape else None,
+        "next_run": vars(found.next_run) if found.next_run else None,
+        "before": _side(rows["before"]),
+        "after": _side(rows["after"]),
+        "rounds": [
+            {
+                "p_value": one.screening.tests.p_value,
+                "added": one.chosen.variant.name if one.chosen else None,
+            }
+            for one in found.search.rounds
+        ],
+        "known_start": found.before.known_start,
+        "notes": found.notes,
+    }
+
+
+def ranked(found: Discovery) -> list[Tested]:
+    """The first round's tests: those that were fitted by what they gained, the others by their tests."""
+    tests = found.search.rounds[0].screening.tests.tested
+    total = {c.variant.name: c.total for c in found.search.rounds[0].candidates}
+    order = sorted(range(len(tests)), key=lambda i: (-total.get(tests[i].variant.name, -math.inf), i))
+    return [tests[i] for i in order]
+
+
+def _candidate(found: Discovery, tested: Tested) -> dict[str, Any]:
+    fitted = next((c for c in found.search.rounds[0].candidates if c.variant.name == tested.variant.name), None)
+    interval = gain_interval(fitted, found.before.seed) if fitted else None
+    variant = tested.variant
+    return {
+        "effect": "curve" if tested.is_curve else variant.name,
+        "kind": "other" if tested.is_curve else variant.effect.verdict,
+        "statistic": tested.statistic,
+        "p_value": tested.p_value,
+        "coefficient": _numbers(tested.coefficient),
+        "sd": _numbers(tested.sd),
+        "unit": variant.effect.unit,
+        "options": {name: _plain(value) for name, value in variant.profiled.items()},
+        "detection_limit": _numbers(limit_of(found, tested)),
+        "heldout_gain": _finite(fitted.total) if fitted else None,
+        "heldout_gain_ci": list(interval) if interval else None,
+        "note": _note(tested, fitted),
+    }
+
+
+def limit_of(found: Discovery, tested: Tested) -> np.ndarray:
+    """What could have been seen: by the last tests, of the program with what was found, where they have the effect."""
+    name = tested.variant.name
+    last = found.search.rounds[-1].screening.tests.tested
+    return next(
+        (t.detection_limit for t in last if t.variant.name == name and not t.untestable), tested.detection_limit
+    )
+
+
+def _note(tested: Tested, fitted: Candidate | None) -> str | None:
+    if tested.untestable:
+        return tested.untestable
+    if tested.departure:
+        return "the fitted noise against the declared"
+    if fitted and isinstance(fitted.refit, str):
+        return fitted.refit
+    if fitted and fitted.against_its_sign:
+        return "its sign is one that physics rules out: a symptom"
+    return None
+
+
+def _finding(finding: Finding) -> dict[str, Any]:
+    return {
+        "effect": finding.variant.name,
+        "kind": finding.kind,
+        "class": finding.alike,
+        "confidence": finding.confidence,
+        "coefficient": finding.coefficient,
+        "sd": finding.sd,
+        "interval_90": [list(pair) for pair in finding.interval],
+        "unit": finding.variant.effect.unit,
+        "options": {name: _plain(value) for name, value in finding.variant.profiled.items()},
+        "equation": finding.variant.effect.equation,
+        "text": finding.variant.effect.text,
+        "heldout_gain": finding.gain,
+    }
+
+
+def _side(row: dict[str, Any]) -> dict[str, Any]:
+    return {key: row[key] for key in ("log_likelihood", "measurement", "coverage_90", "scales")}
+
+
+def sentence(found: Discovery) -> str:
+    """The verdict in one sentence."""
+    verdict, start = found.verdict, IN_WORDS[found.verdict]
+    if verdict == "none":
+        return f"{start} (p = {found.p_value:.2g}); the limits below say what could not have been seen."
+    if found.shape is not None:
+        shape = found.shape
+        return f"{start} (p = {found.p_value:.2g}): {shape.channel} lacks a curve of {shape.variable}."
+    parts = []
+    for finding in found.findings:
+        said = f"{finding.variant.label} = {with_interval(finding)}"
+        if len(finding.alike) > 1:
+            said += f", which these drives cannot tell from {' or '.join(finding.alike[1:])}"
+        parts.append(said)
+    sure = found.findings[0].confidence
+    return f"{start} {'; and '.join(parts)} (p = {found.p_value:.2g}, confidence {sure:.0%})."
+
+
+def with_interval(finding: Finding) -> str:
+    """A coefficient with its 90 % interval and unit."""
+    unit = "" if finding.variant.effect.unit in ("", "1") else f" {finding.variant.effect.unit}"
+    said = [
+        f"{value:.3g} [{low:.3g}, {high:.3g}]"
+        for value, (low, high) in zip(finding.coefficient, finding.interval, strict=True)
+    ]
+    return ", ".join(said) + unit
+
+
+def as_text(found: Discovery) -> str:
+    """The verdict, the equation, the candidates, and before and after."""
+    lines = textwrap.wrap(sentence(found), WIDTH)
+    for finding in found.findings:
+        lines += ["", f"{finding.variant.name}: {finding.variant.effect.text}", f"  {finding.variant.effect.feels}"]
+    if found.shape:
+        lines += [
+            "",
+            f"{found.shape.variable} [{found.shape.variable_unit}]  {found.shape.channel} [{found.shape.unit}]",
+        ]
+        rows = zip(found.shape.points, found.shape.curve, found.shape.band, strict=True)
+        lines += [f"{point:10.3g}  {height:10.3g} ± {band:.2g}" for point, height, band in rows]
+    lines += ["", *_table(found)]
+    if found.next_run:
+        lines += ["", *textwrap.wrap(_next(found), WIDTH)]
+    if found.verdict != "none":
+        lines += ["", "On the validation drives:", str(found.proof)]
+    return "\n".join(lines + [f"note: {note}" for note in found.notes])
+
+
+def _next(found: Discovery) -> str:
+    run = found.next_run
+    assert run is not None
+    return (
+        f"To tell {' from '.join(found.findings[0].alike[:2])}, drive {run.way}: {run.separation:.1f} nats a drive, "
+        f"against {run.usual:.1f} of drives such as these."
+    )
+
+
+def _table(found: Discovery) -> list[str]:
+    header = ["candidate", "kind", "test", "p", "held-out gain", "one step", "± sd", "limit", "unit"]
+    rows = [header, *(_line(found, tested) for tested in ranked(found)[:SHOWN])]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
+    more = len(found.search.rounds[0].screening.tests.tested) - SHOWN
+    return [_aligned(row, widths) for row in rows] + ([f"and {more} more"] if more > 0 else [])
+
+
+def _line(found: Discovery, tested: Tested) -> list[str]:
+    one = _candidate(found, tested)
+    name = f"curve {tested.variant.at}" if tested.is_curve else tested.variant.label
+    gain = "" if one["heldout_gain"] is None else f"{one['heldout_gain']:+.1f}"
+    statistic, p_value = ("–", "–") if tested.untestable else (f"{one['statistic']:.1f}", f"{one['p_value']:.1g}")
+    if tested.is_curve:
+        return [name, one["kind"], statistic, p_value, gain, "", "", "", ""]
+    numbers = [_short(one[key]) for key in ("coefficient", "sd", "detection_limit")]
+    return [name, one["kind"], statistic, p_value, gain, *numbers, one["unit"]]
+
+
+def _aligned(row: list[str], widths: list[int]) -> str:
+    left = (0, 1, len(row) - 1)
+    cells = (c.ljust(w) if i in left else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
+    return "  ".join(cells).rstrip()
+
+
+def _short(value: Any) -> str:
+    if value is None:
+        return "–"
+    return ", ".join(f"{v:.3g}" for v in value) if isinstance(value, list) else f"{value:.3g}"
+
+
+def _numbers(values: np.ndarray) -> float | list[float] | None:
+    if not np.isfinite(values).all():
+        return None
+    found = [float(value) for value in values]
+    return found[0] if len(found) == 1 else found
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value

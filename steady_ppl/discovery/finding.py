@@ -1,0 +1,170 @@
+"""What a search amounts to: an effect with its class, confidence and interval, or a curve."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import stats
+
+from steady_ppl.discovery.candidates import Candidate
+from steady_ppl.discovery.curves import unit_of
+from steady_ppl.discovery.refits import Refit
+from steady_ppl.discovery.screening import Tested
+from steady_ppl.discovery.search import MARGIN, Found, Search
+from steady_ppl.effects import Variant
+from steady_ppl.program import Program, names
+
+INTERVAL = 0.9
+RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect that a program lacks.
+
+    Attributes:
+        variant: the effect, the best of its class.
+        kind: dynamics, actuator, sensor or noise.
+        alike: names of the effects that these drives cannot tell apart, best first.
+        confidence: the probability that the right one is among them.
+        coefficient, sd: each number of the coefficient and its standard deviation.
+        interval: 90 %, one a number.
+        gain: nats of held-out log p(y) that it brings.
+    """
+
+    variant: Variant
+    kind: str
+    alike: list[str]
+    confidence: float
+    coefficient: list[float]
+    sd: list[float]
+    interval: list[tuple[float, float]]
+    gain: float
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A curve where no effect of the catalogue explains the drives.
+
+    Attributes:
+        channel: channel, or measurement, that lacks it.
+        variable: that it depends on.
+        unit, variable_unit: of the curve and of the variable.
+        points, curve: where and how high.
+        band: half the width of a band that holds the whole curve with 90 % probability.
+    """
+
+    channel: str
+    variable: str
+    unit: str
+    variable_unit: str
+    points: list[float]
+    curve: list[float]
+    band: list[float]
+
+
+def findings(search: Search) -> list[Finding]:
+    """The effects that were found, the one that brings most first."""
+    found = [_finding(search, one) for one in search.found]
+    found += [_departure(search, tested) for tested in search.departed]
+    return sorted(found, key=lambda finding: -finding.gain)
+
+
+def _finding(search: Search, found: Found) -> Finding:
+    refit = search.final
+    variant, effect = found.candidate.variant, found.candidate.variant.effect
+    values = refit.coefficient(variant).flatten().double().numpy()
+    spread = _spread(search, variant, len(values))
+    by = stats.norm.isf((1 - INTERVAL) / 2)
+    if effect.null != 0:  # positive, learned as its logarithm
+        interval = [(v * math.exp(-by * s), v * math.exp(by * s)) for v, s in zip(values, spread, strict=True)]
+        spread = values * spread
+    else:
+        interval = [(v - by * s, v + by * s) for v, s in zip(values, spread, strict=True)]
+    alike = found.alike
+    return Finding(
+        variant=variant,
+        kind=effect.verdict,
+        alike=[candidate.variant.name for candidate in alike],
+        confidence=_confidence(search, found, alike),
+        coefficient=[float(v) for v in values],
+        sd=[float(s) for s in spread],
+        interval=[(float(low), float(high)) for low, high in interval],
+        gain=found.candidate.total,
+    )
+
+
+def _spread(search: Search, variant: Variant, count: int) -> np.ndarray:
+    """Standard deviations in the space in which the coefficient is learned, of a fit to all drives."""
+    screening = search.rounds[-1].screening
+    covariance = torch.linalg.pinv(screening.information[""], hermitian=True)
+    folds = search.final.folds
+    share = len(folds[0].drives) / sum(len(fold.drives) for fold in folds)
+    learned = [part.name.split("[")[0] for part in screening.parameters]
+    index = [i for i, name in enumerate(learned) if name in (variant.parameter, f"{variant.parameter}_effect")]
+    assert len(index) == count
+    return (share * covariance.diagonal()[index]).clamp(min=0).sqrt().numpy()
+
+
+def _confidence(search: Search, found: Found, alike: Sequence[Candidate]) -> float:
+    """Posterior probability of the class, all candidates, none and the best curve alike before."""
+    totals = {id(c): c.total for c in found.candidates if isinstance(c.refit, Refit)}
+    best = max(totals.values())
+    whole = sum(math.exp(total - best) for total in totals.values()) + math.exp(min(0.0, -best))
+    curve = max((c.total for c in search.curves if isinstance(c.refit, Refit)), default=-math.inf)
+    whole += math.exp(min(50.0, curve - search.gain - MARGIN))
+    return sum(math.exp(totals[id(c)] - best) for c in alike) / whole
+
+
+def _departure(search: Search, tested: Tested) -> Finding:
+    factor, sd = 1 + float(tested.coefficient[0]), float(tested.sd[0])
+    by = stats.norm.isf((1 - INTERVAL) / 2) * sd / factor
+    return Finding(
+        variant=tested.variant,
+        kind="noise",
+        alike=[tested.variant.name],
+        confidence=1 - tested.p_value,
+        coefficient=[factor],
+        sd=[sd],
+        interval=[(factor * math.exp(-by), factor * math.exp(by))],
+        gain=0.0,
+    )
+
+
+def shape_of(search: Search, program: Program) -> Shape | None:
+    """The curve, if that is what was found."""
+    curve = search.curve
+    if curve is None or not isinstance(curve.refit, Refit):
+        return None
+    variant = curve.variant
+    heights = curve.refit.coefficient(variant)
+    folds = curve.refit.folds
+    share = len(folds[0].drives) / sum(len(fold.drives) for fold in folds)
+    wide = float(stats.norm.isf((1 - INTERVAL) / 2 / len(heights))) * math.sqrt(share)
+    channel, _, variable = variant.at.partition("~")
+    variable = variant.options.get("variable", "reading")
+    about = names(program.measurements)[0] if channel == "all" else channel
+    return Shape(
+        channel=channel,
+        variable=variable,
+        unit=variant.effect.unit,
+        variable_unit=unit_of(program, about if variable == "reading" else variable),
+        points=[float(knot) for knot in variant.options["knots"]],
+        curve=[float(value) for value in heights],
+        band=[wide * float(sd) for sd in curve.tested.sd],
+    )
+
+
+def gain_interval(candidate: Candidate, seed: int) -> tuple[float, float] | None:
+    """95 % bootstrap interval, over drives, of a candidate's held-out gain; None where it was fitted on one fold."""
+    if isinstance(candidate.refit, str) or len(candidate.refit.programs) == 1:
+        return None
+    gain = candidate.gain.double().numpy()
+    random = np.random.default_rng(seed)
+    totals = random.choice(gain, (RESAMPLES, len(gain))).sum(1)
+    low, high = np.quantile(totals, [0.025, 0.975])
+    return float(low), float(high)

@@ -1,0 +1,217 @@
+"""Programs with candidates, fitted to one half of the drives and judged on the other, both ways round."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.effects import Variant, attached, coefficient, with_effect
+from steady_ppl.errors import SteadyError
+from steady_ppl.gaussian_smoother import find_path, means_as_path, require_found, smooth
+from steady_ppl.linearization import Path
+from steady_ppl.lookahead import Lookahead
+from steady_ppl.maximum_likelihood import Maximum, maximise
+from steady_ppl.program import Program
+from steady_ppl.scores import Element, channel_moments, elements, moved, smoothed
+from steady_ppl.seeding import seeded
+
+ROUGH = 1.5  # mean square deviation, in the program's own, from which its noise is widened before anything is fitted
+NOTHING = 2.0  # nats below the program without, after which a fit is given up: a candidate at zero is that program
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Drives to fit and drives to judge, with the paths along which they were last linearised."""
+
+    drives: Trajectories
+    path: Path
+    held_out: Trajectories
+    held_out_path: Path
+
+
+@dataclass(frozen=True)
+class Refit:
+    """A program fitted on each fold.
+
+    Attributes:
+        programs: one a fold.
+        maxima: one a fold.
+        folds: with the paths of these programs.
+        held_out: log p(y) of each drive under the program fitted without it, `(B,)`, the folds one after another; those
+            of the first only where the rest was not worth fitting.
+    """
+
+    programs: list[Program]
+    maxima: list[Maximum]
+    folds: list[Fold]
+    held_out: Tensor
+
+    @property
+    def program(self) -> Program:
+        """The one fitted on the first fold."""
+        return self.programs[0]
+
+    def coefficients(self, variant: Variant) -> list[Tensor]:
+        """An effect's coefficient on each fold."""
+        return [coefficient(program, _there(program, variant)).detach().clone() for program in self.programs]
+
+    def coefficient(self, variant: Variant) -> Tensor:
+        """Its mean over the folds, weighted by their drives: nearly that of a fit to all drives together."""
+        weights = [len(fold.drives) for fold, _ in zip(self.folds, self.programs, strict=False)]
+        parts = [w * value for w, value in zip(weights, self.coefficients(variant), strict=True)]
+        return torch.stack(parts).sum(0) / sum(weights)
+
+    @property
+    def converged(self) -> bool:
+        """Whether both fits did."""
+        return all(maximum.converged for maximum in self.maxima)
+
+
+def first_refit(program: Program, train: Trajectories, valid: Trajectories, *, known_start: bool, seed: int) -> Refit:
+    """Fit the program as it stands, both ways round.
+
+    Raises:
+        FilterError: the drives cannot be smoothed.
+    """
+    own = copy.deepcopy(program)
+    with seeded(seed, "paths"):
+        first = roomy_path(own, train, known_start)
+        maximum = maximise(own, train, first, known_start=known_start)
+        second = find_path(own, valid, known_start=known_start)
+    folds = [Fold(train, maximum.path, valid, second), Fold(valid, second, train, maximum.path)]
+    other = copy.deepcopy(own)
+    return _refit([own, other], folds, known_start, [maximum, None], None)
+
+
+def roomy_path(program: Program, data: Trajectories, known_start: bool) -> Path:
+    """Find paths; where the drives are much rougher than the program says, widen its noise first, in place.
+
+    A program that lacks a strong effect explains nothing at its declared noise: scores there lead nowhere.
+    """
+    path = find_path(program, data, known_start=known_start)
+    ahead = smooth(program, data, path, known_start=known_start, kernels=False)
+    parts = [part for part in elements(program) if _widens(program, part, data)]
+    while parts and _roughness(ahead, data) > ROUGH:
+        before = [part.parameter.data.clone() for part in parts]
+        for part in parts:
+            part.move(math.log(3.0))
+        wider = find_path(program, data, known_start=known_start)
+        there = smooth(program, data, wider, known_start=known_start, kernels=False)
+        if not float(there.log_likelihood.sum()) > float(ahead.log_likelihood.sum()):
+            for part, value in zip(parts, before, strict=True):
+                part.parameter.data.copy_(value)
+            break
+        path, ahead = wider, there
+    return path
+
+
+def _widens(program: Program, part: Element, data: Trajectories) -> bool:
+    """Whether a learnable number is the logarithm of the standard deviation of some channel."""
+    states = data.controls.new_ones((1, *data.steps.shape, len(program.states)))
+    here = channel_moments(program, data, states)[1]
+    with moved(part, 0.1):
+        there = channel_moments(program, data, states)[1]
+    change = (there / here).log()[:, data.transitions]
+    return bool(((change.abs() < 1e-6) | ((change - 0.1).abs() < 1e-3)).all()) and bool((change > 0.05).any())
+
+
+def _roughness(ahead: Lookahead, data: Trajectories) -> float:
+    """Posterior mean square of the channels' or the measurements' standardised deviations, whichever is larger; 1 where
+    the program is right."""
+    at = smoothed(ahead, data)
+    parts = (at.channels, at.measurements)
+    means = [(p.mean.square() + p.variance)[p.present].mean() for p in parts if bool(p.present.any())]
+    return max(float(mean.nan_to_num(torch.inf)) for mean in means)
+
+
+def refit_with(
+    base: Refit,
+    variant: Variant,
+    value: float | Sequence[float] | Tensor,
+    *,
+    known_start: bool,
+    information: Tensor | None = None,
+    worth: float = -math.inf,
+) -> Refit | str:
+    """The program with an effect, or why it cannot be fitted.
+
+    Args:
+        base: the program without.
+        variant: the effect.
+        value: where its coefficient begins.
+        known_start: the first state is certain.
+        information: of the first fold's drives, the coefficient last.
+        worth: what the first fold's drives must gain for the others to be fitted as well, nats.
+    """
+    try:
+        programs = [with_effect(program, variant, value) for program in base.programs]
+        least = [float(maximum.log_likelihood.sum()) - NOTHING for maximum in base.maxima]
+        return _refit(programs, base.folds, known_start, [None] * len(programs), information, least, worth)
+    except SteadyError as error:
+        return str(error)
+
+
+def _refit(
+    programs: list[Program],
+    folds: list[Fold],
+    known_start: bool,
+    maxima: Sequence[Maximum | None],
+    information: Tensor | None,
+    least: Sequence[float] = (-math.inf, -math.inf),
+    worth: float = -math.inf,
+) -> Refit:
+    found, held_out, moved = [], [], []
+    for program, fold, known, floor in zip(programs, folds, maxima, least, strict=True):
+        drives, unseen = wide_drives(fold.drives, program), wide_drives(fold.held_out, program)
+        share = len(fold.drives) / len(folds[0].drives)
+        guess = None if information is None else share * information
+        maximum = known or maximise(
+            program,
+            drives,
+            wide(fold.path, program),
+            known_start=known_start,
+            information=guess,
+            hopeless=floor,
+        )
+        judged = smooth(
+            program,
+            unseen,
+            wide(fold.held_out_path, program),
+            known_start=known_start,
+            passes=6,
+            tolerance=0.02,
+            kernels=False,
+        )
+        require_found(judged, unseen)
+        found.append(maximum)
+        held_out.append(judged.log_likelihood)
+        moved.append(Fold(drives, maximum.path, unseen, means_as_path(judged, unseen)))
+        if float(maximum.log_likelihood.sum()) - floor < worth:
+            break
+    return Refit(programs[: len(found)], found, moved, torch.cat(held_out))
+
+
+def _there(program: Program, variant: Variant) -> Variant:
+    """The effect as a program has it, where its coefficient may have another name."""
+    return next(known for known in attached(program) if known.name == variant.name)
+
+
+def wide(path: Path, program: Program) -> Path:
+    """A path for a program that has further, resting states."""
+    return Path(_with_resting(path.states, program), path.noise)
+
+
+def wide_drives(drives: Trajectories, program: Program) -> Trajectories:
+    """Drives for a program that has further, resting states."""
+    return drives if drives.states is None else replace(drives, states=_with_resting(drives.states, program))
+
+
+def _with_resting(states: Tensor, program: Program) -> Tensor:
+    more = max(0, len(program.states) - states.shape[-1])
+    return torch.cat([states, states.new_zeros((*states.shape[:-1], more))], -1)

@@ -1,0 +1,241 @@
+"""Which effect is missing: screen, refit the leaders, choose on held-out drives, go on until nothing is left.
+
+The steps are those of score-test model building (Klein and Morelli 2006 do them by stepwise regression); what decides
+is held-out log p(y), each drive judged by a program that was fitted without it.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from steady_ppl.data import Trajectories
+from steady_ppl.discovery.candidates import (
+    Candidate,
+    Screening,
+    Settings,
+    at_its_best_place,
+    fitted,
+    judged,
+    leaders,
+    screen_program,
+)
+from steady_ppl.discovery.refits import Refit, first_refit, refit_with
+from steady_ppl.discovery.screening import LEVEL, Tested
+from steady_ppl.effects import attached
+from steady_ppl.program import Program
+
+NATS = 2.0  # of held-out log p(y) within which two candidates cannot be told apart
+BEHIND = 25.0  # nats behind the best on the first fold, with which a candidate is not worth fitting on the second
+MARGIN = 3.0  # nats by which a curve must be better than named effects
+RIVALS = 12.0  # nats behind the best in its round, with which a candidate is looked at again beside other effects
+MOST, CURVES = 3, 3  # effects in a program, and curves that are fitted
+Report = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Round:
+    """What was tested, fitted and chosen.
+
+    Attributes:
+        screening: the tests of the program so far.
+        candidates: those that were fitted, best first.
+        chosen: what is added, None when the round ends the search.
+    """
+
+    screening: Screening
+    candidates: list[Candidate]
+    chosen: Candidate | None
+
+    @property
+    def quiet(self) -> bool:
+        """Whether the tests found nothing."""
+        return self.screening.tests.p_value > LEVEL
+
+
+@dataclass(frozen=True)
+class Found:
+    """An effect that was chosen.
+
+    Attributes:
+        candidate: the best.
+        candidates: all that were fitted in its place, best first.
+        without: the program without it.
+    """
+
+    candidate: Candidate
+    candidates: list[Candidate]
+    without: Refit
+
+    @property
+    def alike(self) -> list[Candidate]:
+        """Those that these drives cannot tell from the best, itself first."""
+        best = self.candidate.total
+        close = [c for c in self.candidates if c.total >= best - NATS]
+        return [c for c in close if c is self.candidate or not c.against_its_sign]
+
+
+@dataclass
+class Search:
+    """What a search came to.
+
+    Attributes:
+        base: the program as it stands, fitted.
+        rounds: in their order; the last tests the final program unless the search ended early.
+        found: the effects that were added.
+        final: the program with all of them, fitted.
+        curves: fits of curves in place of the first effect, best first, where effects alone did not explain the drives.
+    """
+
+    base: Refit
+    final: Refit
+    rounds: list[Round] = field(default_factory=list)
+    found: list[Found] = field(default_factory=list)
+    curves: list[Candidate] = field(default_factory=list)
+
+    @property
+    def departed(self) -> list[Tested]:
+        """What says, in the last tests, that the fitted noise is not the declared."""
+        tests = self.rounds[-1].screening.tests
+        return [tested for tested in tests.tested if tested.departure and tested.p_value <= tests.critical]
+
+    @property
+    def curve(self) -> Candidate | None:
+        """The curve that explains the drives better than all effects that were found."""
+        best = next((curve for curve in self.curves if isinstance(curve.refit, Refit)), None)
+        return best if best is not None and best.total > self.gain + MARGIN else None
+
+    @property
+    def needs_a_name(self) -> bool:
+        """Whether neither a curve nor the noise can be what the tests found."""
+        return self.curve is None and not self.departed
+
+    @property
+    def gain(self) -> float:
+        """Held-out log p(y) of the final program above the first, nats."""
+        return float((self.final.held_out - self.base.held_out[: len(self.final.held_out)]).sum())
+
+
+def search(
+    program: Program,
+    train: Trajectories,
+    valid: Trajectories,
+    *,
+    known_start: bool,
+    declared: Program | None = None,
+    sets: int = 200,
+    later_sets: int = 60,
+    seed: int = 0,
+    withheld: Sequence[str] = (),
+    report: Report = lambda text: None,
+) -> Search:
+    """Look for the effects that a program lacks.
+
+    Args:
+        program: the state-space model; it is not changed.
+        train, valid: as returned by `for_program`; tests are made on the first, both choose.
+        known_start: the first states are certain.
+        declared: the program before it was fitted; `program` when None.
+        sets: simulated sets of the first round.
+        later_sets: of each further one.
+        seed: of the simulated sets.
+        withheld: names of effects that are left out of the catalogue.
+        report: told what is done.
+    """
+    settings = Settings(known_start, seed, withheld)
+    declared = copy.deepcopy(declared or program)
+    report("fitting the program as it stands")
+    base = first_refit(program, train, valid, known_start=known_start, seed=seed)
+    found = Search(base, base)
+    for index in range(MOST + 1):
+        count = sets if index == 0 else later_sets
+        report(f"screening, with {count} simulated sets")
+        screening = screen_program(found.final, declared, settings, sets=count, seed=seed + index)
+        ended = Round(screening, [], None)
+        found.rounds.append(ended)
+        if ended.quiet:
+            break
+        if index == 1:
+            found.curves = _curves(found.base, found.rounds[0].screening, settings, report)
+        if index == MOST:
+            break
+        candidates = _refits(found.final, screening, settings, index == 0, report)
+        best = next((c for c in candidates if not c.against_its_sign and isinstance(c.refit, Refit)), None)
+        gains = best is not None and best.total > NATS
+        if index == 0 and not gains:
+            found.curves = _curves(found.base, screening, settings, report)
+        if best is None or not (gains or (index == 0 and found.needs_a_name)):
+            found.rounds[-1] = Round(screening, candidates, None)
+            break
+        found.rounds[-1] = Round(screening, candidates, best)
+        found.found.append(Found(best, candidates, found.final))
+        assert isinstance(best.refit, Refit)
+        found.final = best.refit
+    if len(found.found) > 1:
+        report("looking at every effect again beside the others")
+        before = [variant.label for variant in attached(found.final.program)]
+        _look_again(found, settings)
+        if [variant.label for variant in attached(found.final.program)] != before:
+            screening = screen_program(found.final, declared, settings, sets=later_sets, seed=seed + MOST + 1)
+            found.rounds.append(Round(screening, [], None))
+    return found
+
+
+def _refits(now: Refit, screening: Screening, settings: Settings, first: bool, report: Report) -> list[Candidate]:
+    candidates: list[Candidate] = []
+    for tested in leaders(screening.tests, first):
+        report(f"fitting with {tested.variant.label}")
+        likely = [float(c.refit.maxima[0].log_likelihood.sum()) for c in candidates if isinstance(c.refit, Refit)]
+        worth = max(likely, default=-math.inf) - float(now.maxima[0].log_likelihood.sum()) - BEHIND
+        candidates.append(fitted(now, tested, screening, settings, worth))
+    close = max((candidate.total for candidate in candidates), default=0.0) - RIVALS
+    found = [at_its_best_place(now, c, settings) if c.total > close else c for c in candidates]
+    return sorted(found, key=lambda candidate: -candidate.total)
+
+
+def _curves(base: Refit, screening: Screening, settings: Settings, report: Report) -> list[Candidate]:
+    found = []
+    for tested in screening.tests.curves[:CURVES]:
+        report(f"fitting with a curve of {tested.variant.at}")
+        found.append(fitted(base, tested, screening, settings))
+    return sorted(found, key=lambda candidate: -candidate.total)
+
+
+def _look_again(search: Search, settings: Settings) -> None:
+    """Drop effects that are not needed beside the others, and let the rivals of each have its place."""
+    for found in list(search.found):
+        others = [other for other in search.found if other is not found]
+        without = _with_all(search.base, others, settings)
+        if isinstance(without, str):
+            continue
+        rivals = [found.candidate] + [
+            c for c in found.candidates if c is not found.candidate and c.total > found.candidate.total - RIVALS
+        ]
+        there = {variant.name for variant in attached(without.program)}
+        again = []
+        for rival in rivals:
+            if rival.variant.name not in there and isinstance(rival.refit, Refit):
+                start = rival.refit.coefficient(rival.variant)
+                refit = refit_with(without, rival.variant, start, known_start=settings.known_start)
+                again.append(at_its_best_place(without, judged(without, rival.tested, refit), settings))
+        again.sort(key=lambda candidate: -candidate.total)
+        best = next((c for c in again if not c.against_its_sign), None)
+        place = search.found.index(found)
+        if best is None or best.total <= NATS or isinstance(best.refit, str):
+            search.found.pop(place)
+            search.final = without
+        else:
+            search.found[place] = Found(best, again, without)
+            search.final = best.refit
+
+
+def _with_all(base: Refit, effects: Sequence[Found], settings: Settings) -> Refit | str:
+    now: Refit | str = base
+    for found in effects:
+        if isinstance(now, str) or isinstance(found.candidate.refit, str):
+            return now
+        start = found.candidate.refit.coefficient(found.candidate.variant)
+        now = refit_with(now, found.candidate.variant, start, known_start=settings.known_start)
+    return now

@@ -1,0 +1,194 @@
+"""Maximum likelihood (with priors, the posterior's mode) of a linearised program by scoring steps.
+
+Steps solve the information matrix against the score. It begins as the cross products of the drives' scores (Berndt,
+Hall, Hall and Hausman 1974) unless it is known, and learns on the way (Broyden, Fletcher, Goldfarb and Shanno).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import FilterError
+from steady_ppl.gaussian_smoother import find_path, means_as_path, require_found, smooth
+from steady_ppl.linearization import Path
+from steady_ppl.lookahead import Lookahead
+from steady_ppl.program import Program
+from steady_ppl.scores import Element, elements, moved, parameter_scores, smoothed
+
+PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
+GIVES_WAY = 0.3  # nats by which an objective may fall: paths are at rest but for the tolerance
+
+
+@dataclass(frozen=True)
+class Maximum:
+    """A program at its maximum.
+
+    Attributes:
+        log_likelihood: `(B,)` log p(y) of the linearised program.
+        objective: their sum and the log prior.
+        path: the posterior means of the drives, along which it is linearised.
+        names: of the learnable numbers.
+        information: `(P, P)` in the unconstrained space.
+        steps: scoring steps taken.
+        decrement: what another step would still gain, nats.
+    """
+
+    log_likelihood: Tensor
+    objective: float
+    path: Path
+    names: tuple[str, ...]
+    information: Tensor
+    steps: int
+    decrement: float
+
+    @property
+    def converged(self) -> bool:
+        """Whether a step would gain less than a tenth of a nat."""
+        return self.decrement < 0.1
+
+
+@torch.no_grad()
+def maximise(
+    program: Program,
+    data: Trajectories,
+    path: Path | None = None,
+    *,
+    known_start: bool = False,
+    information: Tensor | None = None,
+    steps: int = 25,
+    precision: float = 0.02,
+    hopeless: float = -math.inf,
+) -> Maximum:
+    """Move a program's parameters, in place, to where log p(y) of the linearised program plus the log prior is largest.
+
+    Args:
+        program: with normal noise; see `linearize`.
+        data: as returned by `for_program`.
+        path: of the drives, near their posterior means; found from the measurements when None.
+        known_start: the first state is certain.
+        information: `(P, P)` of the learnable numbers, where it is known.
+        steps: scoring steps at most.
+        precision: stop when another step would gain less, nats.
+        hopeless: give up where a few steps have not brought log p(y) above this.
+
+    Raises:
+        FilterError: the program cannot be smoothed at its initial parameters.
+    """
+    parts = elements(program)
+    here = _look(program, data, path or find_path(program, data, known_start=known_start), known_start, parts)
+    require_found(here.ahead, data)
+    count, reach = len(parts), torch.tensor([150 * part.step for part in parts], dtype=torch.float64)
+    if information is None:
+        by_drive = here.scores - here.scores.mean(0)
+        information = by_drive.T @ by_drive
+        information += 0.1 * torch.diag(information.diagonal())
+    information = information + 1e-6 * torch.diag(information.diagonal()) + 1e-3 * torch.eye(count).double()
+    taken, decrement = 0, 0.0
+    for taken in range(steps + 1):
+        move = torch.linalg.solve(information, here.gradient)
+        decrement = 0.5 * float(here.gradient @ move)
+        behind = taken >= 6 and float(here.ahead.log_likelihood.sum()) < hopeless
+        if decrement < precision or taken == steps or behind:
+            break
+        move = move * min(1.0, 1 / max(1e-9, float((move.abs() / reach).max())))
+        share, before = 1.0, _values(parts)
+        while True:
+            _set(parts, before + share * move)
+            there = _try(program, data, here.path, known_start, parts)
+            if there is not None and there.objective >= here.objective - GIVES_WAY:
+                break
+            share /= 3
+            if share < 0.01:
+                _set(parts, before)
+                return _maximum(here, parts, information, taken, decrement)
+        information = _updated(information, share * move, here.gradient - there.gradient)
+        here = there
+    return _maximum(here, parts, information, taken, decrement)
+
+
+@dataclass(frozen=True)
+class _Here:
+    ahead: Lookahead
+    path: Path
+    scores: Tensor
+    gradient: Tensor
+    objective: float
+
+
+def _look(program: Program, data: Trajectories, path: Path, known_start: bool, parts: list[Element]) -> _Here:
+    ahead = smooth(program, data, path, known_start=known_start, passes=PASSES, tolerance=TOLERANCE, kernels=False)
+    scores = parameter_scores(program, data, smoothed(ahead, data), parts)
+    prior, slope = _prior(program, parts)
+    return _Here(
+        ahead=ahead,
+        path=means_as_path(ahead, data),
+        scores=scores,
+        gradient=scores.sum(0) + slope,
+        objective=float(ahead.log_likelihood.sum()) + prior,
+    )
+
+
+def _try(program: Program, data: Trajectories, path: Path, known_start: bool, parts: list[Element]) -> _Here | None:
+    """None where the step went too far: the program blows up there."""
+    try:
+        here = _look(program, data, path, known_start, parts)
+    except FilterError:
+        return None
+    finite = bool(torch.isfinite(here.ahead.log_likelihood).all()) and bool(torch.isfinite(here.gradient).all())
+    return here if finite else None
+
+
+def _prior(program: Program, parts: list[Element]) -> tuple[float, Tensor]:
+    """The log prior and its slope in the unconstrained space, without the Jacobian: for the parameter's own mode."""
+
+    def log_prior() -> float:
+        return sum(float(prior.log_prob(getattr(program, name)).sum()) for name, prior in program.priors.items())
+
+    slope = torch.zeros(len(parts), dtype=torch.float64)
+    if not program.priors:
+        return 0.0, slope
+    for index, part in enumerate(parts):
+        if part.name.split("[")[0] in program.priors:
+            with moved(part, part.step):
+                up = log_prior()
+            with moved(part, -part.step):
+                slope[index] = (up - log_prior()) / (2 * part.step)
+    return log_prior(), slope
+
+
+def _values(parts: list[Element]) -> Tensor:
+    return torch.tensor([float(part.parameter.data.view(-1)[part.index]) for part in parts], dtype=torch.float64)
+
+
+def _set(parts: list[Element], values: Tensor) -> None:
+    for part, value in zip(parts, values.tolist(), strict=True):
+        part.parameter.data.view(-1)[part.index] = value
+
+
+def _updated(information: Tensor, step: Tensor, fall: Tensor) -> Tensor:
+    """The BFGS update with `fall` of the score along `step`, damped where no positive curvature is seen (Powell)."""
+    through = information @ step
+    expected = float(step @ through)
+    seen = float(step @ fall)
+    if seen < 0.2 * expected:
+        share = 0.8 * expected / (expected - seen)
+        fall = share * fall + (1 - share) * through
+        seen = float(step @ fall)
+    return information - torch.outer(through, through) / expected + torch.outer(fall, fall) / seen
+
+
+def _maximum(here: _Here, parts: list[Element], information: Tensor, taken: int, decrement: float) -> Maximum:
+    return Maximum(
+        log_likelihood=here.ahead.log_likelihood,
+        objective=here.objective,
+        path=here.path,
+        names=tuple(part.name for part in parts),
+        information=information,
+        steps=taken,
+        decrement=decrement,
+    )

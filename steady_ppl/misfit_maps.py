@@ -1,0 +1,277 @@
+"""Where, when and in which regime residuals are not what the program makes of itself.
+
+Residuals are averaged with their signs over cells: drives, strips of time, ranges of controls and of state variables,
+and over products with the controls and with themselves some rows before. Every cell is compared with the same cell of
+simulated drives, and false discoveries are controlled over all cells together (Benjamini and Hochberg 1995). The mean
+square of a residual would be nearly blind to a missing effect; it serves to widen the bands where residuals scatter
+more than the program says (the dispersion of quasi-likelihood, McCullagh and Nelder 1989), so that wrong noise is not
+taken for a wrong mean.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy import special
+
+STRIPS, BINS, BINS_OF_PAIRS = 10, 5, 4
+FEWEST = 8  # residuals in a cell
+LAGS = (0, 1, 2, 5, 10)  # rows
+LEVEL = 0.05
+
+Array = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals of `M` sets of the same `B` drives, at each interval.
+
+    Attributes:
+        names: of the `R` residuals.
+        values: `(M, T, B, R)`, standardised, zero where there is none.
+        there: of the same shape, bool.
+        variables: name → what the intervals are sorted by, `(M, T, B)`.
+        raw: of the first set, those with a unit in it, `(T, B, ·)`.
+    """
+
+    names: Sequence[str]
+    values: Array
+    there: Array
+    variables: dict[str, Array] = field(default_factory=dict)
+    raw: Array | None = None
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What a statistic is an average over.
+
+    Attributes:
+        map: the kind of cells: "all", "drive", "time", "drive and time", "regime", "pair", "lag", "memory".
+        residual: its number.
+        where: what tells the cell from others of its map, for example {"left": (0.2, 0.6)}.
+        count: residuals in it.
+        mean: of the residuals, in their unit; None where they have none.
+    """
+
+    map: str
+    residual: int
+    where: dict[str, Any]
+    count: int
+    mean: float | None = None
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A cell whose average lies outside the simulated band.
+
+    Attributes:
+        cell: which.
+        z: how far from the simulated mean, in simulated standard deviations.
+        p_value: of this cell alone, two-sided.
+    """
+
+    cell: Cell
+    z: float
+    p_value: float
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """All cells, judged.
+
+    Attributes:
+        cells, z, p_values: one entry a cell.
+        significant: the findings at a false-discovery rate of 5 %, strongest first.
+        p_value: of the hypothesis that there is nothing, by Simes' test, calibrated on the simulated sets.
+        simulated: the same of each simulated set, `(M,)`.
+        dispersion: mean square of each residual over that of the simulated ones, `(R,)`; NaN where there are none.
+    """
+
+    cells: list[Cell]
+    z: Array
+    p_values: Array
+    significant: list[Finding]
+    p_value: float
+    simulated: Array
+    dispersion: Array
+
+
+def judge(
+    real: Residuals,
+    simulated: Residuals,
+    time: Array,
+    controls: dict[str, Array],
+    pairs: Sequence,
+    unexplained: Array,
+) -> Misfit:
+    """Compare every cell with the simulated ones.
+
+    Args:
+        real: of one set.
+        simulated: of many.
+        time: s since each drive's first row, `(T, B)`.
+        controls: `(T, B)` each; they sort the intervals and are correlated with the residuals.
+        pairs: names of variables that make a map together.
+        unexplained: dispersion that no effect on the mean explains, of every set, the real one first; no band is
+            widened by more.
+    """
+    both = Residuals(
+        real.names,
+        np.concatenate([real.values, simulated.values]),
+        np.concatenate([real.there, simulated.there]),
+        {name: np.concatenate([value, simulated.variables[name]]) for name, value in real.variables.items()},
+        real.raw,
+    )
+    cells, averages = [], []
+    for found, average in _all_cells(both, time, controls, pairs):
+        cells.append(found)
+        averages.append(average)
+    average = np.stack(averages, -1)  # (1 + M, cells)
+    squares = (both.values**2).sum((1, 2)) / np.maximum(both.there.sum((1, 2)), 1)
+    typical = squares[1:].mean(0)
+    dispersion = np.divide(squares, typical, out=np.full_like(squares, np.nan), where=typical > 0)
+    widened = np.sqrt(np.minimum(dispersion, unexplained[:, None]).clip(1.0))[:, [cell.residual for cell in cells]]
+    z, freedom = standardise(average)
+    z /= widened
+    p_values = 2 * special.stdtr(freedom, -np.abs(z))
+    simes = np.array([_simes(row) for row in p_values])
+    level = min(LEVEL, float(np.quantile(simes[1:], LEVEL, method="lower")))  # the tails of t are a model, too
+    chosen = _benjamini_hochberg(p_values[0], level)
+    findings = [Finding(cells[i], float(z[0, i]), float(p_values[0, i])) for i in np.flatnonzero(chosen)]
+    return Misfit(
+        cells=cells,
+        z=z[0],
+        p_values=p_values[0],
+        significant=sorted(findings, key=lambda finding: -abs(finding.z)),
+        p_value=max(float(simes[0]), tail_p_value(-np.log(np.maximum(simes, 1e-300)))),
+        simulated=simes[1:],
+        dispersion=dispersion[0],
+    )
+
+
+def standardise(values: Array) -> tuple[Array, int]:
+    """Each row against the simulated ones, all rows but the first; a simulated row is compared with the others.
+
+    Args:
+        values: `(1 + M, ...)`; NaN where a set has no value, which counts as nothing found.
+
+    Returns:
+        The same shape, in standard deviations, and the degrees of freedom.
+    """
+    simulated = values[1:]
+    count = np.maximum(np.isfinite(simulated).sum(0), 3)
+    mean, variance = np.nanmean(simulated, 0), np.nanvar(simulated, 0) * count / (count - 1)
+    spread = np.sqrt(np.maximum(variance, 1e-300) * (1 + 1 / count))
+    away = simulated - mean
+    left_out = away * count / (count - 1)
+    variance_left = np.maximum(((count - 1) * variance - away * left_out) / (count - 2), 1e-300)
+    z = np.concatenate([((values[:1] - mean) / spread), left_out / np.sqrt(variance_left * (1 + 1 / (count - 1)))])
+    return np.nan_to_num(z), len(simulated) - 1
+
+
+def tail_p_value(values: Array) -> float:
+    """How often a maximum is as large as the first value, by Gumbel's distribution with the moments of the others, the
+    simulated ones."""
+    scale = max(float(values[1:].std(ddof=1)), 1e-12) * math.sqrt(6) / math.pi
+    return -math.expm1(-math.exp(min(-(float(values[0] - values[1:].mean()) / scale) - np.euler_gamma, 700.0)))
+
+
+def _simes(p_values: Array) -> float:
+    ordered = np.sort(p_values)
+    return float((ordered * len(ordered) / np.arange(1, len(ordered) + 1)).min())
+
+
+def _benjamini_hochberg(p_values: Array, level: float) -> Array:
+    ordered = np.sort(p_values)
+    passing = np.flatnonzero(ordered <= level * np.arange(1, len(ordered) + 1) / len(ordered))
+    return p_values <= (ordered[passing[-1]] if len(passing) else -1.0)
+
+
+def _all_cells(
+    data: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence
+) -> Iterator[tuple[Cell, Array]]:
+    """Every cell with its statistic in each set, `(1 + M,)`: the sum over the root of the count."""
+    inside = data.there[0].any(-1)
+    everything = np.zeros(time.shape, int)
+    drives = np.broadcast_to(np.arange(time.shape[1]), time.shape)
+    edges = np.linspace(0, time[inside].max() * (1 + 1e-9) + 1e-9, min(STRIPS, max(1, len(time) // 5)) + 1)
+    strip = np.clip(np.searchsorted(edges, time, side="right") - 1, 0, len(edges) - 2)
+    strips = [{"time": (float(a), float(b))} for a, b in itertools.pairwise(edges)]
+    each = [{"drive": drive} for drive in range(time.shape[1])]
+    yield from _sums(data, "all", everything, [{}])
+    yield from _sums(data, "drive", drives, each)
+    if len(strips) > 1:
+        yield from _sums(data, "time", strip, strips)
+        both = [drive | when for drive in each for when in strips]
+        yield from _sums(data, "drive and time", drives * len(strips) + strip, both)
+    sorted_by = {name: np.broadcast_to(value, data.there.shape[:-1]) for name, value in controls.items()}
+    sorted_by |= data.variables
+    for name, values in sorted_by.items():
+        labels, ranges = _binned(values, inside, BINS)
+        if len(ranges) > 1:
+            yield from _sums(data, "regime", labels, [{name: between} for between in ranges])
+    for first, second in pairs:
+        (one, ranges), (other, across) = (_binned(sorted_by[name], inside, BINS_OF_PAIRS) for name in (first, second))
+        if len(ranges) > 1 and len(across) > 1:
+            where = [{first: a, second: b} for a in ranges for b in across]
+            yield from _sums(data, "pair", one * len(across) + other, where)
+    yield from _correlations(data, inside, controls)
+
+
+def _binned(values: Array, inside: Array, bins: int) -> tuple[Array, list[tuple[float, float]]]:
+    """Numbers of the ranges that hold equally many of the first set's values, and the ranges."""
+    known = values[0][inside]
+    edges = np.unique(np.quantile(known, np.linspace(0, 1, bins + 1)).astype(known.dtype))
+    ranges = [(float(a), float(b)) for a, b in itertools.pairwise(edges)]
+    return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(ranges) - 1, 0)), ranges
+
+
+def _sums(data: Residuals, kind: str, labels: Array, where: list[dict[str, Any]]) -> Iterator[tuple[Cell, Array]]:
+    sets = len(data.values)
+    index = np.broadcast_to(labels, data.there.shape[:-1]) + len(where) * np.arange(sets)[:, None, None]
+    size = sets * len(where)
+    for residual in range(len(data.names)):
+        there = data.there[..., residual]
+        at = index[there]
+        count = np.bincount(at, minlength=size).reshape(sets, -1)
+        total = np.bincount(at, data.values[..., residual][there], minlength=size).reshape(sets, -1)
+        average = np.where(count > 0, total / np.sqrt(np.maximum(count, 1)), np.nan)
+        mean = _means(data, residual, index[0], count[0])
+        for cell, place in enumerate(where):
+            if count[0, cell] >= FEWEST and (count[1:, cell] > 0).mean() > 0.8:
+                yield Cell(kind, residual, place, int(count[0, cell]), mean[cell] if mean else None), average[:, cell]
+
+
+def _means(data: Residuals, residual: int, index: Array, count: Array) -> list[float] | None:
+    """The first set's mean residual in each cell, in its unit."""
+    if data.raw is None or residual >= data.raw.shape[-1]:
+        return None
+    there = data.there[0, ..., residual]
+    total = np.bincount(index[there], data.raw[..., residual][there], minlength=len(count))
+    return (total / np.maximum(count, 1)).tolist()
+
+
+def _correlations(data: Residuals, inside: Array, controls: dict[str, Array]) -> Iterator[tuple[Cell, Array]]:
+    """With the controls, with their changes and with the residual itself, some rows before."""
+    regressors = {}
+    for name, values in controls.items():
+        regressors[name] = np.where(inside, values - values[inside].mean(), 0.0)
+        regressors[f"change of {name}"] = np.where(inside, np.diff(values, axis=0, prepend=values[:1]), 0.0)
+    for residual in range(len(data.names)):
+        values, there = data.values[..., residual], data.there[..., residual]
+        for lag in (lag for lag in LAGS if lag < len(inside) // 2):
+            now, before = slice(lag, None), slice(0, len(inside) - lag)
+            for name, regressor in regressors.items():
+                square = ((regressor[before] ** 2) * there[:, now]).sum((1, 2))
+                if square[0] > 1e-12:
+                    product = (regressor[before] * values[:, now]).sum((1, 2)) / np.sqrt(np.maximum(square, 1e-12))
+                    yield Cell("lag", residual, {name: lag}, int(there[0, now].sum())), product
+            both = there[:, now] & there[:, before]
+            if lag and both[0].sum() >= FEWEST:
+                product = (values[:, now] * values[:, before]).sum((1, 2)) / np.sqrt(np.maximum(both.sum((1, 2)), 1))
+                yield Cell("memory", residual, {"lag": lag}, int(both[0].sum())), product

@@ -1,0 +1,133 @@
+"""Measurements predicted from the rows before them, some rows ahead, and drives simulated to compare with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.linearization import Path
+from steady_ppl.program import Program, acting_controls
+from steady_ppl.sites import AtMean, Observing, Recording, as_vector, residual, running
+from steady_ppl.stepping import Stepping
+from steady_ppl.tracking import Tracked
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Measured less predicted, of rows `horizon`, `horizon` + 1, … from what was measured up to `horizon` rows before.
+
+    Attributes:
+        horizon: in rows.
+        error: `(T + 1 − horizon, B, K)`, on the circle where the measurement is an angle.
+        variance: of the same shape, of the linearised program, measurement noise included; NaN where missing.
+        observed: of the same shape, where there is something to compare.
+    """
+
+    horizon: int
+    error: Tensor
+    variance: Tensor
+    observed: Tensor
+
+    @property
+    def standardised(self) -> Tensor:
+        """Errors in standard deviations of the prediction, zero where missing."""
+        return torch.where(self.observed, self.error / self.variance.sqrt(), 0.0)
+
+    def covered(self) -> Tensor:
+        """Whether the 90 % band holds the measurement."""
+        return (self.standardised.abs() < 1.6448536269514722) & self.observed
+
+
+@torch.no_grad()
+def predict(
+    program: Program, data: Trajectories, tracked: Tracked, horizons: Sequence[int], bands: Sequence[int] | None = None
+) -> dict[int, Prediction]:
+    """Run the program without noise from the filtered state of every row, with the recorded controls.
+
+    Args:
+        program: the state-space model.
+        data: as returned by `for_program`.
+        tracked: of these drives.
+        horizons: how many rows ahead.
+        bands: the horizons whose variances are wanted, the others' are NaN; None: all.
+
+    Returns:
+        A prediction for each horizon that is shorter than the longest drive.
+    """
+    found = {}
+    for horizon, state in _ahead(program, data, tracked, max(horizons)):
+        if horizon in horizons:
+            seen = tracked.linearization.precision[horizon:] > 0
+            wanted = bands is None or horizon in bands
+            variance = tracked.variances_ahead(horizon) if wanted else torch.full(seen.shape, torch.nan).double()
+            observed = data.observed[horizon:] & seen
+            error = errors(program, state, data.measurements[horizon:], observed).double()
+            found[horizon] = Prediction(horizon, torch.where(observed, error, 0.0), variance, observed)
+    return found
+
+
+def _ahead(program: Program, data: Trajectories, tracked: Tracked, most: int) -> Iterator[tuple[int, Tensor]]:
+    state = tracked.states.to(data.controls.dtype)
+    controls, elapsed, steps = acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps
+    for ahead in range(1, min(most, len(steps)) + 1):
+        rows = slice(ahead - 1, len(steps))
+        state = state[: len(steps) - ahead + 1]
+        with running(*state.shape[:-1]), AtMean():
+            state = program.transition(state, controls[rows], elapsed[rows], steps[rows])
+        yield ahead, state
+
+
+def errors(program: Program, states: Tensor, measurements: Tensor, observed: Tensor) -> Tensor:
+    """Measured less what the program measures in these states, `(..., K)`, on the circle for angles."""
+    seen = Recording()
+    with running(*states.shape[:-1]), seen, Observing(measurements, observed):
+        program.observe(states)
+    parts = [as_vector(residual(fn, seen.observed[site]), fn.event_dim) for site, fn in seen.distributions.items()]
+    return torch.cat(parts, -1)
+
+
+@torch.no_grad()
+def simulate_again(program: Program, data: Trajectories, starts: Tensor, channels: int) -> tuple[Trajectories, Path]:
+    """Drives that the program makes of the same controls, with the same gaps in the measurements.
+
+    Args:
+        program: the state-space model.
+        data: `B` drives, as returned by `for_program`.
+        starts: `(M, B, D)`.
+        channels: C, how many numbers a step's noise has.
+
+    Returns:
+        `M · B` drives, all of the first set first, and their true paths.
+    """
+    sets, drives, _ = starts.shape
+    stepping = Stepping(program, data, 1.0)
+    states, noises = [starts.to(data.controls.dtype)], []
+    for row in range(len(data.steps)):
+        noise = torch.randn(sets, drives, channels).to(states[0])
+        moved, _ = stepping.transition(row, states[-1], None, noise)
+        states.append(torch.where(data.transitions[row, :, None], moved, starts.to(moved)))
+        noises.append(torch.where(data.transitions[row, :, None], noise, 0.0))
+    path = torch.stack(states).flatten(1, 2)
+    seen = Recording()
+    with running(*path.shape[:-1]), seen:
+        program.observe(path)
+    drawn = [as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()]
+    again = data.subset(torch.arange(drives).repeat(sets))
+    known = torch.full_like(path, torch.nan)
+    known[0] = path[0]
+    again = replace(again, measurements=torch.where(again.observed, torch.cat(drawn, -1), 0.0), states=known)
+    return again, Path(path, torch.stack(noises).flatten(1, 2))
+
+
+@torch.no_grad()
+def on_a_circle(program: Program, data: Trajectories, states: Tensor) -> Tensor:
+    """Which measurement components do not notice a whole turn, `(K,)`; looked at from the first of `states`."""
+    one, every = states[:1, :1].to(data.controls.dtype), torch.ones_like(data.observed[:1, :1])
+    measured = torch.full_like(data.measurements[:1, :1], 0.3)
+    change = errors(program, one, measured + 2 * math.pi, every) - errors(program, one, measured, every)
+    return (change.abs() < 1e-3).flatten()

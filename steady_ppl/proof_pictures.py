@@ -1,0 +1,66 @@
+"""The picture of a proof: how the error grows with the time ahead."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+
+from steady_ppl.errors import UsageError
+from steady_ppl.program import units
+from steady_ppl.proof_report import FLOOR, units_of_states
+
+if TYPE_CHECKING:
+    from steady_ppl.proving import Proof
+
+COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "black")  # Okabe and Ito
+MARKS = "os^Dvx+"
+
+
+def open_loop_picture(found: Proof, *, of: str | None = None, axes: Axes | None = None) -> Axes:
+    """Root mean square error of open-loop predictions against the seconds ahead, what noise alone leaves in grey.
+
+    Args:
+        found: by `prove`.
+        of: a unit of the measurements, or an error group of the states where the truth is known; the first
+            measurement's unit when not given.
+        axes: drawn on; new ones when not given.
+
+    Raises:
+        UsageError: the proof has no such error.
+    """
+    states = units_of_states(found)
+    of = units(found.rows[found.reference].program.measurements)[0] if of is None else of
+    curves = {name: _curve(found, name, of) for name in found.rows}
+    if not curves[found.reference]:
+        have = {key.of for key in found.rows[found.reference].sums if key.kind in ("measurement", "state")}
+        raise UsageError(f"there is no open-loop error of {of!r}; there are {', '.join(sorted(have))}")
+    axes = axes if axes is not None else plt.subplots(figsize=(6, 4), layout="constrained")[1]
+    floor = curves.pop(FLOOR, [])
+    curves = {name: curve for name, curve in curves.items() if curve}
+    for index, (name, curve) in enumerate(curves.items()):
+        mark, color = MARKS[index % len(MARKS)], COLORS[index % len(COLORS)]
+        axes.plot(*zip(*curve, strict=True), f"{mark}-", color=color, ms=4, lw=1.4, label=name)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    if floor:
+        seconds, errors = zip(*floor, strict=True)
+        lowest = 0.8 * min(error for curve in (floor, *curves.values()) for _, error in curve)
+        axes.fill_between(seconds, lowest, errors, color="0.85", lw=0, label=FLOOR, zorder=0)
+        axes.set_ylim(bottom=lowest)
+    axes.set_xlabel("predicted ahead [s]")
+    unit, what = (states[of], of) if of in states else (of, "measured")
+    axes.set_ylabel(f"{what}, root mean square error{f' [{unit}]' if unit else ''}")
+    axes.legend(fontsize=8)
+    return axes
+
+
+def _curve(found: Proof, name: str, of: str) -> list[tuple[float, float]]:
+    """Seconds ahead and error, where there is one."""
+    found_at = {
+        key.horizon: sums.value
+        for key, sums in found.rows[name].sums.items()
+        if key.kind in ("measurement", "state") and key.of == of
+    }
+    return [(rows * found.step, value) for rows, value in sorted(found_at.items()) if value]

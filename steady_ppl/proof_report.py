@@ -1,0 +1,230 @@
+"""What `prove` found, as one sentence, as a plain dict and as tables of text."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from steady_ppl.effects import attached
+from steady_ppl.paired_bootstrap import LEVEL, RESAMPLES, Change, paired
+from steady_ppl.program import names, units
+from steady_ppl.proof_rows import BANDS, Key, Row
+
+if TYPE_CHECKING:
+    from steady_ppl.proving import Proof
+
+WIDTH, NAME = 100, 20
+FLOOR = "noise floor"
+JUDGED = {  # the signs of what log p(y) and the error gained
+    (0, 0): ("is not shown to help", "is not shown to be better than"),
+    (1, 1): ("helps", "is better than"),
+    (-1, -1): ("makes it worse", "is worse than"),
+    (1, -1): ("helps log p(y) and harms the predictions", "fits better and predicts worse than"),
+    (-1, 1): ("harms log p(y) and helps the predictions", "fits worse and predicts better than"),
+}
+
+
+def figures(found: Proof) -> dict[str, Any]:
+    """Everything as a plain dict; every figure is finite, None where there is none."""
+    return {
+        "verdict": verdict(found),
+        "reference": found.reference,
+        "trajectories": found.trajectories,
+        "known_start": found.known_start,
+        "resamples": RESAMPLES,
+        "level": LEVEL,
+        "horizons": {name: rows * found.step for name, rows in found.horizons.items()},
+        "units": units_of_states(found),
+        "rows": [
+            {"row": name, "program": type(row.program).__name__}
+            | _by_key(found, {key: sums.value for key, sums in row.sums.items()})
+            | {"scales": row.scales, "against_reference": _against(found, name)}
+            for name, row in found.rows.items()
+        ],
+        "notes": found.notes,
+    }
+
+
+def units_of_states(found: Proof) -> dict[str, str]:
+    """Error group of states → unit, empty where its components have several."""
+    program = found.rows[found.reference].program
+    order, unit = names(program.states), units(program.states)
+    groups = program.error_groups or {name: (name,) for name in order}
+    of = {group: {unit[order.index(name)] for name in members} for group, members in groups.items()}
+    return {group: kinds.pop() if len(kinds) == 1 else "" for group, kinds in of.items()}
+
+
+def _by_key(found: Proof, values: Mapping[Key, Any]) -> dict[str, Any]:
+    """Figures nested by kind, of what, and the horizon's name."""
+    ahead = {rows: name for name, rows in found.horizons.items()}
+    nested: dict[str, Any] = {"log_likelihood": None, "measurement": {}, "state": {}, "coverage_90": {}}
+    for key, value in values.items():
+        if key.kind == "log_likelihood":
+            nested[key.kind] = value
+        elif key.horizon in ahead:
+            place = nested[key.kind].setdefault(key.of, {}) if key.of or key.kind == "measurement" else nested[key.kind]
+            place[ahead[key.horizon]] = value
+    return nested
+
+
+def _against(found: Proof, name: str) -> dict[str, Any] | None:
+    if name in (found.reference, FLOOR):
+        return None
+    return _by_key(found, {key: _plain(change) for key, change in changes(found, name).items()})
+
+
+def _plain(change: Change | None) -> dict[str, Any] | None:
+    if change is None:
+        return None
+    interval = change.relative_interval
+    return {
+        "difference": change.value,
+        "interval": list(change.interval),
+        "relative": change.relative,
+        "relative_interval": None if interval is None else list(interval),
+    }
+
+
+def changes(found: Proof, name: str) -> dict[Key, Change | None]:
+    """A row's figures less the reference's, at the horizons that have names."""
+    ours, theirs = found.rows[name].sums, found.rows[found.reference].sums
+    wanted = {0, *found.horizons.values()}
+    return {
+        key: paired(sums, theirs[key], seed=found.seed)
+        for key, sums in ours.items()
+        if key in theirs and key.horizon in wanted
+    }
+
+
+def verdict(found: Proof) -> str:
+    """One sentence on the first row that is not the reference."""
+    name = next(name for name in found.rows if name != found.reference)
+    changed = changes(found, name)
+    likely = changed[Key("log_likelihood", "", 0)]
+    horizon = next(h for h in ("3 s", "1 s", "10 s", "one step") if h in found.horizons)
+    errors = {key.of: change for key, change in changed.items() if key[::2] == ("measurement", found.horizons[horizon])}
+    parts = []
+    if likely is not None:
+        parts.append(f"log p(y) {with_interval(likely.value, likely.interval, 1, ' nats a drive')}")
+    for of, change in errors.items():
+        differs = _differs(_plain(change))
+        where = f" in {of}" if len(errors) > 1 and of else ""
+        if differs:
+            parts.append(f"{horizon.replace(' ', '-')} open-loop error{where} {differs}")
+    gained = _sign([likely]), -_sign(list(errors.values()))
+    alone, between = JUDGED[gained if gained in JUDGED else (sum(gained), sum(gained))]
+    added = _added(found.rows[found.reference], found.rows[name])
+    said = f"Adding {added} {alone}" if added else f"{name} {between} {found.reference}"
+    return f"{said}: {', '.join(parts)}."
+
+
+def _sign(found: Sequence[Change | None]) -> int:
+    signs = {change.sign for change in found if change is not None} - {0}
+    return signs.pop() if len(signs) == 1 else 0
+
+
+def _added(before: Row, after: Row) -> str:
+    """The effects that the one has more, empty where that is not the whole difference."""
+    ours, theirs = ({variant.name: variant for variant in attached(row.program)} for row in (after, before))
+    if theirs.keys() - ours.keys():
+        return ""
+    return " and ".join(variant.label for name, variant in ours.items() if name not in theirs)
+
+
+def with_interval(value: float, interval: Sequence[float], digits: int, unit: str = "") -> str:
+    """A difference with its sign, and its interval."""
+    low, high = (f"{end:.{digits}f}" for end in interval)
+    return f"{value:+.{digits}f}{unit} [{low}, {high}]".replace("-", "−")
+
+
+def as_text(content: Mapping[str, Any]) -> str:
+    """The figures as text: the verdict, and tables no wider than 100 columns."""
+    rows, horizons = content["rows"], list(content["horizons"])
+    far = horizons[1:] or horizons
+    said = f"{content['trajectories']} drives; differences are from {content['reference']}"
+    lines = [content["verdict"], "", f"{said}, with {content['level']:.0%} intervals bootstrapped over drives", ""]
+    bands = [name for name in BANDS if name in horizons]
+    shown = [name if i else f"in 90 % band, {name}" for i, name in enumerate(bands)]
+    header = ["", "log p(y) [nats]", "difference [nats]", *shown]
+    lines += _table(header, [[row["row"], *_likely(row), *_covered(row, bands)] for row in rows])
+    lines += ["", "root mean square error of predictions ahead, and by how much it differs"]
+    units_of = {("measurement", of): of for of in rows[0]["measurement"]}
+    units_of |= {("state", of): unit for of, unit in content["units"].items()}
+    for (kind, of), unit in units_of.items():
+        title = of if kind == "state" else "measured"
+        header = [f"{title} [{unit}]" if unit else title, *far, *(f"{name}, differs" for name in far)]
+        cells = [[row["row"], *_errors(row[kind][of], row, kind, of, far)] for row in rows if of in row[kind]]
+        lines += [*_table(header, cells), ""] if cells else []
+    lines += _scales([row for row in rows if row["row"] != FLOOR])
+    for note in content["notes"]:
+        lines += textwrap.wrap(f"note: {note}", WIDTH)
+    return "\n".join(lines)
+
+
+def _likely(row: Mapping[str, Any]) -> list[str]:
+    change = (row["against_reference"] or {}).get("log_likelihood")
+    said = with_interval(change["difference"], change["interval"], 1) if change else ""
+    return [_number(row["log_likelihood"], ".1f").replace("-", "−"), said]
+
+
+def _covered(row: Mapping[str, Any], bands: Sequence[str]) -> list[str]:
+    return [_number(row["coverage_90"].get(name), ".1%") for name in bands]
+
+
+def _errors(
+    errors: Mapping[str, float | None], row: Mapping[str, Any], kind: str, of: str, horizons: Sequence[str]
+) -> list[str]:
+    against = (row["against_reference"] or {}).get(kind, {}).get(of, {})
+    return [_number(errors.get(name), ".3g") for name in horizons] + [_differs(against.get(name)) for name in horizons]
+
+
+def _differs(change: Mapping[str, Any] | None) -> str:
+    if change is None or change["relative"] is None:
+        return ""
+    return with_interval(100 * change["relative"], [100 * end for end in change["relative_interval"]], 0, " %")
+
+
+def _scales(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Columns that say the same as the one before them, as those of like sensors do, are left out."""
+    columns: dict[str, list[str]] = {}
+    for kind in ("channels", "measurements"):
+        before: list[str] | None = None
+        for label in rows[0]["scales"][kind]:
+            column = [_number(row["scales"][kind].get(label), ".4g") for row in rows]
+            if column == before:
+                last = list(columns)[-1]
+                columns[last if "…" in last else last.replace(" ", " … ", 1)] = columns.pop(last)
+            else:
+                columns[label] = column
+            before = column
+    lines = [[row["row"], *(column[i] for column in columns.values())] for i, row in enumerate(rows)]
+    return _table(["noise σ", *columns], lines)
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else f"{value:{form}}"
+
+
+def _table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
+    """Aligned lines; columns that find no room go into a second table below."""
+    cut = [[_cut(line[0]), *line[1:]] for line in (header, *lines)]
+    widths = [max(map(len, column)) for column in zip(*cut, strict=True)]
+    kept, used = [0], widths[0]
+    for column, width in enumerate(widths[1:], 1):
+        if used + 2 + width > WIDTH and len(kept) > 1:
+            rest = [0, *range(column, len(widths))]
+            below = _table([header[i] for i in rest], [[line[i] for i in rest] for line in lines])
+            break
+        kept.append(column)
+        used += 2 + width
+    else:
+        below = []
+    aligned = (
+        "  ".join([line[0].ljust(widths[0]), *(line[i].rjust(widths[i]) for i in kept[1:])]).rstrip() for line in cut
+    )
+    return [*aligned, *(["", *below] if below else [])]
+
+
+def _cut(name: str) -> str:
+    return name if len(name) <= NAME else name[: NAME - 1] + "…"

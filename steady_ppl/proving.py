@@ -1,0 +1,186 @@
+"""Prove an improvement: programs before and after on drives that neither was fitted on, with paired intervals.
+
+Everything goes by the linearised program: log p(y) by its smoother, predictions by its filter, as in `check`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import DataError, UsageError
+from steady_ppl.fit import Fit
+from steady_ppl.paired_bootstrap import FEWEST
+from steady_ppl.program import Program, names
+from steady_ppl.proof_report import as_text, figures
+from steady_ppl.proof_rows import (
+    Judged,
+    Row,
+    as_row,
+    judge_program,
+    keeping_velocity,
+    median_step,
+    named_horizons,
+    noise_floor,
+)
+
+FLOOR, COASTING = "noise floor", "constant velocity"
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What `prove` found.
+
+    Attributes:
+        rows: name → figures, in the order in which they were given, then the constant velocity and the noise floor.
+        reference: the name of the row that the others are compared with.
+        horizons: name → how many rows ahead, "one step" first.
+        step: s, of a row.
+        trajectories: how many drives.
+        known_start: whether the true first states were given.
+        seed: of the resampling.
+        notes: what was left out or is not as it seems.
+    """
+
+    rows: dict[str, Row]
+    reference: str
+    horizons: dict[str, int]
+    step: float
+    trajectories: int
+    known_start: bool
+    seed: int
+    notes: list[str]
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """Everything as a plain dict, ready for JSON."""
+        return figures(self)
+
+    def __str__(self) -> str:
+        return as_text(self.figures)
+
+
+@torch.no_grad()
+def prove(
+    rows: Mapping[str, Program | Fit],
+    data: Trajectories,
+    *,
+    known_start: bool | None = None,
+    reference: str | None = None,
+    truth: str | None = None,
+    with_constant_velocity: bool = True,
+    seed: int = 0,
+) -> Proof:
+    """Compare programs on drives: log p(y), open-loop errors, coverage, noise scales.
+
+    log p(y) is that of the linearised program, per trajectory. Errors are root mean squares of measured less predicted,
+    1, 3 and 10 s ahead of every row's filtered state, without noise and with the recorded controls, over the components
+    that share a unit; in state space where the x. columns are known, in the program's error groups. Only measurements
+    that every row predicts count.
+
+    Args:
+        rows: name → program, best the one before first and the one after second; further ones such as the oracle's
+            structure refitted and the true parameters. Their noise is normal, their measurements' normal or Student t.
+        data: drives on which none of them was fitted.
+        known_start: the first row's x. columns are the exact start; None: if every `Fit` among the rows was so fitted.
+        reference: the row that the others are compared with, the first when not given.
+        truth: the row whose program made the drives; its own simulated drives give the noise floor.
+        with_constant_velocity: add a row of the reference without any acceleration but noise.
+        seed: of the search for paths, the simulation and the resampling.
+
+    Raises:
+        UsageError: a row's program cannot be linearised, or the rows measure different things.
+        DataError: fewer than 5 trajectories, nothing to compare, or no known start.
+        FilterError: a linearised program broke down.
+
+    Example:
+        >>> import steady_ppl as st  # doctest: +SKIP
+        >>> runs = {name: st.Fit.load(f"runs/{name}") for name in ("before", "after")}  # doctest: +SKIP
+        >>> print(st.prove(runs, st.read_table("test.csv")))  # doctest: +SKIP
+    """
+    programs = {name: row.program if isinstance(row, Fit) else row for name, row in rows.items()}
+    notes: list[str] = []
+    known_start = _start_of(rows, notes) if known_start is None else known_start
+    reference = next(iter(programs), "") if reference is None else reference
+    _require(programs, reference, truth, data)
+    judged = {name: judge_program(name, program, data, known_start, seed) for name, program in programs.items()}
+    before, true = judged[reference], judged.get(truth or "")
+    coasting = keeping_velocity(before, known_start) if with_constant_velocity else None
+    if isinstance(coasting, Judged):
+        judged[COASTING] = coasting
+    floor = noise_floor(true, known_start, seed) if true else None
+    notes += [f"no row {name!r}: {why}" for name, why in ((COASTING, coasting), (FLOOR, floor)) if isinstance(why, str)]
+    counted = _counted(judged.values())
+    found = {name: as_row(row, counted) for name, row in judged.items()}
+    if isinstance(floor, Judged):
+        found[FLOOR] = as_row(floor, _counted([floor]))
+    horizons = named_horizons(before.data)
+    return Proof(
+        rows=found,
+        reference=reference,
+        horizons=horizons,
+        step=median_step(before.data),
+        trajectories=len(data),
+        known_start=known_start,
+        seed=seed,
+        notes=notes + _few_starts(before.data, horizons, known_start) + _blown_up(found),
+    )
+
+
+def _counted(judged: Iterable[Judged]) -> dict[int, Tensor]:
+    """Horizon → the cells that every row predicts, `(T + 1 − horizon, B, K)`."""
+    rows = [row.predictions for row in judged]
+    return {horizon: torch.stack([row[horizon].observed for row in rows]).all(0) for horizon in rows[0]}
+
+
+def _start_of(rows: Mapping[str, Program | Fit], notes: list[str]) -> bool:
+    fitted = [row.known_start for row in rows.values() if isinstance(row, Fit)]
+    if any(fitted) and not all(fitted):
+        notes.append("some rows were fitted with a known start and some without: all are judged without")
+    return bool(fitted) and all(fitted)
+
+
+def _require(programs: Mapping[str, Program], reference: str, truth: str | None, data: Trajectories) -> None:
+    if len(programs) < 2:
+        raise UsageError(f"got {len(programs)} program: a proof needs one before and one after")
+    for name in (reference, truth):
+        if name is not None and name not in programs:
+            raise UsageError(f"there is no row {name!r}; the rows are {', '.join(programs)}")
+    for taken in {FLOOR, COASTING} & programs.keys():
+        raise UsageError(f"a row cannot be called {taken!r}: that is the name of a row of its own")
+    ours = names(programs[reference].measurements)
+    for name, program in programs.items():
+        if names(program.measurements) != ours:
+            raise UsageError(
+                f"{reference} measures {', '.join(ours)} and {name} measures {', '.join(names(program.measurements))}: "
+                "log p(y) of different measurements cannot be compared"
+            )
+    if len(data) < FEWEST:
+        raise DataError(
+            f"got {len(data)} trajectories: intervals over trajectories need at least {FEWEST}, and 16 are better"
+        )
+    if data.time.shape[0] < 2 or not bool(data.observed[1:].any()):
+        raise DataError("nothing to compare: no trajectory has a measurement after its first row")
+
+
+def _few_starts(data: Trajectories, horizons: Mapping[str, int], known_start: bool) -> list[str]:
+    """Say where an error goes by the first rows only."""
+    notes, length = [], data.time.shape[0]
+    for name, horizon in horizons.items():
+        if length - horizon <= 5 < length - 1:
+            said = f"{name} ahead is judged from the first {'row' if length - horizon == 1 else 'rows'} of a drive only"
+            notes.append(said if known_start else said + ", where the state is least known")
+    return notes
+
+
+def _blown_up(rows: Mapping[str, Row]) -> list[str]:
+    worst = {
+        name: [key for key, sums in row.sums.items() if not np.isfinite(sums.total).all()] for name, row in rows.items()
+    }
+    return [f"{name} blows up {min(key.horizon for key in keys)} rows ahead" for name, keys in worst.items() if keys]

@@ -1,0 +1,165 @@
+"""What a program has to beat: a vehicle that keeps its velocity, and a measurement that stays as it was."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pyro.distributions as dist
+import torch
+from pyro.poutine.messenger import Messenger
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.linearization import Path
+from steady_ppl.planar_vehicle import wrap
+from steady_ppl.predictions import Prediction, on_a_circle, predict
+from steady_ppl.program import Program, acting_controls
+from steady_ppl.sites import AtMean, Recording, Standardised, as_vector, normal_moments, running
+from steady_ppl.tracking import Tracked, track
+
+MULTIPLES = (0.5, 1.0, 2.0, 4.0, 8.0)
+ABOUT = (
+    "the program with every channel's mean replaced by zero, so that it ignores the controls and keeps its velocity; "
+    "its channel noise is the one of a scan under which these measurements are most likely"
+)
+
+
+class Coasting(Messenger):
+    """Give latent sites mean zero and other standard deviations, in the order in which they are met.
+
+    Args:
+        scales: of each channel.
+    """
+
+    def __init__(self, scales: Sequence[float]) -> None:
+        super().__init__()
+        self.scales = scales
+        self.column = 0
+
+    def __enter__(self) -> Coasting:
+        self.column = 0
+        super().__enter__()
+        return self
+
+    def _pyro_sample(self, message: Any) -> None:
+        if message["is_observed"]:
+            return
+        fn = message["fn"]
+        mean, _ = normal_moments(fn, message["name"])
+        width = mean.shape[-1] if fn.event_dim else 1
+        scale = mean.new_tensor(self.scales[self.column : self.column + width])
+        self.column += width
+        zero = torch.zeros_like(mean)
+        message["fn"] = (
+            dist.Normal(zero, scale.expand_as(zero)).to_event(1) if fn.event_dim else dist.Normal(zero, scale[0])
+        )
+
+
+class ConstantVelocity(Program):
+    """Another program's start, kinematics and sensors, but no acceleration other than noise.
+
+    Args:
+        program: the other.
+        scales: standard deviation of each channel.
+    """
+
+    def __init__(self, program: Program, scales: Sequence[float]) -> None:
+        super().__init__()
+        self.scales = tuple(scales)
+        self.states, self.controls, self.channels = program.states, program.controls, program.channels
+        self.measurements = program.measurements
+        self.angles = program.angles  # type: ignore[misc]
+        object.__setattr__(self, "of", program)  # not a part of this one: Pyro would rename it
+
+    def initial(self) -> Tensor:
+        return self.of.initial()
+
+    def transition(self, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
+        with Coasting(self.scales):
+            return self.of.transition(state, control, time, step)
+
+    def observe(self, state: Tensor) -> None:
+        self.of.observe(state)
+
+    def actuators(self, control: Tensor, time: Tensor) -> Tensor:
+        return self.of.actuators(control, time)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Predictions of the vehicle that keeps its velocity.
+
+    Attributes:
+        scales: standard deviation of each channel.
+        log_likelihood: log p(y) of all drives, linearised.
+        predictions: horizon → prediction.
+    """
+
+    scales: tuple[float, ...]
+    log_likelihood: float
+    predictions: dict[int, Prediction]
+
+
+@torch.no_grad()
+def constant_velocity(
+    program: Program, data: Trajectories, tracked: Tracked, horizons: Sequence[int], *, known_start: bool
+) -> Reference | str:
+    """Scan the channel noise of `ConstantVelocity` by log p(y) and predict with the best; or why there is none.
+
+    Args:
+        program: the state-space model.
+        data: as returned by `for_program`.
+        tracked: of the program; where the scan begins.
+        horizons: how many rows ahead.
+        known_start: the first state is certain.
+    """
+    path = tracked.path(data)
+    inputs = acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps
+    seen = Recording()
+    with running(*path.noise.shape[:-1]), seen, Standardised(path.noise):
+        program.transition(path.states[:-1], *inputs)
+    sites = seen.distributions
+    values = torch.cat([as_vector(value, sites[site].event_dim) for site, value in seen.values.items()], -1)
+    spreads = [as_vector(normal_moments(fn, site)[1], fn.event_dim) for site, fn in sites.items()]
+    spread = torch.cat([part.expand(*values.shape[:-1], part.shape[-1]) for part in spreads], -1)
+    sizes = (values.double().square() + spread.double().square())[data.transitions].mean(0).sqrt()
+    if not bool((sizes > 0).all() and torch.isfinite(sizes).all()):
+        return "a channel of the program never moves"
+    with running(*path.noise.shape[:-1]), AtMean():
+        moved = program.transition(path.states[:-1], *inputs)
+        coasted = ConstantVelocity(program, sizes.tolist()).transition(path.states[:-1], *inputs)
+    if torch.allclose(moved, coasted, rtol=1e-6, atol=1e-7):
+        return "the program's channels have no mean that could be taken away"
+    best: tuple[float, ConstantVelocity, Tracked] | None = None
+    for multiple in MULTIPLES:
+        coasting = ConstantVelocity(program, (multiple * sizes).tolist())
+        start = Path(path.states, (values / (multiple * sizes)).to(values.dtype))
+        found = track(coasting, data, start, known_start=known_start, passes=3, kernels=False)
+        likely = float(found.log_likelihood.sum())
+        if math.isfinite(likely) and (best is None or likely > best[0]):
+            best = likely, coasting, found
+    if best is None:
+        return "it blows up on these drives"
+    likely, coasting, found = best
+    return Reference(tuple(coasting.scales), likely, predict(coasting, data, found, horizons))
+
+
+@torch.no_grad()
+def last_measurement(
+    program: Program, data: Trajectories, states: Tensor, horizons: Sequence[int]
+) -> dict[int, tuple[Tensor, Tensor]]:
+    """Measured less the component's last value up to `horizon` rows before, and where both exist, `(·, B, K)`."""
+    circle = on_a_circle(program, data, states)
+    held, known = [data.measurements[0]], [data.observed[0]]
+    for value, there in zip(data.measurements[1:], data.observed[1:], strict=True):
+        held.append(torch.where(there, value, held[-1]))
+        known.append(there | known[-1])
+    found = {}
+    for horizon in horizons:
+        error = (data.measurements[horizon:] - torch.stack(held)[: len(held) - horizon]).double()
+        error = torch.where(circle, wrap(error), error)
+        found[horizon] = error, data.observed[horizon:] & torch.stack(known)[: len(known) - horizon]
+    return found

@@ -1,0 +1,42 @@
+"""`steady check`: what it prints, writes and refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from small import only_start, rewritten, simulated, steady, written
+
+FAST = ("--simulations", 20)
+
+
+def test_it_prints_the_verdict_first_and_writes_the_same_figures_and_a_picture(work: Path, tmp_path: Path, capsys):
+    json_file, picture = tmp_path / "check.json", tmp_path / "check.png"
+    options = (*FAST, "--json", json_file, "--picture", picture)
+    assert steady("check", work / "hand", work / "valid.parquet", *options) == 0
+    said = capsys.readouterr().out
+    figures = json.loads(json_file.read_text(), parse_constant=lambda name: pytest.fail(name))
+    assert said.splitlines()[0] == figures["verdict"] and figures["run"] == str(work / "hand")
+    assert picture.read_bytes().startswith(b"\x89PNG") and picture.stat().st_size > 10_000
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["check.json", "check.png"]
+
+
+def test_one_drive_is_enough(work: Path, tmp_path: Path, capsys):
+    table = written(tmp_path / "one.csv", simulated(trajectories=1, rows=33))
+    assert steady("check", work / "hand", table, *FAST) == 0
+    assert "drive" in capsys.readouterr().out.splitlines()[0]
+
+
+def test_what_it_cannot_read_is_one_line_and_writes_nothing(work: Path, tmp_path: Path, refused):
+    table = written(tmp_path / "table.csv", only_start(simulated()))
+    lacking = rewritten(written(tmp_path / "lacking.csv"), "y.bearing_2", "y.bearing_9")
+    empty = tmp_path / "empty.csv"
+    empty.write_text(table.read_text().splitlines()[0] + "\n")
+    more = (*FAST, "--json", tmp_path / "out.json", "--picture", tmp_path / "out.png")
+    refused(2, "there is no such file", "check", work / "hand", tmp_path / "none.csv", *more)
+    refused(2, "the table has no rows", "check", work / "hand", empty, *more)
+    refused(2, "no column y.bearing_2", "check", work / "hand", lacking, *more)
+    refused(2, "is not a run", "check", tmp_path / "none", table, *more)
+    refused(2, "a picture's name that ends in", "check", work / "hand", table, *FAST, "--picture", tmp_path / "a.doc")
+    refused(2, "greater than or equal to 20", "check", work / "hand", table, "--simulations", 5)

@@ -1,0 +1,102 @@
+"""Scoring steps end where log p(y) is largest."""
+
+from __future__ import annotations
+
+import copy
+
+import pyro.distributions as dist
+import pytest
+import torch
+from examples import drives, example
+
+from steady_ppl.discovery.refits import first_refit, refit_with, roomy_path
+from steady_ppl.effects import chosen_variant
+from steady_ppl.gaussian_smoother import smooth
+from steady_ppl.maximum_likelihood import maximise
+from steady_ppl.scores import elements
+
+
+def set_values(program, values) -> None:
+    for part, value in zip(elements(program), values, strict=True):
+        part.parameter.data.view(-1)[part.index] = value
+
+
+def likelihood_of_cart(program, data) -> float:
+    from steady_ppl.gaussian_smoother import find_path
+
+    path = find_path(program, data, known_start=True)
+    return float(smooth(program, data, path, known_start=True).log_likelihood.sum())
+
+
+@pytest.fixture(scope="module")
+def cart():
+    program = example("linear_gaussian")
+    data = drives(program, 30, 60)
+    maximum = maximise(program, data, known_start=True)
+    return program, data, maximum
+
+
+def test_no_neighbour_is_likelier(cart):
+    program, data, maximum = cart
+    assert maximum.converged and maximum.names == ("gain", "damping", "noise", "measurement_sd")
+    best = float(maximum.log_likelihood.sum())
+    assert best == pytest.approx(likelihood_of_cart(program, data), abs=1e-3)
+    for part in elements(program):
+        for by in (-0.1, 0.1):
+            neighbour = copy.deepcopy(program)
+            own = next(one for one in elements(neighbour) if one.name == part.name)
+            own.move(by)
+            assert likelihood_of_cart(neighbour, data) < best
+
+
+def test_the_start_does_not_matter(cart):
+    program, data, maximum = cart
+    far = example("linear_gaussian")
+    for part, by in zip(elements(far), (1.0, -1.0, 0.7, -0.5), strict=True):
+        part.move(by)
+    again = maximise(far, data, known_start=True)
+    assert again.objective == pytest.approx(maximum.objective, abs=0.05)
+    for ours, theirs in zip(elements(far), elements(program), strict=True):
+        torch.testing.assert_close(ours.parameter.data, theirs.parameter.data, atol=0.02, rtol=0.02)
+
+
+def test_a_prior_pulls(cart):
+    program, data, _ = cart
+    pulled = copy.deepcopy(program)
+    pulled.priors = {"gain": dist.Normal(2.0, 0.005)}
+    maximise(pulled, data, known_start=True)
+    gain, before = float(pulled.gain.detach()), float(program.gain.detach())
+    assert before < gain < 2.0 and 2.0 - gain < (2.0 - before) / 4
+
+
+def test_noise_is_widened_before_a_program_that_explains_nothing_is_fitted():
+    """A strong yaw drag that is missing: from the declared noise scoring steps end anywhere."""
+    truth, program = example("hovercraft"), example("hovercraft")
+    program.noise = torch.tensor([0.08, 0.08, 0.05]).double()
+    truth.noise = torch.tensor([0.08, 0.08, 0.05]).double()
+    data = drives(truth.with_effect("yaw_quadratic_drag", 0.25), 6, 61)
+    path = roomy_path(program, data, True)
+    assert float(program.noise.detach().min()) > 0.1
+    assert maximise(program, data, path, known_start=True).converged
+    right = example("hovercraft")
+    before = right.noise.detach().clone()
+    roomy_path(right, drives(right, 6, 41), True)
+    assert torch.equal(right.noise.detach(), before)
+
+
+def test_drives_are_judged_by_fits_that_have_not_seen_them():
+    truth = example("hovercraft").with_effect("yaw_bias", 0.08)
+    program = example("hovercraft")
+    train, valid = drives(truth, 6, 41, seed=1), drives(truth, 8, 41, seed=2)
+    base = first_refit(program, train, valid, known_start=True, seed=0)
+    found = refit_with(base, chosen_variant(program, "yaw_bias", ""), 0.01, known_start=True)
+    assert not isinstance(found, str)
+    assert found.held_out.shape == (14,)
+    variant = chosen_variant(program, "yaw_bias", "")
+    first, second = (float(value) for value in found.coefficients(variant))
+    assert float(found.coefficient(variant)) == pytest.approx((6 * first + 8 * second) / 14)
+    judged = smooth(found.programs[0], valid, found.folds[0].held_out_path, known_start=True, passes=4)
+    torch.testing.assert_close(found.held_out[:8], judged.log_likelihood, atol=0.05, rtol=0)
+    again = maximise(copy.deepcopy(found.programs[0]), train, found.folds[0].path, known_start=True)
+    assert again.objective == pytest.approx(found.maxima[0].objective, abs=0.1)
+    assert float((found.held_out - base.held_out).sum()) > 5

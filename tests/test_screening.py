@@ -1,0 +1,128 @@
+"""The score test of many candidates at once, on scores whose distribution is known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from examples import example
+from scipy import stats
+
+from steady_ppl.discovery.bootstrap import Simulated
+from steady_ppl.discovery.columns import Column
+from steady_ppl.discovery.curves import between, by_height, height, knots_of, variables
+from steady_ppl.discovery.screening import screen
+from steady_ppl.effects import chosen_variant
+
+DRIVES, PARAMETERS = 16, 3
+NAMES = ("linear_drag", "quadratic_drag", "yaw_bias", "slope", "bearing_bias", "sensor_scale")
+
+
+def columns() -> list[Column]:
+    program = example("hovercraft")
+    return [Column(chosen_variant(program, name, "")) for name in NAMES]
+
+
+def scores_of(sets: int, seed: int, missing: float = 0.0) -> torch.Tensor:
+    """Scores `(S, B, N)` that are correlated and not normal; `missing` of the second candidate."""
+    random = torch.Generator().manual_seed(seed)
+    count = PARAMETERS + sum(column.size for column in columns())
+    mixing = torch.randn(count, count, generator=torch.Generator().manual_seed(1)).double() + 2 * torch.eye(count)
+    raw = torch.rand(sets, DRIVES, count, generator=random).double() - 0.5
+    scores = raw @ mixing.T
+    information = mixing @ mixing.T / 12
+    return scores + missing * information[:, PARAMETERS + 1]
+
+
+def test_p_values_are_uniform_where_nothing_is_missing():
+    found, drives = columns(), scores_of(400, 2)
+    p_values = []
+    for index in range(400):
+        simulated = Simulated(scores_of(199, 1000 + index), torch.zeros(199, DRIVES))
+        p_values.append(screen(drives[index], simulated, PARAMETERS, found).p_value)
+    jitter = np.random.default_rng(0).uniform(0, 1 / 200, 400)  # p-values are multiples of 1/200
+    assert stats.kstest(np.array(p_values) - jitter, "uniform").pvalue > 0.01
+
+
+def test_what_is_missing_is_first_with_its_coefficient():
+    screened = screen(
+        scores_of(1, 3, missing=1.2)[0], Simulated(scores_of(400, 4), torch.zeros(400, DRIVES)), 3, columns()
+    )
+    first = screened.tested[0]
+    assert first.variant.name == "quadratic_drag" and screened.p_value < 0.01
+    assert abs(float(first.coefficient[0]) - 1.2) < 4 * float(first.sd[0])
+    quantiles = stats.norm.isf(screened.critical / 2) + stats.norm.isf(0.05)
+    assert first.detection_limit == pytest.approx(quantiles * first.sd)
+    assert 4 < quantiles < 5.5
+
+
+def test_what_fitted_parameters_explain_is_projected_out():
+    """A candidate whose scores are the parameters' mixed is untestable; moving a parameter changes nothing."""
+    simulated, drives = scores_of(400, 5), scores_of(1, 6)[0]
+    mix = torch.tensor([0.3, -1.0, 2.0]).double()
+    for scores in (simulated, drives):
+        scores[..., PARAMETERS + 2] = scores[..., :PARAMETERS] @ mix
+    found = screen(drives, Simulated(simulated, torch.zeros(400, DRIVES)), PARAMETERS, columns())
+    bias = next(tested for tested in found.tested if tested.variant.name == "yaw_bias")
+    assert bias.untestable and not np.isfinite(bias.detection_limit).any()
+    others = {tested.variant.name: tested.statistic for tested in found.tested}
+    information = torch.einsum("sbi,sbj->ij", simulated, simulated)[:, :PARAMETERS] / len(simulated) / DRIVES
+    again = screen(
+        drives + information @ mix * 0.1, Simulated(simulated, torch.zeros(400, DRIVES)), PARAMETERS, columns()
+    )
+    for tested in again.tested:
+        assert tested.statistic == pytest.approx(others[tested.variant.name], abs=0.25)
+
+
+def test_a_curve_is_straight_between_its_knots():
+    knots, heights = (0.0, 1.0, 2.0, 3.0), torch.tensor([0.0, 2.0, -1.0, 1.0]).double()
+    at = torch.tensor([-5.0, 0.0, 0.5, 1.75, 3.0, 9.0]).double()
+    expected = torch.tensor([0.0, 0.0, 1.0, -0.25, 1.0, 1.0]).double()
+    torch.testing.assert_close(height(at, knots, False, heights), expected)
+
+
+def test_a_curve_over_an_angle_closes():
+    knots = knots_of(torch.zeros(1), circular=True)
+    heights = torch.randn(len(knots), generator=torch.Generator().manual_seed(0)).double()
+    at = torch.linspace(-3, 3, 50).double()
+    torch.testing.assert_close(height(at, knots, True, heights), height(at + 4 * math.pi, knots, True, heights))
+    just = torch.tensor([math.pi - 1e-9, math.pi + 1e-9]).double()
+    assert height(just, knots, True, heights).diff().abs() < 1e-7
+
+
+def test_heights_have_the_slopes_that_autograd_finds():
+    random = torch.Generator().manual_seed(2)
+    values, weights = torch.randn(3, 7, 5, generator=random).double(), torch.randn(3, 7, 5, generator=random).double()
+    for circular, knots in ((False, (-1.0, -0.5, 0.0, 0.5, 1.0)), (True, knots_of(torch.zeros(1), True))):
+        heights = torch.zeros(len(knots), dtype=torch.float64, requires_grad=True)
+        whole = (weights * height(values, knots, circular, heights)).sum((0, 1))
+        expected = torch.stack([torch.autograd.grad(one, heights, retain_graph=True)[0] for one in whole])
+        torch.testing.assert_close(by_height(values, weights, knots, circular), expected)
+
+
+def test_a_place_that_is_not_a_number_has_none():
+    _, _, share = between(torch.tensor([torch.nan, 0.5]), (0.0, 1.0), False)
+    assert torch.isnan(share).tolist() == [True, False]
+
+
+def test_curves_may_depend_on_everything_that_a_program_declares():
+    program = example("hovercraft")
+    state, control, time = torch.randn(6).double(), torch.ones(2).double(), torch.zeros(()).double()
+    found = variables(program, state, control, time, {"yaw": torch.ones(()).double()})
+    assert set(program.states[0].split()[:1]) <= found.keys()
+    assert {
+        "heading",
+        "forward velocity",
+        "forward velocity × yaw velocity",
+        "left",
+        "commanded yaw",
+        "time",
+    } <= found.keys()
+    pendulum = example("pendulum")
+    assert set(variables(pendulum, torch.ones(2), torch.ones(1), time, {})) == {"angle", "rate", "torque", "time"}
+
+
+def test_a_variable_that_stands_still_has_no_knots():
+    assert knots_of(torch.full((100,), 2.0), circular=False) is None
