@@ -8,14 +8,15 @@ export OMP_NUM_THREADS ?= 1
 
 .PHONY: demo test learn learn-truck lint types check clean
 
-demo: learn
-
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "steady-ppl needs Python 3.11 or newer; name one with make PYTHON=...")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	touch $@
+
+demo: $(INSTALLED)
+	$(BIN)/steady demo --out $(OUT)/demo
 
 learn: $(INSTALLED)
 	$(BIN)/python benchmarks/learn.py hov --out $(OUT)/learn

@@ -191,6 +191,13 @@ def _direction(planting: Planting, random: np.random.Generator) -> np.ndarray:
     return np.array([sign])
 
 
+def text_of_size(effect: str, limits: float) -> str:
+    """An effect at a size in detection limits, or the largest that is physical."""
+    random = _random(f"{effect} of {limits}")
+    planting = min(_places(effect), key=lambda one: float(np.linalg.norm(one.limit)))
+    return _sized(planting, (min(limits, _most(planting)),) * 2, 0.0, random)
+
+
 def multiple_of_limit(text: str) -> float:
     """How many limits an effect is large, as it was planted."""
     name, at, _, values = parsed(text)

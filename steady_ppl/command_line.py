@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import typer
 
-from steady_ppl import command_check, command_discover, command_effects, command_prove
+from steady_ppl import command_check, command_demo, command_discover, command_effects, command_prove
 from steady_ppl.errors import ComputationError, SteadyError, UsageError
 
 INTERRUPTED = 130  # what typer returns for Ctrl-C
@@ -32,6 +32,7 @@ app = typer.Typer(
 data_app = typer.Typer(help="Published logs to tables.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(data_app, name="data")
 app.command()(command_check.check)
+app.command()(command_demo.demo)
 app.command()(command_discover.discover)
 app.command()(command_effects.add)
 app.command()(command_effects.effects)

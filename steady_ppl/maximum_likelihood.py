@@ -36,6 +36,7 @@ class Maximum:
         information: `(P, P)` in the unconstrained space.
         steps: scoring steps taken.
         decrement: what another step would still gain, nats.
+        gained: objective above that at the parameters from which it began, nats.
     """
 
     log_likelihood: Tensor
@@ -45,6 +46,7 @@ class Maximum:
     information: Tensor
     steps: int
     decrement: float
+    gained: float
 
     @property
     def converged(self) -> bool:
@@ -82,7 +84,11 @@ def maximise(
     parts = elements(program)
     here = _look(program, data, path or find_path(program, data, known_start=known_start), known_start, parts)
     require_found(here.ahead, data)
-    count, reach = len(parts), torch.tensor([150 * part.step for part in parts], dtype=torch.float64)
+    began, count, reach = (
+        here.objective,
+        len(parts),
+        torch.tensor([150 * part.step for part in parts], dtype=torch.float64),
+    )
     if information is None:
         by_drive = here.scores - here.scores.mean(0)
         information = by_drive.T @ by_drive
@@ -105,10 +111,10 @@ def maximise(
             share /= 3
             if share < 0.01:
                 _set(parts, before)
-                return _maximum(here, parts, information, taken, decrement)
+                return _maximum(here, parts, information, taken, decrement, began)
         information = _updated(information, share * move, here.gradient - there.gradient)
         here = there
-    return _maximum(here, parts, information, taken, decrement)
+    return _maximum(here, parts, information, taken, decrement, began)
 
 
 @dataclass(frozen=True)
@@ -182,7 +188,9 @@ def _updated(information: Tensor, step: Tensor, fall: Tensor) -> Tensor:
     return information - torch.outer(through, through) / expected + torch.outer(fall, fall) / seen
 
 
-def _maximum(here: _Here, parts: list[Element], information: Tensor, taken: int, decrement: float) -> Maximum:
+def _maximum(
+    here: _Here, parts: list[Element], information: Tensor, taken: int, decrement: float, began: float
+) -> Maximum:
     return Maximum(
         log_likelihood=here.ahead.log_likelihood,
         objective=here.objective,
@@ -191,4 +199,5 @@ def _maximum(here: _Here, parts: list[Element], information: Tensor, taken: int,
         information=information,
         steps=taken,
         decrement=decrement,
+        gained=here.objective - began,
     )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,8 +23,10 @@ from steady_ppl.program import Program
 from steady_ppl.scores import Element, elements, smoothed, typical_spreads
 
 LEADERS, ALIKE = 6, 0.85  # how many are refitted, and those as well whose columns correlate so much with the first
+NATS = 2.0  # of held-out log p(y) within which two candidates cannot be told apart
+NO_DOUBT = 10.0  # nats of held-out log p(y) for which no test is needed
 PROMISING = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
-NEAR = 6.0  # nats behind the best place on the first fold, with which another is not worth fitting on the second
+BETTER = 0.3  # nats by which another knee or place has to be likelier
 LINEAR = ("push", "command", "history", "measured", "viewpoint")
 
 
@@ -81,6 +84,10 @@ class Candidate:
         """Held-out gain of all drives, nats; extrapolated where one fold was enough to see that it leads nowhere."""
         folds = 2 if isinstance(self.refit, Refit) and len(self.refit.programs) == 1 else 1
         return folds * float(self.gain.sum())
+
+    def significant(self, critical: float) -> bool:
+        """Whether its own test reaches the family's level, or its gain leaves no doubt."""
+        return self.total > NATS and (self.tested.p_value <= critical or self.total > NO_DOUBT)
 
     @property
     def against_its_sign(self) -> bool:
@@ -176,28 +183,41 @@ def fitted(now: Refit, tested: Tested, screening: Screening, settings: Settings,
 
 
 def at_its_best_place(now: Refit, candidate: Candidate, settings: Settings) -> Candidate:
-    """A candidate with the knee, width or place at which it gains most."""
+    """A candidate with the knee, width or place at which it gains most: on its grid, and then between its points."""
     if isinstance(candidate.refit, str) or not candidate.variant.profiled:
         return candidate
-    fold, best = now.folds[0], candidate
-    seen = replace(fold.drives, states=fold.path.states)
-    start = candidate.refit.coefficient(candidate.variant)
-    least = float(now.maxima[0].log_likelihood.sum())
-    for variant in candidate.variant.effect.variants(now.program, seen):
-        if variant.name == candidate.variant.name and variant.label != candidate.variant.label:
-            assert isinstance(best.refit, Refit)
-            worth = float(best.refit.maxima[0].log_likelihood.sum()) - least - NEAR
-            refit = refit_with(now, variant, start, known_start=settings.known_start, worth=worth)
-            other = judged(
-                now, replace(candidate.tested, column=replace(candidate.tested.column, variant=variant)), refit
-            )
-            if (
-                isinstance(refit, Refit)
-                and len(refit.programs) == len(best.refit.programs)
-                and other.total > best.total
-            ):
-                best = other
-    return best
+    fold = now.folds[0]
+    every = candidate.variant.effect.variants(now.program, replace(fold.drives, states=fold.path.states))
+    grid = [variant for variant in every if variant.name == candidate.variant.name]
+    start, at = candidate.refit.coefficient(candidate.variant), candidate.variant
+    best = _gain_of_first_fold(now, candidate.refit)
+
+    def better(variants: Iterable[Variant]) -> bool:
+        nonlocal at, best, start
+        before = best
+        for variant in variants:
+            refit = refit_with(now, variant, start, known_start=settings.known_start, worth=math.inf)
+            if isinstance(refit, Refit) and _gain_of_first_fold(now, refit) > best + BETTER:
+                at, best, start = variant, _gain_of_first_fold(now, refit), refit.coefficient(variant)
+        return best > before
+
+    better(variant for variant in grid if variant.label != candidate.variant.label)
+    for share in (0.5, 0.25):
+        for name in at.profiled:
+            better(_beside(at, grid, name, share))
+    if at is candidate.variant:
+        return candidate
+    refit = refit_with(now, at, start, known_start=settings.known_start)
+    other = judged(now, replace(candidate.tested, column=replace(candidate.tested.column, variant=at)), refit)
+    return other if other.total > candidate.total else candidate
+
+
+def _beside(at: Variant, grid: Sequence[Variant], name: str, share: float) -> list[Variant]:
+    """The effect on either side of a place: by a share of the grid's spacing, or of the value where there is none."""
+    value = at.profiled[name]
+    values = sorted({float(variant.profiled[name]) for variant in grid})
+    apart = min((b - a for a, b in itertools.pairwise(values)), default=0.8 * value)
+    return [replace(at, options={**at.options, name: value + sign * share * apart}) for sign in (1, -1)]
 
 
 def judged(now: Refit, tested: Tested, refit: Refit | str) -> Candidate:

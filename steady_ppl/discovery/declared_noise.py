@@ -21,18 +21,18 @@ class Departure:
 
     Attributes:
         variant: `process_noise` of these channels.
-        away: log ratio of fitted to declared, `(k,)`.
-        slope: its derivative in the fitted parameters, `(P, k)`.
+        away: log ratio of fitted to declared, the channels' mean.
+        slope: its derivative in the fitted parameters, `(P,)`.
     """
 
     variant: Variant
-    away: Tensor
+    away: float
     slope: Tensor
 
     @property
     def factor(self) -> float:
-        """By what the noise differs, the channels together."""
-        return math.exp(float(self.away.mean()))
+        """By what the noise differs."""
+        return math.exp(self.away)
 
 
 @torch.no_grad()
@@ -65,7 +65,7 @@ def departures(
             index = [order.index(channel) for channel in variant.options["channels"]]
             index = [i for i in index if bool(slope[:, i].any()) and not _guessed(fitted, parts, slope[:, i])]
             if index:
-                found.append(Departure(variant, away[index], slope[:, index]))
+                found.append(Departure(variant, float(away[index].mean()), slope[:, index].mean(1)))
     return found
 
 

@@ -20,6 +20,10 @@ from steady_ppl.fit import Fit
 from steady_ppl.program import Program, for_program
 from steady_ppl.proving import Proof, prove
 
+FITTED_FURTHER = 10.0  # nats that fitting a run further may gain before it is said
+
+NOT_CONVERGED = "the program's own fit has not converged: no ranking below is to be trusted"
+
 
 @dataclass(frozen=True)
 class Discovery:
@@ -104,6 +108,7 @@ def discover(
         >>> import steady_ppl as st  # doctest: +SKIP
         >>> print(st.discover(st.load_program("mine.py"), st.read_table("drives.csv")))  # doctest: +SKIP
     """
+    is_fitted = isinstance(program, Fit) and program.recipe != "hand"
     if isinstance(program, Fit):
         known_start = program.known_start if known_start is None else known_start
         declared = declared or _as_written(program.program)
@@ -142,7 +147,7 @@ def discover(
         proof=_proof(found, shape is not None, drives[1], known_start, seed),
         before=fits[0],
         after=fits[1],
-        notes=notes + _notes(found),
+        notes=notes + _notes(found, is_fitted),
     )
 
 
@@ -168,10 +173,13 @@ def _proof(found: Search, is_curve: bool, valid: Trajectories, known_start: bool
     return prove(rows, valid, known_start=known_start, with_constant_velocity=False, seed=seed)
 
 
-def _notes(found: Search) -> list[str]:
+def _notes(found: Search, is_fitted: bool) -> list[str]:
     notes = []
     if not found.base.converged:
-        notes.append("the program's own fit has not converged: the ranking is not to be trusted")
+        notes.append(NOT_CONVERGED)
+    gained = found.base.maxima[0].gained
+    if is_fitted and gained > FITTED_FURTHER:
+        notes.append(f"the run had not converged on these drives: {gained:.0f} nats were gained by fitting it further")
     statistic, count = found.rounds[0].screening.tests.fitted
     if count and statistic > 5 * count + 10:
         notes.append(f"the fitted parameters' own score is large ({statistic:.0f} on {count}): the fit is at a bound")

@@ -156,7 +156,10 @@ def with_interval(finding: Finding) -> str:
 
 def as_text(found: Discovery) -> str:
     """The verdict, the equation, the candidates, and before and after."""
-    lines = textwrap.wrap(sentence(found), WIDTH)
+    first = (
+        [] if found.search.base.converged else ["The program's own fit has not converged; what follows may mislead."]
+    )
+    lines = [*first, *textwrap.wrap(sentence(found), WIDTH)]
     for finding in found.findings:
         lines += ["", f"{finding.variant.name}: {finding.variant.effect.text}", f"  {finding.variant.effect.feels}"]
     if found.shape:
@@ -193,7 +196,7 @@ def _table(found: Discovery) -> list[str]:
 
 def _line(found: Discovery, tested: Tested) -> list[str]:
     one = _candidate(found, tested)
-    name = f"curve {tested.variant.at}" if tested.is_curve else tested.variant.label
+    name = f"curve {tested.variant.at}" if tested.is_curve else tested.variant.name
     gain = "" if one["heldout_gain"] is None else f"{one['heldout_gain']:+.1f}"
     statistic, p_value = ("–", "–") if tested.untestable else (f"{one['statistic']:.1f}", f"{one['p_value']:.1g}")
     if tested.is_curve:
@@ -211,7 +214,7 @@ def _aligned(row: list[str], widths: list[int]) -> str:
 def _short(value: Any) -> str:
     if value is None:
         return "–"
-    return ", ".join(f"{v:.3g}" for v in value) if isinstance(value, list) else f"{value:.3g}"
+    return ", ".join(f"{v:.2g}" for v in value) if isinstance(value, list) else f"{value:.3g}"
 
 
 def _numbers(values: np.ndarray) -> float | list[float] | None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 from steady_ppl.data import Trajectories
 from steady_ppl.discovery.candidates import (
+    NATS,
     Candidate,
     Screening,
     Settings,
@@ -27,7 +28,6 @@ from steady_ppl.discovery.screening import LEVEL, Tested
 from steady_ppl.effects import attached
 from steady_ppl.program import Program
 
-NATS = 2.0  # of held-out log p(y) within which two candidates cannot be told apart
 BEHIND = 25.0  # nats behind the best on the first fold, with which a candidate is not worth fitting on the second
 MARGIN = 3.0  # nats by which a curve must be better than named effects
 RIVALS = 12.0  # nats behind the best in its round, with which a candidate is looked at again beside other effects
@@ -109,7 +109,7 @@ class Search:
 
     @property
     def needs_a_name(self) -> bool:
-        """Whether neither a curve nor the noise can be what the tests found."""
+        """Whether neither a curve nor departed noise can be what the tests found."""
         return self.curve is None and not self.departed
 
     @property
@@ -162,11 +162,14 @@ def search(
         if index == MOST:
             break
         candidates = _refits(found.final, screening, settings, index == 0, report)
-        best = next((c for c in candidates if not c.against_its_sign and isinstance(c.refit, Refit)), None)
-        gains = best is not None and best.total > NATS
+        able = [c for c in candidates if isinstance(c.refit, Refit) and not c.against_its_sign]
+        best = next((c for c in able if c.significant(screening.tests.critical)), None)
+        gains = best is not None
         if index == 0 and not gains:
             found.curves = _curves(found.base, screening, settings, report)
-        if best is None or not (gains or (index == 0 and found.needs_a_name)):
+        if index == 0 and not gains and able and found.needs_a_name:
+            best = able[0]
+        if best is None:
             found.rounds[-1] = Round(screening, candidates, None)
             break
         found.rounds[-1] = Round(screening, candidates, best)

@@ -1,0 +1,224 @@
+"""The whole loop on drives with hidden effects: compare, learn what is missing, add it, fit again, prove.
+
+Every step is a command as one could type it. That command is what runs, and the sentence below it is what it found.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import chdir
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from steady_ppl.command_tour import WIDTH, Tour
+from steady_ppl.errors import ComputationError, RunError, UsageError
+from steady_ppl.program import load_program
+from steady_ppl.run_folder import read_record
+from steady_ppl.run_recipe import recipe_folder
+
+RECORD = "demo.json"  # of a demonstration; a folder without one is not a demonstration's
+OWNERS, TRUTH = "models/hovercraft.py", "models/hovercraft.py:HovercraftTruth"
+BEGINNING = (
+    "A hovercraft whose owner's program knows no drag. What it did is known only by noisy bearings to four landmarks, "
+    "the controls, and where each drive began (--known-start: exactly, as in the paper)."
+)
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is simulated and fitted.
+
+    Attributes:
+        train, valid, test: drives to fit, to choose by, and locked away until the proof.
+        steps: E steps of each fit, fewer than the recipe takes by itself.
+        simulations: sets that calibrate the tests of `check` and `discover`; their own numbers when None.
+    """
+
+    train: int = 16
+    valid: int = 16
+    test: int = 32
+    steps: int = 100
+    simulations: int | None = None
+
+    @property
+    def calibration(self) -> str:
+        """As an option of the commands."""
+        return f" --simulations {self.simulations}" if self.simulations else ""
+
+
+def demonstrate(
+    out: Path, *, size: Size | None = None, force: bool = False, say: Callable[[str], None] = print
+) -> list[dict[str, Any]]:
+    """Go through the loop and keep everything in a folder: tables of drives, programs, runs, figures, pictures.
+
+    Args:
+        out: the folder; an earlier demonstration there is overwritten.
+        size: of the job.
+        force: write into a folder that is no demonstration's.
+        say: told every line.
+
+    Returns:
+        Title, commands, result and seconds of every step.
+
+    Raises:
+        RunError: the folder exists and is no demonstration's.
+        ComputationError: the search ended with nothing that can be added.
+    """
+    size = size or Size()
+    tour = Tour(say, force=out.exists())
+    _open(out, force)
+    say(textwrap.fill(BEGINNING, WIDTH))
+    say(f"\n   $ cd {shlex.quote(str(out))}")
+    with chdir(out):
+        record_drives(tour, size)
+        fit_the_owners_program(tour, size)
+        compare(tour, size)
+        effects = discover(tour, size)
+        grown = add(tour, effects)
+        fit_again(tour, size, grown)
+        prove(tour)
+        say(
+            textwrap.fill(
+                f"What had been hidden: {load_program(TRUTH)}.", WIDTH, initial_indent="\n   ", subsequent_indent="   "
+            )
+        )
+        _write_record({"status": "finished", "seconds": round(tour.seconds, 1), "steps": tour.steps})
+    say(f"\n{out}: check, discovery and proof as .png, .txt and .json; drives; runs; {grown}")
+    say(f"{tour.seconds:.0f} s in all")
+    return tour.steps
+
+
+def record_drives(tour: Tour, size: Size) -> None:
+    """Simulate drives of a hovercraft with drag, and forget its poses."""
+    from steady_ppl.table import read_table, write_table
+
+    tour.step("Record drives, of a hovercraft that does have drag")
+    drives = {"train": size.train, "valid": size.valid, "test": size.test}
+    for seed, (name, count) in enumerate(drives.items(), 1):
+        tour.steady(f"simulate {TRUTH} --trajectories {count} --seed {seed} --out {name}.csv")
+    for name in ("train", "valid"):
+        write_table(read_table(f"{name}.csv").without_truth(keep_start=True), Path(f"{name}.csv"))
+    tour.result(
+        f"{size.train} drives to fit and {size.valid} to choose by: of both only controls, bearings and the first "
+        f"state are kept. {size.test} more are locked away for the proof, with their poses, to judge by."
+    )
+
+
+def fit_the_owners_program(tour: Tour, size: Size) -> None:
+    """Mass, inertia and noise of the program without drag, by the recipe `steady`."""
+    tour.step("Fit the owner's program, which has none")
+    tour.result(_fit(tour, OWNERS, "before", size))
+
+
+def compare(tour: Tour, size: Size) -> None:
+    """Whether the program explains even the drives that it was fitted to."""
+    tour.step("Compare: does it explain even the drives that it was fitted to?")
+    tour.steady(
+        f"check runs/before train.csv{size.calibration} --json check.json --picture check.png",
+        keep="check.txt",
+    )
+    tour.result(_read("check.json")["verdict"])
+
+
+def discover(tour: Tour, size: Size) -> list[str]:
+    """Which effects are missing, as the run's record names them."""
+    tour.step("Discover: which physical effect is missing?")
+    tour.steady(
+        f"discover runs/before train.csv --valid valid.csv{size.calibration} --out runs/found "
+        "--json discovery.json --picture discovery.png",
+        keep="discovery.txt",
+    )
+    sentence = _read("discovery.json")["sentence"]
+    tour.result(sentence)
+    effects = read_record(Path("runs/found"))["effects"]
+    if not effects:
+        raise ComputationError(f"there is nothing to add, and the demonstration ends here: {sentence}")
+    return effects
+
+
+def add(tour: Tour, effects: Sequence[str]) -> str:
+    """Write the program with the effects beside the owner's."""
+    tour.step("Add: write the program with it")
+    names = dict.fromkeys(effect.split(":")[0].split("=")[0] for effect in effects)
+    grown = f"models/hovercraft_with_{'_and_'.join(names)}.py"
+    said = tour.steady(f"add runs/found --out {grown}").splitlines()
+    equations = [line for line in said[1:] if "$" not in line]
+    tour.result(f"{'; '.join(equations)}. It is a Pyro program like any other.")
+    return grown
+
+
+def fit_again(tour: Tour, size: Size, grown: str) -> None:
+    """Fit the new program in the same way, and what made the drives, as the yardstick."""
+    tour.step("Fit again, in the same way, on the same drives; and the true structure, as the yardstick")
+    said = _fit(tour, grown, "after", size)
+    _fit(tour, TRUTH, "oracle", size)
+    tour.result(said)
+
+
+def prove(tour: Tour) -> None:
+    """Before and after on the locked drives."""
+    tour.step("Prove: on the locked drives, which nothing has seen so far")
+    tour.steady(
+        f"prove runs/before runs/after test.csv --oracle runs/oracle --truth {TRUTH} "
+        "--json proof.json --picture proof.png",
+        keep="proof.txt",
+    )
+    figures = _read("proof.json")
+    tour.result(figures["verdict"])
+    tour.say("")
+    for line in summary(figures):
+        tour.say(f"     {line}")
+
+
+def summary(figures: Mapping[str, Any]) -> list[str]:
+    """A few columns of the proof's figures, as aligned lines: log p(y), errors of the measurements and of the first
+    error group of the states, and the channel whose noise had to be largest for what was missing."""
+    rows = figures["rows"]
+    unit, group = next(iter(rows[0]["measurement"])), next(iter(rows[0]["state"]))
+    ahead = [name for name in figures["horizons"] if name != "one step"]
+    before, after = (row["scales"]["channels"] for row in rows[:2])
+    channel = max(before, key=lambda name: before[name] / after[name])
+    far = "3 s" if "3 s" in ahead else ahead[-1]
+    header = ["", "log p(y)", *(f"{name} [{unit}]" for name in ahead)]
+    lines = [[*header, f"{group}, {far} [{figures['units'][group]}]", f"σ {channel}"]]
+    for row in rows:
+        errors = [row["measurement"][unit].get(name) for name in ahead]
+        values = [*errors, row["state"][group].get(far), row["scales"]["channels"].get(channel)]
+        shown = ["–" if value is None else f"{value:.3g}" for value in values]
+        lines.append([row["row"], f"{row['log_likelihood']:.1f}", *shown])
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    cells = [[line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])] for line in lines]
+    return ["  ".join(row) for row in cells]
+
+
+def _fit(tour: Tour, program: str, run: str, size: Size) -> str:
+    """The fitted program, in a line."""
+    said = tour.steady(f"fit {program} train.csv --valid valid.csv --known-start --steps {size.steps} --out runs/{run}")
+    return said.splitlines()[0].removeprefix(f"runs/{run}: ") + "."
+
+
+def _open(out: Path, force: bool) -> None:
+    """Make the folder, mark it as a demonstration's, and put the owner's program there."""
+    if out.exists() and not force and not (out / RECORD).is_file():
+        raise RunError(f"{out} exists and is no demo's: choose another folder, or --force to write into it")
+    source = recipe_folder().parent / OWNERS
+    try:
+        (out / "models").mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source, out / OWNERS)
+        with chdir(out):
+            _write_record({"status": "running"})
+    except OSError as error:
+        raise UsageError(f"{out} cannot be written: {error.strerror} ({error.filename})") from error
+
+
+def _write_record(content: Mapping[str, Any]) -> None:
+    Path(RECORD).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _read(file: str) -> dict[str, Any]:
+    return json.loads(Path(file).read_text(encoding="utf-8"))

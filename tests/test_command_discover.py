@@ -1,0 +1,83 @@
+"""`steady discover` as a person types it, rightly and wrongly."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from examples import MODELS, example
+from small import HOVERCRAFT, simulated, steady, written
+
+from steady_ppl import Fit, simulate, write_table
+
+MODEL = MODELS / "hovercraft.py"
+
+
+def refused(capsys, *arguments: object) -> str:
+    """The one line with which a command is refused."""
+    assert steady(*arguments) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and len(said.err.strip().splitlines()) == 1, said.err
+    return said.err
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    """Drives of a hovercraft with a yaw bias, 81 rows."""
+    folder = tmp_path_factory.mktemp("drives")
+    program = example("hovercraft", torch.float32)
+    program.noise = torch.tensor([0.08, 0.08, 0.05])
+    program = program.with_effect("yaw_bias", 0.1)
+    program.duration = 6.0
+    write_table(simulate(program, 12, seed=1), folder / "drives.csv")
+    return folder / "drives.csv"
+
+
+def test_a_model_is_fitted_searched_and_kept(table, tmp_path, capsys):
+    run, figures, picture = tmp_path / "run", tmp_path / "found.json", tmp_path / "found.png"
+    given = ("--known-start", "--simulations", 50, "--out", run, "--json", figures, "--picture", picture)
+    assert steady("discover", MODEL, table, *given) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("The dynamics lack yaw_bias = 0.")
+    assert "6 of the 12 drives were kept" in said
+    content = json.loads(figures.read_text())
+    assert content["verdict"] == "dynamics" and "yaw_bias" in content["class"]
+    assert picture.stat().st_size > 10_000
+    program = Fit.load(run).program
+    assert float(program.yaw_bias.detach()) == pytest.approx(content["effects"][0]["coefficient"][0], rel=1e-4)
+    assert steady("add", run, "--out", tmp_path / "biased.py") == 2  # it has to lie beside the program it derives from
+    capsys.readouterr()
+    assert "exists" in refused(capsys, "discover", MODEL, table, "--out", run)
+
+
+def test_what_cannot_be_searched_is_said_in_a_line(tmp_path, capsys):
+    few = written(tmp_path / "few.csv", simulated(trajectories=4, rows=20))
+    assert "at least 5" in refused(capsys, "discover", HOVERCRAFT, few)
+    network = f"{MODELS / 'neural_vehicle.py'}:NeuralHovercraft"
+    enough = written(tmp_path / "enough.csv", simulated(trajectories=12, rows=20))
+    said = refused(capsys, "discover", network, enough)
+    assert "network" in said and "hybrid" in said
+    assert "no file" in refused(capsys, "discover", tmp_path / "nothing.py", enough)
+    assert "leave it out" in refused(capsys, "discover", HOVERCRAFT, enough, "--program", HOVERCRAFT)
+
+
+def test_controls_that_never_change_get_no_verdict(tmp_path, capsys):
+    still = simulated(trajectories=12, rows=20)
+    still.controls[:] = 0.5
+    said = refused(capsys, "discover", HOVERCRAFT, written(tmp_path / "still.csv", still))
+    assert "the controls never change (left, right)" in said and "no verdict" in said
+
+
+def test_a_known_start_has_to_be_known(tmp_path, capsys):
+    unknown = written(tmp_path / "unknown.csv", simulated(trajectories=12, rows=20).without_truth())
+    assert "known start" in refused(capsys, "discover", HOVERCRAFT, unknown, "--known-start")
+
+
+def test_a_run_whose_program_changed_is_refused(table, tmp_path, capsys):
+    model = tmp_path / "hovercraft.py"
+    model.write_text(MODEL.read_text())
+    assert steady("fit", model, table, "--recipe", "hand", "--out", tmp_path / "run") == 0
+    model.write_text(MODEL.read_text() + "\n# changed\n")
+    capsys.readouterr()
+    assert "changed" in refused(capsys, "discover", tmp_path / "run", table)

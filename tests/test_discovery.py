@@ -1,0 +1,210 @@
+"""`discover`: right about what is planted, silent where nothing is, and honest about what it cannot tell."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+from examples import example
+
+import steady_ppl as st
+from steady_ppl.effects import Effect, chosen_variant, parsed
+from steady_ppl.effects.registry import _EFFECTS, register
+
+DRIVES, ROWS, SETS = 10, 81, 50
+
+
+def owner():
+    """The hovercraft with the noise that simulates it, everything learnable."""
+    program = example("hovercraft", torch.float32)
+    program.noise = torch.tensor([0.08, 0.08, 0.05])
+    program.guesses = ()
+    return program
+
+
+def tables(program, drives: int = DRIVES, rows: int = ROWS, seed: int = 0):
+    program.duration = (rows - 1) * program.step
+    return st.simulate(program, drives, seed=2 * seed + 1), st.simulate(program, drives, seed=2 * seed + 2)
+
+
+def with_effects(program, *texts):
+    for text in texts:
+        name, at, options, value = parsed(text)
+        program = program.with_effect(chosen_variant(program, name, at, **options), value)
+    return program
+
+
+def discovered(*texts: str, program=None, seed: int = 0, known_start: bool = True, **more) -> st.Discovery:
+    program = owner() if program is None else program
+    train, valid = tables(with_effects(program, *texts), seed=seed)
+    return st.discover(program, train, valid, known_start=known_start, simulations=SETS, **more)
+
+
+@pytest.fixture(scope="module")
+def dragged() -> st.Discovery:
+    return discovered("quadratic_drag=0.05")
+
+
+@pytest.fixture(scope="module")
+def clean() -> st.Discovery:
+    return discovered()
+
+
+def finite(content) -> bool:
+    if isinstance(content, dict):
+        return all(finite(value) for value in content.values())
+    if isinstance(content, list | tuple):
+        return all(finite(value) for value in content)
+    return not isinstance(content, float) or math.isfinite(content)
+
+
+def test_a_missing_drag_is_found_with_its_coefficient(dragged):
+    assert dragged.verdict == "dynamics" and dragged.p_value < 0.05
+    (finding,) = dragged.findings
+    assert finding.alike[0] == "quadratic_drag" and finding.confidence > 0.8
+    assert abs(finding.coefficient[0] - 0.05) < 4 * finding.sd[0]
+    low, high = finding.interval[0]
+    assert low < finding.coefficient[0] < high
+    assert high - low == pytest.approx(2 * 1.645 * finding.sd[0], rel=1e-3)
+
+
+def test_the_error_falls_and_the_noise_with_it(dragged):
+    before, after = dragged.figures["before"], dragged.figures["after"]
+    assert after["log_likelihood"] > before["log_likelihood"] + 2
+    assert after["measurement"]["rad"]["3 s"] < 0.9 * before["measurement"]["rad"]["3 s"]
+    noise = [max(side["scales"]["channels"].values()) for side in (before, after)]
+    assert noise[0] > 1.5 * noise[1]
+
+
+def test_the_improved_fit_has_the_effect_and_can_be_kept(dragged, tmp_path):
+    program = dragged.after.program
+    assert float(program.quadratic_drag.detach()) == pytest.approx(dragged.findings[0].coefficient[0])
+    dragged.after.save(tmp_path / "run")
+    again = st.Fit.load(tmp_path / "run")
+    assert float(again.program.quadratic_drag.detach()) == pytest.approx(dragged.findings[0].coefficient[0])
+
+
+def test_clean_drives_give_none_and_say_what_could_have_been_seen(clean):
+    assert clean.verdict == "none" and clean.p_value > 0.05
+    assert clean.findings == [] and clean.shape is None and clean.figures["effect"] is None
+    limits = {one["effect"]: one["detection_limit"] for one in clean.figures["candidates"]}
+    assert 0 < limits["linear_drag"] < 0.2 and 0 < limits["bearing_bias"] < 0.1
+    assert len(limits["slope"]) == 2
+    assert clean.figures["before"] == clean.figures["after"]
+
+
+def test_a_fault_of_the_sensor_is_not_blamed_on_the_dynamics():
+    found = discovered("landmark_bias:1=0.07")
+    assert found.verdict == "sensor" and found.findings[0].alike == ["landmark_bias:bearing_1"]
+    assert abs(found.findings[0].coefficient[0] - 0.07) < 4 * found.findings[0].sd[0]
+
+
+def test_two_effects_are_both_found():
+    found = discovered("linear_drag=0.12", "landmark_bias:2=0.08")
+    assert {finding.alike[0] for finding in found.findings} >= {"landmark_bias:bearing_2"}
+    assert any("linear_drag" in finding.alike for finding in found.findings)
+
+
+def test_what_no_effect_explains_is_a_curve():
+    found = discovered("yaw_linear_drag=0.12", withheld=["yaw_linear_drag", "yaw_quadratic_drag"])
+    assert found.verdict == "other" and found.findings == []
+    shape = found.shape
+    assert (shape.channel, shape.variable) == ("yaw", "yaw_rate")
+    for point, height, band in zip(shape.points, shape.curve, shape.band, strict=True):
+        assert abs(height + 0.12 * point) < 3 * band + 0.02
+    assert found.figures["class"] == [] and found.figures["effect"] is None
+
+
+def test_noise_that_is_not_the_declared_is_said_to_be():
+    program = owner()
+    truth = owner()
+    truth.noise = 3 * truth.noise.detach()
+    train, valid = tables(truth)
+    found = st.discover(program, train, valid, known_start=True, simulations=SETS)
+    assert found.verdict == "noise"
+    assert all(finding.variant.effect.name == "process_noise" for finding in found.findings)
+    assert found.findings[0].interval[0][0] < 3 < found.findings[0].interval[0][1] * 1.3
+    program.guesses = ("noise",)
+    again = st.discover(program, train, valid, known_start=True, simulations=SETS)
+    assert "process_noise" not in [finding.variant.effect.name for finding in again.findings]
+
+
+def test_an_effect_of_ones_own_is_found():
+    def tether(self, state, control, time, step, c):
+        return {"yaw": -c * state[..., 2].sin()}
+
+    effect = Effect(
+        name="compass_spring",
+        form="push",
+        equation=r"a_\psi = -c \sin\psi",
+        text="a_yaw = -c sin(heading)",
+        unit="rad/s²",
+        feels="turns north by itself",
+        function=tether,
+        typical=0.1,
+        limit=5.0,
+        lacks=lambda program: None if "heading" in program.angles else "there is no heading",
+    )
+    known = list(_EFFECTS)
+    register(effect)
+    try:
+        found = discovered("compass_spring=0.08")
+    finally:
+        _EFFECTS[:] = known
+    assert found.figures["effect"] == "compass_spring"
+    assert abs(found.findings[0].coefficient[0] - 0.08) < 4 * found.findings[0].sd[0]
+
+
+def test_a_pendulum_lacks_friction_and_says_so():
+    program = example("pendulum", torch.float32)
+    found = discovered("coulomb_friction=0.8", program=program)
+    assert found.verdict == "dynamics" and "coulomb_friction" in found.findings[0].alike
+
+
+SCHEMA = {
+    "verdict": str,
+    "p_value": float,
+    "effect": (str, type(None)),
+    "class": list,
+    "confidence": (float, type(None)),
+    "candidates": list,
+    "shape": (dict, type(None)),
+    "next_run": (dict, type(None)),
+    "before": dict,
+    "after": dict,
+}
+CANDIDATE = {
+    "effect": str,
+    "kind": str,
+    "statistic": float,
+    "p_value": float,
+    "coefficient": (float, list, type(None)),
+    "sd": (float, list, type(None)),
+    "unit": str,
+    "detection_limit": (float, list, type(None)),
+    "heldout_gain": (float, type(None)),
+    "heldout_gain_ci": (list, type(None)),
+}
+
+
+def test_the_figures_keep_to_the_schema(dragged, clean):
+    for found in (dragged, clean):
+        figures = json.loads(json.dumps(found.figures, allow_nan=False))
+        assert finite(figures)
+        for key, kind in SCHEMA.items():
+            assert isinstance(figures[key], kind), key
+        assert figures["verdict"] in ("none", "dynamics", "actuator", "sensor", "noise", "other")
+        for candidate in figures["candidates"]:
+            for key, kind in CANDIDATE.items():
+                assert isinstance(candidate[key], kind), (candidate["effect"], key)
+        names = [candidate["effect"] for candidate in figures["candidates"]]
+        assert len(names) == len(set(names))
+
+
+def test_the_text_says_the_verdict_first(dragged, clean):
+    assert str(dragged).startswith("The dynamics lack quadratic_drag = 0.0")
+    assert "a = -c v |v|" in str(dragged) and "open-loop error −" in str(dragged)
+    assert str(clean).startswith("No effect is missing as far as these drives can tell (p = ")
+    assert all(len(line) <= 125 for line in str(dragged).splitlines())
