@@ -26,7 +26,7 @@ learn-truck: $(INSTALLED)
 	$(BIN)/python benchmarks/learn.py truck --data "$(DATA)" --out $(OUT)/learn-truck
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -9,10 +9,12 @@ gone on with. The table of scores is printed at the end and written beside the r
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import math
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -79,8 +81,8 @@ def _improvement(chosen: BenchmarkSet, found: Discovery, test: Any) -> dict[str,
             oracle = refit_with(oracle, variant, value, known_start=True)
     rows: dict[str, Any] = {"before": found.before.program, "after": found.after.program}
     if found.shape is not None and found.search.curve and isinstance(found.search.curve.refit, Refit):
-        rows["after"] = found.search.curve.refit.program
-    rows["oracle"] = found.before.program if isinstance(oracle, str) else oracle.program
+        rows["after"] = found.search.curve.refit.mean_program()
+    rows["oracle"] = found.before.program if isinstance(oracle, str) else oracle.mean_program()
     proof = prove(rows, for_program(owner(), test), known_start=True, with_constant_velocity=False)
     errors = {}
     for row in proof.figures["rows"]:
@@ -124,10 +126,21 @@ def _plain(value: Any) -> Any:
     return value
 
 
+@cache
+def version() -> str:
+    """A digest of the engine's source."""
+    files = sorted((Path(__file__).parents[1] / "steady_ppl").rglob("*.py"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+
+
 def _run(work: Any, chosen: list[tuple[Any, ...]], file: Path, workers: int) -> list[dict[str, Any]]:
     """Records of the file and of everything that is not in it yet, appended as it is done."""
     file.parent.mkdir(exist_ok=True)
     done = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    done = [record for record in done if "failed" not in record]
+    others = {record["version"] for record in done} - {version()}
+    if others:
+        raise SystemExit(f"{file} was made by other versions of the engine ({', '.join(sorted(others))}): move it away")
     there = {record["set"] for record in done}
     left = [arguments for arguments in chosen if arguments[0].name not in there]
     began = time.perf_counter()
@@ -138,6 +151,7 @@ def _run(work: Any, chosen: list[tuple[Any, ...]], file: Path, workers: int) -> 
                 record = future.result()
             except Exception as error:
                 record = {"set": running[future], "failed": f"{type(error).__name__}: {error}"}
+            record["version"] = version()
             done.append(record)
             out.write(json.dumps(record) + "\n")
             out.flush()

@@ -32,8 +32,8 @@ def clearly(record: Record, least: float = CLEARLY) -> bool:
 
 
 def in_class(record: Record) -> bool:
-    """Whether the effect is in the class of the first finding."""
-    return planted(record)[0] in record["class"]
+    """Whether the effect (of two, either) is in the class of the first finding."""
+    return any(name in record["class"] for name in planted(record))
 
 
 def interval(count: int, total: int) -> str:
@@ -89,7 +89,7 @@ def scores_table(records: Sequence[Record]) -> str:
     single = [record for record in of["single"] if clearly(record)]
     weak = [record for record in of["single"] if not clearly(record)]
     one = single + of["large"]
-    named = [r for r in of["single"] + of["large"] if r["class"]]
+    named = [r for r in records if r["class"] and r["confidence"] is not None]
     shares = [value for record in one if (value := attained(record)) is not None]
     sizes = [len(record["class"]) for record in single if record["class"]]
     pairs = [record for record in of["pair"] if clearly(record, 3)]

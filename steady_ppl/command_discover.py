@@ -51,18 +51,18 @@ def discover(
         seed=seed,
         report=_progress,
     )
-    if json_file is not None:
-        _write_json(json_file, {"source": source, **found.figures})
-    if picture is not None:
-        from steady_ppl.discovery.pictures import discovery_picture
-
-        write_picture(discovery_picture(found), picture)
     print(found)
     if out is not None:
         found.after.save(out, force=force)
         for note in found.after.notes:
             _say(note)
         print(f"{out}: {found.after.program}")
+    if json_file is not None:
+        _write_json(json_file, {"source": source, **found.figures})
+    if picture is not None:
+        from steady_ppl.discovery.pictures import discovery_picture
+
+        write_picture(discovery_picture(found), picture)
 
 
 def _progress(text: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -157,10 +158,47 @@ def test_an_effect_of_ones_own_is_found():
     assert abs(found.findings[0].coefficient[0] - 0.08) < 4 * found.findings[0].sd[0]
 
 
-def test_a_pendulum_lacks_friction_and_says_so():
+def test_a_pendulum_lacks_friction_and_a_spring_and_says_so():
     program = example("pendulum", torch.float32)
-    found = discovered("coulomb_friction=0.8", program=program)
-    assert found.verdict == "dynamics" and "coulomb_friction" in found.findings[0].alike
+    found = discovered("coulomb_friction=0.8", "cubic_stiffness=4", program=program)
+    assert found.verdict == "dynamics"
+    assert {finding.alike[0] for finding in found.findings} == {"coulomb_friction", "cubic_stiffness"}
+    for finding, planted in ((one, 0.8 if one.alike[0] == "coulomb_friction" else 4) for one in found.findings):
+        assert abs(finding.coefficient[0] - planted) < 4 * finding.sd[0]
+
+
+def test_an_unknown_start_gaps_and_unequal_lengths_do_not_mislead():
+    train, valid = tables(with_effects(owner(), "quadratic_drag=0.06"), rows=91)
+    found = st.discover(owner(), gappy(train, 1), gappy(valid, 2), simulations=SETS)
+    assert found.verdict == "dynamics" and "quadratic_drag" in found.findings[0].alike
+
+
+def gappy(data, seed: int):
+    """A tenth of the cells missing, every third drive twenty rows shorter, no true states."""
+    random = torch.Generator().manual_seed(seed)
+    lengths = data.lengths.clone()
+    lengths[::3] -= 20
+    inside = torch.arange(len(data.time)).unsqueeze(-1) < lengths
+    seen = (torch.rand(data.observed.shape, generator=random) > 0.1) & inside.unsqueeze(-1) & data.observed
+    time = torch.where(inside, data.time, data.time.gather(0, (lengths - 1).unsqueeze(0)))
+    after = (torch.arange(len(data.time)).unsqueeze(-1) - lengths + 1).clamp(min=0)
+    return replace(
+        data,
+        time=time + 0.1 * after,
+        lengths=lengths,
+        observed=seen,
+        measurements=torch.where(seen, data.measurements, 0.0),
+        controls=torch.where(inside.unsqueeze(-1), data.controls, 0.0),
+        states=None,
+    )
+
+
+def test_a_run_that_has_an_effect_is_searched_for_the_next_one(dragged, tmp_path):
+    dragged.after.save(tmp_path / "run")
+    train, valid = tables(with_effects(owner(), "quadratic_drag=0.05"))
+    again = st.discover(st.Fit.load(tmp_path / "run"), train, valid, simulations=SETS)
+    assert "quadratic_drag" not in [finding.variant.name for finding in again.findings]
+    assert again.before.known_start
 
 
 SCHEMA = {

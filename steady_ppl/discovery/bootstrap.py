@@ -11,6 +11,7 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.discovery.columns import PART, Column, Scoring
+from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import smooth
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
@@ -18,6 +19,8 @@ from steady_ppl.predictions import simulate_again
 from steady_ppl.program import Program
 from steady_ppl.scores import Element, parameter_scores, smoothed
 from steady_ppl.seeding import seeded
+
+MOST_LOST = 0.8  # share of the simulated sets that has to be left
 
 
 @dataclass(frozen=True)
@@ -85,4 +88,11 @@ def simulate_scores(
         )
         scores.append(scores_along(program, part, ahead, parts, columns))
         likely.append(ahead.log_likelihood)
-    return Simulated(torch.cat(scores).unflatten(0, (sets, len(data))), torch.cat(likely).view(sets, len(data)))
+    found = Simulated(torch.cat(scores).unflatten(0, (sets, len(data))), torch.cat(likely).view(sets, len(data)))
+    whole = torch.isfinite(found.scores).all(-1).all(-1) & torch.isfinite(found.log_likelihood).all(-1)
+    if int(whole.sum()) < MOST_LOST * sets:
+        raise FilterError(
+            f"{int((~whole).sum())} of {sets} simulated sets blew up: the fitted program does not even explain "
+            "drives of its own"
+        )
+    return Simulated(found.scores[whole], found.log_likelihood[whole])

@@ -18,6 +18,7 @@ from steady_ppl.discovery.declared_noise import departures
 from steady_ppl.discovery.refits import Refit, refit_with
 from steady_ppl.discovery.screening import LEVEL, Screened, Tested, screen
 from steady_ppl.effects import Variant, attached, catalogue
+from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import smooth
 from steady_ppl.program import Program
 from steady_ppl.scores import Element, elements, smoothed, typical_spreads
@@ -80,10 +81,16 @@ class Candidate:
         return self.tested.variant
 
     @property
+    def is_judged(self) -> bool:
+        """Whether it was fitted on every fold."""
+        return isinstance(self.refit, Refit) and len(self.refit.programs) > 1
+
+    @property
     def total(self) -> float:
-        """Held-out gain of all drives, nats; extrapolated where one fold was enough to see that it leads nowhere."""
-        folds = 2 if isinstance(self.refit, Refit) and len(self.refit.programs) == 1 else 1
-        return folds * float(self.gain.sum())
+        """Held-out gain of all drives, nats, less one for each knee or place, which the training drives chose;
+        extrapolated where one fold was enough to see that it leads nowhere."""
+        folds = 1 if self.is_judged else 2
+        return folds * float(self.gain.sum()) - len(self.variant.profiled)
 
     def significant(self, critical: float) -> bool:
         """Whether its own test reaches the family's level, or its gain leaves no doubt."""
@@ -129,6 +136,9 @@ def screen_program(now: Refit, declared: Program, settings: Settings, *, sets: i
     spread, sharpness = typical_spreads(program, fold.drives, smoothed(ahead, fold.drives))
     columns = columns_of([*variants, *curves(program, seen, spread, sharpness)])
     observed = scores_along(program, fold.drives, ahead, parts, columns)
+    broken = (~torch.isfinite(observed).all(-1)).nonzero().flatten().tolist()
+    if broken:
+        raise FilterError(f"trajectory {fold.drives.labels[broken[0]]}: the fitted program blows up on it")
     simulated = simulate_scores(
         program,
         fold.drives,

@@ -13,9 +13,9 @@ from steady_ppl.data import Trajectories
 from steady_ppl.discovery.discovery_report import as_text, figures
 from steady_ppl.discovery.finding import Finding, Shape, findings, shape_of
 from steady_ppl.discovery.next_run import NextRun, next_run
-from steady_ppl.discovery.refits import Refit
-from steady_ppl.discovery.requirements import require
+from steady_ppl.discovery.requirements import require, unexcited
 from steady_ppl.discovery.search import Search, search
+from steady_ppl.effects import record, restore, written_class
 from steady_ppl.fit import Fit
 from steady_ppl.program import Program, for_program
 from steady_ppl.proving import Proof, prove
@@ -35,7 +35,7 @@ class Discovery:
         shape: the curve where no effect of the catalogue explains the drives.
         next_run: controls that would separate the first finding's class; None where it has one member.
         proof: the program before and after on the validation drives, by the fits to the training drives.
-        before, after: the programs, fitted to all drives; equal where nothing was found.
+        before, after: the programs, fitted to all drives; equal where no effect was found by name.
         notes: what was left out or is not as it seems.
     """
 
@@ -51,9 +51,9 @@ class Discovery:
     @property
     def verdict(self) -> str:
         """none, dynamics, actuator, sensor, noise or other."""
-        if self.shape is not None:
-            return "other"
-        return self.findings[0].kind if self.findings else "none"
+        if self.findings:
+            return self.findings[0].kind
+        return "none" if self.search.rounds[0].quiet else "other"
 
     @property
     def p_value(self) -> float:
@@ -114,7 +114,8 @@ def discover(
         declared = declared or _as_written(program.program)
         program = program.program
     known_start = bool(known_start)
-    declared = copy.deepcopy(declared or program)
+    program = copy.deepcopy(program).cpu()
+    declared = copy.deepcopy(declared or program).cpu()
     notes: list[str] = []
     if valid is None:
         valid = train.subset(range(1, len(train), 2))
@@ -138,7 +139,7 @@ def discover(
     effects = [] if shape else findings(found)
     final = found.base if shape or found.rounds[0].quiet else found.final
     settings = {"simulations": simulations, "seed": seed}
-    fits = [Fit(_mean(refit), "discover", settings, seed, known_start) for refit in (found.base, final)]
+    fits = [Fit(refit.mean_program(), "discover", settings, seed, known_start) for refit in (found.base, final)]
     return Discovery(
         search=found,
         findings=effects,
@@ -152,19 +153,9 @@ def discover(
 
 
 def _as_written(program: Program) -> Program:
+    """The program as its file declares it, with the effects that were added to it."""
     with torch.random.fork_rng():
-        return type(program)()
-
-
-def _mean(refit: Refit) -> Program:
-    """The folds' parameters averaged where they are learned: nearly what a fit to all drives together gives."""
-    mean = copy.deepcopy(refit.programs[0])
-    weights = [len(fold.drives) for fold in refit.folds]
-    for name, parameter in mean.named_parameters():
-        if parameter.requires_grad:
-            parts = [w * dict(p.named_parameters())[name].data for w, p in zip(weights, refit.programs, strict=True)]
-            parameter.data.copy_(torch.stack(parts).sum(0) / sum(weights))
-    return mean
+        return restore(written_class(program)(), record(program)).to(next(program.parameters(), torch.zeros(())).dtype)
 
 
 def _proof(found: Search, is_curve: bool, valid: Trajectories, known_start: bool, seed: int) -> Proof:
@@ -183,7 +174,14 @@ def _notes(found: Search, is_fitted: bool) -> list[str]:
     statistic, count = found.rounds[0].screening.tests.fitted
     if count and statistic > 5 * count + 10:
         notes.append(f"the fitted parameters' own score is large ({statistic:.0f} on {count}): the fit is at a bound")
-    if not found.rounds[-1].quiet and found.found:
+    constant = unexcited(found.base.program, found.base.folds[0].drives)
+    if constant:
+        notes.append(f"{', '.join(constant)} never changes: what it does cannot be told from what happens anyway")
+    if found.curve is not None:
+        notes.append("a curve has no name and is not kept: the improved fit is the program as it stood, fitted")
+    if not found.final.converged and found.found:
+        notes.append("the fit with what was found has not converged")
+    if not found.rounds[-1].quiet:
         notes.append("something is left that no effect of the catalogue brings: the tests were not quiet at the end")
     for candidate in found.rounds[0].candidates:
         if candidate.against_its_sign and candidate.total > 0:

@@ -10,6 +10,7 @@ import numpy as np
 
 from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.finding import Finding, gain_interval
+from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.screening import LEVEL, Tested
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ def _candidate(found: Discovery, tested: Tested) -> dict[str, Any]:
         "kind": "other" if tested.is_curve else variant.effect.verdict,
         "statistic": tested.statistic,
         "p_value": tested.p_value,
-        "coefficient": _numbers(tested.coefficient),
+        "coefficient": _numbers(tested.coefficient + (1.0 if variant.effect.null == 1 else 0.0)),
         "sd": _numbers(tested.sd),
         "unit": variant.effect.unit,
         "options": {name: _plain(value) for name, value in variant.profiled.items()},
@@ -102,6 +103,10 @@ def _note(tested: Tested, fitted: Candidate | None) -> str | None:
         return fitted.refit
     if fitted and fitted.against_its_sign:
         return "its sign is one that physics rules out: a symptom"
+    if fitted and not fitted.is_judged:
+        return "given up after half of the drives: its gain is extrapolated"
+    if fitted and isinstance(fitted.refit, Refit) and not fitted.refit.converged:
+        return "its fit has not converged"
     return None
 
 
@@ -134,14 +139,26 @@ def sentence(found: Discovery) -> str:
     if found.shape is not None:
         shape = found.shape
         return f"{start} (p = {found.p_value:.2g}): {shape.channel} lacks a curve of {shape.variable}."
-    parts = []
-    for finding in found.findings:
-        said = f"{finding.variant.label} = {with_interval(finding)}"
-        if len(finding.alike) > 1:
-            said += f", which these drives cannot tell from {' or '.join(finding.alike[1:])}"
-        parts.append(said)
-    sure = found.findings[0].confidence
-    return f"{start} {'; and '.join(parts)} (p = {found.p_value:.2g}, confidence {sure:.0%})."
+    if not found.findings:
+        return (
+            f"{start} (p = {found.p_value:.2g}), and neither an effect nor a curve brings anything on held-out drives."
+        )
+    clauses: list[str] = []
+    for kind in dict.fromkeys(finding.kind for finding in found.findings):
+        said = [_said(finding) for finding in found.findings if finding.kind == kind]
+        words = IN_WORDS[kind] if not clauses else IN_WORDS[kind][0].lower() + IN_WORDS[kind][1:]
+        clauses.append(f"{words} {' and '.join(said)}")
+    return f"{'; '.join(clauses)} (p = {found.p_value:.2g})."
+
+
+def _said(finding: Finding) -> str:
+    said = f"{finding.variant.label} = {with_interval(finding)}"
+    if len(finding.alike) > 1:
+        said += f", which these drives cannot tell from {' or '.join(finding.alike[1:])}"
+    if finding.confidence is None:
+        return said
+    sure = ">99 %" if finding.confidence > 0.99 else f"{100 * finding.confidence:.0f} %"
+    return f"{said} (confidence {sure})"
 
 
 def with_interval(finding: Finding) -> str:

@@ -30,20 +30,21 @@ class Finding:
         variant: the effect, the best of its class.
         kind: dynamics, actuator, sensor or noise.
         alike: names of the effects that these drives cannot tell apart, best first.
-        confidence: the probability that the right one is among them.
+        confidence: the probability that the right one is among them; None for noise that is not the declared, which is
+            a test's result.
         coefficient, sd: each number of the coefficient and its standard deviation.
         interval: 90 %, one a number.
-        gain: nats of held-out log p(y) that it brings.
+        gain: nats of held-out log p(y) that it brings; None for noise that is not the declared.
     """
 
     variant: Variant
     kind: str
     alike: list[str]
-    confidence: float
+    confidence: float | None
     coefficient: list[float]
     sd: list[float]
     interval: list[tuple[float, float]]
-    gain: float
+    gain: float | None
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def findings(search: Search) -> list[Finding]:
     """The effects that were found, the one that brings most first."""
     found = [_finding(search, one) for one in search.found]
     found += [_departure(search, tested) for tested in search.departed]
-    return sorted(found, key=lambda finding: -finding.gain)
+    return sorted(found, key=lambda finding: -(finding.gain or 0.0))
 
 
 def _finding(search: Search, found: Found) -> Finding:
@@ -101,7 +102,9 @@ def _finding(search: Search, found: Found) -> Finding:
 def _spread(search: Search, variant: Variant, count: int) -> np.ndarray:
     """Standard deviations in the space in which the coefficient is learned, of a fit to all drives."""
     screening = search.rounds[-1].screening
-    covariance = torch.linalg.pinv(screening.information[""], hermitian=True)
+    information = screening.information[""]
+    ridge = 1e-10 * float(information.diagonal().max()) * torch.eye(len(information)).double()
+    covariance = torch.linalg.inv(information + ridge)  # what the drives do not tell has a huge variance
     folds = search.final.folds
     share = len(folds[0].drives) / sum(len(fold.drives) for fold in folds)
     learned = [part.name.split("[")[0] for part in screening.parameters]
@@ -113,11 +116,10 @@ def _spread(search: Search, variant: Variant, count: int) -> np.ndarray:
 def _confidence(search: Search, found: Found, alike: Sequence[Candidate]) -> float:
     """Posterior probability of the class, all candidates, none and the best curve alike before."""
     totals = {id(c): c.total for c in found.candidates if isinstance(c.refit, Refit)}
-    best = max(totals.values())
-    whole = sum(math.exp(total - best) for total in totals.values()) + math.exp(min(0.0, -best))
     curve = max((c.total for c in search.curves if isinstance(c.refit, Refit)), default=-math.inf)
-    whole += math.exp(min(50.0, curve - search.gain - MARGIN))
-    return sum(math.exp(totals[id(c)] - best) for c in alike) / whole
+    rivals = [0.0, found.candidate.total + curve - search.gain - MARGIN]
+    whole = np.logaddexp.reduce([*totals.values(), *rivals])
+    return float(np.exp(np.logaddexp.reduce([totals[id(c)] for c in alike]) - whole))
 
 
 def _departure(search: Search, tested: Tested) -> Finding:
@@ -127,11 +129,11 @@ def _departure(search: Search, tested: Tested) -> Finding:
         variant=tested.variant,
         kind="noise",
         alike=[tested.variant.name],
-        confidence=1 - tested.p_value,
+        confidence=None,
         coefficient=[factor],
         sd=[sd],
         interval=[(factor * math.exp(-by), factor * math.exp(by))],
-        gain=0.0,
+        gain=None,
     )
 
 

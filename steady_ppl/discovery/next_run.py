@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -43,7 +44,8 @@ class NextRun:
 
 @torch.no_grad()
 def next_run(search: Search, known_start: bool, seed: int) -> NextRun | None:
-    """The best of some ways of driving within the limits of the controls that were driven.
+    """The best of some ways of driving within the limits of the controls that were driven, None where none separates
+    the class better than the drives that there are.
 
     Each is simulated with the best member of the class; the others are judged by how much less likely they find it.
     """
@@ -52,20 +54,21 @@ def next_run(search: Search, known_start: bool, seed: int) -> NextRun | None:
         return None
     data = members[0].refit.folds[0].drives  # type: ignore[union-attr]
     usual = _separation(members, data.controls, data, known_start, seed)
-    best: tuple[float, str, Tensor] | None = None
+    found = []
     for way, controls in _ways(data, seed):
         apart = _separation(members, controls.unsqueeze(1).expand_as(data.controls), data, known_start, seed)
-        if best is None or apart > best[0]:
-            best = apart, way, controls
-    if best is None:
+        if math.isfinite(apart) and apart > max(0.0, usual):
+            found.append((apart, way, controls))
+    if not found:
         return None
+    separation, way, controls = max(found, key=lambda one: one[0])
     order = names(members[0].refit.program.controls)  # type: ignore[union-attr]
     return NextRun(
-        way=best[1],
-        controls={name: [round(v, 4) for v in best[2][:, i].tolist()] for i, name in enumerate(order)},
+        way=way,
+        controls={name: [round(v, 4) for v in controls[:, i].tolist()] for i, name in enumerate(order)},
         step=float(data.steps[data.transitions].median()),
-        separation=best[0],
-        usual=usual,
+        separation=separation,
+        usual=usual if math.isfinite(usual) else 0.0,
     )
 
 
@@ -105,8 +108,10 @@ def _ways(data: Trajectories, seed: int) -> Iterator[tuple[str, Tensor]]:
         for index in range(TYPES):
             held = torch.where(torch.rand(count) < 0.5, low, high)
             yield f"hold {index + 1}: one level throughout", held.expand(rows, count).clone()
-            push = torch.where((time < (0.2, 0.4, 0.6)[index]).unsqueeze(-1), high, low.clamp(min=0))
-            yield f"push and coast: full for {(20, 40, 60)[index]} % of the time, then nothing", push
+            push = torch.where(
+                (time < (0.2, 0.4, 0.6)[index]).unsqueeze(-1), high, torch.zeros_like(low).clamp(low, high)
+            )
+            yield f"push and coast: full for {(20, 40, 60)[index]} % of the time, then as little as was driven", push
             levels = low + (high - low) * torch.rand(5, count)
             held = levels[(time * 4.999).long()]
             yield f"steps {index + 1}: five random levels", held

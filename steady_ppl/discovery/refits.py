@@ -67,6 +67,17 @@ class Refit:
         parts = [w * value for w, value in zip(weights, self.coefficients(variant), strict=True)]
         return torch.stack(parts).sum(0) / sum(weights)
 
+    def mean_program(self) -> Program:
+        """The folds' parameters averaged where they are learned: nearly what a fit to all drives together gives."""
+        mean = copy.deepcopy(self.programs[0])
+        weights = [len(fold.drives) for fold, _ in zip(self.folds, self.programs, strict=False)]
+        learned = [dict(program.named_parameters()) for program in self.programs]
+        for name, parameter in mean.named_parameters():
+            if parameter.requires_grad:
+                parts = [weight * values[name].data for weight, values in zip(weights, learned, strict=True)]
+                parameter.data.copy_(torch.stack(parts).sum(0) / sum(weights))
+        return mean
+
     @property
     def converged(self) -> bool:
         """Whether both fits did."""

@@ -23,6 +23,8 @@ def require(program: Program, train: Trajectories, valid: Trajectories, known_st
     if simulations < FEWEST_SETS:
         raise UsageError(f"got {simulations} simulations: the calibration needs at least {FEWEST_SETS}, 200 are better")
     elements(program)
+    if not names(program.channels):
+        raise UsageError("the program declares no noise channels, through which effects act")
     for name, drives in (("training", train), ("validation", valid)):
         if len(drives) < FEWEST_DRIVES:
             raise DataError(
@@ -33,6 +35,8 @@ def require(program: Program, train: Trajectories, valid: Trajectories, known_st
             raise DataError(f"the {name} drives have no measurements after their first rows")
         if known_start:
             _ = drives.known_start
+    if train.measurements.shape == valid.measurements.shape and torch.equal(train.measurements, valid.measurements):
+        raise UsageError("the validation drives are the training drives: nothing could be judged by them")
     why = why_not_linear(program, train, known_start=known_start)
     if why is not None:
         raise UsageError(f"discover needs a program that can be linearised: {why.split(': looking')[0]}")

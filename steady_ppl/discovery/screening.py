@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy import stats
+from scipy import optimize, stats
 from torch import Tensor
 
 from steady_ppl.discovery.bootstrap import Simulated
@@ -22,7 +22,7 @@ from steady_ppl.discovery.curves import NAME as CURVE
 from steady_ppl.discovery.declared_noise import Departure
 from steady_ppl.effects import Variant
 
-LEVEL = 0.05
+LEVEL, POWER = 0.05, 0.95
 GONE = 1e-4  # share of a column's information that the fitted parameters must leave for it to be tested
 
 
@@ -35,9 +35,11 @@ class Tested:
         statistic: the Lagrange multiplier; of a curve, with its prior.
         p_value: of this candidate alone.
         coefficient, sd: one scoring step from zero, and its standard deviation, `(k,)`.
-        detection_limit: the coefficient found with 95 % power at the family-wise level, `(k,)`.
+        detection_limit: the coefficient found with 95 % power at the family-wise level, each number alone, `(k,)`.
         evidence: log Bayes factor of a curve, else zero.
         untestable: why it has no test, else None.
+        alone: standard deviation of each number when the others are zero, `(k,)`.
+        effective: how many independent tests the best of its columns is like.
         departure: whether it says that a fitted σ is not the declared one; there is nothing left to fit then.
     """
 
@@ -49,6 +51,8 @@ class Tested:
     detection_limit: np.ndarray
     evidence: float = 0.0
     untestable: str | None = None
+    alone: np.ndarray | None = None
+    effective: float = 1.0
     departure: bool = False
 
     @property
@@ -117,14 +121,15 @@ def screen(
         alive = [test for test in tests if test is not None]
         found.append(_of_group(columns[members[0]], alive, len(sums)))
         chosen.append(min(alive, key=lambda test: test.p_values[0]).at if alive else _slice(columns, members[0]))
-        curves += [_of_group(test.column, [test], len(sums))[0] for test in alive if test.evidence]
+        curves += [
+            _of_group(test.column, [test], len(sums))[0] for test in alive if test.column.variant.effect.name == CURVE
+        ]
     for departure in departures:
         found.append(_departed(departure, information[own, own], scores[:, own]))
         chosen.append(slice(0, 0))
     family = np.stack([p_values for _, p_values in found]).min(0)
     critical = float(np.quantile(family[1:], LEVEL))
-    reach = float(stats.norm.isf(critical / 2)) + float(stats.norm.isf(0.05))
-    tested = [t if t.untestable else replace(t, detection_limit=reach * t.sd) for t, _ in found]
+    tested = [replace(t, detection_limit=_limit(t, critical)) for t, _ in found]
     own_step = torch.linalg.lstsq(information[own, own], scores[0, own]).solution if fitted else scores[0, own]
     order = sorted(range(len(tested)), key=lambda i: (tested[i].p_value, -tested[i].statistic))
     return Screened(
@@ -145,6 +150,7 @@ class _Found:
     p_values: np.ndarray
     coefficient: np.ndarray
     sd: np.ndarray
+    alone: np.ndarray
     evidence: float = 0.0
 
 
@@ -156,13 +162,33 @@ def _of_group(column: Column, alive: list[_Found], sets: int) -> tuple[Tested, n
         endless = nothing + math.inf
         return Tested(column, 0.0, 1.0, nothing, endless, endless, untestable=reason), np.ones(sets + 1)
     p_values = np.stack([test.p_values for test in alive])
-    effective = _effective(p_values[:, 1:].min(0))
+    effective = _effective(p_values[:, 1:].min(0)) if len(alive) > 1 else 1.0
     best = alive[int(p_values[:, 0].argmin())]
     together = -np.expm1(effective * np.log1p(-np.minimum(p_values.min(0), 1 - 1e-12)))
     tested = Tested(
-        best.column, best.statistic, float(together[0]), best.coefficient, best.sd, best.sd, evidence=best.evidence
+        column=best.column,
+        statistic=best.statistic,
+        p_value=float(together[0]),
+        coefficient=best.coefficient,
+        sd=best.sd,
+        detection_limit=best.sd,
+        evidence=best.evidence,
+        alone=best.alone,
+        effective=effective,
     )
     return tested, together
+
+
+def _limit(tested: Tested, critical: float) -> np.ndarray:
+    """The size of each number, the others zero, at which a noncentral χ² passes the family's level with 95 %."""
+    nothing = np.full(len(tested.coefficient), math.inf)
+    if tested.untestable or tested.is_curve or tested.alone is None or not math.isfinite(tested.variant.effect.null):
+        return nothing
+    size = len(tested.coefficient)
+    level = -math.expm1(math.log1p(-critical) / tested.effective)
+    threshold = stats.chi2.isf(level, size)
+    needed = optimize.brentq(lambda away: stats.ncx2.sf(threshold, size, away) - POWER, 1e-6, 1e4)
+    return math.sqrt(needed) * tested.alone
 
 
 def _test(column: Column, at: slice, projected: Tensor, left: Tensor, before: Tensor) -> _Found | None:
@@ -180,6 +206,7 @@ def _test(column: Column, at: slice, projected: Tensor, left: Tensor, before: Te
         p_values=stats.chi2.sf(statistics, column.size),
         coefficient=steps[0].numpy(),
         sd=torch.linalg.inv(own).diagonal().sqrt().numpy(),
+        alone=own.diagonal().rsqrt().numpy(),
     )
 
 
@@ -202,6 +229,7 @@ def _test_of_curve(column: Column, at: slice, scores: Tensor, own: Tensor) -> _F
         p_values=stats.chi2.sf(statistics / scale, freedom),
         coefficient=(posterior @ scores[0]).numpy(),
         sd=posterior.diagonal().sqrt().numpy(),
+        alone=own.diagonal().rsqrt().numpy(),
         evidence=0.5 * float(statistics[0]) - 0.5 * float(torch.log1p(values).sum()),
     )
 
@@ -221,6 +249,7 @@ def _departed(departure: Departure, information: Tensor, scores: Tensor) -> tupl
         coefficient=np.array([departure.factor - 1]),
         sd=np.array([sd]),
         detection_limit=np.array([sd]),
+        alone=np.array([sd]),
         departure=True,
     )
     return tested, p_values

@@ -162,13 +162,13 @@ def search(
         if index == MOST:
             break
         candidates = _refits(found.final, screening, settings, index == 0, report)
-        able = [c for c in candidates if isinstance(c.refit, Refit) and not c.against_its_sign]
+        able = [c for c in candidates if c.is_judged and not c.against_its_sign]
         best = next((c for c in able if c.significant(screening.tests.critical)), None)
         gains = best is not None
         if index == 0 and not gains:
             found.curves = _curves(found.base, screening, settings, report)
         if index == 0 and not gains and able and found.needs_a_name:
-            best = able[0]
+            best = able[0] if able[0].total > 0 else None
         if best is None:
             found.rounds[-1] = Round(screening, candidates, None)
             break
