@@ -6,7 +6,7 @@ INSTALLED := $(VENV)/installed
 OUT ?= out
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test learn learn-truck lint types check clean
+.PHONY: demo test found learn learn-truck lint types check clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "steady-ppl needs Python 3.11 or newer; name one with make PYTHON=...")'
@@ -27,6 +27,9 @@ learn-truck: $(INSTALLED)
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+
+found: $(INSTALLED)
+	$(BIN)/python -m pytest --numprocesses 2 -m slow
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -21,18 +20,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
-from models.hovercraft import Hovercraft  # noqa: E402
-from steady_ppl import Program, for_program, simulate  # noqa: E402
-from steady_ppl.discovery.candidates import Screening, Settings, screen_program  # noqa: E402
-from steady_ppl.discovery.columns import columns_of  # noqa: E402
-from steady_ppl.discovery.refits import Refit, first_refit  # noqa: E402
-from steady_ppl.discovery.screening import GONE, Screened  # noqa: E402
-from steady_ppl.effects import Variant, attached, catalogue, chosen_variant, parsed  # noqa: E402
+from steady_ppl import Program, for_program, load_program, simulate
+from steady_ppl.discovery.candidates import Screening, Settings, screen_program
+from steady_ppl.discovery.columns import columns_of
+from steady_ppl.discovery.refits import Refit, first_refit
+from steady_ppl.discovery.screening import GONE, Screened
+from steady_ppl.effects import Variant, attached, catalogue, chosen_variant, parsed
 
 Array = np.ndarray
+MODEL = Path(__file__).resolve().parents[1] / "models" / "hovercraft.py"
 FILE = Path(__file__).with_name("discovery_limits.json")
 TRAIN = 16
 REFERENCE, SETS, SEED = 64, 200, 9  # more drives than a training table has, to average over manoeuvres
@@ -71,7 +67,7 @@ def owner(known: Sequence[str] = ()) -> Program:
         known: effects that it has, as on the command line. Wind is planted on a program with the quadratic drag through
             which it acts, because the catalogue's wind is what it adds to that drag: -k (v-w)|v-w| + k v|v|.
     """
-    program = Hovercraft()
+    program = load_program(MODEL)
     program.noise = torch.tensor(NOISE)
     program.guesses = ()  # type: ignore[misc]
     return with_effects(program, known)

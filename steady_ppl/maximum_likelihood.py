@@ -21,6 +21,7 @@ from steady_ppl.program import Program
 from steady_ppl.scores import Element, elements, moved, parameter_scores, smoothed
 
 PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
+PATIENT = 30  # linearisations a step once no share of a step was accepted: some path swings about its mode
 GIVES_WAY = 0.3  # nats by which an objective may fall: paths are at rest but for the tolerance
 
 
@@ -84,17 +85,9 @@ def maximise(
     parts = elements(program)
     here = _look(program, data, path or find_path(program, data, known_start=known_start), known_start, parts)
     require_found(here.ahead, data)
-    began, count, reach = (
-        here.objective,
-        len(parts),
-        torch.tensor([150 * part.step for part in parts], dtype=torch.float64),
-    )
-    if information is None:
-        by_drive = here.scores - here.scores.mean(0)
-        information = by_drive.T @ by_drive
-        information += 0.1 * torch.diag(information.diagonal())
-    information = information + 1e-6 * torch.diag(information.diagonal()) + 1e-3 * torch.eye(count).double()
-    taken, decrement = 0, 0.0
+    began, reach = here.objective, torch.tensor([150 * part.step for part in parts], dtype=torch.float64)
+    information = _firm(_of_drives(here) if information is None else information)
+    taken, decrement, passes = 0, 0.0, PASSES
     for taken in range(steps + 1):
         move = torch.linalg.solve(information, here.gradient)
         decrement = 0.5 * float(here.gradient @ move)
@@ -102,19 +95,48 @@ def maximise(
         if decrement < precision or taken == steps or behind:
             break
         move = move * min(1.0, 1 / max(1e-9, float((move.abs() / reach).max())))
-        share, before = 1.0, _values(parts)
-        while True:
-            _set(parts, before + share * move)
-            there = _try(program, data, here.path, known_start, parts)
-            if there is not None and there.objective >= here.objective - GIVES_WAY:
-                break
-            share /= 3
-            if share < 0.01:
-                _set(parts, before)
-                return _maximum(here, parts, information, taken, decrement, began)
-        information = _updated(information, share * move, here.gradient - there.gradient)
-        here = there
+        share, there = _searched(program, data, here, move, known_start, parts, passes)
+        if there is not None:
+            information = _updated(information, share * move, here.gradient - there.gradient)
+            here = there
+        elif passes == PATIENT:
+            break
+        else:
+            passes = PATIENT
+            here = _look(program, data, here.path, known_start, parts, passes)
+            information = _firm(_of_drives(here))
     return _maximum(here, parts, information, taken, decrement, began)
+
+
+def _searched(
+    program: Program,
+    data: Trajectories,
+    here: _Here,
+    move: Tensor,
+    known_start: bool,
+    parts: list[Element],
+    passes: int,
+) -> tuple[float, _Here | None]:
+    """The share of a move that does not fall, and where it leads; None where none does and nothing is moved."""
+    share, before = 1.0, _values(parts)
+    while share > 0.01:
+        _set(parts, before + share * move)
+        there = _try(program, data, here.path, known_start, parts, passes)
+        if there is not None and there.objective >= here.objective - GIVES_WAY:
+            return share, there
+        share /= 3
+    _set(parts, before)
+    return 0.0, None
+
+
+def _of_drives(here: _Here) -> Tensor:
+    by_drive = here.scores - here.scores.mean(0)
+    information = by_drive.T @ by_drive
+    return information + 0.1 * torch.diag(information.diagonal())
+
+
+def _firm(information: Tensor) -> Tensor:
+    return information + 1e-6 * torch.diag(information.diagonal()) + 1e-3 * torch.eye(len(information)).double()
 
 
 @dataclass(frozen=True)
@@ -126,8 +148,10 @@ class _Here:
     objective: float
 
 
-def _look(program: Program, data: Trajectories, path: Path, known_start: bool, parts: list[Element]) -> _Here:
-    ahead = smooth(program, data, path, known_start=known_start, passes=PASSES, tolerance=TOLERANCE, kernels=False)
+def _look(
+    program: Program, data: Trajectories, path: Path, known_start: bool, parts: list[Element], passes: int = PASSES
+) -> _Here:
+    ahead = smooth(program, data, path, known_start=known_start, passes=passes, tolerance=TOLERANCE, kernels=False)
     scores = parameter_scores(program, data, smoothed(ahead, data), parts)
     prior, slope = _prior(program, parts)
     return _Here(
@@ -139,10 +163,12 @@ def _look(program: Program, data: Trajectories, path: Path, known_start: bool, p
     )
 
 
-def _try(program: Program, data: Trajectories, path: Path, known_start: bool, parts: list[Element]) -> _Here | None:
+def _try(
+    program: Program, data: Trajectories, path: Path, known_start: bool, parts: list[Element], passes: int
+) -> _Here | None:
     """None where the step went too far: the program blows up there."""
     try:
-        here = _look(program, data, path, known_start, parts)
+        here = _look(program, data, path, known_start, parts, passes)
     except FilterError:
         return None
     finite = bool(torch.isfinite(here.ahead.log_likelihood).all()) and bool(torch.isfinite(here.gradient).all())

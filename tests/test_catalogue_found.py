@@ -19,6 +19,7 @@ from discovery_sets import EFFECTS, text_of_size
 
 SEEN = [effect for effect in EFFECTS if effect != "coloured_noise"]  # white and coloured are alike at this noise
 DRIVES, ROWS = 12, 81
+pytestmark = pytest.mark.slow
 SIZE = 4 * (16 * 100 / (DRIVES * (ROWS - 1))) ** 0.5  # the stored limits are those of 16 drives of 101 rows
 
 

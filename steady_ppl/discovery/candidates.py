@@ -15,7 +15,7 @@ from steady_ppl.discovery.bootstrap import scores_along, simulate_scores
 from steady_ppl.discovery.columns import Column, columns_of
 from steady_ppl.discovery.curves import curves
 from steady_ppl.discovery.declared_noise import departures
-from steady_ppl.discovery.refits import Refit, refit_with
+from steady_ppl.discovery.refits import ALWAYS, NEVER, Refit, Worth, refit_with
 from steady_ppl.discovery.screening import LEVEL, Screened, Tested, screen
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.errors import FilterError
@@ -69,11 +69,13 @@ class Candidate:
         tested: its score test.
         refit: the program with it, or why there is none.
         gain: held-out log p(y) above that of the program without, nats, `(B,)`.
+        behind: the best in its round, where one fold was enough to see that this one is behind.
     """
 
     tested: Tested
     refit: Refit | str
     gain: Tensor
+    behind: Candidate | None = None
 
     @property
     def variant(self) -> Variant:
@@ -88,9 +90,11 @@ class Candidate:
     @property
     def total(self) -> float:
         """Held-out gain of all drives, nats, less one for each knee or place, which the training drives chose;
-        extrapolated where one fold was enough to see that it leads nowhere."""
-        folds = 1 if self.is_judged else 2
-        return folds * float(self.gain.sum()) - len(self.variant.profiled)
+        extrapolated where one fold was enough to see that it is behind."""
+        if self.is_judged or not isinstance(self.refit, Refit):
+            return float(self.gain.sum()) - len(self.variant.profiled)
+        ahead = 0.0 if self.behind is None else self.behind.total - 2 * float(self.behind.gain[: len(self.gain)].sum())
+        return ahead + 2 * float(self.gain.sum()) - len(self.variant.profiled)
 
     def significant(self, critical: float) -> bool:
         """Whether its own test reaches the family's level, or its gain leaves no doubt."""
@@ -168,7 +172,7 @@ def leaders(screened: Screened, first: bool) -> list[Tested]:
     return [tested for i, tested in alive if (i, tested) in few or float(screened.alike[top, i]) > ALIKE]
 
 
-def fitted(now: Refit, tested: Tested, screening: Screening, settings: Settings, worth: float = -math.inf) -> Candidate:
+def fitted(now: Refit, tested: Tested, screening: Screening, settings: Settings, worth: Worth = ALWAYS) -> Candidate:
     """The program with a candidate.
 
     Args:
@@ -176,7 +180,7 @@ def fitted(now: Refit, tested: Tested, screening: Screening, settings: Settings,
         tested: the candidate.
         screening: that tested it.
         settings: of the search.
-        worth: what the first fold's drives must gain for the others to be fitted as well, nats.
+        worth: what the first fold must reach for the second to be fitted as well.
     """
     effect = tested.variant.effect
     known = screening.information[_key(tested.column)] if effect.null == 0 and effect.form in LINEAR else None
@@ -206,7 +210,7 @@ def at_its_best_place(now: Refit, candidate: Candidate, settings: Settings) -> C
         nonlocal at, best, start
         before = best
         for variant in variants:
-            refit = refit_with(now, variant, start, known_start=settings.known_start, worth=math.inf)
+            refit = refit_with(now, variant, start, known_start=settings.known_start, worth=NEVER)
             if isinstance(refit, Refit) and _gain_of_first_fold(now, refit) > best + BETTER:
                 at, best, start = variant, _gain_of_first_fold(now, refit), refit.coefficient(variant)
         return best > before

@@ -36,6 +36,17 @@ class Fold:
 
 
 @dataclass(frozen=True)
+class Worth:
+    """What log p(y) the drives of the first fold, or those kept from it, must reach for the second to be fitted."""
+
+    drives: float = -math.inf
+    held_out: float = -math.inf
+
+
+ALWAYS, NEVER = Worth(), Worth(math.inf, math.inf)
+
+
+@dataclass(frozen=True)
 class Refit:
     """A program fitted on each fold.
 
@@ -148,7 +159,7 @@ def refit_with(
     *,
     known_start: bool,
     information: Tensor | None = None,
-    worth: float = -math.inf,
+    worth: Worth = ALWAYS,
 ) -> Refit | str:
     """The program with an effect, or why it cannot be fitted.
 
@@ -158,7 +169,7 @@ def refit_with(
         value: where its coefficient begins.
         known_start: the first state is certain.
         information: of the first fold's drives, the coefficient last.
-        worth: what the first fold's drives must gain for the others to be fitted as well, nats.
+        worth: what the first fold must reach for the second to be fitted as well.
     """
     try:
         programs = [with_effect(program, variant, value) for program in base.programs]
@@ -175,7 +186,7 @@ def _refit(
     maxima: Sequence[Maximum | None],
     information: Tensor | None,
     least: Sequence[float] = (-math.inf, -math.inf),
-    worth: float = -math.inf,
+    worth: Worth = ALWAYS,
 ) -> Refit:
     found, held_out, moved = [], [], []
     for program, fold, known, floor in zip(programs, folds, maxima, least, strict=True):
@@ -195,7 +206,7 @@ def _refit(
             unseen,
             wide(fold.held_out_path, program),
             known_start=known_start,
-            passes=6,
+            passes=15,
             tolerance=0.02,
             kernels=False,
         )
@@ -203,7 +214,7 @@ def _refit(
         found.append(maximum)
         held_out.append(judged.log_likelihood)
         moved.append(Fold(drives, maximum.path, unseen, means_as_path(judged, unseen)))
-        if float(maximum.log_likelihood.sum()) - floor < worth:
+        if float(maximum.log_likelihood.sum()) < worth.drives and float(judged.log_likelihood.sum()) < worth.held_out:
             break
     return Refit(programs[: len(found)], found, moved, torch.cat(held_out))
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from steady_ppl.data import Trajectories
 from steady_ppl.discovery.candidates import (
     NATS,
+    NO_DOUBT,
     Candidate,
     Screening,
     Settings,
@@ -23,12 +24,12 @@ from steady_ppl.discovery.candidates import (
     leaders,
     screen_program,
 )
-from steady_ppl.discovery.refits import Refit, first_refit, refit_with
+from steady_ppl.discovery.refits import Refit, Worth, first_refit, refit_with
 from steady_ppl.discovery.screening import LEVEL, Tested
 from steady_ppl.effects import attached
 from steady_ppl.program import Program
 
-BEHIND = 25.0  # nats behind the best on the first fold, with which a candidate is not worth fitting on the second
+BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
 MARGIN = 3.0  # nats by which a curve must be better than named effects
 RIVALS = 12.0  # nats behind the best in its round, with which a candidate is looked at again beside other effects
 MOST, CURVES = 3, 3  # effects in a program, and curves that are fitted
@@ -103,9 +104,14 @@ class Search:
 
     @property
     def curve(self) -> Candidate | None:
-        """The curve that explains the drives better than all effects that were found."""
+        """The curve that explains the drives better than all effects that were found; where the noise alone may be what
+        the tests found, one that is significant itself."""
         best = next((curve for curve in self.curves if isinstance(curve.refit, Refit)), None)
-        return best if best is not None and best.total > self.gain + MARGIN else None
+        if best is None or best.total <= self.gain + MARGIN:
+            return None
+        tests = self.rounds[0].screening.tests
+        of_all = min(tested.p_value for tested in tests.tested if tested.is_curve)
+        return best if not self.departed or best.total > NO_DOUBT or of_all <= tests.critical else None
 
     @property
     def needs_a_name(self) -> bool:
@@ -190,12 +196,20 @@ def _refits(now: Refit, screening: Screening, settings: Settings, first: bool, r
     candidates: list[Candidate] = []
     for tested in leaders(screening.tests, first):
         report(f"fitting with {tested.variant.label}")
-        likely = [float(c.refit.maxima[0].log_likelihood.sum()) for c in candidates if isinstance(c.refit, Refit)]
-        worth = max(likely, default=-math.inf) - float(now.maxima[0].log_likelihood.sum()) - BEHIND
-        candidates.append(fitted(now, tested, screening, settings, worth))
+        candidates.append(fitted(now, tested, screening, settings, _worth(candidates)))
+    best = max((c for c in candidates if c.is_judged), key=lambda c: c.total, default=None)
+    candidates = [c if c.is_judged else replace(c, behind=best) for c in candidates]
     close = max((candidate.total for candidate in candidates), default=0.0) - RIVALS
     found = [at_its_best_place(now, c, settings) if c.total > close else c for c in candidates]
     return sorted(found, key=lambda candidate: -candidate.total)
+
+
+def _worth(candidates: Sequence[Candidate]) -> Worth:
+    """What the next candidate must reach on the first fold, given those that were fitted."""
+    fits = [c.refit for c in candidates if isinstance(c.refit, Refit)]
+    drives = [float(fit.maxima[0].log_likelihood.sum()) for fit in fits]
+    held_out = [float(fit.held_out[: len(fit.folds[0].held_out)].sum()) for fit in fits]
+    return Worth(max(drives, default=-math.inf) - BEHIND, max(held_out, default=-math.inf) - NATS)
 
 
 def _curves(base: Refit, screening: Screening, settings: Settings, report: Report) -> list[Candidate]:
