@@ -30,7 +30,7 @@ from steady_ppl.effects import chosen_variant, parsed
 from steady_ppl.proving import prove
 
 RESULTS = Path(__file__).parent / "results" / "discovery.jsonl"
-RIVAL_SETS, BRUTE_SETS = 140, 40
+RIVAL_SETS, BRUTE_SETS = 100, 20
 
 
 def judged(chosen: BenchmarkSet) -> dict[str, Any]:

@@ -33,6 +33,8 @@ def discover(
     from steady_ppl.discovery import discover as search
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
+    from steady_ppl.run_folder import run_folder
+    from steady_ppl.run_recipe import fingerprint
     from steady_ppl.table import read_table
 
     is_run = Path(source).is_dir()
@@ -42,10 +44,11 @@ def discover(
         raise RunError(f"{out} exists: choose another folder, or --force to overwrite")
     require_picture(picture)
     given: Any = Fit.load(source, program) if is_run else _program(source, seed)
+    drives, judges = read_table(table), read_table(valid) if valid else None
     found = search(
         given,
-        read_table(table),
-        read_table(valid) if valid else None,
+        drives,
+        judges,
         known_start=known_start or None,
         simulations=simulations,
         seed=seed,
@@ -53,7 +56,9 @@ def discover(
     )
     print(found)
     if out is not None:
-        found.after.save(out, force=force)
+        used = {"table_sha256": fingerprint(drives), "valid_sha256": fingerprint(judges) if judges else None}
+        with run_folder(out, force=force):
+            found.after.save_into(out, begun=used)
         for note in found.after.notes:
             _say(note)
         print(f"{out}: {found.after.program}")

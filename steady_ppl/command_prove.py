@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,6 +31,7 @@ def prove(
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
     from steady_ppl.proving import prove as judge
+    from steady_ppl.run_recipe import fingerprint
     from steady_ppl.table import read_table
 
     *runs, table = arguments
@@ -46,7 +47,9 @@ def prove(
     }
     if truth is not None:
         rows["truth"] = _program(truth, seed)
-    found = judge(rows, read_table(table), truth="truth" if truth is not None else None, seed=seed)
+    drives = read_table(table)
+    found = judge(rows, drives, truth="truth" if truth is not None else None, seed=seed)
+    found.notes[:0] = _used(labels, fingerprint(drives))
     if json_file is not None:
         _write_json(json_file, {"runs": {label: str(run) for label, run in labels.items()}, **found.figures})
     if picture is not None:
@@ -72,3 +75,16 @@ def _labels(runs: Sequence[Path]) -> dict[str, Path]:
             f"the runs {', '.join(map(str, runs))} cannot be told apart by name, or are called as another row"
         )
     return labels
+
+
+def _used(runs: Mapping[str, Path], table: str) -> list[str]:
+    """Runs that have already seen the table."""
+    from steady_ppl.run_folder import read_record
+
+    notes = []
+    for label, run in runs.items():
+        record = read_record(run)
+        for key, how in (("table_sha256", "fitted to"), ("valid_sha256", "chosen by")):
+            if record.get(key) == table:
+                notes.append(f"{label} was {how} this very table: take drives that were not used, this proves nothing")
+    return notes

@@ -16,6 +16,7 @@ from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError
 from steady_ppl.gaussian_smoother import find_and_smooth, means_as_path
 from steady_ppl.linearization import why_not_linear
+from steady_ppl.lookahead import Lookahead
 from steady_ppl.particles import particle_filter
 from steady_ppl.paths import Filtered
 from steady_ppl.program import Program
@@ -77,16 +78,25 @@ def choose_filter(
     return FilterChoice(particles or (200 if ahead else 5000), ahead, name)
 
 
-def neglected(program: Program, data: Trajectories, *, known_start: bool, particles: int = 200) -> Tensor:
+def neglected(
+    program: Program, data: Trajectories, *, known_start: bool, particles: int = 200, ahead: Lookahead | None = None
+) -> Tensor:
     """What the linearised program neglects: log p(y) by the filter that looks ahead, less the linearised program's.
 
     Near zero the Gaussian guide draws from the posterior, as far as its path is near the right mode: the filter is
     steered along the same path and cannot tell.
 
+    Args:
+        program: with normal noise, or measurements of Student t.
+        data: as returned by `for_program`.
+        known_start: the first state is certain.
+        particles: of the filter, for each trajectory.
+        ahead: of these drives; found from the measurements when None.
+
     Returns:
         `(B,)` nats, with the filter's Monte-Carlo error.
     """
-    ahead = find_and_smooth(program, data, known_start=known_start)
+    ahead = ahead or find_and_smooth(program, data, known_start=known_start)
     filtered = particle_filter(
         program, data, particles=particles, known_start=known_start, proposal=Twist(ahead), keep_history=False
     )

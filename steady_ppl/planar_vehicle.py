@@ -22,7 +22,7 @@ class PlanarVehicle(Program):
 
     Attributes:
         landmarks: positions that bearings are measured to, m.
-        bearing_sd: standard deviation of a bearing, rad.
+        bearing_sd: standard deviation of a bearing, rad; 5° unless a program says otherwise, or learns it.
         slips: whether the lateral velocity is free; False where the program takes it back within a step.
     """
 
@@ -37,8 +37,13 @@ class PlanarVehicle(Program):
     }
     axes: ClassVar = {"translation": ("forward", "lateral"), "yaw": ("yaw",)}
     landmarks: Sequence[Sequence[float]] = ()
-    bearing_sd: float = math.radians(5)
+    bearing_sd: float
     slips: bool = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        if not hasattr(type(self), "bearing_sd"):  # not a constant of the class, so that a program may learn it
+            self.bearing_sd = math.radians(5)
 
     @property
     def measurements(self) -> tuple[str, ...]:  # type: ignore[override]

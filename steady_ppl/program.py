@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import pyro
 import torch
-from pyro.nn import PyroModule
+from pyro.nn import PyroModule, PyroParam, PyroSample
 from pyro.nn.module import _PyroModuleMeta
 from torch import Tensor
 
@@ -93,6 +93,16 @@ class Program(PyroModule, metaclass=_WithEffects):
         # parameters belong to this object, not to Pyro's global store, where a second program would find them
         with pyro.settings.context(module_local_params=True):
             super().__init__()
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        hidden = isinstance(value, PyroParam | PyroSample | torch.nn.Parameter) and hasattr(type(self), name)
+        if hidden and not callable(getattr(type(self), name)):
+            raise ProgramError(
+                f"program {type(self).__name__}: {name} is a constant of its class, behind which a parameter of that "
+                "name would never be seen: take another name",
+                site="__init__",
+            )
+        super().__setattr__(name, value)
 
     def initial(self) -> Tensor:
         """Sample the start; returns the first state, `(..., D)`."""

@@ -6,6 +6,8 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from torch import Tensor
+
 from steady_ppl.effects import attached
 from steady_ppl.paired_bootstrap import LEVEL, RESAMPLES, Change, paired
 from steady_ppl.program import names, units
@@ -39,6 +41,7 @@ def figures(found: Proof) -> dict[str, Any]:
         "rows": [
             {"row": name, "program": type(row.program).__name__}
             | _by_key(found, {key: sums.value for key, sums in row.sums.items()})
+            | {"neglected": float(row.neglected.mean()) if isinstance(row.neglected, Tensor) else None}
             | {"scales": row.scales, "against_reference": _against(found, name)}
             for name, row in found.rows.items()
         ],
@@ -146,7 +149,7 @@ def as_text(content: Mapping[str, Any]) -> str:
     lines = [content["verdict"], "", f"{said}, with {content['level']:.0%} intervals bootstrapped over drives", ""]
     bands = [name for name in BANDS if name in horizons]
     shown = [name if i else f"in 90 % band, {name}" for i, name in enumerate(bands)]
-    header = ["", "log p(y) [nats]", "difference [nats]", *shown]
+    header = ["", "log p(y) [nats]", "difference [nats]", "by particles", *shown]
     lines += _table(header, [[row["row"], *_likely(row), *_covered(row, bands)] for row in rows])
     lines += ["", "root mean square error of predictions ahead, and by how much it differs"]
     units_of = {("measurement", of): of for of in rows[0]["measurement"]}
@@ -165,7 +168,8 @@ def as_text(content: Mapping[str, Any]) -> str:
 def _likely(row: Mapping[str, Any]) -> list[str]:
     change = (row["against_reference"] or {}).get("log_likelihood")
     said = with_interval(change["difference"], change["interval"], 1) if change else ""
-    return [_number(row["log_likelihood"], ".1f").replace("-", "−"), said]
+    left = _number(row["neglected"], "+.2f")
+    return [cell.replace("-", "−") for cell in (_number(row["log_likelihood"], ".1f"), said, left)]
 
 
 def _covered(row: Mapping[str, Any], bands: Sequence[str]) -> list[str]:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import FilterError, UsageError
+from steady_ppl.filtering import neglected
 from steady_ppl.gaussian_smoother import find_and_smooth, smooth
 from steady_ppl.linearization import Path, why_not_linear
 from steady_ppl.lookahead import Lookahead
@@ -50,11 +51,13 @@ class Row:
         sums: every figure, drive by drive; of the noise floor's simulated drives.
         scales: "channels" and "measurements" → component as declared → standard deviation (a Student t's scale) that
             nearly all rows of the drives share, None where there is none.
+        neglected: see `Judged`.
     """
 
     program: Program
     sums: dict[Key, Sums]
     scales: Scales
+    neglected: Tensor | str | None = None
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,8 @@ class Judged:
         ahead, tracked: along the same path.
         predictions: horizon → measured less predicted.
         states: error group and horizon → squared errors `(T + 1 − horizon, B)` and where the truth is known.
+        neglected: log p(y) by a particle filter less that of the linearised program, `(B,)` nats; why the filter broke
+            down; None where it was not run.
     """
 
     program: Program
@@ -74,6 +79,7 @@ class Judged:
     tracked: Tracked
     predictions: dict[int, Prediction]
     states: dict[tuple[str, int], tuple[Tensor, Tensor]]
+    neglected: Tensor | str | None = None
 
 
 def median_step(data: Trajectories) -> float:
@@ -109,7 +115,12 @@ def judge_program(name: str, program: Program, data: Trajectories, known_start: 
             ahead = find_and_smooth(program, unseen, known_start=known_start)
     except FilterError as error:
         raise FilterError(f"{name}: {error}", trajectory=error.trajectory, time=error.time) from error
-    return judge(program, run, ahead, known_start)
+    judged = judge(program, run, ahead, known_start)
+    try:
+        with seeded(seed, "prove by particles"):
+            return replace(judged, neglected=neglected(program, unseen, known_start=known_start, ahead=ahead))
+    except FilterError as error:
+        return replace(judged, neglected=str(error))
 
 
 def judge(
@@ -183,7 +194,7 @@ def as_row(judged: Judged, counted: Mapping[int, Tensor]) -> Row:
     for (group, horizon), (squares, known) in judged.states.items():
         if bool(known.any()):
             sums[Key("state", group, horizon)] = _sums(squares.unsqueeze(-1), known.unsqueeze(-1), root=True)
-    return Row(judged.program, sums, noise_scales(judged.program, judged.data, judged.tracked))
+    return Row(judged.program, sums, noise_scales(judged.program, judged.data, judged.tracked), judged.neglected)
 
 
 def _sums(values: Tensor, there: Tensor, *, root: bool = False) -> Sums:

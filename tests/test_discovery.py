@@ -9,8 +9,11 @@ from dataclasses import replace
 import pytest
 import torch
 from examples import example
+from pyro.nn import PyroParam
+from torch.distributions import constraints
 
 import steady_ppl as st
+from steady_ppl.discovery.discovery import _of_one_drive
 from steady_ppl.effects import Effect, chosen_variant, parsed
 from steady_ppl.effects.registry import _EFFECTS, register
 
@@ -130,6 +133,45 @@ def test_noise_that_is_not_the_declared_is_said_to_be():
     program.guesses = ("noise",)
     again = st.discover(program, train, valid, known_start=True, simulations=SETS)
     assert "process_noise" not in [finding.variant.effect.name for finding in again.findings]
+
+
+def test_a_sensor_whose_noise_is_learned_is_said_not_to_be_the_declared():
+    truth, program = FreeSight(), FreeSight()
+    truth.bearing_sd = torch.tensor(0.12)
+    found = st.discover(program, *tables(truth, drives=6, rows=61), known_start=True, simulations=SETS)
+    (finding,) = found.findings
+    assert found.verdict == "noise" and finding.variant.name == "measurement_noise"
+    low, high = finding.interval[0]
+    assert low < 0.12 / 0.06 < high and high - low < 0.2
+    assert "The noise is not as declared: measurement_noise = " in str(found)
+
+
+class FreeSight(type(owner())):
+    """The hovercraft, the standard deviation of its bearings learned."""
+
+    def __init__(self):
+        super().__init__()
+        self.noise = torch.tensor([0.08, 0.08, 0.05])
+        self.bearing_sd = PyroParam(torch.tensor(0.06), constraints.positive)
+
+
+def test_a_gain_of_one_drive_is_said_to_be(dragged):
+    (found,) = dragged.search.found
+    assert _of_one_drive(found) == ""
+    gain = torch.zeros(2 * DRIVES)
+    gain[13] = 9.0
+    alone = replace(found, candidate=replace(found.candidate, gain=gain))
+    assert _of_one_drive(alone).startswith("without drive 4 of the training drives nothing would be left")
+
+
+def test_what_was_found_comes_first_among_the_candidates(dragged):
+    assert dragged.figures["candidates"][0]["effect"] == "quadratic_drag"
+    assert dragged.figures["candidates"][1]["heldout_gain"] is not None
+
+
+def test_what_cannot_be_tested_says_why(clean):
+    notes = {one["effect"]: one["note"] for one in clean.figures["candidates"]}
+    assert notes["process_noise:yaw"] == "the fitted noise against the declared"
 
 
 def test_an_effect_of_ones_own_is_found():

@@ -13,13 +13,13 @@ import torch
 from examples import drives, example
 from oracles import cart_parameters, kalman
 from scipy import stats
-from small import TRUTH, contents, only_start, simulated, steady, written
+from small import HOVERCRAFT, TRUTH, contents, only_start, simulated, steady, written
 
 import steady_ppl as st
 from steady_ppl.paired_bootstrap import Sums, paired
 from steady_ppl.program import Program, for_program
 from steady_ppl.proof_rows import Key
-from steady_ppl.proving import prove
+from steady_ppl.proving import _far_off, prove
 
 matplotlib.use("Agg")
 
@@ -113,6 +113,26 @@ def test_the_same_program_twice_differs_by_nothing(dragged):
     assert len(changes) > 10
     assert all(change["difference"] == 0 and change["interval"] == [0, 0] for change in changes)
     assert found.figures["verdict"].startswith("two is not shown to be better than one: log p(y) +0.0 nats a drive")
+
+
+def test_a_particle_filter_agrees_on_a_linear_program_and_nearly_on_bearings(drag, carts):
+    assert [line(carts[1], name)["neglected"] for name in ("wrong", "right")] == pytest.approx([0, 0], abs=0.02)
+    for name in ("before", "after"):
+        assert 0 < abs(line(drag, name)["neglected"]) < 0.3
+    assert line(drag, "noise floor")["neglected"] is None
+    assert not [note for note in drag.notes if "particle" in note]
+
+
+def test_a_drive_that_the_linearised_program_misjudges_is_named(drag, dragged):
+    left = torch.zeros(len(dragged))
+    left[3], left[7] = -4.0, 2.5
+    rows = {"after": replace(drag.rows["after"], neglected=left)}
+    assert _far_off(rows, dragged) == [
+        "after: on drive 4 a particle filter's log p(y) is 4.0 nats below the linearised program's, and so on 1 more: "
+        "look at it before you trust the table"
+    ]
+    rows = {"after": replace(drag.rows["after"], neglected="it broke down")}
+    assert _far_off(rows, dragged)[0].endswith("can be trusted: it broke down")
 
 
 @pytest.mark.parametrize("horizon", ["1 s", "3 s"])
@@ -327,3 +347,11 @@ def test_the_command_refuses_without_touching_a_file(tmp_path, work, refused, ca
     before = contents(tmp_path)
     assert steady("prove", *runs, table, "--json", tmp_path / "nowhere" / "proof.json") == 2
     assert "cannot be written" in capsys.readouterr().err and contents(tmp_path) == before
+
+
+def test_a_table_that_a_run_was_fitted_to_proves_nothing(tmp_path, work, capsys):
+    table = written(tmp_path / "test.csv", simulated(trajectories=5, rows=33, seed=4))
+    assert steady("fit", HOVERCRAFT, table, "--recipe", "hand", "--known-start", "--out", tmp_path / "seen") == 0
+    capsys.readouterr()
+    assert steady("prove", work / "hand", tmp_path / "seen", table) == 0
+    assert "note: seen was fitted to this very table" in " ".join(capsys.readouterr().out.split())

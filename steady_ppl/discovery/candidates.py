@@ -25,7 +25,8 @@ from steady_ppl.scores import Element, elements, smoothed, typical_spreads
 
 LEADERS, ALIKE = 6, 0.85  # how many are refitted, and those as well whose columns correlate so much with the first
 NATS = 2.0  # of held-out log p(y) within which two candidates cannot be told apart
-NO_DOUBT = 10.0  # nats of held-out log p(y) for which no test is needed
+NO_DOUBT = 10.0  # nats of held-out log p(y) for which a test need only be near the family's level
+NEARLY = LEVEL / 5  # p-value of a single test that is near it
 PROMISING = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
 BETTER = 0.3  # nats by which another knee or place has to be likelier
 LINEAR = ("push", "command", "history", "measured", "viewpoint")
@@ -97,8 +98,14 @@ class Candidate:
         return ahead + 2 * float(self.gain.sum()) - len(self.variant.profiled)
 
     def significant(self, critical: float) -> bool:
-        """Whether its own test reaches the family's level, or its gain leaves no doubt."""
-        return self.total > NATS and (self.tested.p_value <= critical or self.total > NO_DOUBT)
+        """Whether its own test reaches the family's level, or nearly does and its gain leaves no doubt.
+
+        Where the program's own fit has ended beside its best, anything that moves the other parameters gains; the test
+        does not see that.
+        """
+        if self.total > NO_DOUBT:
+            return self.tested.p_value <= max(critical, NEARLY)
+        return self.total > NATS and self.tested.p_value <= critical
 
     @property
     def against_its_sign(self) -> bool:
@@ -126,7 +133,7 @@ def screen_program(now: Refit, declared: Program, settings: Settings, *, sets: i
     seen = replace(fold.drives, states=fold.path.states)
     ahead = smooth(program, fold.drives, fold.path, known_start=settings.known_start, passes=3, tolerance=0.01)
     away = departures(declared, program, fold.drives, fold.path.states, parts)
-    away = [departure for departure in away if departure.variant.name not in there]
+    away = [one for one in away if one.variant.name not in there and one.variant.effect.name not in settings.withheld]
     skip = there | {departure.variant.name for departure in away}
     variants = [
         variant
@@ -135,8 +142,6 @@ def screen_program(now: Refit, declared: Program, settings: Settings, *, sets: i
         for variant in effect.variants(program, seen)
         if variant.name not in skip
     ]
-    if "process_noise" in settings.withheld:
-        away = []
     spread, sharpness = typical_spreads(program, fold.drives, smoothed(ahead, fold.drives))
     columns = columns_of([*variants, *curves(program, seen, spread, sharpness)])
     observed = scores_along(program, fold.drives, ahead, parts, columns)
@@ -168,7 +173,7 @@ def leaders(screened: Screened, first: bool) -> list[Tested]:
     if not alive:
         return []
     top = alive[0][0]
-    few = [one for k, one in enumerate(alive[:LEADERS]) if first or k == 0 or one[1].p_value < LEVEL / 5]
+    few = [one for k, one in enumerate(alive[:LEADERS]) if first or k == 0 or one[1].p_value < NEARLY]
     return [tested for i, tested in alive if (i, tested) in few or float(screened.alike[top, i]) > ALIKE]
 
 

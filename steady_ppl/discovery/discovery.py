@@ -10,11 +10,12 @@ from typing import Any
 import torch
 
 from steady_ppl.data import Trajectories
+from steady_ppl.discovery.candidates import NATS
 from steady_ppl.discovery.discovery_report import as_text, figures
 from steady_ppl.discovery.finding import Finding, Shape, findings, shape_of
 from steady_ppl.discovery.next_run import NextRun, next_run
 from steady_ppl.discovery.requirements import require, unexcited
-from steady_ppl.discovery.search import Search, search
+from steady_ppl.discovery.search import Found, Search, search
 from steady_ppl.effects import record, restore, written_class
 from steady_ppl.fit import Fit
 from steady_ppl.program import Program, for_program
@@ -183,7 +184,18 @@ def _notes(found: Search, is_fitted: bool) -> list[str]:
         notes.append("the fit with what was found has not converged")
     if not found.rounds[-1].quiet:
         notes.append("something is left that no effect of the catalogue brings: the tests were not quiet at the end")
+    notes += [f"{one.candidate.variant.label}: {said}" for one in found.found if (said := _of_one_drive(one))]
     for candidate in found.rounds[0].candidates:
         if candidate.against_its_sign and candidate.total > 0:
             notes.append(f"{candidate.variant.label} would help with a sign that physics rules out: a symptom")
     return notes
+
+
+def _of_one_drive(found: Found) -> str:
+    """Which drive carries a gain alone, if one does."""
+    gain, refit = found.candidate.gain, found.candidate.refit
+    if isinstance(refit, str) or found.candidate.total - float(gain.max()) > NATS:
+        return ""
+    held_out = [(name, fold.held_out) for name, fold in zip(("validation", "training"), refit.folds, strict=True)]
+    drives = [f"{label} of the {name} drives" for name, data in held_out for label in data.labels]
+    return f"without drive {drives[int(gain.argmax())]} nothing would be left of its gain: look at that drive"

@@ -58,10 +58,16 @@ def figures(found: Discovery) -> dict[str, Any]:
 
 
 def ranked(found: Discovery) -> list[Tested]:
-    """The first round's tests: those that were fitted by what they gained, the others by their tests."""
+    """The first round's tests: what was found, then those that were fitted by what they gained, then the others."""
     tests = found.search.rounds[0].screening.tests.tested
     total = {c.variant.name: c.total for c in found.search.rounds[0].candidates}
-    order = sorted(range(len(tests)), key=lambda i: (-total.get(tests[i].variant.name, -math.inf), i))
+    chosen = [finding.variant.name for finding in found.findings]
+
+    def place(index: int) -> tuple[int, float, int]:
+        name = tests[index].variant.name
+        return chosen.index(name) if name in chosen else len(chosen), -total.get(name, -math.inf), index
+
+    order = sorted(range(len(tests)), key=place)
     return [tests[i] for i in order]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
 from steady_ppl.data import Trajectories
@@ -35,8 +37,12 @@ def require(program: Program, train: Trajectories, valid: Trajectories, known_st
             raise DataError(f"the {name} drives have no measurements after their first rows")
         if known_start:
             _ = drives.known_start
-    if train.measurements.shape == valid.measurements.shape and torch.equal(train.measurements, valid.measurements):
-        raise UsageError("the validation drives are the training drives: nothing could be judged by them")
+    both = shared(train, valid)
+    if both:
+        raise UsageError(
+            f"{len(both)} of the validation drives are training drives as well ({_few(both)}): nothing could be judged "
+            "by them"
+        )
     why = why_not_linear(program, train, known_start=known_start)
     if why is not None:
         raise UsageError(f"discover needs a program that can be linearised: {why.split(': looking')[0]}")
@@ -46,6 +52,22 @@ def require(program: Program, train: Trajectories, valid: Trajectories, known_st
             f"the controls never change ({', '.join(constant)}): these drives cannot tell what the controls do from "
             "what happens anyway, and no verdict is given; record drives with changing controls"
         )
+
+
+def shared(one: Trajectories, other: Trajectories) -> list[str]:
+    """Labels of those of the second drives whose measurements are also among the first."""
+    known = {_measured(one, index) for index in range(len(one))}
+    return [other.labels[index] for index in range(len(other)) if _measured(other, index) in known]
+
+
+def _measured(data: Trajectories, index: int) -> bytes:
+    rows = int(data.lengths[index])
+    seen = data.observed[:rows, index]
+    return torch.where(seen, data.measurements[:rows, index], 0.0).numpy().tobytes() + seen.numpy().tobytes()
+
+
+def _few(labels: Sequence[str]) -> str:
+    return ", ".join(labels[:3]) + (" …" if len(labels) > 3 else "")
 
 
 def unexcited(program: Program, data: Trajectories) -> list[str]:

@@ -24,6 +24,8 @@ from steady_ppl.effects import Variant
 
 LEVEL, POWER = 0.05, 0.95
 GONE = 1e-4  # share of a column's information that the fitted parameters must leave for it to be tested
+CONTAINED = "the fitted parameters already explain it"
+UNEXCITED = "these drives never excite it"
 
 
 @dataclass(frozen=True)
@@ -119,10 +121,13 @@ def screen(
     for members in _groups(columns):
         tests = [_test(columns[i], _slice(columns, i), projected, left, before) for i in members]
         alive = [test for test in tests if test is not None]
-        found.append(_of_group(columns[members[0]], alive, len(sums)))
+        excited = any(bool((before[_slice(columns, i)] > 0).any()) for i in members)
+        found.append(_of_group(columns[members[0]], alive, len(sums), CONTAINED if excited else UNEXCITED))
         chosen.append(min(alive, key=lambda test: test.p_values[0]).at if alive else _slice(columns, members[0]))
         curves += [
-            _of_group(test.column, [test], len(sums))[0] for test in alive if test.column.variant.effect.name == CURVE
+            _of_group(test.column, [test], len(sums), "")[0]
+            for test in alive
+            if test.column.variant.effect.name == CURVE
         ]
     for departure in departures:
         found.append(_departed(departure, information[own, own], scores[:, own]))
@@ -154,13 +159,12 @@ class _Found:
     evidence: float = 0.0
 
 
-def _of_group(column: Column, alive: list[_Found], sets: int) -> tuple[Tested, np.ndarray]:
-    """The test of the best of several columns, and its p-values in every set."""
+def _of_group(column: Column, alive: list[_Found], sets: int, otherwise: str) -> tuple[Tested, np.ndarray]:
+    """The test of the best of several columns, and its p-values in every set; where there is none, why."""
     if not alive:
         nothing = np.zeros(column.size)
-        reason = "the fitted parameters already explain it, or these drives never excite it"
         endless = nothing + math.inf
-        return Tested(column, 0.0, 1.0, nothing, endless, endless, untestable=reason), np.ones(sets + 1)
+        return Tested(column, 0.0, 1.0, nothing, endless, endless, untestable=otherwise), np.ones(sets + 1)
     p_values = np.stack([test.p_values for test in alive])
     effective = _effective(p_values[:, 1:].min(0)) if len(alive) > 1 else 1.0
     best = alive[int(p_values[:, 0].argmin())]
