@@ -12,9 +12,9 @@ import argparse
 import hashlib
 import json
 import math
+import sys
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ import torch
 from discovery_scores import rivals_table, scores_table
 from discovery_sets import BenchmarkSet, benchmark_sets, owner, quick, tables
 
+import steady_ppl
 from steady_ppl import for_program
 from steady_ppl.discovery import Discovery, discover
 from steady_ppl.discovery.discovery_report import ranked
@@ -30,7 +31,7 @@ from steady_ppl.effects import chosen_variant, parsed
 from steady_ppl.proving import prove
 
 RESULTS = Path(__file__).parent / "results" / "discovery.jsonl"
-RIVAL_SETS, BRUTE_SETS = 100, 20
+RIVAL_SETS, BRUTE_SETS = 140, 40
 
 
 def judged(chosen: BenchmarkSet) -> dict[str, Any]:
@@ -126,11 +127,20 @@ def _plain(value: Any) -> Any:
     return value
 
 
-@cache
 def version() -> str:
-    """A digest of the engine's source."""
-    files = sorted((Path(__file__).parents[1] / "steady_ppl").rglob("*.py"))
+    """A digest of the engine's source, as far as `discover` and `prove` import it: a picture or a command changes no
+    figure."""
+    return ENGINE
+
+
+def _digest() -> str:
+    engine = Path(steady_ppl.__file__).parent
+    loaded = [Path(module.__file__) for module in list(sys.modules.values()) if getattr(module, "__file__", None)]
+    files = sorted(file for file in loaded if engine in file.parents)
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+
+
+ENGINE = _digest()
 
 
 def _run(work: Any, chosen: list[tuple[Any, ...]], file: Path, workers: int) -> list[dict[str, Any]]:

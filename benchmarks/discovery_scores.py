@@ -71,6 +71,14 @@ def covered(records: Iterable[Record]) -> list[bool]:
     return found
 
 
+def uniformity(records: Sequence[Record]) -> str:
+    """How far the p-values of clean sets are from uniform (Kolmogorov–Smirnov)."""
+    if not records:
+        return "–"
+    test = stats.kstest([record["p_value"] for record in records], "uniform")
+    return f"{test.statistic:.3f}, {test.pvalue:.2f} of {len(records)}"
+
+
 def calibration_error(records: Sequence[Record]) -> float:
     """Expected calibration error of the stated confidence over five bins of equal size (Naeini et al. 2015)."""
     said = np.array([record["confidence"] for record in records])
@@ -105,6 +113,7 @@ def scores_table(records: Sequence[Record]) -> str:
         ("truth in the class, at 1–2 ×", share(weak, in_class), ""),
         ("large effects: truth in the class", share(of["large"], in_class), "≥ 95 %"),
         ("family-wise false alarms on clean data", share(of["clean"], lambda r: r["verdict"] != "none"), "5 % inside"),
+        ("clean p-values: distance from uniform (Kolmogorov–Smirnov), its p", uniformity(of["clean"]), ""),
         ("kind, at ≥ 2 ×", share(single, lambda r: r["verdict"] == kind_of(planted(r)[0])), "≥ 93 %"),
         (
             "“other” where the effect is withheld and has no alias",
@@ -124,15 +133,33 @@ def scores_table(records: Sequence[Record]) -> str:
         ("sets that failed", f"{len(failed)} of {len(records) + len(failed)}", "0"),
     ]
     lines = ["| | figure | must |", "|---|---|---|", *(f"| {a} | {b} | {c} |" for a, b, c in rows)]
-    return "\n".join(
-        [*lines, "", *by_effect(single + weak), *(f"failed: {r['set']}: {r['failed']}" for r in failed), ""]
-    )
+    lines += [
+        "",
+        *by_effect(single + weak),
+        "",
+        f"Seeds: {seeds(records)}. Digest of the engine's source: {made_by(records)}.",
+        "",
+    ]
+    return "\n".join([*lines, *(f"failed: {r['set']}: {r['failed']}" for r in failed), ""])
+
+
+def made_by(records: Sequence[Record]) -> str:
+    """Digests of the source that made the records; there is one."""
+    return ", ".join(sorted({record["version"] for record in records})) or "–"
+
+
+def seeds(records: Sequence[Record]) -> str:
+    """Of every stratum, from the smallest to the largest: of tables s they are 10 s + 1, 2 and 3."""
+    strata = dict.fromkeys(record["stratum"] for record in sorted(records, key=lambda r: r["seed"]))
+    found = {name: [r["seed"] for r in records if r["stratum"] == name] for name in strata}
+    return ", ".join(f"{name} {min(every)}–{max(every)} ({len(every)} sets)" for name, every in found.items())
 
 
 def by_effect(records: Sequence[Record]) -> list[str]:
     """Truth in the class for each effect."""
     names = dict.fromkeys(planted(record)[0].partition(":")[0] for record in records)
-    lines = ["| effect | in the class at ≥ 2 × | at 1–2 × | what it was taken for |", "|---|---|---|---|"]
+    header = ["effect", "in the class at ≥ 2 ×", "at 1–2 ×", "90 % intervals that cover", "what it was taken for"]
+    lines = [f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
     for name in names:
         own = [record for record in records if planted(record)[0].partition(":")[0] == name]
         counts = []
@@ -140,12 +167,14 @@ def by_effect(records: Sequence[Record]) -> list[str]:
             part = [record for record in own if clearly(record) == large]
             counts.append(f"{sum(map(in_class, part))} of {len(part)}")
         wrong = [record["class"][0] if record["class"] else record["verdict"] for record in own if not in_class(record)]
-        lines.append(f"| {name} | {counts[0]} | {counts[1]} | {', '.join(wrong)} |")
+        cover = covered(own)
+        lines.append(f"| {name} | {counts[0]} | {counts[1]} | {sum(cover)} of {len(cover)} | {', '.join(wrong)} |")
     return lines
 
 
 def _among_three(record: Record) -> bool:
-    return planted(record)[0] in [*record["class"][:3], *record["ranking"][:3]]
+    ranked = list(dict.fromkeys([*record["class"], *record["ranking"]]))
+    return planted(record)[0] in ranked[:3]
 
 
 def _nearly_all(record: Record) -> bool:

@@ -29,7 +29,6 @@ EFFECTS = (
     "coloured_noise",
 )
 CAPS = {"dead_zone": 0.21, "battery_sag": 0.8, "heavy_tails": 0.45, "coloured_noise": 0.95, "actuator_lag": 1.0}
-WEAR = ("thrust_saturation", "battery_sag")  # the catalogue leaves their sign open; parts do not wear the other way
 ALONE = ("wind", "process_noise")  # neither in pairs nor withheld: the one needs a drag, the other a declared noise
 SINGLE, LARGE, CLEAN, PAIRS, WITHHELD = 10, 4, 200, 30, 60
 VALID, TEST = 16, 32
@@ -188,7 +187,7 @@ def _direction(planting: Planting, random: np.random.Generator) -> np.ndarray:
     if effect.components:
         angle = random.uniform(0, 2 * math.pi)
         return np.array([math.cos(angle), math.sin(angle)])
-    sign = 1.0 if effect.sign or planting.effect in WEAR else random.choice([-1.0, 1.0])
+    sign = 1.0 if effect.sign else random.choice([-1.0, 1.0])
     return np.array([sign])
 
 

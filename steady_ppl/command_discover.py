@@ -18,8 +18,9 @@ def discover(
         Path | None, typer.Option(help="Drives to choose by; every second drive of TABLE when not given.")
     ] = None,
     known_start: Annotated[
-        bool, typer.Option(help="Give the first row's x. columns as the exact start; a RUN knows its own setting.")
-    ] = False,
+        bool | None,
+        typer.Option(help="Give the first row's x. columns as the exact start; a RUN's own setting when not given."),
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Run folder for the improved fit.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
     picture: Annotated[Path | None, typer.Option(help="Draw what was found into this file, for example .png.")] = None,
@@ -29,7 +30,7 @@ def discover(
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing run.")] = False,
 ) -> None:
     """Learn which physical effect a program lacks: none, one by name, several, or a curve that has no name."""
-    from steady_ppl.command_line import _program, _say, _write_json
+    from steady_ppl.command_line import _program, _require_folder, _say, _write_json
     from steady_ppl.discovery import discover as search
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
@@ -43,17 +44,19 @@ def discover(
     if out is not None and out.exists() and not force:
         raise RunError(f"{out} exists: choose another folder, or --force to overwrite")
     require_picture(picture)
+    _require_folder(json_file)
     given: Any = Fit.load(source, program) if is_run else _program(source, seed)
     drives, judges = read_table(table), read_table(valid) if valid else None
     found = search(
         given,
         drives,
         judges,
-        known_start=known_start or None,
+        known_start=known_start,
         simulations=simulations,
         seed=seed,
         report=_progress,
     )
+    _progress("")
     print(found)
     if out is not None:
         used = {"table_sha256": fingerprint(drives), "valid_sha256": fingerprint(judges) if judges else None}
@@ -72,4 +75,4 @@ def discover(
 
 def _progress(text: str) -> None:
     if sys.stderr.isatty():
-        print(f"\r\x1b[K{text} …", end="", file=sys.stderr, flush=True)
+        print(f"\r\x1b[K{text} …" if text else "\r\x1b[K", end="", file=sys.stderr, flush=True)

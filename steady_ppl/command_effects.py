@@ -77,6 +77,6 @@ def with_effects(program: Any, effects: list[str], say: Any) -> Any:
             program, origin = program.with_effect(variant, value), "as given" if value else "typical"
             variant = added(program)[-1]
         numbers = getattr(program, variant.parameter).detach().flatten().tolist()
-        unit = "" if variant.effect.unit == "1" else f" {variant.effect.unit}"
+        unit = "" if variant.unit == "1" else f" {variant.unit}"
         say(f"{variant.label} = {', '.join(f'{number:.4g}' for number in numbers)}{unit} ({origin})")
     return program

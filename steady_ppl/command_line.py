@@ -239,6 +239,12 @@ def _write_json(path: Path, content: Any) -> None:
         raise UsageError(f"{path} cannot be written: {error.strerror}") from error
 
 
+def _require_folder(path: Path | None) -> None:
+    """Refuse a file whose folder does not exist, before anything is computed."""
+    if path is not None and not path.parent.is_dir():
+        raise UsageError(f"{path} cannot be written: there is no folder {path.parent}")
+
+
 def _say(line: str) -> None:
     print(f"steady: {line}", file=sys.stderr)
 

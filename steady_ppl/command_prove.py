@@ -27,7 +27,7 @@ def prove(
     seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
 ) -> None:
     """Prove that runs are better than the first one: log p(y), open-loop errors and noise, with paired intervals."""
-    from steady_ppl.command_line import _program, _write_json
+    from steady_ppl.command_line import _program, _require_folder, _write_json
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
     from steady_ppl.proving import prove as judge
@@ -38,6 +38,7 @@ def prove(
     if not runs:
         raise UsageError("prove needs at least one RUN and then a TABLE")
     require_picture(picture)
+    _require_folder(json_file)
     labels = _labels(runs) | ({"oracle": oracle} if oracle else {})
     if program and len(program) != len(labels):
         raise UsageError(f"--program is given {len(program)} times for {len(labels)} runs: name one for each, in order")

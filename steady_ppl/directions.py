@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from steady_ppl.actuation import lagged
 from steady_ppl.data import Trajectories
 from steady_ppl.linearization import Path
 from steady_ppl.planar_vehicle import wrap
@@ -163,19 +164,11 @@ def _miscarried(command: Tensor, data: Trajectories, speed: Tensor | None) -> di
         "dead zone of": -command.clamp(-DEAD * most, DEAD * most),
         "saturation of": command.clamp(-KNEE * most, KNEE * most) - command,
         "delay of": -change,
-        "lag of": _lagged(command, step) - command,
+        "lag of": lagged(command.unsqueeze(-1), data.elapsed.double()[:-1], torch.tensor(LAG)).squeeze(-1) - command,
     }
     if speed is not None:
         shapes["speed-dependent gain of"] = command * speed.abs().double()
     return shapes
-
-
-def _lagged(command: Tensor, step: Tensor) -> Tensor:
-    """What a first-order lag of `LAG` makes of a command, `(T, B)`."""
-    values = [command[0]]
-    for now, since in zip(command[:-1], step[:-1], strict=True):
-        values.append(values[-1] + (1 - torch.exp(-since / LAG)) * (now - values[-1]))
-    return torch.stack(values)
 
 
 def _dynamics(program: Program, data: Trajectories, path: Path, scores: _Scores) -> Named:

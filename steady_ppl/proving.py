@@ -112,7 +112,10 @@ def prove(
     known_start = _start_of(rows, notes) if known_start is None else known_start
     reference = next(iter(programs), "") if reference is None else reference
     _require(programs, reference, truth, data)
-    judged = {name: judge_program(name, program, data, known_start, seed) for name, program in programs.items()}
+    judged: dict[str, Judged] = {}
+    for name, program in programs.items():
+        same = next((other for other in judged if programs[other] is program), None)
+        judged[name] = judged[same] if same else judge_program(name, program, data, known_start, seed)
     before, true = judged[reference], judged.get(truth or "")
     coasting = keeping_velocity(before, known_start) if with_constant_velocity else None
     if isinstance(coasting, Judged):
@@ -132,7 +135,7 @@ def prove(
         trajectories=len(data),
         known_start=known_start,
         seed=seed,
-        notes=notes + _few_starts(before.data, horizons, known_start) + _blown_up(found) + _far_off(found, data),
+        notes=notes + _few_starts(before.data, horizons, known_start) + _blown_up(found) + far_off(found, data),
     )
 
 
@@ -189,7 +192,7 @@ def _blown_up(rows: Mapping[str, Row]) -> list[str]:
     return [f"{name} blows up {min(key.horizon for key in keys)} rows ahead" for name, keys in worst.items() if keys]
 
 
-def _far_off(rows: Mapping[str, Row], data: Trajectories) -> list[str]:
+def far_off(rows: Mapping[str, Row], data: Trajectories) -> list[str]:
     """Drives on which the linearised program's log p(y) is not to be trusted, the worst of each row."""
     notes = []
     for name, row in rows.items():

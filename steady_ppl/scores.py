@@ -28,6 +28,7 @@ from steady_ppl.program import Program, acting_controls
 from steady_ppl.sites import AtMean, Recording, as_vector, normal_moments, residual, running
 
 LARGEST = 60  # parameters that are screened one by one; networks have more
+RELATIVE = 1e-3  # of a number, by which differences move it at least: single precision has seven digits
 Moments = tuple[Tensor, Tensor]
 
 
@@ -257,7 +258,7 @@ def elements(program: Program) -> list[Element]:
         UsageError: there are more than can be screened one by one.
     """
     steps = {
-        variant.parameter: 0.02 * float(torch.as_tensor(variant.effect.typical).abs().max())
+        variant.parameter: 0.02 * float(variant.typical.abs().max())
         for variant in attached(program)
         if variant.effect.null == 0
     }
@@ -266,9 +267,9 @@ def elements(program: Program) -> list[Element]:
         if not parameter.requires_grad:
             continue
         name = name.removesuffix("_unconstrained")
-        for index in range(parameter.numel()):
+        for index, value in enumerate(parameter.detach().flatten().tolist()):
             label = f"{name}[{index}]" if parameter.numel() > 1 else name
-            found.append(Element(label, parameter, index, steps.get(name, 0.01)))
+            found.append(Element(label, parameter, index, max(steps.get(name, 0.01), RELATIVE * abs(value))))
     if len(found) > LARGEST:
         raise UsageError(
             f"program {type(program).__name__} has {len(found)} learnable numbers: a network cannot be screened "

@@ -132,7 +132,7 @@ class HovercraftWithDrag(Hovercraft):
     """
 
     attached = {"linear_drag": "linear_drag"}
-    priors = {**Hovercraft.priors, "linear_drag": dist.Normal(0.0, 1.0)}
+    priors = {**Hovercraft.priors, "linear_drag": dist.Cauchy(0.0, 1.0)}
 
     def __init__(self):
         super().__init__()

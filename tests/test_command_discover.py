@@ -53,7 +53,7 @@ def test_a_model_is_fitted_searched_and_kept(table, tmp_path, capsys):
 
 def test_what_cannot_be_searched_is_said_in_a_line(tmp_path, capsys):
     few = written(tmp_path / "few.csv", simulated(trajectories=4, rows=20))
-    assert "at least 5" in refused(capsys, "discover", HOVERCRAFT, few)
+    assert "4 drives are too few: 10 are needed" in refused(capsys, "discover", HOVERCRAFT, few)
     network = f"{MODELS / 'neural_vehicle.py'}:NeuralHovercraft"
     enough = written(tmp_path / "enough.csv", simulated(trajectories=12, rows=20))
     said = refused(capsys, "discover", network, enough)

@@ -1,5 +1,6 @@
 """The discovery benchmark's sets are what they say they are, and its rivals see what they should where it is easy."""
 
+import json
 import math
 import sys
 from collections import Counter
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 from steady_ppl import for_program
 from steady_ppl.effects import chosen_variant, find, parsed
@@ -15,11 +17,13 @@ from steady_ppl.scores import elements
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
+import discovery_scores
 import discovery_sets
 from discovery_limits import plantings, with_effects
 from discovery_sets import BenchmarkSet, benchmark_sets, owner, quick, tables
 
 EVERY = benchmark_sets()
+STORED = Path(discovery_sets.__file__).with_name("results") / "discovery.jsonl"
 
 
 def limits_of(text, known=()):
@@ -147,3 +151,30 @@ def test_rivals_leave_out_what_is_withheld(monkeypatch):
     drives = [table.subset(range(4)) for table in tables(EVERY[0])[:2]]
     (ranking,) = RIVALS["stepwise"](drives, owner(), withheld=["quadratic_drag"]).values()
     assert "quadratic_drag" not in ranking.effects and "linear_drag" in ranking.effects
+
+
+# --- the stored results -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def stored() -> list[dict]:
+    """The records of the last full run."""
+    return [json.loads(line) for line in STORED.read_text().splitlines()]
+
+
+def test_every_set_has_its_record_by_one_engine(stored):
+    assert [record["set"] for record in stored if "failed" in record] == []
+    assert {record["set"] for record in stored} == {one.name for one in EVERY} and len(stored) == len(EVERY)
+    assert len({record["version"] for record in stored}) == 1
+
+
+def test_p_values_of_clean_sets_are_uniform_and_one_in_twenty_is_accused(stored):
+    clean = [record for record in stored if record["stratum"] == "clean"]
+    assert stats.kstest([record["p_value"] for record in clean], "uniform").pvalue > 0.01
+    accused = stats.binomtest(sum(record["verdict"] != "none" for record in clean), len(clean))
+    low, high = accused.proportion_ci(0.95, "exact")
+    assert low <= 0.05 <= high
+
+
+def test_the_stored_table_is_that_of_the_records(stored):
+    assert STORED.with_suffix(".md").read_text().startswith(discovery_scores.scores_table(stored))

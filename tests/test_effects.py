@@ -302,7 +302,7 @@ def test_the_prior_of_a_coefficient_counts_in_the_joint_density() -> None:
         (prior,) = [site["fn"].log_factor for name, site in trace.nodes.items() if name.startswith("prior")]
         return prior.detach()
 
-    expected = torch.distributions.Normal(0.0, 1.0).log_prob(torch.tensor([0.0, 0.7]))
+    expected = torch.distributions.Cauchy(0.0, 1.0).log_prob(torch.tensor([0.0, 0.7]))
     torch.testing.assert_close(torch.stack([density(0.0), density(0.7)]), expected.double())
 
 

@@ -19,7 +19,7 @@ import steady_ppl as st
 from steady_ppl.paired_bootstrap import Sums, paired
 from steady_ppl.program import Program, for_program
 from steady_ppl.proof_rows import Key
-from steady_ppl.proving import _far_off, prove
+from steady_ppl.proving import far_off, prove
 
 matplotlib.use("Agg")
 
@@ -127,12 +127,12 @@ def test_a_drive_that_the_linearised_program_misjudges_is_named(drag, dragged):
     left = torch.zeros(len(dragged))
     left[3], left[7] = -4.0, 2.5
     rows = {"after": replace(drag.rows["after"], neglected=left)}
-    assert _far_off(rows, dragged) == [
+    assert far_off(rows, dragged) == [
         "after: on drive 4 a particle filter's log p(y) is 4.0 nats below the linearised program's, and so on 1 more: "
         "look at it before you trust the table"
     ]
     rows = {"after": replace(drag.rows["after"], neglected="it broke down")}
-    assert _far_off(rows, dragged)[0].endswith("can be trusted: it broke down")
+    assert far_off(rows, dragged)[0].endswith("can be trusted: it broke down")
 
 
 @pytest.mark.parametrize("horizon", ["1 s", "3 s"])

@@ -20,7 +20,7 @@ from steady_ppl.program import Program
 from steady_ppl.scores import Element, parameter_scores, smoothed
 from steady_ppl.seeding import seeded
 
-MOST_LOST = 0.8  # share of the simulated sets that has to be left
+LEAST_LEFT = 0.8  # share of the simulated sets that must not blow up
 
 
 @dataclass(frozen=True)
@@ -59,26 +59,24 @@ def simulate_scores(
     parts: Sequence[Element],
     columns: Sequence[Column],
     *,
-    sets: int,
     known_start: bool,
     seed: int,
     passes: int = 2,
 ) -> Simulated:
-    """Simulate drives with the same controls and gaps from the same starts, and score them at the same parameters.
+    """Simulate drives with the same controls and gaps, and score them at the same parameters.
 
     Args:
         program: fitted.
         data: as returned by `for_program`.
-        starts: where each drive begins, `(B, D)`.
+        starts: where each drive begins, `(S, B, D)`.
         parts, columns: what is scored.
-        sets: how many times all drives are simulated.
         known_start: the first state is certain.
         seed: the same seed gives the same scores.
         passes: linearisations; they begin at the true path.
     """
-    channels = len(program.channels)
+    channels, sets = len(program.channels), len(starts)
     with seeded(seed, "bootstrap"):
-        drives, path = simulate_again(program, data, starts.expand(sets, *starts.shape), channels)
+        drives, path = simulate_again(program, data, starts, channels)
     scores, likely = [], []
     for first in range(0, len(drives), PART):
         index = torch.arange(first, min(first + PART, len(drives)))
@@ -90,7 +88,7 @@ def simulate_scores(
         likely.append(ahead.log_likelihood)
     found = Simulated(torch.cat(scores).unflatten(0, (sets, len(data))), torch.cat(likely).view(sets, len(data)))
     whole = torch.isfinite(found.scores).all(-1).all(-1) & torch.isfinite(found.log_likelihood).all(-1)
-    if int(whole.sum()) < MOST_LOST * sets:
+    if int(whole.sum()) < LEAST_LEFT * sets:
         raise FilterError(
             f"{int((~whole).sum())} of {sets} simulated sets blew up: the fitted program does not even explain "
             "drives of its own"

@@ -20,8 +20,10 @@ from steady_ppl.discovery.screening import LEVEL, Screened, Tested, screen
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import smooth
+from steady_ppl.lookahead import Lookahead
 from steady_ppl.program import Program
 from steady_ppl.scores import Element, elements, smoothed, typical_spreads
+from steady_ppl.seeding import seeded
 
 LEADERS, ALIKE = 6, 0.85  # how many are refitted, and those as well whose columns correlate so much with the first
 NATS = 2.0  # of held-out log p(y) within which two candidates cannot be told apart
@@ -38,12 +40,10 @@ class Settings:
 
     Attributes:
         known_start: the first states are certain.
-        seed: of the simulated sets.
         withheld: names of effects that are left out of the catalogue.
     """
 
     known_start: bool
-    seed: int = 0
     withheld: Sequence[str] = ()
 
 
@@ -151,10 +151,9 @@ def screen_program(now: Refit, declared: Program, settings: Settings, *, sets: i
     simulated = simulate_scores(
         program,
         fold.drives,
-        fold.path.states[0],
+        _starts(ahead, fold.path.states[0], settings.known_start, sets, seed),
         parts,
         columns,
-        sets=sets,
         known_start=settings.known_start,
         seed=seed,
     )
@@ -164,6 +163,15 @@ def screen_program(now: Refit, declared: Program, settings: Settings, *, sets: i
         information[_key(column)] = simulated.information[index][:, index]
         first += column.size
     return Screening(screen(observed, simulated, len(parts), columns, away), parts, information)
+
+
+def _starts(ahead: Lookahead, path: Tensor, known_start: bool, sets: int, seed: int) -> Tensor:
+    """First states of simulated sets, `(S, B, D)`: the known ones, or draws of their posterior."""
+    if known_start:
+        return path.expand(sets, *path.shape)
+    with seeded(seed, "starts"):
+        _, states, _ = ahead.draws(sets)
+    return states[:, 0].to(path)
 
 
 def leaders(screened: Screened, first: bool) -> list[Tested]:

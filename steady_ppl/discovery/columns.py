@@ -39,7 +39,7 @@ class Column:
 
 def columns_of(variants: Sequence[Variant]) -> list[Column]:
     """One column a variant, or one for each of its probes."""
-    return [Column(v, probe) for v in variants for probe in (v.effect.probes or (None,))]
+    return [Column(v, probe) for v in variants for probe in (v.probes or (None,))]
 
 
 class Scoring:
@@ -79,7 +79,7 @@ class Scoring:
             yield (torch.as_tensor(column.probe).to(like), absent), reach
             return
         size = variant.effect.size
-        typical = torch.as_tensor(variant.effect.typical).to(like).flatten()
+        typical = variant.typical.to(like)
         steps = 0.05 * torch.where(typical == 0, typical.abs().max(), typical.abs())
         for index in range(size):
             by = torch.zeros(size).to(like)

@@ -85,9 +85,11 @@ def unit_of(program: Program, variable: str) -> str:
 
 def knots_of(values: Tensor, circular: bool) -> tuple[float, ...] | None:
     """Where a curve bends, from the smallest to the largest value but for the outermost hundredths; a whole turn for an
-    angle; None where the variable does not vary."""
+    angle; None where the variable does not vary, or is never seen."""
     if circular:
         return tuple(-math.pi + 2 * math.pi * k / KNOTS for k in range(KNOTS))
+    if not len(values):
+        return None
     every = values[:: max(1, len(values) // 100_000)]
     low, high = (float(q) for q in torch.quantile(every, torch.tensor([0.01, 0.99]).to(every)))
     if not math.isfinite(high - low) or high - low < 1e-6 * max(1.0, abs(high)):

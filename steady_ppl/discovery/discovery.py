@@ -14,12 +14,13 @@ from steady_ppl.discovery.candidates import NATS
 from steady_ppl.discovery.discovery_report import as_text, figures
 from steady_ppl.discovery.finding import Finding, Shape, findings, shape_of
 from steady_ppl.discovery.next_run import NextRun, next_run
-from steady_ppl.discovery.requirements import require, unexcited
+from steady_ppl.discovery.requirements import FEWEST_DRIVES, require, unexcited
 from steady_ppl.discovery.search import Found, Search, search
 from steady_ppl.effects import record, restore, written_class
+from steady_ppl.errors import DataError
 from steady_ppl.fit import Fit
 from steady_ppl.program import Program, for_program
-from steady_ppl.proving import Proof, prove
+from steady_ppl.proving import Proof, far_off, prove
 
 FITTED_FURTHER = 10.0  # nats that fitting a run further may gain before it is said
 
@@ -34,9 +35,11 @@ class Discovery:
         search: everything that was tested and fitted.
         findings: the effects that are missing, the one that brings most first; empty where none or a curve is.
         shape: the curve where no effect of the catalogue explains the drives.
-        next_run: controls that would separate the first finding's class; None where it has one member.
+        next_run: controls that would separate the first class of several members; None where there is none, or where
+            no way of driving that was tried does.
         proof: the program before and after on the validation drives, by the fits to the training drives.
         before, after: the programs, fitted to all drives; equal where no effect was found by name.
+        doubts: why no ranking is to be trusted, empty as a rule.
         notes: what was left out or is not as it seems.
     """
 
@@ -47,6 +50,7 @@ class Discovery:
     proof: Proof
     before: Fit
     after: Fit
+    doubts: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -119,6 +123,11 @@ def discover(
     declared = copy.deepcopy(declared or program).cpu()
     notes: list[str] = []
     if valid is None:
+        if len(train) < 2 * FEWEST_DRIVES:
+            raise DataError(
+                f"{len(train)} drives are too few: {2 * FEWEST_DRIVES} are needed, half of them to choose by, because "
+                "the unit that is resampled is the drive"
+            )
         valid = train.subset(range(1, len(train), 2))
         train = train.subset(range(0, len(train), 2))
         notes.append(f"no validation drives were given: {len(valid)} of the {len(train) + len(valid)} drives were kept")
@@ -141,16 +150,40 @@ def discover(
     final = found.base if shape or found.rounds[0].quiet else found.final
     settings = {"simulations": simulations, "seed": seed}
     fits = [Fit(refit.mean_program(), "discover", settings, seed, known_start) for refit in (found.base, final)]
+    proof = _proof(found, shape is not None, drives[1], known_start, seed)
+    unclear = _unclear(found, effects)
+    proposed = next_run(unclear, known_start, seed) if unclear else None
+    if unclear and proposed is None:
+        alike = " from ".join(candidate.variant.name for candidate in unclear.alike[:2])
+        notes.append(f"no way of driving that was tried tells {alike} better than these drives do")
     return Discovery(
         search=found,
         findings=effects,
         shape=shape,
-        next_run=next_run(found, known_start, seed) if effects and len(effects[0].alike) > 1 else None,
-        proof=_proof(found, shape is not None, drives[1], known_start, seed),
+        next_run=proposed,
+        proof=proof,
         before=fits[0],
         after=fits[1],
-        notes=notes + _notes(found, is_fitted),
+        doubts=_doubts(found),
+        notes=notes + _notes(found, is_fitted) + far_off(proof.rows, drives[1]),
     )
+
+
+def _unclear(found: Search, effects: Sequence[Finding]) -> Found | None:
+    """The first of what was found whose class has several members."""
+    names = [effect.variant.name for effect in effects if len(effect.alike) > 1]
+    return next((one for name in names for one in found.found if one.candidate.variant.name == name), None)
+
+
+def _doubts(found: Search) -> list[str]:
+    doubts = [] if found.base.converged else [NOT_CONVERGED]
+    statistic, count = found.rounds[0].screening.tests.fitted
+    if count and statistic > 5 * count + 10:
+        doubts.append(
+            f"the fitted parameters' own score is large ({statistic:.0f} on {count}), the fit is at a bound: no "
+            "ranking below is to be trusted"
+        )
+    return doubts
 
 
 def _as_written(program: Program) -> Program:
@@ -167,19 +200,17 @@ def _proof(found: Search, is_curve: bool, valid: Trajectories, known_start: bool
 
 def _notes(found: Search, is_fitted: bool) -> list[str]:
     notes = []
-    if not found.base.converged:
-        notes.append(NOT_CONVERGED)
     gained = found.base.maxima[0].gained
     if is_fitted and gained > FITTED_FURTHER:
         notes.append(f"the run had not converged on these drives: {gained:.0f} nats were gained by fitting it further")
-    statistic, count = found.rounds[0].screening.tests.fitted
-    if count and statistic > 5 * count + 10:
-        notes.append(f"the fitted parameters' own score is large ({statistic:.0f} on {count}): the fit is at a bound")
     constant = unexcited(found.base.program, found.base.folds[0].drives)
     if constant:
         notes.append(f"{', '.join(constant)} never changes: what it does cannot be told from what happens anyway")
     if found.curve is not None:
-        notes.append("a curve has no name and is not kept: the improved fit is the program as it stood, fitted")
+        notes.append(
+            "a curve has no name and is not kept: 'after' is what it would bring, --out has the program as it stood, "
+            "fitted"
+        )
     if not found.final.converged and found.found:
         notes.append("the fit with what was found has not converged")
     if not found.rounds[-1].quiet:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -53,6 +54,7 @@ def figures(found: Discovery) -> dict[str, Any]:
             for one in found.search.rounds
         ],
         "known_start": found.before.known_start,
+        "doubts": found.doubts,
         "notes": found.notes,
     }
 
@@ -72,7 +74,7 @@ def ranked(found: Discovery) -> list[Tested]:
 
 
 def _candidate(found: Discovery, tested: Tested) -> dict[str, Any]:
-    fitted = next((c for c in found.search.rounds[0].candidates if c.variant.name == tested.variant.name), None)
+    fitted = _fitted(found, tested)
     interval = gain_interval(fitted, found.before.seed) if fitted else None
     variant = tested.variant
     return {
@@ -80,15 +82,31 @@ def _candidate(found: Discovery, tested: Tested) -> dict[str, Any]:
         "kind": "other" if tested.is_curve else variant.effect.verdict,
         "statistic": tested.statistic,
         "p_value": tested.p_value,
-        "coefficient": _numbers(tested.coefficient + (1.0 if variant.effect.null == 1 else 0.0)),
-        "sd": _numbers(tested.sd),
-        "unit": variant.effect.unit,
+        **_one_step(tested),
+        "unit": variant.unit,
         "options": {name: _plain(value) for name, value in variant.profiled.items()},
         "detection_limit": _numbers(limit_of(found, tested)),
         "heldout_gain": _finite(fitted.total) if fitted else None,
         "heldout_gain_ci": list(interval) if interval else None,
         "note": _note(tested, fitted),
     }
+
+
+def _fitted(found: Discovery, tested: Tested) -> Candidate | None:
+    """Its fit: of what was found as it was last looked at, else of the first round."""
+    if tested.is_curve:
+        return next((c for c in found.search.curves if c.variant.at == tested.variant.at), None)
+    every = [one.candidate for one in found.search.found] + found.search.rounds[0].candidates
+    return next((c for c in every if c.variant.name == tested.variant.name), None)
+
+
+def _one_step(tested: Tested) -> dict[str, Any]:
+    """The coefficient by one scoring step and its standard deviation; of what has no scale where it is absent, the
+    probe that told most."""
+    null = tested.variant.effect.null
+    if not math.isfinite(null):
+        return {"coefficient": tested.column.probe, "sd": None}
+    return {"coefficient": _numbers(tested.coefficient + null), "sd": _numbers(tested.sd)}
 
 
 def limit_of(found: Discovery, tested: Tested) -> np.ndarray:
@@ -125,7 +143,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "coefficient": finding.coefficient,
         "sd": finding.sd,
         "interval_90": [list(pair) for pair in finding.interval],
-        "unit": finding.variant.effect.unit,
+        "unit": finding.variant.unit,
         "options": {name: _plain(value) for name, value in finding.variant.profiled.items()},
         "equation": finding.variant.effect.equation,
         "text": finding.variant.effect.text,
@@ -169,7 +187,7 @@ def _said(finding: Finding) -> str:
 
 def with_interval(finding: Finding) -> str:
     """A coefficient with its 90 % interval and unit."""
-    unit = "" if finding.variant.effect.unit in ("", "1") else f" {finding.variant.effect.unit}"
+    unit = "" if finding.variant.unit in ("", "1") else f" {finding.variant.unit}"
     said = [
         f"{value:.3g} [{low:.3g}, {high:.3g}]"
         for value, (low, high) in zip(finding.coefficient, finding.interval, strict=True)
@@ -179,10 +197,8 @@ def with_interval(finding: Finding) -> str:
 
 def as_text(found: Discovery) -> str:
     """The verdict, the equation, the candidates, and before and after."""
-    first = (
-        [] if found.search.base.converged else ["The program's own fit has not converged; what follows may mislead."]
-    )
-    lines = [*first, *textwrap.wrap(sentence(found), WIDTH)]
+    doubts = [line for doubt in found.doubts for line in textwrap.wrap(f"warning: {doubt}", WIDTH)]
+    lines = [*doubts, *textwrap.wrap(sentence(found), WIDTH)]
     for finding in found.findings:
         lines += ["", f"{finding.variant.name}: {finding.variant.effect.text}", f"  {finding.variant.effect.feels}"]
     if found.shape:
@@ -197,14 +213,16 @@ def as_text(found: Discovery) -> str:
         lines += ["", *textwrap.wrap(_next(found), WIDTH)]
     if found.verdict != "none":
         lines += ["", "On the validation drives:", str(found.proof)]
-    return "\n".join(lines + [f"note: {note}" for note in found.notes])
+    said = set(found.proof.notes) if found.verdict != "none" else set()
+    notes = [line for note in found.notes if note not in said for line in textwrap.wrap(f"note: {note}", WIDTH)]
+    return "\n".join([*lines, *notes])
 
 
 def _next(found: Discovery) -> str:
     run = found.next_run
     assert run is not None
     return (
-        f"To tell {' from '.join(found.findings[0].alike[:2])}, drive {run.way}: {run.separation:.1f} nats a drive, "
+        f"To tell {' from '.join(run.between[:2])}, drive {run.way}: {run.separation:.1f} nats a drive, "
         f"against {run.usual:.1f} of drives such as these."
     )
 
@@ -213,8 +231,19 @@ def _table(found: Discovery) -> list[str]:
     header = ["candidate", "kind", "test", "p", "held-out gain", "one step", "± sd", "limit", "unit"]
     rows = [header, *(_line(found, tested) for tested in ranked(found)[:SHOWN])]
     widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
-    more = len(found.search.rounds[0].screening.tests.tested) - SHOWN
-    return [_aligned(row, widths) for row in rows] + ([f"and {more} more"] if more > 0 else [])
+    rest = ranked(found)[SHOWN:]
+    more = _limits(found, rest) if found.verdict == "none" else [f"and {len(rest)} more"] * bool(rest)
+    return [_aligned(row, widths) for row in rows] + more
+
+
+def _limits(found: Discovery, tested: Sequence[Tested]) -> list[str]:
+    """What could not have been seen of those that are not in the table."""
+    said = []
+    for one in tested:
+        limit = _short(_numbers(limit_of(found, one)))
+        if not (one.is_curve or one.untestable or limit == "–"):
+            said.append(f"{one.variant.name} {limit}{'' if one.variant.unit == '1' else ' ' + one.variant.unit}")
+    return textwrap.wrap(f"and below their limits: {'; '.join(said)}", WIDTH) if said else []
 
 
 def _line(found: Discovery, tested: Tested) -> list[str]:

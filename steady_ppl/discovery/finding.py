@@ -153,7 +153,7 @@ def shape_of(search: Search, program: Program) -> Shape | None:
     return Shape(
         channel=channel,
         variable=variable,
-        unit=variant.effect.unit,
+        unit=variant.unit,
         variable_unit=unit_of(program, about if variable == "reading" else variable),
         points=[float(knot) for knot in variant.options["knots"]],
         curve=[float(value) for value in heights],

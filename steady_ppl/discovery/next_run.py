@@ -12,7 +12,7 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.refits import Refit, wide, wide_drives
-from steady_ppl.discovery.search import Search
+from steady_ppl.discovery.search import Found
 from steady_ppl.gaussian_smoother import smooth
 from steady_ppl.linearization import Path
 from steady_ppl.predictions import simulate_again
@@ -28,6 +28,7 @@ class NextRun:
     """Controls to drive next.
 
     Attributes:
+        between: the class.
         way: how they are made, in words.
         controls: control → its values, one a row.
         step: s, of a row.
@@ -35,6 +36,7 @@ class NextRun:
         usual: the same of the drives that there are.
     """
 
+    between: list[str]
     way: str
     controls: dict[str, list[float]]
     step: float
@@ -43,27 +45,31 @@ class NextRun:
 
 
 @torch.no_grad()
-def next_run(search: Search, known_start: bool, seed: int) -> NextRun | None:
+def next_run(found: Found, known_start: bool, seed: int) -> NextRun | None:
     """The best of some ways of driving within the limits of the controls that were driven, None where none separates
     the class better than the drives that there are.
 
     Each is simulated with the best member of the class; the others are judged by how much less likely they find it.
+
+    Args:
+        found: an effect whose class has several members.
+        known_start: the first states are certain.
+        seed: of the ways that are random, and of the simulations.
     """
-    members = [c for c in search.found[0].alike if isinstance(c.refit, Refit)] if search.found else []
-    if len(members) < 2:
-        return None
+    members = [c for c in found.alike if isinstance(c.refit, Refit)]
     data = members[0].refit.folds[0].drives  # type: ignore[union-attr]
     usual = _separation(members, data.controls, data, known_start, seed)
-    found = []
+    better = []
     for way, controls in _ways(data, seed):
         apart = _separation(members, controls.unsqueeze(1).expand_as(data.controls), data, known_start, seed)
         if math.isfinite(apart) and apart > max(0.0, usual):
-            found.append((apart, way, controls))
-    if not found:
+            better.append((apart, way, controls))
+    if not better:
         return None
-    separation, way, controls = max(found, key=lambda one: one[0])
+    separation, way, controls = max(better, key=lambda one: one[0])
     order = names(members[0].refit.program.controls)  # type: ignore[union-attr]
     return NextRun(
+        between=[member.variant.name for member in members],
         way=way,
         controls={name: [round(v, 4) for v in controls[:, i].tolist()] for i, name in enumerate(order)},
         step=float(data.steps[data.transitions].median()),

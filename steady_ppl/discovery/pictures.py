@@ -218,7 +218,7 @@ def _component(variant: Variant, index: int) -> str:
 
 
 def _with_unit(limit: float, variant: Variant) -> str:
-    unit = variant.effect.unit
+    unit = variant.unit
     if limit > variant.effect.limit:
         return "beyond the physical"
     return f"{limit:.2g}" + ("" if unit in ("", "1") else f" {unit}")

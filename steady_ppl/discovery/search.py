@@ -150,7 +150,7 @@ def search(
         withheld: names of effects that are left out of the catalogue.
         report: told what is done.
     """
-    settings = Settings(known_start, seed, withheld)
+    settings = Settings(known_start, withheld)
     declared = copy.deepcopy(declared or program)
     report("fitting the program as it stands")
     base = first_refit(program, train, valid, known_start=known_start, seed=seed)
@@ -163,7 +163,7 @@ def search(
         found.rounds.append(ended)
         if ended.quiet:
             break
-        if index == 1:
+        if index == 1 and not found.curves:
             found.curves = _curves(found.base, found.rounds[0].screening, settings, report)
         if index == MOST:
             break
@@ -174,7 +174,7 @@ def search(
         if index == 0 and not gains:
             found.curves = _curves(found.base, screening, settings, report)
         if index == 0 and not gains and able and found.needs_a_name:
-            best = able[0] if able[0].total > 0 else None
+            best = able[0] if able[0].total > NATS else None
         if best is None:
             found.rounds[-1] = Round(screening, candidates, None)
             break

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -44,7 +45,17 @@ def _everywhere(program: Program, data: Trajectories | None) -> Sequence[Mapping
 def _per_unit(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
     """The coefficient has a control's unit: together where they share one, else each alone."""
     groups = _groups(program)
-    return groups if len(groups) == 1 else groups[1:]
+    groups = groups if len(groups) == 1 else groups[1:]
+    return [{**group, "scale": _size(data, group["controls"])} for group in groups]
+
+
+def _size(data: Trajectories | None, controls: Sequence[str]) -> float:
+    """The power of two below the largest command; one where there are no drives."""
+    if data is None:
+        return 1.0
+    columns = [data.control_names.index(name) for name in controls]
+    largest = float(data.controls[..., columns][data.rows].abs().amax())
+    return 2.0 ** math.floor(math.log2(largest)) if largest > 0 else 1.0
 
 
 def _knees(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
@@ -215,7 +226,7 @@ ACTUATORS = [
         name="battery_sag",
         form="history",
         equation=r"u \to (1 - c\,t / T)\,u",
-        text="u → (1 - c t/T) u, T a drive's length",
+        text="u → (1 - c t/T) u, T the program's duration",
         unit="1",
         feels="weaker towards the end of every drive",
         function=battery_sag,

@@ -82,10 +82,10 @@ def _start(variant: Variant, value: float | Sequence[float] | Tensor | None, lik
 
 
 def prior(effect: Effect) -> Any:
-    """The prior of an effect's coefficient: its own, or a normal as wide as is physical."""
+    """The prior of an effect's coefficient: its own, or a Cauchy as wide as is physical."""
     if effect.prior is not None:
         return effect.prior
-    return dist.Normal(1.0 if effect.null == 1 else 0.0, effect.limit)
+    return dist.Cauchy(1.0 if effect.null == 1 else 0.0, effect.limit)
 
 
 def added(program: Program) -> tuple[Variant, ...]:

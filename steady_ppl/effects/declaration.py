@@ -17,8 +17,10 @@ with the coefficient as `c`; it has one `return`, at its end. The form says what
 from __future__ import annotations
 
 import inspect
+import math
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -27,7 +29,7 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import UsageError
-from steady_ppl.program import Program
+from steady_ppl.program import Program, names, units
 
 VERDICTS = {
     "push": "dynamics",
@@ -61,7 +63,7 @@ class Effect:
         feels: what it feels like on the vehicle, in a line.
         function: how it acts.
         typical: a coefficient that is clearly felt; `(k,)` values for a vector.
-        limit: magnitudes beyond this are not physical; a normal prior has this standard deviation.
+        limit: magnitudes beyond this are hardly physical; the prior's scale.
         sign: of the coefficient where physics fixes it, else 0.
         null: the coefficient at which the effect is absent.
         components: names of a vector coefficient's components.
@@ -69,7 +71,8 @@ class Effect:
         choices: what else it depends on, one mapping of the function's further arguments a choice: which channels,
             controls or component, called `at`, and knees, widths or places.
         profiled: the arguments among these that are knees, widths or places.
-        prior: of the coefficient, a Pyro distribution; normal with standard deviation `limit` when None.
+        prior: of the coefficient, a Pyro distribution; a Cauchy of scale `limit` about its absence when None, whose
+            tails leave room for vehicles of another size.
         lacks: why it does not apply to a program, or None.
     """
 
@@ -96,6 +99,15 @@ class Effect:
             raise UsageError(f"effect {self.name}: no form {self.form!r}; there are {', '.join(VERDICTS)}")
         if "c" not in inspect.signature(self.function).parameters:
             raise UsageError(f"effect {self.name}: its function takes no coefficient c")
+        typical = self.typical if isinstance(self.typical, tuple) else (self.typical,)
+        if len(typical) != self.size:
+            raise UsageError(f"effect {self.name}: {len(typical)} typical numbers for {self.size} components")
+        if not any(typical) or not all(map(math.isfinite, typical)):
+            raise UsageError(f"effect {self.name}: its typical coefficient is {self.typical}: none would feel it")
+        if self.components and self.sign:
+            raise UsageError(f"effect {self.name}: a coefficient of several components has no sign")
+        if not self.limit > 0:
+            raise UsageError(f"effect {self.name}: its limit is a magnitude above zero, got {self.limit}")
 
     @property
     def verdict(self) -> str:
@@ -108,14 +120,15 @@ class Effect:
         return max(1, len(self.components))
 
     def variants(self, program: Program, data: Trajectories | None = None) -> list[Variant]:
-        """All ways in which it could act on a program; knees and places are chosen for `data` where given."""
+        """All ways in which it could act on a program; knees, places and scales are chosen for `data` where given."""
         if self.lacks(program):
             return []
-        return [self.variant(**choice) for choice in self.choices(program, data)]
+        found = [self.variant(**choice) for choice in self.choices(program, data)]
+        return [replace(variant, unit=_unit(program, variant)) for variant in found]
 
-    def variant(self, at: str = "", **options: Any) -> Variant:
+    def variant(self, at: str = "", scale: float = 1.0, **options: Any) -> Variant:
         """The effect with everything settled but its coefficient."""
-        return Variant(self, at, options)
+        return Variant(self, at, options, scale=scale, unit=self.unit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,12 +140,26 @@ class Variant:
         at: where it acts, if there is a choice.
         options: the further arguments of its function.
         called: another name for the coefficient, where a program has a parameter of the effect's name.
+        scale: by which the effect's probes and typical value are multiplied for the drives that were looked at.
+        unit: of the coefficient in this program.
     """
 
     effect: Effect
     at: str
     options: Mapping[str, Any]
     called: str = ""
+    scale: float = 1.0
+    unit: str = ""
+
+    @property
+    def probes(self) -> list[float]:
+        """Finite coefficients at which it is screened as well."""
+        return [self.scale * probe for probe in self.effect.probes]
+
+    @property
+    def typical(self) -> Tensor:
+        """A coefficient that is clearly felt, `(k,)`."""
+        return self.scale * torch.as_tensor(self.effect.typical).flatten()
 
     @property
     def profiled(self) -> dict[str, Any]:
@@ -204,3 +231,18 @@ class Variant:
     def needs_mean(self) -> bool:
         """Whether it depends on what the channels' means are without it."""
         return "mean" in inspect.signature(self.effect.function).parameters
+
+
+def _unit(program: Program, variant: Variant) -> str:
+    """The coefficient's unit in a program whose controls, measurements and channels have units of their own."""
+    unit, options = variant.effect.unit, variant.options
+    if unit == "of the control" and "controls" in options:
+        return units(program.controls)[names(program.controls).index(options["controls"][0])] or unit
+    if unit == "of the measurement" and "component" in options:
+        return units(program.measurements)[options["component"]] or unit
+    if "channels" in options and variant.effect.form == "push":
+        of_channel = units(program.channels)[names(program.channels).index(options["channels"][0])]
+        moved = of_channel.removesuffix("/s²")
+        if moved and moved != of_channel and not unit.startswith(("rad", "1/rad")):
+            return re.sub(r"(?<![a-z])m(?![a-z])", moved, unit)
+    return unit

@@ -81,7 +81,8 @@ def _docstring(above: str, layers: Sequence[Layer]) -> list[str]:
     for layer in layers:
         effect, told = layer.variant.effect, ", ".join(f"{k} {v:.6g}" for k, v in layer.variant.profiled.items())
         lines.append(f"{layer.name}: {effect.text}" + (f", {told}" if told else ""))
-        lines.append(f"    c in {effect.unit}; {effect.feels}" if effect.unit != "1" else f"    {effect.feels}")
+        unit = layer.variant.unit
+        lines.append(f"    c in {unit}; {effect.feels}" if unit != "1" else f"    {effect.feels}")
     wrapped = [
         part
         for line in lines
@@ -117,9 +118,9 @@ def tensor_text(value: Tensor) -> str:
 
 
 def _prior(prior: Any) -> str:
-    if type(prior) is not dist.Normal or prior.loc.dim():
-        raise UsageError(f"a prior that is {prior} cannot be written out: expected a normal one of one number")
-    return f"dist.Normal({float(f'{prior.loc:.6g}')}, {float(f'{prior.scale:.6g}')})"
+    if type(prior) not in (dist.Normal, dist.Cauchy) or prior.loc.dim():
+        raise UsageError(f"a prior that is {prior} cannot be written out: expected a normal or Cauchy of one number")
+    return f"dist.{type(prior).__name__}({float(f'{prior.loc:.6g}')}, {float(f'{prior.scale:.6g}')})"
 
 
 def _deviations(program: Program, states: Sequence[str], layers: Sequence[Layer]) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from dataclasses import replace
 from typing import Any
 
 from steady_ppl.effects.actuators import ACTUATORS
@@ -111,7 +112,7 @@ def chosen_variant(program: Program, effect: str | Effect, at: str = "", **optio
     choices = effect.variants(program)
     for index, choice in enumerate(choices):
         if at in (choice.at, str(index)) or (not at and index == 0):
-            return Variant(effect, choice.at, {**choice.options, **options})
+            return replace(choice, options={**choice.options, **options})
     places = ", ".join(dict.fromkeys(choice.at for choice in choices if choice.at))
     raise UsageError(
         f"effect {effect.name} has no place {at!r}: " + (f"it can be at {places}" if places else "there is one only")

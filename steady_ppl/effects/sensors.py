@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,6 +15,19 @@ from steady_ppl.program import Program, names, units
 
 def _each(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
     return [{"component": index, "at": name} for index, name in enumerate(names(program.measurements))]
+
+
+def _each_of_its_size(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+    return [{**choice, "scale": _spread(data, choice["component"])} for choice in _each(program, data)]
+
+
+def _spread(data: Trajectories | None, component: int) -> float:
+    """The power of two below a measurement's standard deviation over all drives; one where there are none."""
+    if data is None:
+        return 1.0
+    values = data.measurements[..., component][data.observed[..., component]].double()
+    spread = float(values.std()) if len(values) > 1 else 0.0
+    return 2.0 ** math.floor(math.log2(spread)) if spread > 0 else 1.0
 
 
 def _one_landmark(program: Program) -> str | None:
@@ -91,7 +105,7 @@ SENSORS = [
         function=one_bias,
         typical=0.05,
         limit=1.0,
-        choices=_each,
+        choices=_each_of_its_size,
         lacks=_planar,
     ),
     Effect(
