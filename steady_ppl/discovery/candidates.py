@@ -22,7 +22,7 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import smooth
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.program import Program
-from steady_ppl.scores import Element, elements, smoothed, typical_spreads
+from steady_ppl.scores import Element, elements, measured, smoothed, typical_spreads
 from steady_ppl.seeding import seeded
 
 LEADERS, ALIKE = 6, 0.85  # how many are refitted, and those as well whose columns correlate so much with the first
@@ -135,10 +135,11 @@ def screen_program(now: Refit, declared: Program, settings: Settings, *, sets: i
     away = departures(declared, program, fold.drives, fold.path.states, parts)
     away = [one for one in away if one.variant.name not in there and one.variant.effect.name not in settings.withheld]
     skip = there | {departure.variant.name for departure in away}
+    tailed = bool(torch.isfinite(measured(program, fold.path.states[:1, :1]).freedom).any())  # Student t as it stands
     variants = [
         variant
         for effect in catalogue(program)
-        if effect.name not in settings.withheld
+        if effect.name not in settings.withheld and not (tailed and effect.form == "tails")
         for variant in effect.variants(program, seen)
         if variant.name not in skip
     ]
