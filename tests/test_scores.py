@@ -115,6 +115,7 @@ def test_scores_of_curves_are_those_of_their_heights(hovercraft):
         "forward~forward velocity",
         "yaw~heading",
         "lateral~commanded yaw",
+        "forward~time × what is commanded",
         "bearing_1~reading",
         "all~reading",
     ):

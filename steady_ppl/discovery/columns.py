@@ -11,7 +11,7 @@ from torch import Tensor
 
 from steady_ppl.altering import by_channel
 from steady_ppl.data import Trajectories
-from steady_ppl.discovery.curves import by_height, over_reading, over_state, variables
+from steady_ppl.discovery.curves import by_height, multiplier, over_reading, over_state, variables
 from steady_ppl.effects import Variant
 from steady_ppl.program import Program, acting_controls, names
 from steady_ppl.scores import Smoothed, channel_moments, measured
@@ -117,7 +117,8 @@ class Scoring:
         """Scores of the heights at the knots of a curve that is added to a channel, `(B, K)`."""
         index = names(self.program.channels).index(variant.options["channel"])
         variable, knots = variant.options["variable"], variant.options["knots"]
-        weights = self.at.channels.weights(index) / self.spread[..., index]
+        times = multiplier(self._means_around(index), variant.options["channel"], variant.options["times"])
+        weights = self.at.channels.weights(index) / self.spread[..., index] * times
         return by_height(self._variables(index)[variable], weights, knots, variable in self.program.angles)
 
     def _variables(self, index: int) -> dict[str, Tensor]:

@@ -44,7 +44,8 @@ def curve_panel(found: Discovery, axes: Axes) -> Axes:
     rug = np.random.default_rng(0).choice(values, min(len(values), TICKS), replace=False)
     axes.plot(rug, np.full(len(rug), 0.015), "|", color="black", ms=6, alpha=0.3, transform=axes.get_xaxis_transform())
     axes.axhline(0, color="black", lw=0.6)
-    axes.set_ylabel(f"missing from {shape.channel}{f' [{shape.unit}]' if shape.unit else ''}")
+    times = f", times {shape.times}" if shape.times else ""
+    axes.set_ylabel(f"missing from {shape.channel}{times}{f' [{shape.unit}]' if shape.unit not in ('', '1') else ''}")
     axes.legend(fontsize=7, loc="upper right" if heights[0] > heights[-1] else "upper left")
     about = (
         f"{shape.variable}{f' [{shape.variable_unit}]' if shape.variable_unit else ''}; ticks: where the drives were"

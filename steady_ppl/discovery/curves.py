@@ -1,7 +1,8 @@
 """What no catalogue has: a curve of some variable that a channel or a measurement lacks.
 
-Piecewise linear between knots, with a Gaussian-process prior (a normal over the heights at the knots, whose correlation
-falls with their distance), so that it bends only where the drives ask for it.
+A curve adds to a channel, or multiplies what is commanded of it (over time: wear). It is piecewise linear between
+knots, with a Gaussian-process prior (a normal over the heights at the knots, whose correlation falls with their
+distance), so that it bends only where the drives ask for it.
 """
 
 from __future__ import annotations
@@ -24,11 +25,13 @@ KNOTS = 7
 REACH = 0.4  # of the variable's range over which heights are alike
 TALL = 1.5  # prior standard deviation of the heights, in the noise's
 NAME = "curve"
+ALONE, COMMANDED = "", "what is commanded"  # what a curve is multiplied with
 
 
 @torch.no_grad()
 def curves(program: Program, data: Trajectories, spread: Tensor, sharpness: Tensor) -> list[Variant]:
-    """All curves that are looked at: every channel over every variable, every measurement over its own reading.
+    """All curves that are looked at: every channel over every variable, what is commanded of it over time, every
+    measurement over its own reading.
 
     Args:
         program: without them.
@@ -46,10 +49,27 @@ def curves(program: Program, data: Trajectories, spread: Tensor, sharpness: Tens
         if knots is None:
             continue
         for index, channel in enumerate(names(program.channels)):
-            unit = units(program.channels)[index]
-            effect = _effect("push", variable, knots, float(spread[index]), unit, variable in program.angles)
-            found.append(effect.variant(at=f"{channel}~{variable}", channel=channel, variable=variable, knots=knots))
+            for times in (ALONE, COMMANDED) if variable == "time" else (ALONE,):
+                size = _size(data, multiplier(mean, channel, times))
+                if size > 0:
+                    unit = "1" if times else units(program.channels)[index]
+                    height = float(spread[index]) / size
+                    effect = _effect("push", variable, knots, height, unit, variable in program.angles)
+                    at = f"{channel}~{variable}{f' × {times}' if times else ''}"
+                    found.append(effect.variant(at=at, channel=channel, variable=variable, knots=knots, times=times))
     return found + _of_readings(program, data, sharpness)
+
+
+def multiplier(mean: Mapping[str, Tensor], channel: str, times: str) -> Tensor | float:
+    """What a curve of a channel is multiplied with, `(...)`."""
+    return mean[channel] if times == COMMANDED else 1.0
+
+
+def _size(data: Trajectories, values: Tensor | float) -> float:
+    """The root mean square of what a curve is multiplied with."""
+    if not isinstance(values, Tensor):
+        return values
+    return float(values.expand(data.transitions.shape)[data.transitions].square().mean().sqrt())
 
 
 def variables(
@@ -124,10 +144,10 @@ def by_height(values: Tensor, weights: Tensor, knots: Sequence[float], circular:
     return found.view(drives, count)
 
 
-def over_state(self, state, control, time, step, c, mean, channel, variable, knots):
+def over_state(self, state, control, time, step, c, mean, channel, variable, knots, times):
     """A curve that adds to a channel."""
     value = variables(self, state, control, time, mean)[variable]
-    return {channel: height(value, knots, variable in self.angles, c)}
+    return {channel: height(value, knots, variable in self.angles, c) * multiplier(mean, channel, times)}
 
 
 def over_reading(self, state, measured, c, chosen, circular, knots):

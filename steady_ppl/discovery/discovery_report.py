@@ -162,7 +162,7 @@ def sentence(found: Discovery) -> str:
         return f"{start} (p = {found.p_value:.2g}); the limits below say what could not have been seen."
     if found.shape is not None:
         shape = found.shape
-        return f"{start} (p = {found.p_value:.2g}): {shape.channel} lacks a curve of {shape.variable}."
+        return f"{start} (p = {found.p_value:.2g}): {shape.channel} lacks a curve of {shape.variable}{_times(found)}."
     if not found.findings:
         return (
             f"{start} (p = {found.p_value:.2g}), and neither an effect nor a curve brings anything on held-out drives."
@@ -173,6 +173,10 @@ def sentence(found: Discovery) -> str:
         words = IN_WORDS[kind] if not clauses else IN_WORDS[kind][0].lower() + IN_WORDS[kind][1:]
         clauses.append(f"{words} {' and '.join(said)}")
     return f"{'; '.join(clauses)} (p = {found.p_value:.2g})."
+
+
+def _times(found: Discovery) -> str:
+    return f" times {found.shape.times}" if found.shape and found.shape.times else ""
 
 
 def _said(finding: Finding) -> str:

@@ -54,6 +54,7 @@ class Shape:
     Attributes:
         channel: channel, or measurement, that lacks it.
         variable: that it depends on.
+        times: what the curve is multiplied with, empty where it adds by itself.
         unit, variable_unit: of the curve and of the variable.
         points, curve: where and how high.
         band: half the width of a band that holds the whole curve with 90 % probability.
@@ -61,6 +62,7 @@ class Shape:
 
     channel: str
     variable: str
+    times: str
     unit: str
     variable_unit: str
     points: list[float]
@@ -153,6 +155,7 @@ def shape_of(search: Search, program: Program) -> Shape | None:
     return Shape(
         channel=channel,
         variable=variable,
+        times=variant.options.get("times", ""),
         unit=variant.unit,
         variable_unit=unit_of(program, about if variable == "reading" else variable),
         points=[float(knot) for knot in variant.options["knots"]],

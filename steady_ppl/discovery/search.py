@@ -32,7 +32,7 @@ from steady_ppl.program import Program
 BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
 MARGIN = 3.0  # nats by which a curve must be better than named effects
 RIVALS = 12.0  # nats behind the best in its round, with which a candidate is looked at again beside other effects
-MOST, CURVES = 3, 3  # effects in a program, and curves that are fitted
+MOST, CURVES = 3, 3  # effects in a program, and adding curves that are fitted
 Report = Callable[[str], None]
 
 
@@ -213,11 +213,19 @@ def _worth(candidates: Sequence[Candidate]) -> Worth:
 
 
 def _curves(base: Refit, screening: Screening, settings: Settings, report: Report) -> list[Candidate]:
+    every = screening.tests.curves
+    adding = [tested for tested in every if not tested.variant.options.get("times")]
+    multiplying = [tested for tested in every if tested.variant.options.get("times")]
     found = []
-    for tested in screening.tests.curves[:CURVES]:
+    for tested in [*adding[:CURVES], *multiplying[:1]]:
         report(f"fitting with a curve of {tested.variant.at}")
         found.append(fitted(base, tested, screening, settings))
-    return sorted(found, key=lambda candidate: -candidate.total)
+
+    def worth(candidate: Candidate) -> float:
+        """The simpler one, unless the other brings clearly more."""
+        return candidate.total - (MARGIN if candidate.variant.options.get("times") else 0.0)
+
+    return sorted(found, key=worth, reverse=True)
 
 
 def _look_again(search: Search, settings: Settings) -> None:
