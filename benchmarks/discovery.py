@@ -176,21 +176,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a few sets of every kind, in about five minutes")
     parser.add_argument("--rivals", action="store_true", help="the rivals as well")
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--results", type=Path, help="benchmarks/results/discovery.jsonl, with --quick …-quick.jsonl")
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
     sets = quick() if options.quick else benchmark_sets()
-    records = _run(judged, [(one,) for one in sets], options.results, options.workers)
-    text = scores_table(records)
+    results = options.results or (RESULTS.with_stem(RESULTS.stem + "-quick") if options.quick else RESULTS)
+    records = _run(judged, [(one,) for one in sets], results, options.workers)
+    results.with_suffix(".md").write_text(scores_table(records))
+    print(scores_table(records))
     if options.rivals:
         named = [one for one in sets if one.stratum in ("single", "clean")]
         chosen = named[:: max(1, len(named) // RIVAL_SETS)][:RIVAL_SETS]
         every = max(1, len(chosen) // BRUTE_SETS)
         work = [(one, index % every == 0) for index, one in enumerate(chosen)]
-        beside = options.results.with_name(options.results.stem + "-rivals.jsonl")
-        text += "\n" + rivals_table(records, _run(rivals_of, work, beside, options.workers))
-    options.results.with_suffix(".md").write_text(text)
-    print(text)
+        beside = results.with_stem(results.stem + "-rivals")
+        text = rivals_table(records, _run(rivals_of, work, beside, options.workers))
+        beside.with_suffix(".md").write_text(text)
+        print(text)
 
 
 if __name__ == "__main__":

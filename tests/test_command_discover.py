@@ -62,6 +62,21 @@ def test_what_cannot_be_searched_is_said_in_a_line(tmp_path, capsys):
     assert "leave it out" in refused(capsys, "discover", HOVERCRAFT, enough, "--program", HOVERCRAFT)
 
 
+def test_drives_that_both_tables_have_are_refused(tmp_path, capsys):
+    drives = simulated(trajectories=8, rows=20)
+    one = written(tmp_path / "one.csv", drives.subset(range(6)))
+    other = written(tmp_path / "other.csv", drives.subset(range(3, 8)))
+    said = refused(capsys, "discover", HOVERCRAFT, one, "--valid", other)
+    assert "3 of the validation drives are training drives as well (4, 5, 6)" in said
+
+
+def test_a_folder_that_does_not_exist_is_said_before_anything_is_computed(tmp_path, capsys):
+    table = tmp_path / "there_is_no_such_table.csv"
+    for command in (("discover", HOVERCRAFT, table), ("check", tmp_path, table), ("prove", tmp_path, tmp_path, table)):
+        said = refused(capsys, *command, "--json", tmp_path / "nowhere" / "found.json")
+        assert "there is no folder" in said and "nowhere" in said
+
+
 def test_controls_that_never_change_get_no_verdict(tmp_path, capsys):
     still = simulated(trajectories=12, rows=20)
     still.controls[:] = 0.5

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -13,9 +14,12 @@ from pyro.nn import PyroParam
 from torch.distributions import constraints
 
 import steady_ppl as st
-from steady_ppl.discovery.discovery import _of_one_drive
+from steady_ppl.discovery.curves import knots_of
+from steady_ppl.discovery.discovery import NOT_CONVERGED, _of_one_drive
+from steady_ppl.discovery.next_run import next_run
 from steady_ppl.effects import Effect, chosen_variant, parsed
 from steady_ppl.effects.registry import _EFFECTS, register
+from steady_ppl.maximum_likelihood import maximise
 
 DRIVES, ROWS, SETS = 10, 81, 50
 
@@ -172,6 +176,43 @@ def test_what_was_found_comes_first_among_the_candidates(dragged):
 def test_what_cannot_be_tested_says_why(clean):
     notes = {one["effect"]: one["note"] for one in clean.figures["candidates"]}
     assert notes["process_noise:yaw"] == "the fitted noise against the declared"
+
+
+def test_a_fit_that_has_not_converged_is_said_before_any_ranking(monkeypatch):
+    monkeypatch.setattr("steady_ppl.discovery.refits.maximise", partial(maximise, steps=1))
+    found = discovered("yaw_bias=0.1")
+    assert not found.search.base.converged and NOT_CONVERGED in found.doubts
+    assert str(found).startswith("warning: the program's own fit has not converged")
+    assert found.figures["doubts"] == found.doubts
+
+
+def test_the_next_run_tells_what_these_drives_do_not():
+    """Steady flight at one speed: what brakes it may go with the velocity or with its square."""
+    found = discovered("linear_drag=0.1")
+    (one,) = found.search.found
+    brakes = [c for c in one.candidates if c.variant.name in ("linear_drag", "quadratic_drag")]
+    run = next_run(Unclear(brakes), True, 0)
+    assert run.between == ["linear_drag", "quadratic_drag"] and run.separation > max(0.0, run.usual)
+    assert {len(values) for values in run.controls.values()} == {ROWS}
+    low, high = (float(edge) for edge in torch.aminmax(found.search.base.folds[0].drives.controls[:-1]))
+    assert all(low - 1e-3 <= value <= high + 1e-3 for values in run.controls.values() for value in values)
+
+
+class Unclear:
+    """A class of several effects."""
+
+    def __init__(self, alike):
+        self.alike = alike
+
+
+def test_a_sensor_that_failed_on_all_training_drives_is_no_obstacle():
+    program = example("pendulum", torch.float32)
+    train, valid = tables(program)
+    train.observed[:] = False
+    train.observed[0] = True
+    with pytest.raises(st.DataError, match="no measurements after their first rows"):
+        st.discover(program, train, valid, simulations=SETS)
+    assert knots_of(torch.zeros(0), circular=False) is None
 
 
 def test_an_effect_of_ones_own_is_found():

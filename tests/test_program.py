@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import textwrap
 from dataclasses import replace
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from examples import MODELS, drives, example
+from pyro.nn import PyroParam
 from small import HOVERCRAFT
 
 from steady_ppl import DataError, Program, ProgramError, load_program, simulate
@@ -304,3 +306,32 @@ def test_a_digit_edited_within_a_second_counts(tmp_path: Path) -> None:
         file.write_text(text.replace("tensor(0.6)", f"tensor({noise})"))
         assert float(load_program(file).noise.detach()) == pytest.approx(float(noise))
     assert not (tmp_path / "__pycache__").exists()
+
+
+def test_a_parameter_that_a_constant_of_the_class_would_hide_is_refused() -> None:
+    class Mapped(type(load_program(MODELS / "hovercraft.py"))):  # type: ignore[misc]
+        """Learns where the landmarks are."""
+
+        def __init__(self):
+            super().__init__()
+            self.landmarks = PyroParam(torch.zeros(4, 2))
+
+    with pytest.raises(ProgramError, match="landmarks is a constant of its class"):
+        Mapped()
+
+
+def test_the_bearings_noise_can_be_learned_and_can_be_a_constant_of_the_class() -> None:
+    hovercraft = type(load_program(MODELS / "hovercraft.py"))
+    program = hovercraft()
+    assert program.bearing_sd == pytest.approx(math.radians(5))
+    program.bearing_sd = PyroParam(torch.tensor(0.1), torch.distributions.constraints.positive)
+    assert program.bearing_sd.item() == pytest.approx(0.1) and "bearing_sd_unconstrained" in dict(
+        program.named_parameters()
+    )
+
+    class Sharp(hovercraft):  # type: ignore[misc]
+        """Sees better."""
+
+        bearing_sd = math.radians(1)
+
+    assert Sharp().bearing_sd == math.radians(1)
