@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from steady_ppl.particles import particle_filter, roll_out
     from steady_ppl.paths import Filtered, Paths
     from steady_ppl.planar_vehicle import PlanarVehicle, WrappedNormal, bearings_to, dense, stack, wrap
-    from steady_ppl.program import Program, for_program, load_program
+    from steady_ppl.program import Program, for_program
+    from steady_ppl.program_file import load_program
     from steady_ppl.proof_pictures import open_loop_picture
     from steady_ppl.proving import Proof, prove
     from steady_ppl.seeding import seeded
@@ -58,7 +59,8 @@ _HOMES = {
     "particles": ("particle_filter", "roll_out"),
     "paths": ("Filtered", "Paths"),
     "planar_vehicle": ("PlanarVehicle", "WrappedNormal", "bearings_to", "dense", "stack", "wrap"),
-    "program": ("Program", "for_program", "load_program"),
+    "program": ("Program", "for_program"),
+    "program_file": ("load_program",),
     "proof_pictures": ("open_loop_picture",),
     "proving": ("Proof", "prove"),
     "seeding": ("seeded",),

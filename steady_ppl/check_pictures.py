@@ -140,7 +140,7 @@ def _subject(found: Check, residual: int) -> str:
 
 def against_references(found: Check, axes: Axes) -> None:
     """Errors over the noise floor, root mean square over the components, against the time ahead."""
-    step = float(found.data.steps[found.data.transitions].median())
+    step = found.data.median_step
     seconds = [horizon * step for horizon in found.horizons.values()]
     lines: dict[str, Any] = {"program": (NEAR, "o-", []), "last measurement": ("0.5", "s:", [])}
     if isinstance(found.reference, Reference):

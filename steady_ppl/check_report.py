@@ -194,7 +194,7 @@ def sentence(found: Check, finding: Finding) -> str:
 
 def place(found: Check, cell: Cell) -> str:
     """Where a cell is, in words with units."""
-    seconds = float(found.data.steps[found.data.transitions].median())
+    seconds = found.data.median_step
     if cell.map == "memory":
         return f"{cell.where['lag'] * seconds:.2g} s later"
     if cell.map == "lag":

@@ -24,7 +24,7 @@ from steady_ppl.fit import Fit
 from steady_ppl.gaussian_smoother import find_and_smooth, smooth
 from steady_ppl.linearization import why_not_linear
 from steady_ppl.misfit_maps import Misfit, Residuals, judge
-from steady_ppl.predictions import Prediction, predict, simulate_again
+from steady_ppl.predictions import Prediction, named_horizons, predict, simulate_again
 from steady_ppl.program import Program, for_program, names
 from steady_ppl.reference_motion import Reference, constant_velocity, last_measurement
 from steady_ppl.seeding import seeded
@@ -98,7 +98,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     program = fit.program
     run = for_program(program, data).without_truth(keep_start=fit.known_start)
     _require(program, run, fit.known_start, simulations)
-    horizons = _horizons(run)
+    horizons = named_horizons(run, SECONDS)
     with seeded(seed, "check"):
         ahead = find_and_smooth(program, run, known_start=fit.known_start)
         real = track(program, run, ahead.linearization.path, known_start=fit.known_start, passes=1)
@@ -152,13 +152,6 @@ def _require(program: Program, data: Trajectories, known_start: bool, simulation
     why = why_not_linear(program, data, known_start=known_start)
     if why is not None:
         raise UsageError(f"check needs a program that can be linearised: {why.split(': looking')[0]}")
-
-
-def _horizons(data: Trajectories) -> dict[str, int]:
-    """Name → rows, those that fit into the longest drive."""
-    step = float(data.steps[data.transitions].median())
-    rows = {f"{seconds:g} s": round(seconds / step) for seconds in SECONDS}
-    return {"one step": 1} | {name: count for name, count in rows.items() if 1 < count < data.time.shape[0]}
 
 
 def _without_broken(data: Trajectories, tracked: Tracked, drives: int) -> tuple[Trajectories, Tracked, int]:

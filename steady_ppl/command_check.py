@@ -19,17 +19,17 @@ def check(
 ) -> None:
     """Compare a run with measurements: where, when and in which regime it fails, and who is at fault."""
     from steady_ppl.checking import check as compare
-    from steady_ppl.command_line import _require_folder, _write_json
+    from steady_ppl.command_parts import require_folder, write_json
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
     from steady_ppl.table import read_table
 
     require_picture(picture)
-    _require_folder(json_file)
+    require_folder(json_file)
     found = compare(Fit.load(run, program), read_table(table), simulations=simulations, seed=seed)
     figures = found.figures
     if json_file is not None:
-        _write_json(json_file, {"run": str(run), **figures})
+        write_json(json_file, {"run": str(run), **figures})
     if picture is not None:
         from steady_ppl.check_pictures import check_picture
 

@@ -30,7 +30,7 @@ def discover(
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing run.")] = False,
 ) -> None:
     """Learn which physical effect a program lacks: none, one by name, several, or a curve that has no name."""
-    from steady_ppl.command_line import _program, _require_folder, _say, _write_json
+    from steady_ppl.command_parts import program_from, require_folder, say, write_json
     from steady_ppl.discovery import discover as search
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
@@ -44,8 +44,8 @@ def discover(
     if out is not None and out.exists() and not force:
         raise RunError(f"{out} exists: choose another folder, or --force to overwrite")
     require_picture(picture)
-    _require_folder(json_file)
-    given: Any = Fit.load(source, program) if is_run else _program(source, seed)
+    require_folder(json_file)
+    given: Any = Fit.load(source, program) if is_run else program_from(source, seed)
     drives, judges = read_table(table), read_table(valid) if valid else None
     found = search(
         given,
@@ -63,10 +63,10 @@ def discover(
         with run_folder(out, force=force):
             found.after.save_into(out, begun=used)
         for note in found.after.notes:
-            _say(note)
+            say(note)
         print(f"{out}: {found.after.program}")
     if json_file is not None:
-        _write_json(json_file, {"source": source, **found.figures})
+        write_json(json_file, {"source": source, **found.figures})
     if picture is not None:
         from steady_ppl.discovery.pictures import discovery_picture
 

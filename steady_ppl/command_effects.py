@@ -27,20 +27,20 @@ def add(
     Its parameters start at the run's values, a coefficient at the value that is given, else at the run's, else at the
     effect's typical one.
     """
-    from steady_ppl.command_line import _program, _say
+    from steady_ppl.command_parts import program_from, say
     from steady_ppl.effects import added, write_program
     from steady_ppl.fit import Fit
 
     is_run = Path(source).is_dir()
     if program and not is_run:
         raise UsageError("--program names the program of a RUN: leave it out")
-    grown = Fit.load(source, program).program if is_run else _program(source, 0)
-    grown = with_effects(grown, effects or [], _say)
+    grown = Fit.load(source, program).program if is_run else program_from(source, 0)
+    grown = with_effects(grown, effects or [], say)
     if not added(grown):
         raise UsageError(f"{source} has no effect that its file does not have: name one, `steady effects` lists them")
     notes = write_program(grown, out, force=force)
     for note in notes if is_run else []:
-        _say(note)
+        say(note)
     print(f"{out}: {grown}")
     for variant in added(grown):
         print(f"{variant.label}: {variant.effect.text}")
@@ -51,10 +51,10 @@ def effects(
     model: Annotated[str | None, typer.Argument(help="Only those that this program could have, and why.")] = None,
 ) -> None:
     """List the physical effects that a program may lack."""
-    from steady_ppl.command_line import _program
+    from steady_ppl.command_parts import program_from
     from steady_ppl.effects.page import page
 
-    print(page(_program(model, 0) if model else None), end="")
+    print(page(program_from(model, 0) if model else None), end="")
 
 
 def with_effects(program: Any, effects: list[str], say: Any) -> Any:

@@ -6,8 +6,6 @@ Exit codes: 0 done, 1 the computation failed or was interrupted, 2 bad usage or 
 from __future__ import annotations
 
 import ast
-import json
-import os
 import sys
 import traceback
 from enum import StrEnum
@@ -17,7 +15,8 @@ from typing import Annotated, Any
 import typer
 
 from steady_ppl import command_check, command_demo, command_discover, command_effects, command_prove
-from steady_ppl.errors import ComputationError, SteadyError, UsageError
+from steady_ppl.command_parts import program_from, say, write_json
+from steady_ppl.errors import SteadyError, UsageError
 
 INTERRUPTED = 130  # what typer returns for Ctrl-C
 
@@ -81,7 +80,7 @@ def simulate(
 
     if controls and trajectories:
         raise UsageError("--controls has as many drives as its table: leave --trajectories out")
-    program = command_effects.with_effects(_program(model, seed), effect or [], _say)
+    program = command_effects.with_effects(program_from(model, seed), effect or [], say)
     like = read_table(controls) if controls else None
     write_table(run(program, trajectories or 16, seed=seed, like=like), out)
 
@@ -133,7 +132,7 @@ def fit(
     given: dict[str, Any] = {"particles": particles, "draws": draws, "steps": steps, "guide": guide and guide.value}
     result = run_recipe(
         recipe,
-        _program(model, seed),
+        program_from(model, seed),
         read_table(table),
         read_table(valid) if valid else None,
         out,
@@ -146,7 +145,7 @@ def fit(
         progress=True,
     )
     for note in result.notes:
-        _say(note)
+        say(note)
     print(f"{out}: {result.program}")
     if result.trained is not None:
         judged = {e["step"]: e["log_likelihood"] for e in result.trained.history if "log_likelihood" in e}
@@ -156,7 +155,7 @@ def fit(
                 f"held-out log p(y) {first:.2f} → {kept:.2f} at step {result.trained.kept}, whose parameters were kept"
             )
         if result.trained.interrupted:
-            _say(f"interrupted; the run so far is usable, `--resume` goes on with {out}")
+            say(f"interrupted; the run so far is usable, `--resume` goes on with {out}")
             raise typer.Exit(1)
 
 
@@ -192,22 +191,10 @@ def evaluate(
     print(table_of(results, [f"{run.name} ({result['recipe']})" for run, result in zip(runs, results, strict=True)]))
     for run, result in zip(runs, results, strict=True):
         if result["filter"] != "lookahead":
-            _say(f"{run}: judged by the filter {result['filter']}")
+            say(f"{run}: judged by the filter {result['filter']}")
     if json_file is not None:
         rows = [{"run": str(run), **result} for run, result in zip(runs, results, strict=True)]
-        _write_json(json_file, {"runs": rows})
-
-
-def _program(model: str, seed: int) -> Any:
-    """Load a program, its random initial weights keyed by the seed, and try it once on a probe."""
-    from steady_ppl.probe import probe
-    from steady_ppl.program import load_program
-    from steady_ppl.seeding import seeded
-
-    with seeded(seed, "program"):
-        program = load_program(model)
-    probe(program)
-    return program
+        write_json(json_file, {"runs": rows})
 
 
 def _settings(pairs: list[str], options: dict[str, Any]) -> dict[str, Any]:
@@ -226,29 +213,6 @@ def _settings(pairs: list[str], options: dict[str, Any]) -> dict[str, Any]:
     return options
 
 
-def _write_json(path: Path, content: Any) -> None:
-    """Write a file whole or not at all; a figure that is not finite is an error, JSON has no word for it."""
-    beside = path.with_name(path.name + ".partial")
-    try:
-        beside.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
-        os.replace(beside, path)
-    except ValueError as error:
-        raise ComputationError(f"{path} is not written: a figure is not finite, the program has blown up") from error
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise UsageError(f"{path} cannot be written: {error.strerror}") from error
-
-
-def _require_folder(path: Path | None) -> None:
-    """Refuse a file whose folder does not exist, before anything is computed."""
-    if path is not None and not path.parent.is_dir():
-        raise UsageError(f"{path} cannot be written: there is no folder {path.parent}")
-
-
-def _say(line: str) -> None:
-    print(f"steady: {line}", file=sys.stderr)
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -258,26 +222,26 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         code = command.main(arguments, prog_name="steady", standalone_mode=False) or 0
         if code == INTERRUPTED:
-            _say("interrupted")
+            say("interrupted")
             return 1
         return code
     except SteadyError as error:
         if debug:
             traceback.print_exc()
-        _say(str(error))
+        say(str(error))
         return error.exit_code
     except KeyboardInterrupt:
-        _say("interrupted")
+        say("interrupted")
         return 1
     except Exception as error:
         if hasattr(error, "format_message"):
             if error.format_message():
-                _say(f"{error.format_message()} (steady --help shows the usage)")
+                say(f"{error.format_message()} (steady --help shows the usage)")
             return 2
         if debug:
             traceback.print_exc()
         lines = str(error).strip().splitlines() or [""]
-        _say(f"{type(error).__name__}: {lines[0]} (--debug shows where)")
+        say(f"{type(error).__name__}: {lines[0]} (--debug shows where)")
         return 1
 
 

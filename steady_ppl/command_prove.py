@@ -27,7 +27,7 @@ def prove(
     seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
 ) -> None:
     """Prove that runs are better than the first one: log p(y), open-loop errors and noise, with paired intervals."""
-    from steady_ppl.command_line import _program, _require_folder, _write_json
+    from steady_ppl.command_parts import program_from, require_folder, write_json
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
     from steady_ppl.proving import prove as judge
@@ -38,7 +38,7 @@ def prove(
     if not runs:
         raise UsageError("prove needs at least one RUN and then a TABLE")
     require_picture(picture)
-    _require_folder(json_file)
+    require_folder(json_file)
     labels = _labels(runs) | ({"oracle": oracle} if oracle else {})
     if program and len(program) != len(labels):
         raise UsageError(f"--program is given {len(program)} times for {len(labels)} runs: name one for each, in order")
@@ -47,12 +47,12 @@ def prove(
         label: Fit.load(run, source) for (label, run), source in zip(labels.items(), sources, strict=True)
     }
     if truth is not None:
-        rows["truth"] = _program(truth, seed)
+        rows["truth"] = program_from(truth, seed)
     drives = read_table(table)
     found = judge(rows, drives, truth="truth" if truth is not None else None, seed=seed)
     found.notes[:0] = _used(labels, fingerprint(drives))
     if json_file is not None:
-        _write_json(json_file, {"runs": {label: str(run) for label, run in labels.items()}, **found.figures})
+        write_json(json_file, {"runs": {label: str(run) for label, run in labels.items()}, **found.figures})
     if picture is not None:
         from matplotlib.figure import Figure
 

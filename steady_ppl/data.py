@@ -73,6 +73,15 @@ class Trajectories:
         return (self.time[1:] - self.time[:-1]).to(self.controls.dtype)
 
     @property
+    def median_step(self) -> float:
+        """Of all intervals, s; in double precision."""
+        return float((self.time[1:] - self.time[:-1])[self.transitions].median())
+
+    def rows_ahead(self, seconds: float) -> int:
+        """How many rows make up a time."""
+        return round(seconds / self.median_step)
+
+    @property
     def elapsed(self) -> Tensor:
         """`(T + 1, B)` seconds since each trajectory's first row."""
         return (self.time - self.time[0]).to(self.controls.dtype)

@@ -73,3 +73,9 @@ class FilterError(ComputationError):
 
 class TrainingError(ComputationError):
     """Training failed, for example on a loss that is not finite."""
+
+
+def one_line(error: BaseException) -> str:
+    """An error's type and the first line of its message."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__

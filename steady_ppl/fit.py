@@ -19,7 +19,8 @@ from steady_ppl import effects
 from steady_ppl.checkpoint import read_tensors, write_tensors
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import RunError
-from steady_ppl.program import Program, load_program
+from steady_ppl.program import Program
+from steady_ppl.program_file import load_program
 from steady_ppl.run_folder import PARAMETERS, POSTERIOR, read_record, run_folder, write_record
 from steady_ppl.training import Trained
 

@@ -37,8 +37,7 @@ def measurement_errors(program: Program, data: Trajectories, *, particles: int, 
         open loop shorter than a step or longer than every trajectory is left out.
     """
     totals: dict[str, list[float]] = {}
-    step = float(data.steps[data.transitions].median())
-    rows = {name: round(seconds / step) for name, seconds in OPEN_LOOP.items()}
+    rows = {name: data.rows_ahead(seconds) for name, seconds in OPEN_LOOP.items()}
     horizons = {name: count for name, count in rows.items() if 1 <= count < data.time.shape[0]}
     for part in in_parts(data, particles):
         for name, (total, count) in _totals(program, part, particles, known_start, horizons).items():

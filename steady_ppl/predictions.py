@@ -60,7 +60,7 @@ def predict(
         A prediction for each horizon that is shorter than the longest drive.
     """
     found = {}
-    for horizon, state in _ahead(program, data, tracked, max(horizons)):
+    for horizon, state in states_ahead(program, data, tracked, max(horizons)):
         if horizon in horizons:
             seen = tracked.linearization.precision[horizon:] > 0
             wanted = bands is None or horizon in bands
@@ -71,7 +71,8 @@ def predict(
     return found
 
 
-def _ahead(program: Program, data: Trajectories, tracked: Tracked, most: int) -> Iterator[tuple[int, Tensor]]:
+def states_ahead(program: Program, data: Trajectories, tracked: Tracked, most: int) -> Iterator[tuple[int, Tensor]]:
+    """From every row on, without noise: how many rows ahead, and the states there, `(T + 1 − ahead, B, D)`."""
     state = tracked.states.to(data.controls.dtype)
     controls, elapsed, steps = acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps
     for ahead in range(1, min(most, len(steps)) + 1):
@@ -131,3 +132,9 @@ def on_a_circle(program: Program, data: Trajectories, states: Tensor) -> Tensor:
     measured = torch.full_like(data.measurements[:1, :1], 0.3)
     change = errors(program, one, measured + 2 * math.pi, every) - errors(program, one, measured, every)
     return (change.abs() < 1e-3).flatten()
+
+
+def named_horizons(data: Trajectories, seconds: Sequence[float]) -> dict[str, int]:
+    """Name → rows ahead: one step, and those times that fit into the longest drive."""
+    rows = {f"{one:g} s": data.rows_ahead(one) for one in seconds}
+    return {"one step": 1} | {name: count for name, count in rows.items() if 1 < count < data.time.shape[0]}

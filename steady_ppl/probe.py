@@ -12,8 +12,8 @@ from pyro import poutine
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
-from steady_ppl.errors import ProgramError, SteadyError
-from steady_ppl.program import Program, names, one_line
+from steady_ppl.errors import ProgramError, SteadyError, one_line
+from steady_ppl.program import Program, names
 from steady_ppl.sites import Broadcasting, Observing, Recording, Replaying
 
 DRAWS, ROWS, TRAJECTORIES = 7, 11, 13

@@ -18,7 +18,7 @@ from steady_ppl.linearization import Path, why_not_linear
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.metrics import squared_errors
 from steady_ppl.paired_bootstrap import Sums
-from steady_ppl.predictions import Prediction, _ahead, predict, simulate_again
+from steady_ppl.predictions import Prediction, named_horizons, predict, simulate_again, states_ahead
 from steady_ppl.program import Program, error_groups, for_program, units
 from steady_ppl.reference_motion import ConstantVelocity, constant_velocity
 from steady_ppl.scores import channel_moments, measured
@@ -82,17 +82,6 @@ class Judged:
     neglected: Tensor | str | None = None
 
 
-def median_step(data: Trajectories) -> float:
-    """Of all intervals, s."""
-    return float((data.time[1:] - data.time[:-1])[data.transitions].median())
-
-
-def named_horizons(data: Trajectories) -> dict[str, int]:
-    """Name → rows ahead, those that fit into the longest drive."""
-    rows = {f"{seconds:g} s": round(seconds / median_step(data)) for seconds in SECONDS}
-    return {"one step": 1} | {name: count for name, count in rows.items() if 1 < count < data.time.shape[0]}
-
-
 def judge_program(name: str, program: Program, data: Trajectories, known_start: bool, seed: int) -> Judged:
     """Find the paths from the measurements alone, predict, and compare.
 
@@ -129,14 +118,14 @@ def judge(
     """Track along a path that was found and compare what is predicted from every row with measurements and truth."""
     unseen = data.without_truth(keep_start=known_start)
     tracked = track(program, unseen, ahead.linearization.path, known_start=known_start, kernels=kernels)
-    named = named_horizons(data)
+    named = named_horizons(data, SECONDS)
     longest = max(named.values())
     horizons = {round(rows) for rows in np.geomspace(1, longest, DRAWN).tolist()} | set(named.values())
     bands = [named[name] for name in BANDS if name in named]
     predictions = predict(program, unseen, tracked, sorted(horizons), bands=bands)
     states: dict[tuple[str, int], tuple[Tensor, Tensor]] = {}
     if data.states is not None and bool(torch.isfinite(data.states[1:]).any()):
-        for horizon, state in _ahead(program, unseen, tracked, longest):
+        for horizon, state in states_ahead(program, unseen, tracked, longest):
             if horizon in horizons:
                 truth = data.states[horizon:]
                 for group, squares in squared_errors(program, state, truth).items():

@@ -18,16 +18,16 @@ from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
 from steady_ppl.paired_bootstrap import FEWEST
+from steady_ppl.predictions import named_horizons
 from steady_ppl.program import Program, names
 from steady_ppl.proof_report import as_text, figures
 from steady_ppl.proof_rows import (
+    SECONDS,
     Judged,
     Row,
     as_row,
     judge_program,
     keeping_velocity,
-    median_step,
-    named_horizons,
     noise_floor,
 )
 
@@ -126,12 +126,12 @@ def prove(
     found = {name: as_row(row, counted) for name, row in judged.items()}
     if isinstance(floor, Judged):
         found[FLOOR] = as_row(floor, _counted([floor]))
-    horizons = named_horizons(before.data)
+    horizons = named_horizons(before.data, SECONDS)
     return Proof(
         rows=found,
         reference=reference,
         horizons=horizons,
-        step=median_step(before.data),
+        step=before.data.median_step,
         trajectories=len(data),
         known_start=known_start,
         seed=seed,

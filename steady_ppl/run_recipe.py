@@ -16,7 +16,8 @@ from steady_ppl.checkpoint import read_tensors
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import RunError, UsageError
 from steady_ppl.fit import Fit, program_source, versions
-from steady_ppl.program import Program, for_program, run_file
+from steady_ppl.program import Program, for_program
+from steady_ppl.program_file import run_file
 from steady_ppl.run_folder import CHECKPOINT, read_record, run_folder, write_record
 
 Recipe = Callable[..., Fit]

@@ -12,8 +12,6 @@ of a missing drag. Scores keep the posterior's dependence, and are divided by wh
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import pyro.distributions as dist
@@ -21,14 +19,11 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
-from steady_ppl.effects import attached
-from steady_ppl.errors import UsageError
+from steady_ppl.elements import Element, moved
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.program import Program, acting_controls
 from steady_ppl.sites import AtMean, Recording, as_vector, normal_moments, residual, running
 
-LARGEST = 60  # parameters that are screened one by one; networks have more
-RELATIVE = 1e-3  # of a number, by which differences move it at least: single precision has seven digits
 Moments = tuple[Tensor, Tensor]
 
 
@@ -230,54 +225,6 @@ def typical_spreads(program: Program, data: Trajectories, at: Smoothed) -> Momen
     )
 
 
-@dataclass(frozen=True)
-class Element:
-    """One number among a program's parameters, in the unconstrained space in which it is learned.
-
-    Attributes:
-        name: of the parameter, with an index where it has several numbers.
-        parameter: the tensor.
-        index: in its flat form.
-        step: by which finite differences move it.
-    """
-
-    name: str
-    parameter: Tensor
-    index: int
-    step: float
-
-    def move(self, by: float) -> None:
-        """Change it."""
-        self.parameter.data.view(-1)[self.index] += by
-
-
-def elements(program: Program) -> list[Element]:
-    """Every learnable number of a program.
-
-    Raises:
-        UsageError: there are more than can be screened one by one.
-    """
-    steps = {
-        variant.parameter: 0.02 * float(variant.typical.abs().max())
-        for variant in attached(program)
-        if variant.effect.null == 0
-    }
-    found = []
-    for name, parameter in program.named_parameters():
-        if not parameter.requires_grad:
-            continue
-        name = name.removesuffix("_unconstrained")
-        for index, value in enumerate(parameter.detach().flatten().tolist()):
-            label = f"{name}[{index}]" if parameter.numel() > 1 else name
-            found.append(Element(label, parameter, index, max(steps.get(name, 0.01), RELATIVE * abs(value))))
-    if len(found) > LARGEST:
-        raise UsageError(
-            f"program {type(program).__name__} has {len(found)} learnable numbers: a network cannot be screened "
-            "parameter by parameter; discover the effects missing from a mechanistic program, or from a hybrid of one"
-        )
-    return found
-
-
 def parameter_scores(program: Program, data: Trajectories, at: Smoothed, parts: list[Element]) -> Tensor:
     """Scores of a program's own parameters, `(B, P)`."""
     if not parts:
@@ -322,14 +269,3 @@ def _log_student(z: Tensor, freedom: Tensor) -> Tensor:
     """Log-density of a Student t of scale one."""
     half = (freedom + 1) / 2
     return half.lgamma() - (freedom / 2).lgamma() - freedom.log() / 2 - half * torch.log1p(z.square() / freedom)
-
-
-@contextmanager
-def moved(part: Element, by: float) -> Iterator[None]:
-    """A program whose parameter is another for a while."""
-    before = part.parameter.data.view(-1)[part.index].clone()
-    part.move(by)
-    try:
-        yield
-    finally:
-        part.parameter.data.view(-1)[part.index] = before

@@ -11,9 +11,9 @@ from examples import drives, example
 
 from steady_ppl.discovery.refits import first_refit, refit_with, roomy_path
 from steady_ppl.effects import chosen_variant
+from steady_ppl.elements import elements
 from steady_ppl.gaussian_smoother import smooth
 from steady_ppl.maximum_likelihood import maximise
-from steady_ppl.scores import elements
 
 
 def set_values(program, values) -> None:

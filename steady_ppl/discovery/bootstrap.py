@@ -11,13 +11,14 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.discovery.columns import PART, Column, Scoring
+from steady_ppl.elements import Element
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import smooth
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.predictions import simulate_again
 from steady_ppl.program import Program
-from steady_ppl.scores import Element, parameter_scores, smoothed
+from steady_ppl.scores import parameter_scores, smoothed
 from steady_ppl.seeding import seeded
 
 LEAST_LEFT = 0.8  # share of the simulated sets that must not blow up

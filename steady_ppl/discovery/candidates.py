@@ -18,11 +18,12 @@ from steady_ppl.discovery.declared_noise import departures
 from steady_ppl.discovery.refits import ALWAYS, NEVER, Refit, Worth, refit_with
 from steady_ppl.discovery.screening import LEVEL, Screened, Tested, screen
 from steady_ppl.effects import Variant, attached, catalogue
+from steady_ppl.elements import Element, elements
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import smooth
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.program import Program
-from steady_ppl.scores import Element, elements, measured, smoothed, typical_spreads
+from steady_ppl.scores import measured, smoothed, typical_spreads
 from steady_ppl.seeding import seeded
 
 LEADERS, ALIKE = 6, 0.85  # how many are refitted, and those as well whose columns correlate so much with the first

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.effects import Variant, catalogue
+from steady_ppl.elements import Element, moved
 from steady_ppl.program import Program, names
-from steady_ppl.scores import Element, channel_moments, measured, moved
+from steady_ppl.scores import channel_moments, measured
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def next_run(found: Found, known_start: bool, seed: int) -> NextRun | None:
         between=[member.variant.name for member in members],
         way=way,
         controls={name: [round(v, 4) for v in controls[:, i].tolist()] for i, name in enumerate(order)},
-        step=float(data.steps[data.transitions].median()),
+        step=data.median_step,
         separation=separation,
         usual=usual if math.isfinite(usual) else 0.0,
     )

@@ -12,13 +12,14 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.effects import Variant, attached, coefficient, with_effect
+from steady_ppl.elements import Element, elements, moved
 from steady_ppl.errors import SteadyError
 from steady_ppl.gaussian_smoother import find_path, means_as_path, require_found, smooth
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.program import Program
-from steady_ppl.scores import Element, channel_moments, elements, moved, smoothed
+from steady_ppl.scores import channel_moments, smoothed
 from steady_ppl.seeding import seeded
 
 ROUGH = 1.5  # mean square deviation, in the program's own, from which its noise is widened before anything is fitted

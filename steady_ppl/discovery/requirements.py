@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import torch
 
 from steady_ppl.data import Trajectories
+from steady_ppl.elements import elements
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.linearization import why_not_linear
 from steady_ppl.program import Program, names
-from steady_ppl.scores import elements
 
 FEWEST_DRIVES, FEWEST_SETS = 5, 50
 

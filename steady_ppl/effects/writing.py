@@ -13,7 +13,8 @@ from steady_ppl.effects.program_text import program_text, tensor_text
 from steady_ppl.effects.source import broken
 from steady_ppl.errors import UsageError
 from steady_ppl.probe import probe
-from steady_ppl.program import Program, load_program
+from steady_ppl.program import Program
+from steady_ppl.program_file import load_program
 
 
 def write_program(program: Program, path: str | Path, *, force: bool = False) -> list[str]:

@@ -1,0 +1,46 @@
+"""What the commands share: programs by path, JSON whole or not at all, a word to the person."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from steady_ppl.errors import ComputationError, UsageError
+
+
+def program_from(model: str, seed: int) -> Any:
+    """Load a program, its random initial weights keyed by the seed, and try it once on a probe."""
+    from steady_ppl.probe import probe
+    from steady_ppl.program_file import load_program
+    from steady_ppl.seeding import seeded
+
+    with seeded(seed, "program"):
+        program = load_program(model)
+    probe(program)
+    return program
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write a file whole or not at all; a figure that is not finite is an error, JSON has no word for it."""
+    beside = path.with_name(path.name + ".partial")
+    try:
+        beside.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+        os.replace(beside, path)
+    except ValueError as error:
+        raise ComputationError(f"{path} is not written: a figure is not finite, the program has blown up") from error
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise UsageError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def require_folder(path: Path | None) -> None:
+    """Refuse a file whose folder does not exist, before anything is computed."""
+    if path is not None and not path.parent.is_dir():
+        raise UsageError(f"{path} cannot be written: there is no folder {path.parent}")
+
+
+def say(line: str) -> None:
+    print(f"steady: {line}", file=sys.stderr)

@@ -1,0 +1,93 @@
+"""Programs and recipes from files, run afresh under private names, so that no file's neighbours are in the way."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import itertools
+import sys
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+from types import CodeType, ModuleType
+
+from steady_ppl.errors import ProgramError, SteadyError, one_line
+from steady_ppl.program import Program
+
+_LOADS = itertools.count()
+
+
+def load_program(source: str | Path) -> Program:
+    """Load a program by path: `models/hovercraft.py` (the class named after the file) or `mine.py:Boat`.
+
+    The file is run afresh under a private module name; `from .sibling import …` finds files of its own folder.
+
+    Raises:
+        ProgramError: the file does not exist or does not import, or has no such class.
+    """
+    path, _, class_name = str(source).rpartition(":")
+    if not class_name.isidentifier() or not path:
+        path, class_name = str(source), ""
+    file = Path(path)
+    class_name = class_name or "".join(word.capitalize() for word in file.stem.split("_"))
+    module = run_file(file)
+    program_class = getattr(module, class_name, None)
+    if not (inspect.isclass(program_class) and issubclass(program_class, Program)):
+        own = [c for c in vars(module).values() if inspect.isclass(c) and c.__module__ == module.__name__]
+        have = ", ".join(c.__name__ for c in own if issubclass(c, Program)) or "none"
+        if inspect.isclass(program_class):
+            have += f"; its class {class_name} derives from no steady_ppl.Program"
+        raise ProgramError(f"{file.name} has no program {class_name}; its programs: {have} (choose with {path}:NAME)")
+    try:
+        return program_class()
+    except SteadyError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise ProgramError(f"{class_name}() of {file.name} failed: {one_line(error)}") from error
+
+
+class _AsWritten(SourceFileLoader):
+    """Compiles what the file says now: a cache goes by size and whole seconds, which misses a digit edited quickly."""
+
+    def get_code(self, fullname: str) -> CodeType:
+        return self.source_to_code(self.get_data(self.path), self.path)
+
+
+def run_file(file: Path) -> ModuleType:
+    """Run a Python file as a module of a private package that stands for its folder.
+
+    Raises:
+        ProgramError: the file does not exist or raises while it is imported.
+    """
+    if not file.is_file():
+        raise ProgramError(f"no file {file}")
+    folder = file.resolve().parent
+    package = f"_steady_folder_{next(_LOADS)}"
+    parent = ModuleType(package)
+    parent.__path__ = [str(folder)]
+    sys.modules[package] = parent
+    if file.suffix != ".py":
+        raise ProgramError(f"{file} is not a Python file")
+    name = f"{package}.{file.stem}"
+    spec = importlib.util.spec_from_file_location(name, file, loader=_AsWritten(name, str(file)))
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        message = one_line(error).replace(f"{package}.", ".")
+        raise ProgramError(f"{file} does not import: {_place(folder, file, error)}: {message}") from error
+    return module
+
+
+def _place(folder: Path, file: Path, error: BaseException) -> str:
+    """The last line in one of the folder's files on the way to an error."""
+    if isinstance(error, SyntaxError) and error.lineno is not None:
+        return f"line {error.lineno} of {Path(error.filename or file).name}"
+    place, trace = file.name, error.__traceback__
+    while trace is not None:
+        passed = Path(trace.tb_frame.f_code.co_filename)
+        if passed.resolve().parent == folder:
+            place = f"line {trace.tb_lineno} of {passed.name}"
+        trace = trace.tb_next
+    return place
