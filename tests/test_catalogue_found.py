@@ -26,12 +26,13 @@ pytestmark = pytest.mark.slow
 SIZE = 4 * (16 * 100 / (DRIVES * (ROWS - 1))) ** 0.5  # the stored limits are those of 16 drives of 101 rows
 
 
-OTHERS = {  # of the benchmark's hovercraft and of other programs, with four detection limits of clean drives like these
+OTHERS = {  # of the hovercraft and of other programs: four detection limits, or what is clearly felt
     "hovercraft": (
         *("acceleration_bias=0.32,0", "side_slip:lead=0=0.112", "speed_dependent_gain=0.16", "measurement_noise=1.23"),
         "acceleration_limit=0.6",  # it has no limit: absent is infinite
     ),
-    "truck": ("command_noise=2.05", "curvature_steering=1.85", "clock_offset=0.105", "dead_zone:turn=0.79"),
+    "truck": ("clock_offset=0.105",),
+    "truck, seen sharply": ("command_noise=1", "curvature_steering=0.5", "lever_arm=0.3"),
     "pendulum": (
         *("stiffness=6.9", "cubic_stiffness=1.05", "coulomb_friction=0.54", "acceleration_bias=0.36"),
         *("sensor_bias:angle=0.041", "clock_offset=0.06", "actuator_delay=0.077"),
@@ -48,7 +49,9 @@ def program_called(name: str) -> Program:
         if "sharply" in name:
             program.bearing_sd = math.radians(0.02)
         return program
-    program = example(name.partition(" ")[0], torch.float32)
+    program = example(name.replace(",", "").partition(" ")[0], torch.float32)
+    if "sharply" in name:
+        program.noise, program.bearing_sd = torch.tensor([1.0, 1.0, 0.5]), math.radians(1)
     if "known gain" in name:
         program.gain_unconstrained.requires_grad_(False)
     program.guesses = ()  # type: ignore[misc]

@@ -17,6 +17,7 @@ import steady_ppl as st
 from steady_ppl.discovery.curves import knots_of
 from steady_ppl.discovery.discovery import NOT_CONVERGED, _of_one_drive
 from steady_ppl.discovery.next_run import next_run
+from steady_ppl.discovery.refits import _led_back
 from steady_ppl.effects import Effect, chosen_variant, parsed
 from steady_ppl.effects.registry import _EFFECTS, register
 from steady_ppl.maximum_likelihood import maximise
@@ -184,6 +185,19 @@ def test_a_fit_that_has_not_converged_is_said_before_any_ranking(monkeypatch):
     assert not found.search.base.converged and NOT_CONVERGED in found.doubts
     assert str(found).startswith("warning: the program's own fit has not converged")
     assert found.figures["doubts"] == found.doubts
+
+
+def test_a_drive_that_strayed_is_led_back():
+    program = owner()
+    data = st.for_program(program, tables(program, drives=6, rows=41)[0]).without_truth(keep_start=True)
+    right = maximise(program, data, known_start=True)
+    lost, states = right.log_likelihood.clone(), right.path.states.clone()
+    lost[2], states[1:, 2] = -500.0, 0.0
+    found = _led_back(
+        program, data, replace(right, log_likelihood=lost, path=replace(right.path, states=states)), known_start=True
+    )
+    assert torch.allclose(found.log_likelihood, right.log_likelihood, atol=0.3)
+    assert _led_back(program, data, right, known_start=True) is right
 
 
 def test_the_next_run_tells_what_these_drives_do_not():

@@ -15,7 +15,7 @@ from steady_ppl.discovery.curves import unit_of
 from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.screening import Tested
 from steady_ppl.discovery.search import MARGIN, Found, Search
-from steady_ppl.effects import Variant
+from steady_ppl.effects import Variant, attached
 from steady_ppl.program import Program, names
 
 INTERVAL = 0.9
@@ -110,7 +110,8 @@ def _spread(search: Search, variant: Variant, count: int) -> np.ndarray:
     folds = search.final.folds
     share = len(folds[0].drives) / sum(len(fold.drives) for fold in folds)
     learned = [part.name.split("[")[0] for part in screening.parameters]
-    index = [i for i, name in enumerate(learned) if name in (variant.parameter, f"{variant.parameter}_effect")]
+    (there,) = [known for known in attached(search.final.program) if known.name == variant.name]
+    index = [i for i, name in enumerate(learned) if name == there.parameter]
     assert len(index) == count
     return (share * covariance.diagonal()[index]).clamp(min=0).sqrt().numpy()
 

@@ -23,6 +23,7 @@ from steady_ppl.scores import channel_moments, smoothed
 from steady_ppl.seeding import seeded
 
 ROUGH = 1.5  # mean square deviation, in the program's own, from which its noise is widened before anything is fitted
+FAR, SEARCHES = 6.0, 3  # standard deviations by which a drive strays from the others, and searches for its path
 NOTHING = 2.0  # nats below the program without, after which a fit is given up: a candidate at zero is that program
 
 
@@ -105,11 +106,36 @@ def first_refit(program: Program, train: Trajectories, valid: Trajectories, *, k
     own = copy.deepcopy(program)
     with seeded(seed, "paths"):
         first = roomy_path(own, train, known_start)
-        maximum = maximise(own, train, first, known_start=known_start)
-        second = find_path(own, valid, known_start=known_start)
-    folds = [Fold(train, maximum.path, valid, second), Fold(valid, second, train, maximum.path)]
-    other = copy.deepcopy(own)
-    return _refit([own, other], folds, known_start, [maximum, None], None)
+        one = _led_back(own, train, maximise(own, train, first, known_start=known_start), known_start)
+        other = copy.deepcopy(own)
+        second = maximise(other, valid, find_path(other, valid, known_start=known_start), known_start=known_start)
+        second = _led_back(other, valid, second, known_start)
+    folds = [Fold(train, one.path, valid, second.path), Fold(valid, second.path, train, one.path)]
+    return _refit([own, other], folds, known_start, [one, second], None)
+
+
+def _led_back(program: Program, data: Trajectories, maximum: Maximum, known_start: bool) -> Maximum:
+    """A fit whose strays have found another path: drives far less likely than the others, whose paths were found before
+    the program was fitted."""
+    for _ in range(SEARCHES):
+        cells = data.observed.sum((0, 2)).clamp(min=1)
+        each = maximum.log_likelihood / cells
+        middle = each.median()
+        usual = 1.5 * (each - middle).abs().median()
+        strays = (~(each >= middle - FAR * usual)).nonzero().flatten()
+        if not len(strays):
+            break
+        part = data.subset(strays)
+        found = find_path(program, part, known_start=known_start)
+        there = smooth(program, part, found, known_start=known_start, kernels=False)
+        better = there.log_likelihood > maximum.log_likelihood[strays] + 1
+        if not bool(better.any()):
+            break
+        states, noise = maximum.path.states.clone(), maximum.path.noise.clone()
+        moved = means_as_path(there, part)
+        states[:, strays[better]], noise[:, strays[better]] = moved.states[:, better], moved.noise[:, better]
+        maximum = maximise(program, data, Path(states, noise), known_start=known_start)
+    return maximum
 
 
 def roomy_path(program: Program, data: Trajectories, known_start: bool) -> Path:

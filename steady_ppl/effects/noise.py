@@ -57,7 +57,8 @@ def process_noise(self, state, control, time, step, c, channels):
 def command_noise(self, state, control, time, step, c):
     forward, _, yaw_rate = self.body_velocity(state)
     speed, turn = control[..., self.control_index("speed")], control[..., self.control_index("turn")]
-    return {"forward": 1 + c * (speed - forward).abs(), "yaw": 1 + c * (turn - yaw_rate).abs()}
+    slow, askew = (speed - forward).abs(), (turn - yaw_rate).abs()
+    return {"forward": (1 + c * slow).clamp(min=0.05), "yaw": (1 + c * askew).clamp(min=0.05)}
 
 
 def coloured_noise(self, c, channels):
