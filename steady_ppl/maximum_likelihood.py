@@ -119,7 +119,7 @@ def _searched(
     passes: int,
 ) -> tuple[float, _Here | None]:
     """The share of a move that does not fall, and where it leads; None where none does and nothing is moved."""
-    share, before = 1.0, _values(parts)
+    share, before = 1.0 if bool(torch.isfinite(move).all()) else 0.0, _values(parts)
     while share > 0.01:
         _set(parts, before + share * move)
         there = _try(program, data, here.path, known_start, parts, passes)

@@ -16,7 +16,9 @@ from torch.distributions import constraints
 import steady_ppl as st
 from steady_ppl.discovery.curves import knots_of
 from steady_ppl.discovery.discovery import NOT_CONVERGED, _of_one_drive
+from steady_ppl.discovery.finding import _spread
 from steady_ppl.discovery.next_run import next_run
+from steady_ppl.discovery.places import variance_of_places
 from steady_ppl.discovery.refits import _led_back
 from steady_ppl.effects import Effect, chosen_variant, parsed
 from steady_ppl.effects.registry import _EFFECTS, register
@@ -185,6 +187,16 @@ def test_a_fit_that_has_not_converged_is_said_before_any_ranking(monkeypatch):
     assert not found.search.base.converged and NOT_CONVERGED in found.doubts
     assert str(found).startswith("warning: the program's own fit has not converged")
     assert found.figures["doubts"] == found.doubts
+
+
+def test_not_knowing_a_knee_is_in_the_coefficients_interval():
+    found = discovered("thrust_saturation:knee=0.6=0.8")
+    (finding,) = found.findings
+    assert finding.variant.name == "thrust_saturation" and abs(finding.coefficient[0] - 0.8) < 3 * finding.sd[0]
+    alone = _spread(found.search, finding.variant, 1)[0]
+    (one,) = found.search.found
+    places = float(variance_of_places(one.without, one.candidate, known_start=True))
+    assert places > 0.1 * alone**2 and finding.sd[0] ** 2 == pytest.approx(alone**2 + places, rel=1e-3)
 
 
 def test_a_drive_that_strayed_is_led_back():

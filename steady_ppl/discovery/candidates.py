@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +14,7 @@ from steady_ppl.discovery.bootstrap import scores_along, simulate_scores
 from steady_ppl.discovery.columns import Column, columns_of
 from steady_ppl.discovery.curves import curves
 from steady_ppl.discovery.declared_noise import departures
-from steady_ppl.discovery.refits import ALWAYS, NEVER, Refit, Worth, refit_with
+from steady_ppl.discovery.refits import ALWAYS, Refit, Worth, refit_with
 from steady_ppl.discovery.screening import LEVEL, Screened, Tested, screen
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.elements import Element, elements
@@ -31,7 +30,6 @@ NATS = 2.0  # of held-out log p(y) within which two candidates cannot be told ap
 NO_DOUBT = 10.0  # nats of held-out log p(y) for which a test need only be near the family's level
 NEARLY = LEVEL / 5  # p-value of a single test that is near it
 PROMISING = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
-BETTER = 0.3  # nats by which another knee or place has to be likelier
 LINEAR = ("push", "command", "history", "measured", "viewpoint")
 
 
@@ -207,46 +205,8 @@ def fitted(now: Refit, tested: Tested, screening: Screening, settings: Settings,
         return judged(now, tested, refit)
 
     candidate = fit(1.0)
-    lost = isinstance(candidate.refit, str) or _gain_of_first_fold(now, candidate.refit) < 0
+    lost = isinstance(candidate.refit, str) or gain_of_first_fold(now, candidate.refit) < 0
     return fit(0.1) if lost and known is not None and tested.statistic > PROMISING else candidate
-
-
-def at_its_best_place(now: Refit, candidate: Candidate, settings: Settings) -> Candidate:
-    """A candidate with the knee, width or place at which it gains most: on its grid, and then between its points."""
-    if isinstance(candidate.refit, str) or not candidate.variant.profiled:
-        return candidate
-    fold = now.folds[0]
-    every = candidate.variant.effect.variants(now.program, replace(fold.drives, states=fold.path.states))
-    grid = [variant for variant in every if variant.name == candidate.variant.name]
-    start, at = candidate.refit.coefficient(candidate.variant), candidate.variant
-    best = _gain_of_first_fold(now, candidate.refit)
-
-    def better(variants: Iterable[Variant]) -> bool:
-        nonlocal at, best, start
-        before = best
-        for variant in variants:
-            refit = refit_with(now, variant, start, known_start=settings.known_start, worth=NEVER)
-            if isinstance(refit, Refit) and _gain_of_first_fold(now, refit) > best + BETTER:
-                at, best, start = variant, _gain_of_first_fold(now, refit), refit.coefficient(variant)
-        return best > before
-
-    better(variant for variant in grid if variant.label != candidate.variant.label)
-    for share in (0.5, 0.25):
-        for name in at.profiled:
-            better(_beside(at, grid, name, share))
-    if at is candidate.variant:
-        return candidate
-    refit = refit_with(now, at, start, known_start=settings.known_start)
-    other = judged(now, replace(candidate.tested, column=replace(candidate.tested.column, variant=at)), refit)
-    return other if other.total > candidate.total else candidate
-
-
-def _beside(at: Variant, grid: Sequence[Variant], name: str, share: float) -> list[Variant]:
-    """The effect on either side of a place: by a share of the grid's spacing, or of the value where there is none."""
-    value = at.profiled[name]
-    values = sorted({float(variant.profiled[name]) for variant in grid})
-    apart = min((b - a for a, b in itertools.pairwise(values)), default=0.8 * value)
-    return [replace(at, options={**at.options, name: value + sign * share * apart}) for sign in (1, -1)]
 
 
 def judged(now: Refit, tested: Tested, refit: Refit | str) -> Candidate:
@@ -256,7 +216,7 @@ def judged(now: Refit, tested: Tested, refit: Refit | str) -> Candidate:
     return Candidate(tested, refit, refit.held_out - now.held_out[: len(refit.held_out)])
 
 
-def _gain_of_first_fold(now: Refit, refit: Refit) -> float:
+def gain_of_first_fold(now: Refit, refit: Refit) -> float:
     return float((refit.maxima[0].log_likelihood - now.maxima[0].log_likelihood).sum())
 
 

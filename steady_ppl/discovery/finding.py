@@ -12,6 +12,7 @@ from scipy import stats
 
 from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.curves import unit_of
+from steady_ppl.discovery.places import variance_of_places
 from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.screening import Tested
 from steady_ppl.discovery.search import MARGIN, Found, Search
@@ -82,6 +83,9 @@ def _finding(search: Search, found: Found) -> Finding:
     variant, effect = found.candidate.variant, found.candidate.variant.effect
     values = refit.coefficient(variant).flatten().double().numpy()
     spread = _spread(search, variant, len(values))
+    if variant.profiled:
+        places = variance_of_places(found.without, found.candidate, search.known_start)
+        spread = np.sqrt(spread**2 + places.numpy())
     by = stats.norm.isf((1 - INTERVAL) / 2)
     if effect.null != 0:  # positive, learned as its logarithm
         interval = [(v * math.exp(-by * s), v * math.exp(by * s)) for v, s in zip(values, spread, strict=True)]

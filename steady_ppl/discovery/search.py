@@ -18,12 +18,12 @@ from steady_ppl.discovery.candidates import (
     Candidate,
     Screening,
     Settings,
-    at_its_best_place,
     fitted,
     judged,
     leaders,
     screen_program,
 )
+from steady_ppl.discovery.places import at_its_best_place
 from steady_ppl.discovery.refits import Refit, Worth, first_refit, refit_with
 from steady_ppl.discovery.screening import LEVEL, Tested
 from steady_ppl.effects import attached
@@ -83,6 +83,7 @@ class Search:
     """What a search came to.
 
     Attributes:
+        known_start: the first states are certain.
         base: the program as it stands, fitted.
         rounds: in their order; the last tests the final program unless the search ended early.
         found: the effects that were added.
@@ -90,6 +91,7 @@ class Search:
         curves: fits of curves in place of the first effect, best first, where effects alone did not explain the drives.
     """
 
+    known_start: bool
     base: Refit
     final: Refit
     rounds: list[Round] = field(default_factory=list)
@@ -154,7 +156,7 @@ def search(
     declared = copy.deepcopy(declared or program)
     report("fitting the program as it stands")
     base = first_refit(program, train, valid, known_start=known_start, seed=seed)
-    found = Search(base, base)
+    found = Search(known_start, base, base)
     for index in range(MOST + 1):
         count = sets if index == 0 else later_sets
         report(f"screening, with {count} simulated sets")
