@@ -31,7 +31,6 @@ OTHERS = {  # of the hovercraft and of other programs: four detection limits, or
         *("acceleration_bias=0.32,0", "side_slip:lead=0=0.112", "speed_dependent_gain=0.16", "measurement_noise=1.23"),
         "acceleration_limit=0.6",  # it has no limit: absent is infinite
     ),
-    "truck": ("clock_offset=0.105",),
     "truck, seen sharply": ("command_noise=1", "curvature_steering=0.5", "lever_arm=0.3"),
     "pendulum": (
         *("stiffness=6.9", "cubic_stiffness=1.05", "coulomb_friction=0.54", "acceleration_bias=0.36"),
