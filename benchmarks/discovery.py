@@ -69,7 +69,7 @@ def judged(chosen: BenchmarkSet) -> dict[str, Any]:
     }
     if chosen.stratum != "clean":
         record |= _improvement(chosen, found, test)
-    return _plain(record)
+    return plain(record)
 
 
 def _improvement(chosen: BenchmarkSet, found: Discovery, test: Any) -> dict[str, Any]:
@@ -113,27 +113,22 @@ def rivals_of(chosen: BenchmarkSet, brute: bool) -> dict[str, Any]:
                     "detected": ranking.detected,
                     "seconds": round(ranking.seconds, 1),
                 }
-    return _plain({"set": chosen.name, "stratum": chosen.stratum, "effects": list(chosen.effects), "rivals": found})
+    return plain({"set": chosen.name, "stratum": chosen.stratum, "effects": list(chosen.effects), "rivals": found})
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Ready for JSON: figures to five digits, None where there is none."""
     if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
+        return {key: plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
+        return [plain(inner) for inner in value]
     if isinstance(value, float):
         return float(f"{value:.5g}") if math.isfinite(value) else None
     return value
 
 
-def version() -> str:
-    """A digest of the engine's source, as far as `discover` and `prove` import it: a picture or a command changes no
-    figure."""
-    return ENGINE
-
-
 def _digest() -> str:
+    """Of the engine's source, as far as `discover` and `prove` import it: a picture or a command changes no figure."""
     engine = Path(steady_ppl.__file__).parent
     loaded = [Path(module.__file__) for module in list(sys.modules.values()) if getattr(module, "__file__", None)]
     files = sorted(file for file in loaded if engine in file.parents)
@@ -143,12 +138,12 @@ def _digest() -> str:
 ENGINE = _digest()
 
 
-def _run(work: Any, chosen: list[tuple[Any, ...]], file: Path, workers: int) -> list[dict[str, Any]]:
+def run_sets(work: Any, chosen: list[tuple[Any, ...]], file: Path, workers: int) -> list[dict[str, Any]]:
     """Records of the file and of everything that is not in it yet, appended as it is done."""
     file.parent.mkdir(exist_ok=True)
     done = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
     done = [record for record in done if "failed" not in record]
-    others = {record["version"] for record in done} - {version()}
+    others = {record["version"] for record in done} - {ENGINE}
     if others:
         raise SystemExit(f"{file} was made by other versions of the engine ({', '.join(sorted(others))}): move it away")
     there = {record["set"] for record in done}
@@ -161,7 +156,7 @@ def _run(work: Any, chosen: list[tuple[Any, ...]], file: Path, workers: int) -> 
                 record = future.result()
             except Exception as error:
                 record = {"set": running[future], "failed": f"{type(error).__name__}: {error}"}
-            record["version"] = version()
+            record["version"] = ENGINE
             done.append(record)
             out.write(json.dumps(record) + "\n")
             out.flush()
@@ -181,7 +176,7 @@ def main() -> None:
     options = parser.parse_args()
     sets = quick() if options.quick else benchmark_sets()
     results = options.results or (RESULTS.with_stem(RESULTS.stem + "-quick") if options.quick else RESULTS)
-    records = _run(judged, [(one,) for one in sets], results, options.workers)
+    records = run_sets(judged, [(one,) for one in sets], results, options.workers)
     results.with_suffix(".md").write_text(scores_table(records))
     print(scores_table(records))
     if options.rivals:
@@ -190,7 +185,7 @@ def main() -> None:
         every = max(1, len(chosen) // BRUTE_SETS)
         work = [(one, index % every == 0) for index, one in enumerate(chosen)]
         beside = results.with_stem(results.stem + "-rivals")
-        text = rivals_table(records, _run(rivals_of, work, beside, options.workers))
+        text = rivals_table(records, run_sets(rivals_of, work, beside, options.workers))
         beside.with_suffix(".md").write_text(text)
         print(text)
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from discovery import _plain, _run
+from discovery import plain, run_sets
 from discovery_limits import owner, with_effects
 from discovery_scores import made_by, share, uniformity
 
@@ -62,7 +62,7 @@ def judged(case: Case) -> dict[str, Any]:
     found = discover(program, train, valid, known_start=told.get("known_start", True), seed=case.seed)
     figures = found.figures
     keys = ("effect", "class", "coefficient", "interval_90", "heldout_gain")
-    return _plain(
+    return plain(
         {
             "set": case.name,
             "condition": case.condition,
@@ -136,7 +136,7 @@ def main() -> None:
         for seed in range(options.seeds)
     ]
     cases += [(Case("unknown start", "", 61_000 + seed),) for seed in range(options.clean)]
-    records = _run(judged, cases, options.results, options.workers)
+    records = run_sets(judged, cases, options.results, options.workers)
     done = [record for record in records if "failed" not in record]
     clean = [r for r in done if r["condition"] == "unknown start" and not r["planted"]]
     lines = [

@@ -43,4 +43,5 @@ def require_folder(path: Path | None) -> None:
 
 
 def say(line: str) -> None:
+    """A word to the person, beside what a script reads."""
     print(f"steady: {line}", file=sys.stderr)

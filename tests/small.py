@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -50,6 +51,15 @@ def impossible(data: Trajectories, trajectory: int, row: int) -> Trajectories:
     measurements = data.measurements.clone()
     measurements[row, trajectory] = 1e30
     return replace(data, measurements=measurements)
+
+
+def finite(content) -> bool:
+    """Whether no figure of a report is infinite or missing."""
+    if isinstance(content, dict):
+        return all(finite(value) for value in content.values())
+    if isinstance(content, list | tuple):
+        return all(finite(value) for value in content)
+    return not isinstance(content, float) or math.isfinite(content)
 
 
 def tree(folder: Path) -> list[Path]:

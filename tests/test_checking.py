@@ -13,6 +13,7 @@ import pytest
 import torch
 from examples import drives, example
 from oracles import assert_mean, cart_parameters, kalman
+from small import finite
 
 import steady_ppl as st
 from steady_ppl.checking import _in_own_spreads
@@ -49,14 +50,6 @@ def dragged() -> st.Check:
 @pytest.fixture(scope="module")
 def clean() -> st.Check:
     return judged(table(hovercraft(), seed=3))
-
-
-def finite(content) -> bool:
-    if isinstance(content, dict):
-        return all(finite(value) for value in content.values())
-    if isinstance(content, list | tuple):
-        return all(finite(value) for value in content)
-    return not isinstance(content, float) or math.isfinite(content)
 
 
 def test_clean_drives_are_left_alone(clean):

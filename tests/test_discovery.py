@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 from functools import partial
 
@@ -11,6 +10,7 @@ import pytest
 import torch
 from examples import example
 from pyro.nn import PyroParam
+from small import finite
 from torch.distributions import constraints
 
 import steady_ppl as st
@@ -61,14 +61,6 @@ def dragged() -> st.Discovery:
 @pytest.fixture(scope="module")
 def clean() -> st.Discovery:
     return discovered()
-
-
-def finite(content) -> bool:
-    if isinstance(content, dict):
-        return all(finite(value) for value in content.values())
-    if isinstance(content, list | tuple):
-        return all(finite(value) for value in content)
-    return not isinstance(content, float) or math.isfinite(content)
 
 
 def test_a_missing_drag_is_found_with_its_coefficient(dragged):

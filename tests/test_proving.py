@@ -13,7 +13,7 @@ import torch
 from examples import drives, example
 from oracles import cart_parameters, kalman
 from scipy import stats
-from small import HOVERCRAFT, TRUTH, contents, only_start, simulated, steady, written
+from small import HOVERCRAFT, TRUTH, contents, finite, only_start, simulated, steady, written
 
 import steady_ppl as st
 from steady_ppl.paired_bootstrap import Sums, paired
@@ -64,14 +64,6 @@ def carts(cart):
 def line(proof, name: str):
     (row,) = (row for row in proof.figures["rows"] if row["row"] == name)
     return row
-
-
-def finite(content) -> bool:
-    if isinstance(content, dict):
-        return all(finite(value) for value in content.values())
-    if isinstance(content, list):
-        return all(finite(value) for value in content)
-    return not isinstance(content, float) or math.isfinite(content)
 
 
 def test_the_program_with_the_drag_is_proved_better(drag):
