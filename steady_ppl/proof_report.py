@@ -145,8 +145,11 @@ def as_text(content: Mapping[str, Any]) -> str:
     """The figures as text: the verdict, and tables no wider than 100 columns."""
     rows, horizons = content["rows"], list(content["horizons"])
     far = horizons[1:] or horizons
-    said = f"{content['trajectories']} drives; differences are from {content['reference']}"
-    lines = [content["verdict"], "", f"{said}, with {content['level']:.0%} intervals bootstrapped over drives", ""]
+    said = (
+        f"{content['trajectories']} drives; differences are from {content['reference']}, "
+        f"with {content['level']:.0%} intervals bootstrapped over drives"
+    )
+    lines = [*textwrap.wrap(content["verdict"], WIDTH), "", said, ""]
     bands = [name for name in BANDS if name in horizons]
     shown = [name if i else f"in 90 % band, {name}" for i, name in enumerate(bands)]
     header = ["", "log p(y) [nats]", "difference [nats]", "by particles", *shown]

@@ -6,6 +6,7 @@ particle filter says how far its log p(y) is from the program's own.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +21,7 @@ from steady_ppl.fit import Fit
 from steady_ppl.paired_bootstrap import FEWEST
 from steady_ppl.predictions import named_horizons
 from steady_ppl.program import Program, names
-from steady_ppl.proof_report import as_text, figures
+from steady_ppl.proof_report import FLOOR, as_text, figures
 from steady_ppl.proof_rows import (
     SECONDS,
     Judged,
@@ -31,7 +32,7 @@ from steady_ppl.proof_rows import (
     noise_floor,
 )
 
-FLOOR, COASTING = "noise floor", "constant velocity"
+COASTING = "constant velocity"
 FAR_OFF = 2.0  # nats of a drive's log p(y) between a particle filter and the linearised program
 
 
@@ -198,13 +199,17 @@ def far_off(rows: Mapping[str, Row], data: Trajectories) -> list[str]:
     for name, row in rows.items():
         if isinstance(row.neglected, str):
             notes.append(f"{name}: no particle filter says how far its log p(y) can be trusted: {row.neglected}")
-        if not isinstance(row.neglected, Tensor) or not bool((row.neglected.abs() > FAR_OFF).any()):
+        if not isinstance(row.neglected, Tensor):
             continue
-        worst = int(row.neglected.abs().nan_to_num(torch.inf).argmax())
-        by, count = float(row.neglected[worst]), int((row.neglected.abs() > FAR_OFF).sum())
-        others = f", and so on {count - 1} more" if count > 1 else ""
+        size = row.neglected.abs().nan_to_num(torch.inf)
+        worst, count = int(size.argmax()), int((size > FAR_OFF).sum())
+        if not count:
+            continue
+        by = float(row.neglected[worst])
+        said = f"{abs(by):.1f} nats {'above' if by > 0 else 'below'}" if math.isfinite(by) else "not comparable with"
+        others = f" ({count - 1} other{'s' if count > 2 else ''} likewise)" if count > 1 else ""
         notes.append(
-            f"{name}: on drive {data.labels[worst]} a particle filter's log p(y) is {abs(by):.1f} nats "
-            f"{'above' if by > 0 else 'below'} the linearised program's{others}: look at it before you trust the table"
+            f"{name}: on drive {data.labels[worst]} a particle filter's log p(y) is {said} the linearised "
+            f"program's{others}: look at it before you trust the table"
         )
     return notes

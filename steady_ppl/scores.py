@@ -235,10 +235,10 @@ def parameter_scores(program: Program, data: Trajectories, at: Smoothed, parts: 
         width = 2 * part.step
         with moved(part, part.step):
             mean_up, spread_up = channel_moments(program, data, at.channels.points)
-            a_few_up = measured(program, at.measurements.points[:1, :, :1])
+            a_few_up = measured(program, at.measurements.points[:1])
         with moved(part, -part.step):
             mean_down, spread_down = channel_moments(program, data, at.channels.points)
-            a_few_down = measured(program, at.measurements.points[:1, :, :1])
+            a_few_down = measured(program, at.measurements.points[:1])
         score = at.channels.of_mean((mean_up - mean_down) / (width * spread))
         score = score + at.channels.of_spread((spread_up[0] / spread_down[0]).log() / width)
         if not a_few_up.same(a_few_down):

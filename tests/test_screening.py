@@ -13,7 +13,7 @@ from scipy import stats
 from steady_ppl.discovery.bootstrap import Simulated
 from steady_ppl.discovery.columns import Column
 from steady_ppl.discovery.curves import between, by_height, height, knots_of, variables
-from steady_ppl.discovery.screening import screen
+from steady_ppl.discovery.screening import LEVEL, _critical, screen
 from steady_ppl.effects import chosen_variant
 
 DRIVES, PARAMETERS = 16, 3
@@ -126,3 +126,13 @@ def test_curves_may_depend_on_everything_that_a_program_declares():
 
 def test_a_variable_that_stands_still_has_no_knots():
     assert knots_of(torch.full((100,), 2.0), circular=False) is None
+
+
+@pytest.mark.parametrize("sets", [50, 60, 200, 999])
+def test_a_single_tests_level_and_the_familys_say_the_same(sets):
+    """The family's p-value is at most 5 % exactly where some test is at or below the critical one."""
+    family = np.random.default_rng(sets).uniform(size=sets)
+    critical = _critical(family)
+    for observed in (*np.sort(family), critical, *np.nextafter(np.sort(family)[:12], 0.0)):
+        whole = (1 + int((family <= observed).sum())) / (1 + sets)
+        assert (whole <= LEVEL) == (observed <= critical)

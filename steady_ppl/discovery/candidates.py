@@ -131,7 +131,7 @@ def screen_program(now: Refit, declared: Program, settings: Settings, *, sets: i
     there = {variant.name for variant in attached(program)}
     seen = replace(fold.drives, states=fold.path.states)
     ahead = smooth(program, fold.drives, fold.path, known_start=settings.known_start, passes=3, tolerance=0.01)
-    away = departures(declared, program, fold.drives, fold.path.states, parts)
+    away = departures(declared, now, parts)
     away = [one for one in away if one.variant.name not in there and one.variant.effect.name not in settings.withheld]
     skip = there | {departure.variant.name for departure in away}
     tailed = bool(torch.isfinite(measured(program, fold.path.states[:1, :1]).freedom).any())  # Student t as it stands
@@ -217,7 +217,14 @@ def judged(now: Refit, tested: Tested, refit: Refit | str) -> Candidate:
 
 
 def gain_of_first_fold(now: Refit, refit: Refit) -> float:
+    """Nats of log p(y) by which a fit explains better the drives that it was fitted to."""
     return float((refit.maxima[0].log_likelihood - now.maxima[0].log_likelihood).sum())
+
+
+def gain_of_fits(now: Refit, refit: Refit) -> float:
+    """The same of the drives of every fold, each by the fit to it."""
+    pairs = zip(refit.maxima, now.maxima, strict=False)
+    return float(sum((one.log_likelihood - other.log_likelihood).sum() for one, other in pairs))
 
 
 def _start(tested: Tested) -> Any:

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
-from steady_ppl.effects import Variant, catalogue
+from steady_ppl.discovery.refits import Fold, Refit, as_declared
+from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.elements import Element, moved
 from steady_ppl.program import Program, names
 from steady_ppl.scores import channel_moments, measured
@@ -22,55 +23,70 @@ class Departure:
 
     Attributes:
         variant: `process_noise` of these channels, or `measurement_noise`.
-        away: log ratio of fitted to declared, their mean.
-        slope: its derivative in the fitted parameters, `(P,)`.
+        away: log ratio of fitted to declared, their mean, on the drives that are tested.
+        on_all: the same on the drives of all folds.
+        share: of the drives that are tested among all.
+        slope: derivative of `away` in the fitted parameters, `(P,)`.
     """
 
     variant: Variant
     away: float
+    on_all: float
+    share: float
     slope: Tensor
 
     @property
     def factor(self) -> float:
         """By what the noise differs."""
-        return math.exp(self.away)
+        return math.exp(self.on_all)
 
 
 @torch.no_grad()
-def departures(
-    declared: Program, fitted: Program, data: Trajectories, states: Tensor, parts: Sequence[Element]
-) -> list[Departure]:
+def departures(declared: Program, now: Refit, parts: Sequence[Element]) -> list[Departure]:
     """Of every group of channels and of the measurements, where their noise is learned and no guess (`guesses`).
+
+    What effects that were added to the program do to its noise is no departure.
 
     Args:
         declared: the program as it was before it was fitted.
-        fitted: the program.
-        data: as returned by `for_program`.
-        states: along which the noise is looked at, `(T + 1, B, D)`.
-        parts: the learnable numbers of `fitted`.
+        now: the fitted program; the first fold's drives are tested.
+        parts: the learnable numbers of the first fold's program.
     """
+    own = [part.name.split("[")[0] not in {known.parameter for known in attached(now.program)} for part in parts]
+    counts = [len(fold.drives) for fold in now.folds]
     found = []
     for name, spread in SPREADS.items():
-        slope = _slope(spread, fitted, data, states, parts)
-        away = spread(fitted, data, states) - spread(declared, data, states[..., : len(declared.states)])
-        variants = [v for effect in catalogue(fitted) if effect.name == name for v in effect.variants(fitted)]
+        slope = _slope(spread, now.program, now.folds[0], parts) * torch.tensor(own).unsqueeze(-1)
+        away = torch.stack(
+            [
+                _spread(spread, program, fold) - _spread(spread, as_declared(declared, program), fold)
+                for program, fold in zip(now.programs, now.folds, strict=True)
+            ]
+        )
+        mean = (torch.tensor(counts).unsqueeze(-1) * away).sum(0) / sum(counts)
+        variants = [v for effect in catalogue(now.program) if effect.name == name for v in effect.variants(now.program)]
         for variant in variants if parts else []:
-            index = _columns(fitted, variant)
-            index = [i for i in index if bool(slope[:, i].any()) and not _guessed(fitted, parts, slope[:, i])]
+            index = _columns(now.program, variant)
+            index = [i for i in index if bool(slope[:, i].any()) and not _guessed(now.program, parts, slope[:, i])]
             if index:
-                found.append(Departure(variant, float(away[index].mean()), slope[:, index].mean(1)))
+                away_of, mean_of = float(away[0, index].mean()), float(mean[index].mean())
+                found.append(Departure(variant, away_of, mean_of, counts[0] / sum(counts), slope[:, index].mean(1)))
     return found
 
 
-def _slope(spread: Spread, program: Program, data: Trajectories, states: Tensor, parts: Sequence[Element]) -> Tensor:
+def _slope(spread: Spread, program: Program, fold: Fold, parts: Sequence[Element]) -> Tensor:
     """The derivative of log standard deviations in the parameters, `(P, C)` or `(P, K)`."""
     slopes = []
     for part in parts:
         with moved(part, part.step):
-            up = spread(program, data, states)
+            up = _spread(spread, program, fold)
         with moved(part, -part.step):
-            slopes.append((up - spread(program, data, states)) / (2 * part.step))
+            slopes.append((up - _spread(spread, program, fold)) / (2 * part.step))
     return torch.stack(slopes) if slopes else torch.zeros(0)
+
+
+def _spread(spread: Spread, program: Program, fold: Fold) -> Tensor:
+    return spread(program, fold.drives, fold.path.states)
 
 
 def _of_channels(program: Program, data: Trajectories, states: Tensor) -> Tensor:

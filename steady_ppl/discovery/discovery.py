@@ -213,7 +213,8 @@ def _notes(found: Search, is_fitted: bool) -> list[str]:
         )
     if not found.final.converged and found.found:
         notes.append("the fit with what was found has not converged")
-    if not found.rounds[-1].quiet:
+    tests = found.rounds[-1].screening.tests
+    if any(tested.p_value <= tests.critical for tested in tests.tested if not tested.departure):
         notes.append("something is left that no effect of the catalogue brings: the tests were not quiet at the end")
     notes += [f"{one.candidate.variant.label}: {said}" for one in found.found if (said := _of_one_drive(one))]
     for candidate in found.rounds[0].candidates:

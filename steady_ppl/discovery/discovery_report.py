@@ -241,13 +241,17 @@ def _table(found: Discovery) -> list[str]:
 
 
 def _limits(found: Discovery, tested: Sequence[Tested]) -> list[str]:
-    """What could not have been seen of those that are not in the table."""
-    said = []
+    """What could not have been seen of those that are not in the table, and what could not be tested at all."""
+    below, never = list[str](), list[str]()
     for one in tested:
         limit = _short(_numbers(limit_of(found, one)))
-        if not (one.is_curve or one.untestable or limit == "–"):
-            said.append(f"{one.variant.name} {limit}{'' if one.variant.unit == '1' else ' ' + one.variant.unit}")
-    return textwrap.wrap(f"and below their limits: {'; '.join(said)}", WIDTH) if said else []
+        if one.untestable:
+            never.append(f"{one.variant.name} ({one.untestable})")
+        elif not one.is_curve:
+            unit = "" if one.variant.unit == "1" or limit == "–" else " " + one.variant.unit
+            below.append(f"{one.variant.name} {'of no limit' if limit == '–' else limit}{unit}")
+    said = [("and below their limits", below), ("not testable", never)]
+    return [line for text, names in said if names for line in textwrap.wrap(f"{text}: {'; '.join(names)}", WIDTH)]
 
 
 def _line(found: Discovery, tested: Tested) -> list[str]:

@@ -85,7 +85,8 @@ def _finding(search: Search, found: Found) -> Finding:
     spread = _spread(search, variant, len(values))
     if variant.profiled:
         places = variance_of_places(found.without, found.candidate, search.known_start)
-        spread = np.sqrt(spread**2 + places.numpy())
+        scale = values if effect.null != 0 else 1.0  # of its logarithm
+        spread = np.sqrt(spread**2 + places.numpy() / scale**2)
     by = stats.norm.isf((1 - INTERVAL) / 2)
     if effect.null != 0:  # positive, learned as its logarithm
         interval = [(v * math.exp(-by * s), v * math.exp(by * s)) for v, s in zip(values, spread, strict=True)]
@@ -121,7 +122,7 @@ def _spread(search: Search, variant: Variant, count: int) -> np.ndarray:
 
 
 def _confidence(search: Search, found: Found, alike: Sequence[Candidate]) -> float:
-    """Posterior probability of the class, all candidates, none and the best curve alike before."""
+    """Posterior probability of the class; all candidates and none are alike before, the best curve by `MARGIN` less."""
     totals = {id(c): c.total for c in found.candidates if isinstance(c.refit, Refit)}
     curve = max((c.total for c in search.curves if isinstance(c.refit, Refit)), default=-math.inf)
     rivals = [0.0, found.candidate.total + curve - search.gain - MARGIN]
@@ -154,7 +155,7 @@ def shape_of(search: Search, program: Program) -> Shape | None:
     folds = curve.refit.folds
     share = len(folds[0].drives) / sum(len(fold.drives) for fold in folds)
     wide = float(stats.norm.isf((1 - INTERVAL) / 2 / len(heights))) * math.sqrt(share)
-    channel, _, variable = variant.at.partition("~")
+    channel = variant.at.partition("~")[0]
     variable = variant.options.get("variable", "reading")
     about = names(program.measurements)[0] if channel == "all" else channel
     return Shape(
@@ -173,7 +174,7 @@ def gain_interval(candidate: Candidate, seed: int) -> tuple[float, float] | None
     """95 % bootstrap interval, over drives, of a candidate's held-out gain; None where it was fitted on one fold."""
     if isinstance(candidate.refit, str) or len(candidate.refit.programs) == 1:
         return None
-    gain = candidate.gain.double().numpy()
+    gain = candidate.gain.double().numpy() - len(candidate.variant.profiled) / len(candidate.gain)
     random = np.random.default_rng(seed)
     totals = random.choice(gain, (RESAMPLES, len(gain))).sum(1)
     low, high = np.quantile(totals, [0.025, 0.975])

@@ -93,7 +93,7 @@ def _separation(members: list[Candidate], controls: Tensor, data: Trajectories, 
     for member in members[1:]:
         assert isinstance(member.refit, Refit)
         apart.append(float((own - _log_likelihood(member.refit.program, again, truth, known_start)).mean()))
-    return min(apart)
+    return min(apart) if all(map(math.isfinite, apart)) else math.nan
 
 
 def _log_likelihood(program: Program, drives: Trajectories, path: Path, known_start: bool) -> Tensor:

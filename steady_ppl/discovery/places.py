@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from steady_ppl.discovery.candidates import Candidate, Settings, gain_of_first_fold, judged
-from steady_ppl.discovery.refits import NEVER, Refit, refit_with
+from steady_ppl.discovery.candidates import Candidate, Settings, gain_of_fits, judged
+from steady_ppl.discovery.refits import Refit, refit_elsewhere, refit_with
 from steady_ppl.effects import Variant
 
 BETTER = 0.3  # nats by which another knee or place has to be likelier
+PASSES = 4  # along all knees and places in turns, with steps of one size
 NEAR = 0.25  # of the grid's spacing, at which a place's likelihood is compared with its neighbours'
 
 
@@ -21,35 +22,38 @@ def at_its_best_place(now: Refit, candidate: Candidate, settings: Settings) -> C
     """A candidate with the knee, width or place at which it gains most: on its grid, and then between its points."""
     if isinstance(candidate.refit, str) or not candidate.variant.profiled:
         return candidate
-    grid = _grid(now, candidate)
-    start, at = candidate.refit.coefficient(candidate.variant), candidate.variant
-    best = gain_of_first_fold(now, candidate.refit)
+    grid, at, tested = _grid(now, candidate), candidate.variant, candidate.tested
+    fit: Refit | str = candidate.refit
+    if not candidate.is_judged:
+        fit = refit_with(now, at, candidate.refit.coefficient(at), known_start=settings.known_start)
+        if isinstance(fit, str):
+            return candidate
 
-    def better(variants: Iterable[Variant]) -> bool:
-        nonlocal at, best, start
-        before = best
+    def try_all(variants: Iterable[Variant]) -> None:
+        nonlocal at, fit
         for variant in variants:
-            refit = refit_with(now, variant, start, known_start=settings.known_start, worth=NEVER)
-            if isinstance(refit, Refit) and gain_of_first_fold(now, refit) > best + BETTER:
-                at, best, start = variant, gain_of_first_fold(now, refit), refit.coefficient(variant)
-        return best > before
+            assert isinstance(fit, Refit)
+            other = refit_elsewhere(now, fit, variant, known_start=settings.known_start)
+            if isinstance(other, Refit) and gain_of_fits(now, other) > gain_of_fits(now, fit) + BETTER:
+                at, fit = variant, other
 
-    better(variant for variant in grid if variant.label != candidate.variant.label)
+    try_all(variant for variant in grid if variant.label != candidate.variant.label)
     for share in (0.5, 0.25):
-        for name in at.profiled:
-            better(_beside(at, grid, name, share))
-    if at is candidate.variant:
-        return candidate
-    refit = refit_with(now, at, start, known_start=settings.known_start)
-    other = judged(now, replace(candidate.tested, column=replace(candidate.tested.column, variant=at)), refit)
-    return other if other.total > candidate.total else candidate
+        for _ in range(PASSES):
+            before = at
+            for name in at.profiled:
+                try_all(_beside(at, grid, name, share))
+            if at is before:
+                break
+    there = judged(now, replace(tested, column=replace(tested.column, variant=at)), fit)
+    return there if there.total > candidate.total else candidate
 
 
 def variance_of_places(now: Refit, candidate: Candidate, known_start: bool) -> Tensor:
     """What the uncertainty of knees, widths and places adds to the variance of a coefficient, `(k,)`.
 
-    By the delta method along the profile likelihood of each alone; one that these drives do not tell is taken as
-    uncertain within its grid.
+    By the delta method along their profile likelihood, with a prior as wide as their grid. Where the program cannot be
+    fitted on either side of one, its coefficient is taken as uncertain by its own size.
 
     Args:
         now: the program without the candidate.
@@ -57,22 +61,61 @@ def variance_of_places(now: Refit, candidate: Candidate, known_start: bool) -> T
         known_start: the first states are certain.
     """
     assert isinstance(candidate.refit, Refit)
-    start = candidate.refit.coefficient(candidate.variant)
-    best = gain_of_first_fold(now, candidate.refit)
-    added = torch.zeros(start.numel(), dtype=torch.float64)
-    for name in candidate.variant.profiled:
-        grid = _grid(now, candidate)
-        values = {variant.profiled[name] for variant in grid}
-        sides = []
-        for variant in _beside(candidate.variant, grid, name, NEAR):
-            refit = refit_with(now, variant, start, known_start=known_start, worth=NEVER)
-            if isinstance(refit, Refit):
-                sides.append((refit.coefficients(variant)[0].flatten().double(), gain_of_first_fold(now, refit)))
-        if len(sides) == 2:
-            change = (sides[0][0] - sides[1][0]) / 2
-            fall = 2 * best - sides[0][1] - sides[1][1]  # twice the mean: the curvature, in steps to the side
-            added += change.square() / max(fall, (2 * NEAR / max(1, len(values) - 1)) ** 2)
-    return added
+    at, grid, near = candidate.variant, _grid(now, candidate), candidate.refit
+    here, best = near.coefficient(at).flatten().double(), gain_of_fits(now, near)
+
+    def fitted(variant: Variant) -> tuple[Tensor, float] | None:
+        """How the coefficient changes, and by how much the likelihood falls."""
+        refit = refit_elsewhere(now, near, variant, known_start=known_start)
+        if isinstance(refit, str):
+            return None
+        return refit.coefficient(variant).flatten().double() - here, best - gain_of_fits(now, refit)
+
+    variance, ways = torch.zeros_like(here), list[_Way]()
+    for name in at.profiled:
+        sides = [
+            (sign, v, fit) for sign, v in zip((1, -1), _beside(at, grid, name, NEAR), strict=True) if (fit := fitted(v))
+        ]
+        if not sides:
+            variance = variance + here.square()
+            continue
+        slope = torch.stack([sign * change for sign, _, (change, _) in sides]).mean(0)
+        bend = sum(2 * fall for *_, (_, fall) in sides) / len(sides)
+        count = len({variant.profiled[name] for variant in grid})
+        sign, variant, (_, fall) = sides[0]
+        ways.append(_Way(name, sign, variant, fall, slope, bend, (2 * NEAR / max(1, count - 1)) ** 2))
+    if not ways:
+        return variance
+    curvature = torch.diag(torch.tensor([way.bend for way in ways], dtype=torch.float64))
+    for (i, one), (j, other) in itertools.combinations(enumerate(ways), 2):
+        both = fitted(replace(one.beside, options={**one.beside.options, other.name: other.beside.options[other.name]}))
+        if both is not None:
+            curvature[i, j] = curvature[j, i] = one.sign * other.sign * (both[1] - one.fall - other.fall)
+    values, turn = torch.linalg.eigh(curvature)
+    along = torch.stack([way.slope for way in ways], -1) @ turn
+    return variance + (along.square() / (values.clamp(min=0) + min(way.prior for way in ways))).sum(-1)
+
+
+@dataclass(frozen=True)
+class _Way:
+    """A step beside a place, in one of its numbers.
+
+    Attributes:
+        name: of the number.
+        sign, beside: which way it goes and where that leads.
+        fall: of the likelihood there, nats.
+        slope: change of the coefficient by a step up, `(k,)`.
+        bend: curvature of the likelihood in steps.
+        prior: precision of a normal as wide as the grid, in steps.
+    """
+
+    name: str
+    sign: int
+    beside: Variant
+    fall: float
+    slope: Tensor
+    bend: float
+    prior: float
 
 
 def _grid(now: Refit, candidate: Candidate) -> list[Variant]:

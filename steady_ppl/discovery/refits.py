@@ -13,7 +13,7 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.effects import Variant, attached, coefficient, with_effect
 from steady_ppl.elements import Element, elements, moved
-from steady_ppl.errors import SteadyError
+from steady_ppl.errors import FilterError, SteadyError
 from steady_ppl.gaussian_smoother import find_path, means_as_path, require_found, smooth
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
@@ -23,6 +23,7 @@ from steady_ppl.scores import channel_moments, smoothed
 from steady_ppl.seeding import seeded
 
 ROUGH = 1.5  # mean square deviation, in the program's own, from which its noise is widened before anything is fitted
+WIDER = math.log(20.0)  # log ratio of a channel's noise after a fit and before, from which it explains next to nothing
 FAR, SEARCHES = 6.0, 3  # standard deviations by which a drive strays from the others, and searches for its path
 NOTHING = 2.0  # nats below the program without, after which a fit is given up: a candidate at zero is that program
 
@@ -45,7 +46,7 @@ class Worth:
     held_out: float = -math.inf
 
 
-ALWAYS, NEVER = Worth(), Worth(math.inf, math.inf)
+ALWAYS = Worth()
 
 
 @dataclass(frozen=True)
@@ -58,12 +59,15 @@ class Refit:
         folds: with the paths of these programs.
         held_out: log p(y) of each drive under the program fitted without it, `(B,)`, the folds one after another; those
             of the first only where the rest was not worth fitting.
+        rough: the program before its fit made its noise many times wider, from whose parameters fits with an effect
+            begin as well; None where it did not.
     """
 
     programs: list[Program]
     maxima: list[Maximum]
     folds: list[Fold]
     held_out: Tensor
+    rough: Program | None = None
 
     @property
     def program(self) -> Program:
@@ -111,7 +115,8 @@ def first_refit(program: Program, train: Trajectories, valid: Trajectories, *, k
         second = maximise(other, valid, find_path(other, valid, known_start=known_start), known_start=known_start)
         second = _led_back(other, valid, second, known_start)
     folds = [Fold(train, one.path, valid, second.path), Fold(valid, second.path, train, one.path)]
-    return _refit([own, other], folds, known_start, [one, second], None)
+    refit = _refit([own, other], folds, known_start, [one, second])
+    return replace(refit, rough=copy.deepcopy(program) if _far_wider(own, program, train) else None)
 
 
 def _led_back(program: Program, data: Trajectories, maximum: Maximum, known_start: bool) -> Maximum:
@@ -132,10 +137,21 @@ def _led_back(program: Program, data: Trajectories, maximum: Maximum, known_star
         if not bool(better.any()):
             break
         states, noise = maximum.path.states.clone(), maximum.path.noise.clone()
-        moved = means_as_path(there, part)
-        states[:, strays[better]], noise[:, strays[better]] = moved.states[:, better], moved.noise[:, better]
+        found = means_as_path(there, part)
+        states[:, strays[better]], noise[:, strays[better]] = found.states[:, better], found.noise[:, better]
+        before = maximum.gained - maximum.objective
         maximum = maximise(program, data, Path(states, noise), known_start=known_start)
+        maximum = replace(maximum, gained=maximum.objective + before)
     return maximum
+
+
+def _far_wider(fitted: Program, program: Program, data: Trajectories) -> bool:
+    """Whether a fit has made some channel's noise several times what it was."""
+    return any(
+        float(now.parameter.detach().flatten()[now.index] - then.parameter.detach().flatten()[then.index]) > WIDER
+        for now, then in zip(elements(fitted), elements(program), strict=True)
+        if _widens(fitted, now, data)
+    )
 
 
 def roomy_path(program: Program, data: Trajectories, known_start: bool) -> Path:
@@ -201,9 +217,39 @@ def refit_with(
     try:
         programs = [with_effect(program, variant, value) for program in base.programs]
         least = [float(maximum.log_likelihood.sum()) - NOTHING for maximum in base.maxima]
-        return _refit(programs, base.folds, known_start, [None] * len(programs), information, least, worth)
+        nothing = [None] * len(programs)
+        fit = _refit(programs, base.folds, known_start, nothing, information, least, worth, base.rough)
     except SteadyError as error:
         return str(error)
+    return replace(fit, rough=base.rough)
+
+
+def refit_elsewhere(base: Refit, near: Refit, variant: Variant, *, known_start: bool) -> Refit | str:
+    """The program with an effect at another knee, width or place, or why it cannot be fitted.
+
+    Args:
+        base: the program without.
+        near: with the effect at some place near, where the fit begins.
+        variant: the effect.
+        known_start: the first state is certain.
+    """
+    try:
+        programs = [with_effect(program, variant) for program in base.programs]
+        for program, fitted in zip(programs, near.programs, strict=True):
+            program.load_state_dict(fitted.state_dict())
+        return _refit(programs, near.folds, known_start, [None] * len(programs))
+    except SteadyError as error:
+        return str(error)
+
+
+def as_declared(declared: Program, fitted: Program) -> Program:
+    """A copy of a fitted program with its own parameters as declared; the coefficients of its effects stay."""
+    program, values = copy.deepcopy(fitted), dict(declared.named_parameters())
+    coefficients = {known.parameter for known in attached(fitted)}
+    for name, parameter in program.named_parameters():
+        if name in values and name.removesuffix("_unconstrained") not in coefficients:
+            parameter.data.copy_(values[name].data)
+    return program
 
 
 def _refit(
@@ -211,39 +257,42 @@ def _refit(
     folds: list[Fold],
     known_start: bool,
     maxima: Sequence[Maximum | None],
-    information: Tensor | None,
+    information: Tensor | None = None,
     least: Sequence[float] = (-math.inf, -math.inf),
     worth: Worth = ALWAYS,
+    rough: Program | None = None,
 ) -> Refit:
-    found, held_out, moved = [], [], []
+    fitted, found, held_out, judged_folds = list[Program](), [], [], []
     for program, fold, known, floor in zip(programs, folds, maxima, least, strict=True):
         drives, unseen = wide_drives(fold.drives, program), wide_drives(fold.held_out, program)
-        share = len(fold.drives) / len(folds[0].drives)
+        share, path = len(fold.drives) / len(folds[0].drives), wide(fold.held_out_path, program)
         guess = None if information is None else share * information
+        afresh = None if rough is None else _afresh(as_declared(rough, program), drives, known_start, floor)
+        if afresh is not None:
+            floor = max(floor, float(afresh[1].log_likelihood.sum()))
         maximum = known or maximise(
-            program,
-            drives,
-            wide(fold.path, program),
-            known_start=known_start,
-            information=guess,
-            hopeless=floor,
+            program, drives, wide(fold.path, program), known_start=known_start, information=guess, hopeless=floor
         )
-        judged = smooth(
-            program,
-            unseen,
-            wide(fold.held_out_path, program),
-            known_start=known_start,
-            passes=15,
-            tolerance=0.02,
-            kernels=False,
-        )
+        if afresh is not None and afresh[1].objective > maximum.objective:
+            program, maximum = afresh
+            path = find_path(program, unseen, known_start=known_start)
+        judged = smooth(program, unseen, path, known_start=known_start, passes=15, tolerance=0.02, kernels=False)
         require_found(judged, unseen)
+        fitted.append(program)
         found.append(maximum)
         held_out.append(judged.log_likelihood)
-        moved.append(Fold(drives, maximum.path, unseen, means_as_path(judged, unseen)))
+        judged_folds.append(Fold(drives, maximum.path, unseen, means_as_path(judged, unseen)))
         if float(maximum.log_likelihood.sum()) < worth.drives and float(judged.log_likelihood.sum()) < worth.held_out:
             break
-    return Refit(programs[: len(found)], found, moved, torch.cat(held_out))
+    return Refit(fitted, found, judged_folds, torch.cat(held_out))
+
+
+def _afresh(program: Program, drives: Trajectories, known_start: bool, floor: float) -> tuple[Program, Maximum] | None:
+    """A fit whose paths are found anew; None where the program cannot follow the drives."""
+    try:
+        return program, maximise(program, drives, known_start=known_start, hopeless=floor)
+    except FilterError:
+        return None
 
 
 def _there(program: Program, variant: Variant) -> Variant:

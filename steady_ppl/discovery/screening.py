@@ -123,7 +123,7 @@ def screen(
         alive = [test for test in tests if test is not None]
         excited = any(bool((before[_slice(columns, i)] > 0).any()) for i in members)
         found.append(_of_group(columns[members[0]], alive, len(sums), CONTAINED if excited else UNEXCITED))
-        chosen.append(min(alive, key=lambda test: test.p_values[0]).at if alive else _slice(columns, members[0]))
+        chosen.append(min(alive, key=lambda test: test.rank).at if alive else _slice(columns, members[0]))
         curves += [
             _of_group(test.column, [test], len(sums), "")[0]
             for test in alive
@@ -133,7 +133,7 @@ def screen(
         found.append(_departed(departure, information[own, own], scores[:, own]))
         chosen.append(slice(0, 0))
     family = np.stack([p_values for _, p_values in found]).min(0)
-    critical = float(np.quantile(family[1:], LEVEL))
+    critical = _critical(family[1:])
     tested = [replace(t, detection_limit=_limit(t, critical)) for t, _ in found]
     own_step = torch.linalg.lstsq(information[own, own], scores[0, own]).solution if fitted else scores[0, own]
     order = sorted(range(len(tested)), key=lambda i: (tested[i].p_value, -tested[i].statistic))
@@ -147,6 +147,12 @@ def screen(
     )
 
 
+def _critical(simulated: np.ndarray) -> float:
+    """The largest p-value below which the family's own p-value, (1 + sets as extreme) / (1 + sets), keeps the level."""
+    allowed = int(LEVEL * (len(simulated) + 1)) - 1
+    return float(np.nextafter(np.sort(simulated)[max(0, allowed)], 0.0))
+
+
 @dataclass(frozen=True)
 class _Found:
     column: Column
@@ -158,6 +164,11 @@ class _Found:
     alone: np.ndarray
     evidence: float = 0.0
 
+    @property
+    def rank(self) -> tuple[float, float]:
+        """Small where much is found, also where p-values are too small to be told apart."""
+        return float(self.p_values[0]), -self.statistic
+
 
 def _of_group(column: Column, alive: list[_Found], sets: int, otherwise: str) -> tuple[Tested, np.ndarray]:
     """The test of the best of several columns, and its p-values in every set; where there is none, why."""
@@ -167,7 +178,7 @@ def _of_group(column: Column, alive: list[_Found], sets: int, otherwise: str) ->
         return Tested(column, 0.0, 1.0, nothing, endless, endless, untestable=otherwise), np.ones(sets + 1)
     p_values = np.stack([test.p_values for test in alive])
     effective = _effective(p_values[:, 1:].min(0)) if len(alive) > 1 else 1.0
-    best = alive[int(p_values[:, 0].argmin())]
+    best = min(alive, key=lambda test: test.rank)
     together = -np.expm1(effective * np.log1p(-np.minimum(p_values.min(0), 1 - 1e-12)))
     tested = Tested(
         column=best.column,
@@ -245,7 +256,7 @@ def _departed(departure: Departure, information: Tensor, scores: Tensor) -> tupl
     sd = float((departure.slope @ step).sqrt())
     z = torch.cat([torch.tensor([departure.away]).double(), scores[1:] @ step]).numpy() / sd
     p_values = 2 * stats.norm.sf(np.abs(z))
-    sd *= departure.factor
+    sd *= math.sqrt(departure.share) * departure.factor
     tested = Tested(
         column=Column(departure.variant),
         statistic=float(z[0] ** 2),

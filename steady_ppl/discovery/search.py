@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from steady_ppl.data import Trajectories
 from steady_ppl.discovery.candidates import (
     NATS,
+    NEARLY,
     NO_DOUBT,
     Candidate,
     Screening,
@@ -75,7 +76,7 @@ class Found:
         """Those that these drives cannot tell from the best, itself first."""
         best = self.candidate.total
         close = [c for c in self.candidates if c.total >= best - NATS]
-        return [c for c in close if c is self.candidate or not c.against_its_sign]
+        return [self.candidate, *(c for c in close if c is not self.candidate and not c.against_its_sign)]
 
 
 @dataclass
@@ -175,8 +176,8 @@ def search(
         gains = best is not None
         if index == 0 and not gains:
             found.curves = _curves(found.base, screening, settings, report)
-        if index == 0 and not gains and able and found.needs_a_name:
-            best = able[0] if able[0].total > NATS else None
+        if index == 0 and not gains and found.needs_a_name:
+            best = next((c for c in able if c.total > NATS and c.tested.p_value <= NEARLY), None)
         if best is None:
             found.rounds[-1] = Round(screening, candidates, None)
             break

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,7 +9,7 @@ import torch
 
 from steady_ppl.actuation import delayed, lagged
 from steady_ppl.data import Trajectories
-from steady_ppl.effects.declaration import Effect
+from steady_ppl.effects.declaration import Effect, power_of_two_below
 from steady_ppl.effects.planar_forces import not_planar
 from steady_ppl.program import Program, names, units
 
@@ -50,12 +49,11 @@ def _per_unit(program: Program, data: Trajectories | None) -> Sequence[Mapping[s
 
 
 def _size(data: Trajectories | None, controls: Sequence[str]) -> float:
-    """The power of two below the largest command; one where there are no drives."""
+    """Of the largest command."""
     if data is None:
         return 1.0
     columns = [data.control_names.index(name) for name in controls]
-    largest = float(data.controls[..., columns][data.rows].abs().amax())
-    return 2.0 ** math.floor(math.log2(largest)) if largest > 0 else 1.0
+    return power_of_two_below(float(data.controls[..., columns][data.rows].abs().amax()))
 
 
 def _knees(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:

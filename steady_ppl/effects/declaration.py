@@ -45,6 +45,11 @@ VERDICTS = {
 Choices = Callable[[Program, Trajectories | None], Sequence[Mapping[str, Any]]]
 
 
+def power_of_two_below(size: float) -> float:
+    """For a coefficient to be learned in units of; one where nothing has a size."""
+    return 2.0 ** math.floor(math.log2(size)) if size > 0 else 1.0
+
+
 def one_choice(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
     """An effect that acts in one way only."""
     return [{}]

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from steady_ppl.data import Trajectories
-from steady_ppl.effects.declaration import Effect
+from steady_ppl.effects.declaration import Effect, power_of_two_below
 from steady_ppl.effects.planar_forces import not_planar
 from steady_ppl.planar_vehicle import PlanarVehicle
 from steady_ppl.program import Program, names, units
@@ -22,12 +21,11 @@ def _each_of_its_size(program: Program, data: Trajectories | None) -> Sequence[M
 
 
 def _spread(data: Trajectories | None, component: int) -> float:
-    """The power of two below a measurement's standard deviation over all drives; one where there are none."""
+    """Of a measurement, over all drives."""
     if data is None:
         return 1.0
     values = data.measurements[..., component][data.observed[..., component]].double()
-    spread = float(values.std()) if len(values) > 1 else 0.0
-    return 2.0 ** math.floor(math.log2(spread)) if spread > 0 else 1.0
+    return power_of_two_below(float(values.std()) if len(values) > 1 else 0.0)
 
 
 def _one_landmark(program: Program) -> str | None:
