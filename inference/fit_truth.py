@@ -18,7 +18,7 @@ def fit(
     weight_decay: float = 1.0,
     averaging: float = 0.98,
     validate_every: int = 50,
-    validation_particles: int = 2000,
+    validation_particles: int | None = None,
     patience: int = 5,
     seed: int = 0,
     **run,
@@ -31,6 +31,7 @@ def fit(
         valid: held-out drives.
         known_start: the first row's true state is given to the filter of the validation.
         steps: gradient steps, each on all drives.
+        validation_particles: N of the filter that judges the held-out drives, see `Validation.suited`.
         run: checkpoint, resume and progress of `train`.
     """
     settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
@@ -45,9 +46,16 @@ def fit(
         validate_every=validate_every,
         patience=patience,
     )
-    held_out = for_program(program, valid) if valid is not None else None
-    validation = Validation(held_out, particles=validation_particles, known_start=known_start)
+    validation = Validation.suited(program, valid, known_start=known_start, particles=validation_particles)
     trained = train(
         program, TruthGuide(program), data, validation, optimization, known_start=known_start, seed=seed, **run
     )
-    return Fit(program, "fit-truth", settings, seed=seed, known_start=known_start, trained=trained)
+    return Fit(
+        program,
+        "fit-truth",
+        settings,
+        seed=seed,
+        known_start=known_start,
+        trained=trained,
+        notes=validation.notes,
+    )

@@ -27,7 +27,8 @@ from steady_ppl import (
 )
 
 # What the paper and its authors' code use, best with AuthorsHovercraft or AuthorsTruck; hours on two cores:
-# steady.fit(program, table, valid, **PAPER). They kept the single best validation; `train` the latest within an error.
+# steady.fit(program, table, valid, **PAPER). They kept the single best validation, by a bootstrap of 100,000 particles
+# at 1 Hz; `train` keeps the latest within an error, by the filter that looks ahead.
 PAPER = {
     "guide": "bootstrap",
     "particles": 20_000,
@@ -43,18 +44,16 @@ PAPER = {
     "first_weight": 0.001,
     "ramp": 1.0,
     "validate_every": 500,
-    "validation_particles": 100_000,
     "patience": 30,
 }
 
 GUIDES = {"gaussian": GaussianGuide, "lookahead": LookaheadGuide, "bootstrap": SMCGuide}
 
-# What two cores afford. The first two need normal noise; they are judged at every row by the filter that looks ahead,
-# the bootstrap at every tenth row, where it needs fewer particles.
+# What two cores afford. The first two need normal noise.
 DEFAULTS = {
-    "lookahead": {"particles": 100, "draws": 64, "gradient_steps": 1, "validation_particles": 100},
-    "gaussian": {"draws": 30, "gradient_steps": 1, "validation_particles": 100},
-    "bootstrap": {"particles": 600, "draws": 64, "gradient_steps": 2, "validation_particles": 2000},
+    "lookahead": {"particles": 100, "draws": 64, "gradient_steps": 1},
+    "gaussian": {"draws": 30, "gradient_steps": 1},
+    "bootstrap": {"particles": 600, "draws": 64, "gradient_steps": 2},
 }
 
 
@@ -97,7 +96,7 @@ def fit(
         steps: number of E steps.
         gradient_steps: Adam steps on the draws of each E step.
         learning_rate, betas, final_rate, weight_decay, averaging, batch, validate_every, patience: see `Optimization`.
-        validation_particles: N of the filter that judges the held-out drives.
+        validation_particles: N of the filter that judges the held-out drives, see `Validation.suited`.
         first_weight: the observation weight at the first step.
         ramp: share of the training over which it grows to 1.
         run: checkpoint, resume and progress of `train`.
@@ -127,16 +126,11 @@ def fit(
         known_start=known_start,
         **{name: settings[name] for name in ("particles", "draws") if name in DEFAULTS[guide]},
     )
-    optimization = Optimization(**{field.name: settings[field.name] for field in dataclasses.fields(Optimization)})
-    held_out = for_program(program, valid) if valid is not None else None
-    looks_ahead = guide != "bootstrap"
-    validation = Validation(
-        held_out,
-        particles=settings["validation_particles"],
-        known_start=known_start,
-        every=1 if looks_ahead else 10,
-        look_ahead=looks_ahead,
+    optimization = Optimization(
+        **{field.name: settings[field.name] for field in dataclasses.fields(Optimization) if field.name in settings}
     )
+    validation = Validation.suited(program, valid, known_start=known_start, particles=validation_particles)
+    notes += validation.notes
     trained = train(program, e_step, data, validation, optimization, known_start=known_start, seed=seed, **run)
     if e_step.in_plain_torch:
         notes.append(f"the E steps ran in plain torch, without compiled kernels: {e_step.in_plain_torch}")

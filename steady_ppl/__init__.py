@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from steady_ppl.actuation import delayed, lagged
     from steady_ppl.altering import Coloured, blurred, channel_means, heavy_tailed, misread, pushed, widened
+    from steady_ppl.auto_rollout import AutoRollout
     from steady_ppl.checking import Check, check
     from steady_ppl.data import Trajectories
     from steady_ppl.discovery import Discovery, discover
@@ -23,52 +24,61 @@ if TYPE_CHECKING:
         TrainingError,
         UsageError,
     )
-    from steady_ppl.filtering import log_likelihood, neglected, run_filter, smoothed_states
+    from steady_ppl.filtering import choose_filter, log_likelihood, neglected, run_filter, smoothed_states
     from steady_ppl.fit import Fit
+    from steady_ppl.fixes import fixes
     from steady_ppl.guides import PathGuide, SMCGuide, TruthGuide
+    from steady_ppl.inference_network import InferenceNetwork
     from steady_ppl.joint import Joint
     from steady_ppl.linearization import why_not_linear
     from steady_ppl.linearized_guides import GaussianGuide, LookaheadGuide
     from steady_ppl.particles import particle_filter, roll_out
     from steady_ppl.paths import Filtered, Paths
-    from steady_ppl.planar_vehicle import PlanarVehicle, WrappedNormal, bearings_to, dense, stack, wrap
+    from steady_ppl.planar_vehicle import PlanarVehicle, UnknownMap, WrappedNormal, bearings_to, dense, stack, wrap
     from steady_ppl.program import Program, for_program
     from steady_ppl.program_file import load_program
     from steady_ppl.proof_pictures import open_loop_picture
     from steady_ppl.proving import Proof, prove
     from steady_ppl.seeding import seeded
     from steady_ppl.simulation import simulate
+    from steady_ppl.smoother_guide import SmootherGuide
     from steady_ppl.table import read_table, write_table
     from steady_ppl.tempering import Constant, LinearRamp
     from steady_ppl.training import Optimization, Trained, train
     from steady_ppl.validation import Validation
+    from steady_ppl.variational_guides import VariationalGuide
 
 _HOMES = {
     "actuation": ("delayed", "lagged"),
     "altering": ("Coloured", "blurred", "channel_means", "heavy_tailed", "misread", "pushed", "widened"),
+    "auto_rollout": ("AutoRollout",),
     "checking": ("Check", "check"),
     "data": ("Trajectories",),
     "discovery": ("Discovery", "discover"),
     "errors": ("DataError", "FilterError", "ProgramError", "RunError", "SteadyError", "TrainingError", "UsageError"),
-    "filtering": ("log_likelihood", "neglected", "run_filter", "smoothed_states"),
+    "filtering": ("choose_filter", "log_likelihood", "neglected", "run_filter", "smoothed_states"),
     "fit": ("Fit",),
+    "fixes": ("fixes",),
     "guides": ("PathGuide", "SMCGuide", "TruthGuide"),
+    "inference_network": ("InferenceNetwork",),
     "joint": ("Joint",),
     "linearization": ("why_not_linear",),
     "linearized_guides": ("GaussianGuide", "LookaheadGuide"),
     "particles": ("particle_filter", "roll_out"),
     "paths": ("Filtered", "Paths"),
-    "planar_vehicle": ("PlanarVehicle", "WrappedNormal", "bearings_to", "dense", "stack", "wrap"),
+    "planar_vehicle": ("PlanarVehicle", "UnknownMap", "WrappedNormal", "bearings_to", "dense", "stack", "wrap"),
     "program": ("Program", "for_program"),
     "program_file": ("load_program",),
     "proof_pictures": ("open_loop_picture",),
     "proving": ("Proof", "prove"),
     "seeding": ("seeded",),
     "simulation": ("simulate",),
+    "smoother_guide": ("SmootherGuide",),
     "tempering": ("Constant", "LinearRamp"),
     "table": ("read_table", "write_table"),
     "training": ("Optimization", "Trained", "train"),
     "validation": ("Validation",),
+    "variational_guides": ("VariationalGuide",),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 __all__ = sorted(_HOME)  # pyright: ignore

@@ -46,13 +46,17 @@ class Device(StrEnum):
 
 
 class GuideName(StrEnum):
-    """The E step."""
+    """The E step of STEADY, and the guides of SVI."""
 
     lookahead = "lookahead"
     gaussian = "gaussian"
     bootstrap = "bootstrap"
+    network = "network"
+    mean_field = "mean-field"
+    smoother = "smoother"
 
 
+RECIPES = "steady, steady-minus, svi, hand, fit-hand, fit-tv, fit-truth, or a recipe of your own: PATH.py."
 Seed = Annotated[int, typer.Option(help="Random seed.", min=0)]
 Out = Annotated[Path, typer.Option("--out", help="Table to write, .csv or .parquet.")]
 
@@ -110,8 +114,11 @@ def fit(
     table: Annotated[Path, typer.Argument(help="Training drives, .csv or .parquet.")],
     out: Annotated[Path, typer.Option("--out", help="Run folder to write.")],
     valid: Annotated[Path | None, typer.Option(help="Held-out drives that decide when to stop.")] = None,
-    recipe: Annotated[str, typer.Option(help="steady, hand, fit-truth, or a recipe of your own: PATH.py.")] = "steady",
-    guide: Annotated[GuideName | None, typer.Option(help="The E step.")] = None,
+    recipe: Annotated[str, typer.Option(help=RECIPES)] = "steady",
+    guide: Annotated[
+        GuideName | None, typer.Option(help="The E step: the first three steady's, the others svi's.")
+    ] = None,
+    hand: Annotated[str | None, typer.Option(help="The program written by hand, for fit-hand.")] = None,
     known_start: Annotated[bool, typer.Option(help="Give the first row's x. columns as the exact start.")] = False,
     particles: Annotated[int | None, typer.Option(help="Particles for each drive.", min=1)] = None,
     draws: Annotated[int | None, typer.Option(help="Paths for each drive in the M step.", min=1)] = None,
@@ -129,7 +136,8 @@ def fit(
     from steady_ppl.run_recipe import run_recipe
     from steady_ppl.table import read_table
 
-    given: dict[str, Any] = {"particles": particles, "draws": draws, "steps": steps, "guide": guide and guide.value}
+    given: dict[str, Any] = {"particles": particles, "draws": draws, "steps": steps, "hand": hand}
+    given["guide"] = guide and guide.value
     result = run_recipe(
         recipe,
         program_from(model, seed),
@@ -166,6 +174,9 @@ def evaluate(
     particles: Annotated[int | None, typer.Option(help="Particles of the filters.", min=2)] = None,
     rollouts: Annotated[int, typer.Option(help="Noisy roll-outs from each true state.", min=1)] = 1000,
     seed: Seed = 0,
+    surveyed: Annotated[
+        str | None, typer.Option("--map", help="A program with the true landmarks, for runs that learned theirs.")
+    ] = None,
     program: Annotated[
         list[str] | None,
         typer.Option(
@@ -177,6 +188,7 @@ def evaluate(
     from steady_ppl.evaluation import evaluate as judge
     from steady_ppl.evaluation import table_of
     from steady_ppl.fit import Fit
+    from steady_ppl.program_file import load_program
     from steady_ppl.table import read_table
 
     if len(arguments) < 2:
@@ -187,9 +199,14 @@ def evaluate(
     sources: list[str | None] = [*program] if program else [None] * len(runs)
     fits = [Fit.load(run, source) for run, source in zip(runs, sources, strict=True)]
     drives = read_table(table)
-    results = [judge(fit, drives, particles=particles, rollouts=rollouts, seed=seed) for fit in fits]
+    true_map = load_program(surveyed) if surveyed else None
+    settings: dict[str, Any] = {"particles": particles, "rollouts": rollouts, "seed": seed, "surveyed": true_map}
+    results = [judge(fit, drives, **settings) for fit in fits]
     print(table_of(results, [f"{run.name} ({result['recipe']})" for run, result in zip(runs, results, strict=True)]))
     for run, result in zip(runs, results, strict=True):
+        if true_map is not None:
+            error = result["map"]
+            print(f"{run.name}: landmarks off by {error['rms']:.3g} m rms, {error['most']:.3g} m at most")
         if result["filter"] != "lookahead":
             say(f"{run}: judged by the filter {result['filter']}")
     if json_file is not None:

@@ -11,8 +11,8 @@ from steady_ppl.data import Trajectories
 from steady_ppl.filtering import choose_filter, log_likelihood
 from steady_ppl.fit import Fit
 from steady_ppl.measurement_errors import measurement_errors
-from steady_ppl.metrics import forward, forward_mean, state_estimation
-from steady_ppl.program import for_program
+from steady_ppl.metrics import forward, forward_mean, map_errors, state_estimation
+from steady_ppl.program import Program, for_program
 from steady_ppl.seeding import seeded
 
 
@@ -24,6 +24,7 @@ def evaluate(
     rollouts: int = 1000,
     look_ahead: bool | None = None,
     seed: int = 0,
+    surveyed: Program | None = None,
 ) -> dict[str, Any]:
     """Errors of one fitted program; equal seeds give every program the same random numbers.
 
@@ -34,10 +35,12 @@ def evaluate(
         rollouts: noisy roll-outs from each true state.
         look_ahead: whether log p(y) and the states come from a filter that looks ahead; None where the program allows.
         seed: of the Monte-Carlo draws.
+        surveyed: a program with the true landmarks, if the map is to be judged.
 
     Returns:
         `filter` ("lookahead", or "bootstrap" and why), `log_likelihood` (mean per trajectory at every tenth row),
-        `forward`, `forward_mean`, `state_estimation` (error groups; empty without true states) and `measurement`.
+        `forward`, `forward_mean`, `state_estimation` (error groups; empty without true states), `measurement` and, if
+        asked for, `map` (see `map_errors`).
     """
     program, known_start = fit.program, fit.known_start
     data = for_program(program, table)
@@ -60,6 +63,8 @@ def evaluate(
             result["state_estimation"] = state_estimation(program, data, **settings)
     with seeded(seed, "measurement"):
         result["measurement"] = measurement_errors(program, data, particles=2000, known_start=known_start)
+    if surveyed is not None:
+        result["map"] = map_errors(program, surveyed)
     return result
 
 

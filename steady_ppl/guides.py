@@ -60,21 +60,7 @@ class PathGuide:
         """The guide of the model `Joint`; `data` are the trajectories of the last `refresh`."""
         if self.paths is None:
             raise RuntimeError("refresh(data, progress) must run before the guide does")
-        paths = self.paths
-        rows, trajectories = data.time.shape
-
-        def known(site: str, value: torch.Tensor) -> None:
-            pyro.sample(site, dist.Delta(value if self.draws > 1 else value[0], event_dim=paths.event_dims[site]))
-
-        with pyro.plate("trajectory", trajectories, dim=-1):
-            with pyro.plate("row", rows, dim=-2), masked(data.rows):
-                known("states", paths.states)
-            with pyro.plate("first_row", 1, dim=-2):
-                for site, value in paths.start.items():
-                    known(site, value)
-            with pyro.plate("interval", rows - 1, dim=-2), masked(data.transitions):
-                for site, value in paths.noise.items():
-                    known(site, value)
+        sample_known(self.paths, data)
 
 
 class FilteringGuide(PathGuide):
@@ -160,3 +146,22 @@ class TruthGuide(PathGuide):
         if data is not self._of:
             self.paths, self._of = true_paths(self.program, data), data
         return {}
+
+
+def sample_known(paths: Paths, data: Trajectories) -> None:
+    """Sample the sites of `Joint` as certainties at given paths of `data`, draws on the left if several."""
+    rows, trajectories = data.time.shape
+    several = len(paths.states) > 1
+
+    def known(site: str, value: torch.Tensor) -> None:
+        pyro.sample(site, dist.Delta(value if several else value[0], event_dim=paths.event_dims[site]))
+
+    with pyro.plate("trajectory", trajectories, dim=-1):
+        with pyro.plate("row", rows, dim=-2), masked(data.rows):
+            known("states", paths.states)
+        with pyro.plate("first_row", 1, dim=-2):
+            for site, value in paths.start.items():
+                known(site, value)
+        with pyro.plate("interval", rows - 1, dim=-2), masked(data.transitions):
+            for site, value in paths.noise.items():
+                known(site, value)

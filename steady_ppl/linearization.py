@@ -19,6 +19,7 @@ from steady_ppl.compiled_rows import on_all_rows
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import ProgramError
 from steady_ppl.planar_vehicle import wrap
+from steady_ppl.probe import start_size, step_size
 from steady_ppl.program import Program, acting_controls, names
 from steady_ppl.sites import (
     AtMean,
@@ -147,12 +148,9 @@ def why_not_linear(program: Program, data: Trajectories, *, known_start: bool = 
         },
         lengths=data.lengths[:1].clamp(max=rows),
     )
-    seen = Recording()
     with running(rows - 1, 1):
         state = broadcast_event(program.initial(), torch.Size((rows - 1, 1)), 1)
-        with seen:
-            program.transition(state, head.controls[:-1], head.elapsed[:-1], head.steps)
-    channels = sum(fn.event_shape.numel() for fn in seen.distributions.values())
+    channels = step_size(program)
     path = Path(state[:1].expand(rows, -1, -1), state.new_zeros((rows - 1, 1, channels)))
     try:
         linearize(program, head, path, known_start=known_start)
@@ -198,7 +196,7 @@ def _start(program: Program, data: Trajectories, first: Tensor, known_start: boo
 
     if known_start:
         return data.known_start - first, first.new_zeros((*first.shape, 1))
-    began, (start_noise,) = _derivatives(start, first.new_zeros((first.shape[0], _start_channels(program))))
+    began, (start_noise,) = _derivatives(start, first.new_zeros((first.shape[0], start_size(program))))
     return began - first, start_noise
 
 
@@ -234,13 +232,6 @@ def _on_a_circle(program: Program, data: Trajectories, state: Tensor) -> tuple[i
         apart[..., angles] = wrap(apart[..., angles])
         same &= (apart.abs() <= 0.01 * change.abs() + 1e-5 * (1 + states.abs())).flatten(1).all(1)
     return tuple(angle for angle, periodic in zip(angles, same[1:].tolist(), strict=True) if periodic)
-
-
-def _start_channels(program: Program) -> int:
-    seen = Recording()
-    with running(1, 1), seen:
-        program.initial()
-    return sum(fn.event_shape.numel() for fn in seen.distributions.values())
 
 
 @dataclass(frozen=True)

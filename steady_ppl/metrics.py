@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
+from steady_ppl.errors import UsageError
 from steady_ppl.filtering import in_parts, run_filter
 from steady_ppl.particles import roll_out
-from steady_ppl.planar_vehicle import wrap
+from steady_ppl.planar_vehicle import PlanarVehicle, wrap
 from steady_ppl.program import Program, acting_controls, error_groups, names
 from steady_ppl.sites import AtMean
 
@@ -121,3 +122,20 @@ def _end_of_roll_out(
     ):
         pass
     return state
+
+
+def map_errors(program: Program, surveyed: Program) -> Errors:
+    """How far a program's landmarks are from those of another, m: `rms` and `most`.
+
+    Raises:
+        UsageError: one of them has no landmarks, or another number of them.
+    """
+    places = []
+    for one in (program, surveyed):
+        if not isinstance(one, PlanarVehicle):
+            raise UsageError(f"program {type(one).__name__} has no landmarks: it is no PlanarVehicle")
+        places.append(torch.as_tensor(one.landmarks).detach().double().cpu())
+    if places[0].shape != places[1].shape:
+        raise UsageError(f"{len(places[0])} landmarks cannot be compared with {len(places[1])}")
+    squares = (places[0] - places[1]).square().sum(-1)
+    return {"rms": float(squares.mean().sqrt()), "most": float(squares.max().sqrt())}

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import matplotlib.pyplot as plt
+import numpy as np
+import torch
 from matplotlib.axes import Axes
 
 if TYPE_CHECKING:
@@ -18,7 +20,7 @@ def posterior_trajectories(
     posterior: arviz.InferenceData,
     trajectory: str,
     *,
-    landmarks: Sequence[Sequence[float]] = (),
+    landmarks: Sequence[Sequence[float]] | torch.Tensor = (),
     axes: Axes | None = None,
     color: str = POSTERIOR,
     label: str = "posterior draws",
@@ -42,7 +44,7 @@ def posterior_trajectories(
     if "true_x" in constants and bool(constants["true_x"].notnull().sum() > 1):
         axes.plot(constants["true_x"], constants["true_y"], color=TRUTH, lw=1.4, ls="--", label="truth")
     if len(landmarks):
-        xs, ys = zip(*landmarks, strict=True)
+        xs, ys = torch.as_tensor(landmarks).detach().cpu().unbind(-1)
         axes.plot(xs, ys, "^", color=LANDMARK, ms=8, label="landmark", clip_on=True)
     unit: Any = draws["x"].attrs.get("units", "")
     axes.set_xlabel(f"x [{unit}]")
@@ -53,3 +55,43 @@ def posterior_trajectories(
         if line.get_label() == label:
             line.set_rasterized(True)
     return axes
+
+
+def posterior_velocities(
+    posterior: arviz.InferenceData,
+    trajectory: str,
+    *,
+    axes: Sequence[Axes] | None = None,
+    color: str = POSTERIOR,
+    label: str = "posterior",
+) -> Sequence[Axes]:
+    """Longitudinal and lateral velocity in the body frame: median and 90 % of the draws, and the truth where it
+    is known.
+
+    Args:
+        posterior: of `Fit.posterior`, of a planar vehicle.
+        trajectory: its label.
+        axes: two, drawn on; new ones when not given.
+    """
+    axes = axes if axes is not None else plt.subplots(2, 1, figsize=(7, 4.5), sharex=True)[1]
+    draws = posterior["posterior"].sel(trajectory=trajectory, chain=0)
+    constants = posterior["constant_data"].sel(trajectory=trajectory)
+    time = constants["time"]
+    found = _in_body_frame(draws["heading"], draws["vx"], draws["vy"])
+    true = None
+    if "true_vx" in constants and bool(constants["true_vx"].notnull().sum() > 1):
+        true = _in_body_frame(*(constants[f"true_{name}"] for name in ("heading", "vx", "vy")))
+    for index, (one, name) in enumerate(zip(axes, ("longitudinal", "lateral"), strict=True)):
+        low, median, high = found[index].quantile([0.05, 0.5, 0.95], dim="draw")
+        one.fill_between(time, low, high, color=color, alpha=0.25, lw=0)
+        one.plot(time, median, color=color, lw=1.4, label=label)
+        if true is not None and not any(line.get_label() == "truth" for line in one.get_lines()):
+            one.plot(time, true[index], color=TRUTH, lw=1.2, ls="--", label="truth")
+        one.set_ylabel(f"{name} [m/s]")
+    axes[-1].set_xlabel("time [s]")
+    return axes
+
+
+def _in_body_frame(heading: Any, vx: Any, vy: Any) -> tuple[Any, Any]:
+    cos, sin = np.cos(heading), np.sin(heading)
+    return cos * vx + sin * vy, cos * vy - sin * vx

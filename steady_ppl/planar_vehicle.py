@@ -12,6 +12,7 @@ import torch
 from pyro.distributions import constraints
 from torch import Tensor, nn
 
+from steady_ppl.errors import ProgramError
 from steady_ppl.program import Program, names
 
 
@@ -35,6 +36,7 @@ class PlanarVehicle(Program):
         "velocity": ("vx", "vy"),
         "yaw_rate": ("yaw_rate",),
     }
+    derivatives: ClassVar = {"x": "vx", "y": "vy", "heading": "yaw_rate"}
     axes: ClassVar = {"translation": ("forward", "lateral"), "yaw": ("yaw",)}
     landmarks: Sequence[Sequence[float]] = ()
     bearing_sd: float
@@ -191,3 +193,39 @@ def _on_device(landmarks: Sequence[Sequence[float]] | Tensor, state: Tensor) -> 
 @lru_cache(maxsize=16)
 def _kept_on_device(landmarks: tuple[tuple[float, float], ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.tensor(landmarks, dtype=dtype, device=device)
+
+
+class UnknownMap(PlanarVehicle):
+    """A vehicle whose landmarks are not where they were declared: they are learned together with its dynamics.
+
+    To be put before a vehicle that declares them: `class Mine(UnknownMap, Hovercraft)`. What fixes the frame is known
+    starts, or else landmarks that are `surveyed` (two leave nothing free but what the start's prior says).
+
+    Attributes:
+        surveyed: which landmarks are where they are declared, by index.
+        map: `(K, 2)` m, learnable.
+    """
+
+    surveyed: Sequence[int] = ()
+    declared: Tensor
+    stays: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        declared = super().landmarks
+        if not len(declared):
+            raise ProgramError(
+                f"program {type(self).__name__}: UnknownMap stands before the vehicle that declares landmarks, as in "
+                "class Mine(UnknownMap, Hovercraft)",
+                site="__init__",
+            )
+        stays = torch.zeros(len(declared), 1, dtype=torch.bool)
+        stays[list(self.surveyed)] = True
+        self.register_buffer("declared", torch.tensor(declared), persistent=False)
+        self.register_buffer("stays", stays, persistent=False)
+        self.map = nn.Parameter(self.declared.clone())
+
+    @property
+    def landmarks(self) -> Tensor:  # type: ignore[override]
+        """Where they are taken to be, `(K, 2)` m."""
+        return torch.where(self.stays, self.declared, self.map)

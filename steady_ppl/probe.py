@@ -14,7 +14,7 @@ from torch import Tensor
 
 from steady_ppl.errors import ProgramError, SteadyError, one_line
 from steady_ppl.program import Program, names
-from steady_ppl.sites import Broadcasting, Observing, Recording, Replaying
+from steady_ppl.sites import Broadcasting, Observing, Recording, Replaying, broadcast_event, running
 
 DRAWS, ROWS, TRAJECTORIES = 7, 11, 13
 LEFT = (DRAWS, ROWS, TRAJECTORIES)
@@ -181,3 +181,22 @@ def _check_state(method: str, state: object, size: int) -> None:
             "shape on the left, with the component last",
             site=method,
         )
+
+
+def start_size(program: Program) -> int:
+    """How many numbers `initial` draws."""
+    seen = Recording()
+    with running(1, 1), seen:
+        program.initial()
+    return sum(fn.event_shape.numel() for fn in seen.distributions.values())
+
+
+def step_size(program: Program) -> int:
+    """How many numbers each `transition` draws."""
+    seen = Recording()
+    with running(1, 1):
+        state = broadcast_event(program.initial(), torch.Size((1, 1)), 1)
+        control, one = state.new_zeros(1, 1, len(program.controls)), state.new_ones(1, 1)
+        with seen:
+            program.transition(state, control, 0.0 * one, one)
+    return sum(fn.event_shape.numel() for fn in seen.distributions.values())

@@ -122,6 +122,11 @@ class Program(PyroModule, metaclass=_WithEffects):
         return control
 
     @property
+    def derivatives(self) -> Mapping[str, str]:
+        """State component → the one that is its rate of change."""
+        return {position: velocity for position, velocity in self.motion.values() if position and velocity}
+
+    @property
     def axes(self) -> Mapping[str, tuple[str, ...]]:
         """Channels that one coefficient of a generic effect can belong to, by the name of the group; each channel of
         `motion` alone unless a program knows better."""

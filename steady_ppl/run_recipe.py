@@ -15,7 +15,7 @@ import torch
 from steady_ppl.checkpoint import read_tensors
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import RunError, UsageError
-from steady_ppl.fit import Fit, program_source, versions
+from steady_ppl.fit import Fit, program_source, sha256, versions
 from steady_ppl.program import Program, for_program
 from steady_ppl.program_file import run_file
 from steady_ppl.run_folder import CHECKPOINT, read_record, run_folder, write_record
@@ -107,6 +107,7 @@ def run_recipe(
         "known_start": known_start,
         "seed": seed,
         "options": json.loads(json.dumps(dict(options))),  # as the record will say them
+        "option_files": _files(options),
         "table_sha256": fingerprint(table),
         "valid_sha256": fingerprint(valid) if valid is not None else None,
         "versions": versions(),
@@ -142,12 +143,22 @@ def fingerprint(table: Trajectories) -> str:
     return digest.hexdigest()
 
 
+def _files(options: Mapping[str, Any]) -> dict[str, str]:
+    """Hashes of the programs that options name."""
+    named = {name: Path(value.partition(".py")[0] + ".py") for name, value in options.items() if ".py" in str(value)}
+    return {name: sha256(file) for name, file in named.items() if file.is_file()}
+
+
 def _require_same(folder: Path, begun: Mapping[str, Any]) -> None:
     before = read_record(folder)
     for key in ("program", "table_sha256", "valid_sha256"):
         if before.get(key) != begun[key]:
             what = {"program": "program", "table_sha256": "training table", "valid_sha256": "--valid table"}[key]
             raise RunError(f"{folder}: --resume goes on with the same {what}, but it is another or has changed since")
+    if before.get("option_files", {}) != begun["option_files"]:
+        raise RunError(
+            f"{folder}: --resume goes on with the same {' and '.join(begun['option_files'])}; a file has changed"
+        )
     for key in ("recipe", "known_start", "seed", "options"):
         if before.get(key) != begun[key]:
             raise RunError(f"{folder}: --resume needs the same {key}: {before.get(key)} then, {begun[key]} now")

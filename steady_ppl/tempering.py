@@ -33,4 +33,4 @@ class LinearRamp:
     share: float = 1.0
 
     def __call__(self, progress: float) -> float:
-        return min(1.0, self.first + (1 - self.first) * progress / self.share) if self.share > 0 else 1.0
+        return self.first + (1 - self.first) * min(1.0, progress / self.share) if self.share > 0 else 1.0

@@ -52,6 +52,7 @@ class Optimization:
         final_rate: share of the learning rate at the end.
         weight_decay: of the matrices of `torch.nn.Linear`, decoupled; each step shrinks them by learning rate × decay
             (the authors' code: 1).
+        gradient_norm: every array's gradient is scaled down to this norm at most; None leaves it.
         averaging: weight of the past in the running mean of the parameters; that mean is validated and returned.
         batch: trajectories an E step, all when None.
         validate_every: E steps between two validations.
@@ -64,6 +65,7 @@ class Optimization:
     betas: tuple[float, float] = (0.9, 0.99)
     final_rate: float = 0.05
     weight_decay: float = 1.0
+    gradient_norm: float | None = None
     averaging: float = 0.98
     batch: int | None = None
     validate_every: int = 25
@@ -157,6 +159,9 @@ def train(
                         optimizer.zero_grad()
                         loss.backward()
                         _require_finite_gradients(state.parameters, state.step)
+                        if optimization.gradient_norm is not None:
+                            for value in state.parameters.values():
+                                nn.utils.clip_grad_norm_(value, optimization.gradient_norm)
                         optimizer.step()
                 state.step += 1
                 keep = min(optimization.averaging, (state.step - 1) / (state.step + 9))
@@ -249,7 +254,8 @@ def _groups(program: Program, guide: Guide, optimization: Optimization) -> list[
         rate = optimization.learning_rate * relative(program.rates, name)
         groups.append({"params": [value], "lr": rate, "weight_decay": decay})
     for value in _guide_parameters(guide).values():
-        groups.append({"params": [value], "lr": optimization.learning_rate, "weight_decay": 0.0})
+        rate = optimization.learning_rate * getattr(guide, "rate", 1.0)
+        groups.append({"params": [value], "lr": rate, "weight_decay": 0.0})
     return groups
 
 

@@ -10,8 +10,9 @@ import torch
 
 from steady_ppl.data import Trajectories
 from steady_ppl.filtering import log_likelihood
+from steady_ppl.linearization import why_not_linear
 from steady_ppl.particles import STEPS_WORTH_COMPILING
-from steady_ppl.program import Program
+from steady_ppl.program import Program, for_program
 from steady_ppl.seeding import seeded
 
 SEVERAL = 10  # validations are in a training
@@ -27,6 +28,7 @@ class Validation:
         known_start: start at the true first state.
         every: use every n-th row's measurements (10 Hz to 1 Hz).
         look_ahead: with a filter that looks ahead; `particles` can then be a twentieth.
+        reason: why it does not, where that was wanted.
     """
 
     data: Trajectories | None = None
@@ -34,6 +36,32 @@ class Validation:
     known_start: bool = False
     every: int = 10
     look_ahead: bool = False
+    reason: str | None = None
+
+    @property
+    def notes(self) -> list[str]:
+        """What a fit should say of it."""
+        if self.reason is None:
+            return []
+        return [f"held-out drives were judged by the bootstrap filter at every tenth row: {self.reason}"]
+
+    @classmethod
+    def suited(
+        cls, program: Program, table: Trajectories | None, *, known_start: bool = False, particles: int | None = None
+    ) -> Validation:
+        """Looking ahead at every row where the program's noise is normal, else by the bootstrap at every tenth.
+
+        Args:
+            table: the held-out drives, if there are any.
+            particles: N; 100 looking ahead and 2000 otherwise when not given.
+        """
+        if table is None:
+            return cls(None, known_start=known_start)
+        data = for_program(program, table)
+        reason = why_not_linear(program, data, known_start=known_start)
+        if reason is not None:
+            return cls(data, particles or 2000, known_start, reason=reason)
+        return cls(data, particles or 100, known_start, every=1, look_ahead=True)
 
     def __call__(self, program: Program, seed: int) -> list[float]:
         """Log p(y) of each held-out trajectory."""

@@ -101,7 +101,10 @@ def test_a_class_that_is_no_complete_program_is_refused(tmp_path: Path, refused)
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (("--recipe", "magic"), "no recipe 'magic'; there are fit-truth, hand, steady"),
+        (
+            ("--recipe", "magic"),
+            "no recipe 'magic'; there are fit-hand, fit-truth, fit-tv, hand, steady, steady-minus, svi",
+        ),
         (("--recipe", "mine.py"), "no recipe file mine.py"),
         (("--recipe", "hand", "--particles", "9"), "recipe hand has no setting particles; it has none"),
         (

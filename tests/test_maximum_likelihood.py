@@ -9,7 +9,8 @@ import pytest
 import torch
 from examples import drives, example
 
-from steady_ppl.discovery.refits import first_refit, refit_with, roomy_path
+from steady_ppl.discovery.candidates import gain_of_fits
+from steady_ppl.discovery.refits import first_refit, refit_elsewhere, refit_with, roomy_path
 from steady_ppl.effects import chosen_variant
 from steady_ppl.elements import elements
 from steady_ppl.gaussian_smoother import smooth
@@ -100,3 +101,31 @@ def test_drives_are_judged_by_fits_that_have_not_seen_them():
     again = maximise(copy.deepcopy(found.programs[0]), train, found.folds[0].path, known_start=True)
     assert again.objective == pytest.approx(found.maxima[0].objective, abs=0.1)
     assert float((found.held_out - base.held_out).sum()) > 5
+
+
+def test_fits_begin_at_the_declared_noise_as_well_where_the_program_alone_explains_nothing():
+    """A sensor far worse than declared: without it, only process noise beyond all measure explains the drives."""
+    truth, program = example("hovercraft"), example("hovercraft")
+    for one in (truth, program):
+        one.noise = torch.tensor([0.08, 0.08, 0.05]).double()
+    truth = truth.with_effect("range_dependent_noise", 0.2)
+    train, valid = drives(truth, 4, 41, seed=1), drives(truth, 4, 41, seed=2)
+    base = first_refit(program, train, valid, known_start=True, seed=0)
+    assert base.rough is not None and float(base.program.noise.detach().max()) > 20 * 0.05
+    variant = chosen_variant(program, "range_dependent_noise", "")
+    found = refit_with(base, variant, 0.05, known_start=True)
+    assert not isinstance(found, str)
+    assert float(found.coefficient(variant)) == pytest.approx(0.2, rel=0.3)
+    assert all(float(one.noise.detach().max()) < 0.2 for one in found.programs)
+
+
+def test_a_fit_at_another_knee_is_the_one_from_nothing():
+    truth, program = example("hovercraft").with_effect("thrust_saturation", 0.8, knee=0.6), example("hovercraft")
+    train, valid = drives(truth, 5, 41, seed=1), drives(truth, 5, 41, seed=2)
+    base = first_refit(program, train, valid, known_start=True, seed=0)
+    assert base.rough is None
+    knees = [chosen_variant(program, "thrust_saturation", knee=knee) for knee in (0.5, 0.65)]
+    direct = [refit_with(base, knee, 0.5, known_start=True) for knee in knees]
+    near = refit_elsewhere(base, direct[0], knees[1], known_start=True)
+    assert gain_of_fits(base, near) == pytest.approx(gain_of_fits(base, direct[1]), abs=0.2)
+    assert float((near.held_out - direct[1].held_out).sum()) == pytest.approx(0.0, abs=0.5)

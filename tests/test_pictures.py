@@ -15,7 +15,7 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 
-from steady_ppl.pictures import posterior_trajectories
+from steady_ppl.pictures import posterior_trajectories, posterior_velocities
 
 
 @pytest.fixture(scope="module")
@@ -78,3 +78,15 @@ def test_without_truth_or_with_the_start_alone_no_truth_is_drawn() -> None:
 def test_a_trajectory_that_is_not_there_is_an_error(drawn) -> None:
     with pytest.raises(KeyError):
         posterior_trajectories(drawn, "nine")
+
+
+def test_velocities_are_those_of_the_body(drawn) -> None:
+    axes = posterior_velocities(drawn, "2", label="one")
+    posterior_velocities(drawn, "2", axes=axes, label="other", color="red")
+    assert [labels(one) for one in axes] == [["one", "truth", "other"]] * 2
+    assert [one.get_ylabel() for one in axes] == ["longitudinal [m/s]", "lateral [m/s]"]
+    truth = drawn["constant_data"].sel(trajectory="2")
+    turned = np.exp(-1j * truth["true_heading"].values) * (truth["true_vx"].values + 1j * truth["true_vy"].values)
+    for one, expected in zip(axes, (turned.real, turned.imag), strict=True):
+        (line,) = (line for line in one.get_lines() if line.get_label() == "truth")
+        np.testing.assert_allclose(line.get_ydata(), expected, atol=1e-6)

@@ -467,3 +467,17 @@ def test_steady_learns_the_maximum_likelihood_estimate_of_the_cart():
     train(program, guide, data, Validation(), optimization, progress=False)
     # d standard errors off the estimate cost d² / 2 nats: half of one
     assert top - float(evidence(program).detach()) < 0.125
+
+
+def test_gradients_are_scaled_down_to_their_norm(data, monkeypatch):
+    """Each array's by itself, before the optimiser sees it."""
+    norms, step = [], torch.optim.AdamW.step
+
+    def spy(self, *arguments):
+        norms.append([float(p.grad.norm()) for group in self.param_groups for p in group["params"]])
+        return step(self, *arguments)
+
+    monkeypatch.setattr(torch.optim.AdamW, "step", spy)
+    for bound in (None, 0.01):
+        run(example("linear_gaussian"), data, Optimization(steps=2, validate_every=2, gradient_norm=bound))
+    assert max(norms[0]) > 0.02 and all(value <= 0.01 * (1 + 1e-5) for one in norms[2:] for value in one)

@@ -3,6 +3,8 @@
 import pytest
 import torch
 from examples import example
+from small import simulated
+from test_recipes import HeavyTailed
 
 from steady_ppl import Validation, for_program, log_likelihood, seeded, simulate
 from steady_ppl.validation import as_good
@@ -41,3 +43,14 @@ def test_validation_repeats_its_random_numbers_and_averages_at_the_stated_rate()
     with seeded(7, "validate"):
         expected = log_likelihood(program, data, particles=50, known_start=False, every=5)
     assert first == pytest.approx(expected.tolist())
+
+
+def test_the_filter_suits_the_programs_noise():
+    """Looking ahead wherever the noise is normal, and a note where it is not."""
+    program = example("hovercraft", torch.float32)
+    ahead = Validation.suited(program, simulated(rows=6), known_start=True)
+    assert (ahead.look_ahead, ahead.every, ahead.particles, ahead.notes) == (True, 1, 100, [])
+    blind = Validation.suited(HeavyTailed(), simulated(rows=6), known_start=True, particles=70)
+    assert (blind.look_ahead, blind.every, blind.particles) == (False, 10, 70)
+    assert "bootstrap filter at every tenth row: site 'acceleration' is StudentT" in blind.notes[0]
+    assert Validation.suited(program, None).data is None

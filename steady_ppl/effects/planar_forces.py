@@ -52,7 +52,7 @@ def _limits(program: Program, data: Trajectories | None) -> Sequence[Mapping[str
 def _places(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
     """Patches on a grid over where the vehicle was, as far as its landmarks and its start say."""
     if data is None or data.states is None:
-        landmarks = torch.as_tensor(program.landmarks).double()
+        landmarks = torch.as_tensor(program.landmarks).detach().double()
         low, high = 0.5 * landmarks.amin(0), 0.5 * landmarks.amax(0)
     else:
         places = data.states[..., :2][torch.isfinite(data.states[..., :2]).all(-1)].double()

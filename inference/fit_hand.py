@@ -1,0 +1,67 @@
+"""FitHand: a program written by hand says where the vehicle was, and another is fitted to that as if it were true."""
+
+import dataclasses
+
+import torch
+
+from steady_ppl import Fit, Trajectories, UsageError, choose_filter, for_program, load_program, run_filter, seeded
+from steady_ppl.program import names
+
+from . import fit_truth
+
+
+def fit(
+    program,
+    table: Trajectories,
+    valid: Trajectories | None = None,
+    *,
+    known_start: bool = False,
+    hand=None,
+    lineages: int = 8,
+    particles: int | None = None,
+    steps: int = 500,
+    learning_rate: float = 1e-2,
+    weight_decay: float = 1.0,
+    averaging: float = 0.98,
+    validate_every: int = 50,
+    validation_particles: int | None = None,
+    patience: int = 5,
+    seed: int = 0,
+    **run,
+) -> Fit:
+    """Fit `program` to paths of the drives of `table` by the program `hand`.
+
+    Args:
+        program: the state-space model, changed in place.
+        table: the training drives; true states, where there are any, are used for a known start only.
+        valid: held-out drives.
+        known_start: the first row's true state is given.
+        hand: the program written by hand, or where it is (`models/hovercraft.py`); of the same states.
+        lineages: paths of each drive (the paper: 8 on Hov, 1 on Hov+, 7 on Truck).
+        particles: of the filter that draws them; 200 looking ahead, 5000 otherwise when None (the paper: 100 000).
+        steps, learning_rate, weight_decay, averaging, validate_every, validation_particles, patience, run: as in
+            `fit_truth`.
+
+    Raises:
+        UsageError: no program is given, or its states are others.
+    """
+    settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
+    if hand is None:
+        raise UsageError("fit-hand needs the program written by hand: --hand MODEL, or hand=")
+    if isinstance(hand, str):
+        hand = load_program(hand)
+    settings["hand"] = type(hand).__name__
+    if names(hand.states) != names(program.states):
+        raise UsageError(f"fit-hand: {type(hand).__name__} and {type(program).__name__} have different states")
+    data = for_program(hand, table)
+    choice = choose_filter(hand, data, known_start=known_start, particles=particles)
+    with seeded(seed, "hand"):
+        filtered = run_filter(
+            hand, data, particles=choice.particles, known_start=known_start, look_ahead=choice.look_ahead
+        )
+        paths = filtered.paths(lineages).within(data)
+    copies = data.subset(torch.arange(len(data)).repeat(lineages))
+    believed = dataclasses.replace(copies, states=paths.states.transpose(0, 1).flatten(1, 2))
+    supervised = {name: value for name, value in settings.items() if name not in ("hand", "lineages", "particles")}
+    fitted = fit_truth.fit(program, believed, valid, **supervised, **run)
+    return dataclasses.replace(fitted, recipe="fit-hand", settings=settings)

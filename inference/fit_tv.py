@@ -1,0 +1,91 @@
+"""FitTV: a pose from each row's own measurements, its derivative by total variation, and the program fitted to both.
+
+What one does without a model of the motion. Nothing of the drives' true states is looked at, not even their start: the
+poses are `fixes`. Chartrand's total-variation derivative (2011) is pynumdiff's.
+"""
+
+import dataclasses
+import warnings
+
+import numpy as np
+import torch
+
+from steady_ppl import Fit, Trajectories, UsageError, fixes, for_program, seeded
+from steady_ppl.program import names
+
+from . import fit_truth
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # that a solver which is not needed here is missing
+    from pynumdiff.total_variation_regularization import iterative_velocity
+
+
+def fit(
+    program,
+    table: Trajectories,
+    valid: Trajectories | None = None,
+    *,
+    known_start: bool = False,
+    regularization: float = 0.01,
+    iterations: int = 20,
+    steps: int = 500,
+    learning_rate: float = 1e-2,
+    weight_decay: float = 1.0,
+    averaging: float = 0.98,
+    validate_every: int = 50,
+    validation_particles: int | None = None,
+    patience: int = 5,
+    seed: int = 0,
+    **run,
+) -> Fit:
+    """Fit `program` to states that are differentiated from the measurements of `table`.
+
+    Args:
+        program: the state-space model, changed in place; its measurements tell the pose row by row (see `fixes`).
+        table: the training drives; true states are not looked at.
+        valid: held-out drives.
+        known_start: the first row's true state is given to the filter of the validation.
+        regularization: weight of the derivative's total variation (α in the paper).
+        iterations: of the derivative's solver.
+        steps, learning_rate, weight_decay, averaging, validate_every, validation_particles, patience, run: as in
+            `fit_truth`.
+
+    Raises:
+        DataError: a row's measurements do not tell the pose.
+        UsageError: the program does not say which components are derivatives of which.
+    """
+    settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
+    data = for_program(program, table).without_truth()
+    with seeded(seed, "fixes"):
+        poses = fixes(program, data)
+    estimated = dataclasses.replace(data, states=differentiated(program, data, poses, regularization, iterations))
+    supervised = {name: value for name, value in settings.items() if name not in ("regularization", "iterations")}
+    fitted = fit_truth.fit(program, estimated, valid, **supervised, **run)
+    return dataclasses.replace(fitted, recipe="fit-tv", settings=settings)
+
+
+def differentiated(program, data: Trajectories, poses: torch.Tensor, regularization: float, iterations: int):
+    """The states `(T + 1, B, D)` of poses and their total-variation derivatives; gaps are interpolated."""
+    order = names(program.states)
+    rates = program.derivatives
+    missing = [name for name in order if name not in rates and name not in rates.values()]
+    if missing:
+        raise UsageError(
+            f"fit-tv: program {type(program).__name__} does not say what {missing[0]} is the derivative of"
+        )
+    states = torch.full_like(poses, torch.nan)
+    for drive, rows in enumerate(data.lengths.tolist()):
+        time = data.elapsed[:rows, drive].double().numpy(force=True)
+        even = np.linspace(time[0], time[-1], rows)  # which the solver needs
+        for position, rate in rates.items():
+            values = poses[:rows, drive, order.index(position)].double().numpy(force=True)
+            there = np.isfinite(values)
+            if not there.any():
+                raise UsageError(f"fit-tv: {position} cannot be told from one row's measurements")
+            known = np.unwrap(values[there]) if position in program.angles else values[there]
+            smooth, derivative = iterative_velocity(
+                np.interp(even, time[there], known), even[1] - even[0], iterations, regularization
+            )
+            for name, found in ((position, smooth), (rate, derivative)):
+                states[:rows, drive, order.index(name)] = torch.from_numpy(np.interp(time, even, found))
+    return states

@@ -1,0 +1,119 @@
+"""SVI: the same program and the same loop as STEADY, with a guide that has parameters instead of a particle filter.
+
+The ELBO's bound on log p(y) is climbed in the program's and the guide's parameters together (Kingma and Welling 2014;
+for state-space models Krishnan, Shalit and Sontag 2017). Held-out log p(y), from the same filter as for STEADY, decides
+which parameters are kept.
+"""
+
+import dataclasses
+
+from pyro.infer.autoguide import AutoNormal
+
+from steady_ppl import (
+    AutoRollout,
+    Fit,
+    InferenceNetwork,
+    LinearRamp,
+    Optimization,
+    SmootherGuide,
+    Trajectories,
+    UsageError,
+    Validation,
+    for_program,
+    seeded,
+    train,
+)
+
+
+def network(program, data: Trajectories, width: int, centred: bool, **more):
+    """A recurrent network that reads the measurements, as in the paper's baseline: one for all drives."""
+    return InferenceNetwork(program, data, width=width, centred=centred, **more)
+
+
+def mean_field(program, data: Trajectories, width: int, centred: bool, **more):
+    """Independent normals for each interval's noise of each drive, by Pyro's AutoNormal."""
+    return AutoRollout(program, data, auto=AutoNormal, **more)
+
+
+def smoother(program, data: Trajectories, width: int, centred: bool, **more):
+    """The linearised posterior of each drive, every number of which is then learned."""
+    return SmootherGuide(program, data, **more)
+
+
+GUIDES = {"network": network, "mean-field": mean_field, "smoother": smoother}
+
+
+def fit(
+    program,
+    table: Trajectories,
+    valid: Trajectories | None = None,
+    *,
+    known_start: bool = False,
+    guide: str = "network",
+    width: int = 64,
+    centred: bool = False,
+    draws: int = 8,
+    guide_rate: float = 1.0,
+    first_kl_weight: float = 1.0,
+    annealing: float = 0.5,
+    steps: int = 1500,
+    learning_rate: float = 3e-3,
+    betas: tuple[float, float] = (0.9, 0.99),
+    final_rate: float = 0.05,
+    weight_decay: float = 1.0,
+    gradient_norm: float | None = 1.0,
+    averaging: float = 0.98,
+    batch: int | None = None,
+    validate_every: int = 75,
+    validation_particles: int | None = None,
+    patience: int = 10,
+    seed: int = 0,
+    **run,
+) -> Fit:
+    """Fit `program` to the measurements of `table`; `valid` decides when to stop.
+
+    Args:
+        program: the state-space model with normal noise, changed in place.
+        table: the training drives; true states, where there are any, are used for a known start only.
+        valid: held-out drives.
+        known_start: the first row's true state is given.
+        guide: one of GUIDES.
+        width: of the network's layers.
+        centred: whether the network proposes accelerations instead of their deviations from the program's mean.
+        draws: of each drive a step.
+        guide_rate: learning rate of the guide's parameters relative to the program's.
+        first_kl_weight, annealing: the KL divergence's weight at the first step, and the share of the training over
+            which it changes to 1; below 1 it is KL annealing (Bowman et al. 2016), above 1 it tempers the observations.
+        steps: gradient steps.
+        learning_rate, betas, final_rate, weight_decay, gradient_norm, averaging, batch, validate_every, patience: see
+            `Optimization`.
+        validation_particles: N of the filter that judges the held-out drives.
+        run: checkpoint, resume and progress of `train`.
+
+    Raises:
+        UsageError: no such guide, or it takes no batch.
+        ProgramError: the program's noise is not normal.
+        TrainingError: the loss is not finite.
+    """
+    settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
+    if guide not in GUIDES:
+        raise UsageError(f"no guide {guide!r}; there are {', '.join(GUIDES)}")
+    data = for_program(program, table)
+    with seeded(seed, "prepare"):
+        program.prepare(data, known_start)
+        q = GUIDES[guide](
+            program,
+            data,
+            width,
+            centred,
+            draws=draws,
+            known_start=known_start,
+            annealing=LinearRamp(first_kl_weight, annealing),
+            rate=guide_rate,
+        )
+    optimization = Optimization(
+        **{field.name: settings[field.name] for field in dataclasses.fields(Optimization) if field.name in settings}
+    )
+    validation = Validation.suited(program, valid, known_start=known_start, particles=validation_particles)
+    trained = train(program, q, data, validation, optimization, known_start=known_start, seed=seed, **run)
+    return Fit(program, "svi", settings, seed=seed, known_start=known_start, trained=trained, notes=validation.notes)

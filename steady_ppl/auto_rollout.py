@@ -1,0 +1,86 @@
+"""Pyro's automatic guides over the noise of given drives: a mean field, or whatever else it has."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pyro
+import pyro.distributions as dist
+import torch
+from pyro import poutine
+from pyro.infer.autoguide import AutoGuide, AutoNormal
+from pyro.infer.autoguide.initialization import init_to_value
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import UsageError
+from steady_ppl.probe import start_size, step_size
+from steady_ppl.program import Program
+from steady_ppl.variational_guides import VariationalGuide
+
+
+class AutoRollout(VariationalGuide):
+    """Any of Pyro's automatic guides, over the standard normal noise of given trajectories.
+
+    Args:
+        data: the trajectories, as returned by `for_program`; each has parameters of its own.
+        auto: for example `pyro.infer.autoguide.AutoNormal` (mean field) or `AutoLowRankMultivariateNormal`.
+        options: of `auto`, for example `init_scale`.
+        more: of `VariationalGuide`.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        data: Trajectories,
+        *,
+        auto: type[AutoGuide] = AutoNormal,
+        options: dict[str, Any] | None = None,
+        **more: Any,
+    ) -> None:
+        super().__init__(program, **more)
+        self.sizes, self.labels = (start_size(program), step_size(program)), data.labels
+        self.now: dict[str, Tensor] = {}
+        with pyro.settings.context(module_local_params=True), poutine.block():
+            self.auto = auto(
+                self._noise, **{"init_loc_fn": init_to_value(values=self._noise_at_zero(data))} | (options or {})
+            )
+            self.auto(data)  # makes its parameters
+
+    def begin(self, data: Trajectories) -> Tensor:
+        if data.labels != self.labels:
+            raise UsageError(
+                "an automatic guide has parameters for each of its drives: it takes no others and no batch"
+            )
+        values, ratios = list[dict[str, Tensor]](), list[Tensor]()
+        for _ in range(self.draws):
+            with pyro.settings.context(module_local_params=True), poutine.block():
+                trace = poutine.trace(self.auto).get_trace(data)
+            drawn: dict[str, Any] = {
+                name: trace.nodes[name]["value"] for name in ("start", "noise") if name in trace.nodes
+            }
+            values.append(drawn)
+            normal = [dist.Normal(0.0, 1.0).log_prob(value).sum() for value in drawn.values()]
+            ratios.append(trace.log_prob_sum() - torch.stack(normal).sum())
+        self.now = {name: torch.stack([drawn[name] for drawn in values]) for name in values[0]}
+        return torch.stack(ratios)
+
+    def start(self) -> tuple[Tensor, Tensor]:
+        noise = self.now["start"][:, 0]
+        return noise, noise.new_zeros(noise.shape[:2])
+
+    def step(self, row: int, state: Tensor) -> tuple[Tensor, Tensor | float]:
+        return self.now["noise"][:, row], state.new_zeros(())
+
+    def _noise(self, data: Trajectories) -> None:
+        """The prior of the noise of start and intervals."""
+        with pyro.plate("trajectory", len(data), dim=-1):
+            for name, zero in self._noise_at_zero(data).items():
+                with pyro.plate(f"{name}_row", len(zero), dim=-2):
+                    pyro.sample(name, dist.Normal(zero, torch.ones_like(zero)).to_event(1))
+
+    def _noise_at_zero(self, data: Trajectories) -> dict[str, Tensor]:
+        rows = {"noise": (len(data.time) - 1, self.sizes[1])}
+        if not self.known_start:
+            rows = {"start": (1, self.sizes[0])} | rows
+        return {name: data.controls.new_zeros(count, len(data), size) for name, (count, size) in rows.items()}

@@ -1,0 +1,175 @@
+"""Guides with parameters of their own: the program, rolled out under noise that they propose (SVI).
+
+States follow from the start and the channel noise, differentiable from end to end; the joint density is the same as for
+every other guide. Kingma and Welling (2014); Krishnan, Shalit and Sontag (2017).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pyro
+import torch
+from pyro.poutine.messenger import Messenger
+from torch import Tensor, nn
+
+from steady_ppl.data import Trajectories
+from steady_ppl.guides import sample_known
+from steady_ppl.paths import Paths
+from steady_ppl.program import Program, acting_controls
+from steady_ppl.sites import KnownStart, Recording, Replaying, Standardised, broadcast_event, running
+from steady_ppl.tempering import Constant, Tempering
+
+
+class VariationalGuide(nn.Module):
+    """What the guides share that roll the program out; a subclass proposes its noise.
+
+    The start's noise is proposed in its standard deviations from its mean, ε, and so is that of intervals unless the
+    guide is `centred`: then its values z are. With ε the guide moves with the program's parameters and the ELBO is
+    E[log p(y | states) − (log q(ε) − log N(ε; 0, 1))]; with z it does not, and the program's parameters are moved by
+    E[∂ log p(z | states)], as in STEADY's M step.
+
+    Args:
+        program: the state-space model; its noise is normal.
+        draws: of each trajectory a gradient step.
+        known_start: the first state is certain.
+        annealing: schedule of the weight of the KL divergence.
+        rate: learning rate of the guide's parameters relative to the recipe's.
+    """
+
+    centred = False
+
+    def __init__(
+        self,
+        program: Program,
+        *,
+        draws: int = 1,
+        known_start: bool = False,
+        annealing: Tempering | None = None,
+        rate: float = 1.0,
+    ) -> None:
+        super().__init__()
+        self._program = (program,)  # in a tuple it is no submodule: its parameters are not the guide's
+        self.draws, self.known_start, self.rate = draws, known_start, rate
+        self.annealing = annealing or Constant()
+        self.kl_weight = 1.0
+
+    @property
+    def program(self) -> Program:
+        """The state-space model."""
+        return self._program[0]
+
+    def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
+        """Look the KL weight up; nothing is drawn outside the gradient."""
+        self.kl_weight = self.annealing(progress)
+        return {} if isinstance(self.annealing, Constant) else {"kl_weight": self.kl_weight}
+
+    def begin(self, data: Trajectories) -> Tensor:
+        """Called before each roll-out; the log-density of whatever is drawn here at once, as in `step`, `(M,)`."""
+        return data.controls.new_zeros(self.draws)
+
+    def start(self) -> tuple[Tensor, Tensor]:
+        """ε of `initial`, `(M, B, C₀)`, and log q(ε) − log N(ε; 0, 1), `(M, B)`."""
+        raise NotImplementedError
+
+    def step(self, row: int, state: Tensor) -> tuple[Tensor, Tensor | float]:
+        """The noise of the `transition` after a row, `(M, B, C)`, from states `(M, B, D)`; and log q(z) where the guide
+        is centred, else log q(ε) − log N(ε; 0, 1), `(M, B)`."""
+        raise NotImplementedError
+
+    def forward(self, data: Trajectories) -> None:
+        """The guide of the model `Joint`."""
+        paths, at_start, later = self.roll_out(data)
+        sample_known(paths, data)
+        weight = self.kl_weight
+        density = weight * (at_start + later)
+        if not self.known_start:
+            density = density + _prior_of_start(self.program, paths)
+        if not self.centred or weight != 1:
+            density = density + (1 - weight * self.centred) * _prior_of_noise(self.program, data, paths)
+        pyro.factor("proposal", density.reshape(-1, 1, 1) if self.draws > 1 else density[0], has_rsample=True)
+
+    def roll_out(self, data: Trajectories) -> tuple[Paths, Tensor, Tensor]:
+        """Paths of `data`; log-densities of start and noise as `start` and `step` give them, each summed, `(M,)`."""
+        trajectories = len(data)
+        later, at_start = self.begin(data), data.controls.new_zeros(self.draws)
+        left = torch.Size((self.draws, 1, trajectories))
+        started, moving = Recording(), Recording()
+        certain: Messenger
+        if self.known_start:
+            certain = KnownStart(data.known_start)
+        else:
+            noise, apart = self.start()
+            at_start, certain = apart.sum(1), Standardised(noise.unsqueeze(1))
+        with running(*left):
+            with started, certain:
+                state = broadcast_event(self.program.initial(), left, 1).squeeze(1)
+            states, values = [state], dict[str, list[Tensor]]()
+            controls = acting_controls(self.program, data)[:-1]
+            for row, given in enumerate(
+                zip(controls.split(1), data.elapsed[:-1].split(1), data.steps.split(1), strict=True)
+            ):
+                noise, density = self.step(row, state)
+                inside = data.transitions[row]
+                later = later + torch.where(inside, density, 0.0).sum(-1)
+                moving = Recording()
+                with moving, (Taking if self.centred else Standardised)(noise.unsqueeze(1)):
+                    moved = self.program.transition(state.unsqueeze(1), *given).squeeze(1)
+                state = torch.where(inside[:, None], moved, state)
+                states.append(state)
+                for site, value in moving.values.items():
+                    values.setdefault(site, []).append(value)
+        event_dims = {site: fn.event_dim for site, fn in (started.distributions | moving.distributions).items()}
+        paths = Paths(
+            states=torch.stack(states, 1),
+            start={site: broadcast_event(value, left, event_dims[site]) for site, value in started.values.items()},
+            noise={site: torch.cat(parts, 1) for site, parts in values.items()},
+            event_dims=event_dims | {"states": 1},
+        )
+        return paths, at_start, later
+
+
+class Taking(Messenger):
+    """Give latent sites the columns of some values in the order in which the sites are met.
+
+    Args:
+        values: `(..., C)`.
+    """
+
+    def __init__(self, values: Tensor) -> None:
+        super().__init__()
+        self.values, self.column = values, 0
+
+    def _pyro_sample(self, message: Any) -> None:
+        width = message["fn"].event_shape.numel()
+        taken = self.values[..., self.column : self.column + width]
+        self.column += width
+        message["value"] = taken if message["fn"].event_dim else taken[..., 0]
+
+
+def _prior_of_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor:
+    """Log-density of the channel noise under the program, as `Joint` scores it, `(M,)`."""
+    states, seen = paths.states[:, :-1], Recording()
+    with running(*states.shape[:-1]), seen, Replaying(paths.noise):
+        program.transition(states, acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
+    logs = [fn.log_prob(paths.noise[site]) for site, fn in seen.distributions.items()]
+    return torch.where(data.transitions, torch.stack(logs).sum(0), 0.0).sum((1, 2))
+
+
+def _prior_of_start(program: Program, paths: Paths) -> Tensor:
+    draws, _, trajectories, _ = paths.states.shape
+    seen = Recording()
+    with running(draws, 1, trajectories), seen, Replaying(paths.start):
+        program.initial()
+    logs = [fn.log_prob(paths.start[site]) for site, fn in seen.distributions.items()]
+    return torch.stack(logs).sum((0, 2, 3))
+
+
+def log_ratio(noise: Tensor, random: Tensor, log_scale: Tensor) -> Tensor:
+    """log q(ε) − log N(ε; 0, 1), `(...)`, of ε = … + L r, r standard normal, exp(log_scale) the diagonal of L."""
+    return (0.5 * (noise.square() - random.square()) - log_scale).sum(-1)
+
+
+def times(matrix: Tensor, vector: Tensor) -> Tensor:
+    """`(..., N, M)` by `(..., M)`."""
+    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)

@@ -1,0 +1,141 @@
+"""The baselines: each learns a small case end to end, from what it may look at and nothing else."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from examples import MODELS
+from small import HOVERCRAFT, only_start, simulated, steady, written
+from test_recipes import held_out, same, values
+
+from steady_ppl import UsageError, load_program, seeded, simulate
+from steady_ppl.planar_vehicle import PlanarVehicle
+from steady_ppl.run_recipe import find_recipe
+
+QUIET = {"progress": False}
+LEARN = {"steps": 60, "learning_rate": 0.05}
+SVI = {"steps": 150, "learning_rate": 0.02, "gradient_norm": None}
+RECIPES = {
+    "svi": SVI,
+    "svi mean-field": {**SVI, "guide": "mean-field"},
+    "svi smoother": {**SVI, "guide": "smoother"},
+    "fit-hand": {"hand": str(HOVERCRAFT), "lineages": 3, **LEARN},  # in the first test another, which is wrong
+    "fit-tv": LEARN,
+    "steady-minus": LEARN,
+}
+FEW = {name: options | {"steps": 3, "validate_every": 2} for name, options in RECIPES.items()}
+
+
+def vehicle(degrees: float) -> PlanarVehicle:
+    """The owner's hovercraft, seen so sharply."""
+    program = load_program(HOVERCRAFT)
+    program.bearing_sd = math.radians(degrees)
+    return program
+
+
+def learned(name: str, program, train, valid=None, **options):
+    return find_recipe(name.split()[0])(program, train, valid, **options, **QUIET)
+
+
+@pytest.mark.parametrize("name", list(RECIPES))
+def test_each_beats_hand(name: str) -> None:
+    """A vehicle believed to be twice as heavy as it is: its mass is found, and held-out drives are likelier."""
+    degrees = 0.25 if name == "fit-tv" else 5.0  # one row's bearings must be worth differentiating
+    truth = vehicle(degrees)
+    truth.duration = 4.0
+    train, valid = (only_start(simulate(truth, count, seed=seed)) for count, seed in ((12, 0), (4, 1)))
+    program = vehicle(degrees)
+    program.mass = torch.tensor(3.0)
+    options, far = dict(RECIPES[name]), abs(3.0 - 1.5) / 4
+    if name == "fit-hand":  # nearer than the hand, whose paths it believes
+        options["hand"], far = vehicle(degrees), abs(2.2 - 1.5)
+        options["hand"].mass = torch.tensor(2.2)
+    before = held_out(options.get("hand", program), valid)
+    learned(name, program, train, valid, known_start=True, **options)
+    assert abs(program.mass.item() - 1.5) < far
+    assert held_out(program, valid) > before
+
+
+@pytest.mark.parametrize("known_start", [True, False])
+@pytest.mark.parametrize("name", list(FEW))
+def test_none_of_them_looks_at_the_true_states(name: str, known_start: bool) -> None:
+    """But for a known start, and FitTV not even for that: the same bit for bit whatever the x. columns say."""
+    train, valid = simulated(rows=9), simulated(rows=9, seed=1)
+    lies = replace(train, states=train.states + 3.0)
+    lies.states[0] = train.states[0] + (3.0 if name == "fit-tv" or not known_start else 0.0)
+    results = []
+    for table in (train, lies, train.without_truth(keep_start=known_start)):
+        with seeded(1):
+            program = load_program(MODELS / "neural_vehicle.py:NeuralHovercraft")
+        fit = learned(name, program, table, only_start(valid), known_start=known_start, **FEW[name])
+        results.append((values(program), fit.trained))
+    for parameters, trained in results[1:]:
+        assert same(parameters, results[0][0]) and trained == results[0][1]
+
+
+def test_fit_hand_needs_a_hand() -> None:
+    with pytest.raises(UsageError, match="--hand MODEL"):
+        learned("fit-hand", load_program(HOVERCRAFT), simulated(rows=5))
+
+
+def test_fit_hand_needs_the_same_states() -> None:
+    with pytest.raises(UsageError, match="Pendulum and Hovercraft have different states"):
+        learned("fit-hand", load_program(HOVERCRAFT), simulated(rows=5), hand=str(MODELS / "pendulum.py"))
+
+
+def test_a_hand_that_changed_is_not_resumed_with(tmp_path, capsys) -> None:
+    hand, table = tmp_path / "hovercraft.py", written(tmp_path / "t.csv", simulated(rows=9))
+    hand.write_text(HOVERCRAFT.read_text())
+    few = ("--steps", 2, "--set", "lineages=2", "--known-start")
+    command = ("fit", HOVERCRAFT, table, "--recipe", "fit-hand", "--hand", hand, *few, "--out", tmp_path / "run")
+    assert steady(*command) == 0
+    hand.write_text(hand.read_text().replace("1.5", "1.6"))
+    assert steady(*command, "--resume") == 2
+    assert "goes on with the same hand" in capsys.readouterr().err
+
+
+def test_fit_hand_by_command(tmp_path, capsys) -> None:
+    table = written(tmp_path / "t.csv", simulated(rows=9))
+    few = ("--set", "lineages=2", "--steps", 2, "--known-start", "--out", tmp_path / "run")
+    assert steady("fit", HOVERCRAFT, table, "--recipe", "fit-hand", *few) == 2
+    assert "--hand MODEL" in capsys.readouterr().err and not (tmp_path / "run").exists()
+    assert steady("fit", HOVERCRAFT, table, "--recipe", "fit-hand", "--hand", HOVERCRAFT, *few) == 0
+    assert steady("fit", HOVERCRAFT, table, "--hand", HOVERCRAFT, "--out", tmp_path / "other") == 2
+    assert "recipe steady has no setting hand" in capsys.readouterr().err
+
+
+def test_svis_guides_are_named() -> None:
+    with pytest.raises(UsageError, match="no guide 'lookahead'; there are network, mean-field, smoother"):
+        learned("svi", load_program(HOVERCRAFT), simulated(rows=5), guide="lookahead")
+    with pytest.raises(UsageError, match="no batch"):
+        learned("svi", load_program(HOVERCRAFT), simulated(rows=5), guide="mean-field", batch=2, steps=1)
+
+
+def test_steady_minus_does_not_temper() -> None:
+    fit = learned("steady-minus", load_program(HOVERCRAFT), simulated(rows=9), steps=4, validate_every=1)
+    assert [entry["observation_weight"] for entry in fit.trained.history] == [1.0] * 4
+    assert fit.recipe == "steady-minus"
+
+
+@pytest.mark.parametrize("guide", ["network", "mean-field", "smoother"])
+def test_svi_resumes_as_if_nothing_had_happened(tmp_path, guide: str) -> None:
+    """The guide's parameters are in the checkpoint as well."""
+    outcomes = []
+    for steps in ((6,), (3, 6)):
+        file = tmp_path / f"{len(steps)}.safetensors"
+        for index, count in enumerate(steps):
+            with seeded(1):
+                program = load_program(HOVERCRAFT)
+            options = {
+                "validate_every": 3,
+                "final_rate": 1.0,
+                "annealing": 0.0,
+                "checkpoint": file,
+                "resume": index > 0,
+            }
+            learned("svi", program, simulated(rows=9), guide=guide, steps=count, **options)
+        outcomes.append(values(program))
+    assert same(*outcomes)

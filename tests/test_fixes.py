@@ -1,0 +1,76 @@
+"""Fixes: the pose that one row's bearings tell, without the rows around it and without the true states."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from examples import drives, example
+from small import simulated
+
+from steady_ppl import DataError, fixes, for_program, seeded
+from steady_ppl.planar_vehicle import wrap
+from steady_ppl.run_recipe import recipe_folder
+
+
+def found(program, data):
+    with seeded(1):
+        return fixes(program, data)
+
+
+def test_sharp_bearings_tell_the_pose() -> None:
+    program = example("hovercraft")
+    program.bearing_sd = 1e-4
+    data = drives(program, 3, 21)
+    states = found(program, data)
+    away = (states - data.states)[..., :3]
+    away[..., 2] = wrap(away[..., 2])
+    assert float(away.abs().max()) < 0.02  # a tenth of a milliradian, ten metres away, at bad angles
+    assert bool(states[..., 3:].isnan().all())
+
+
+def test_what_does_not_tell_it_is_left_open() -> None:
+    program = example("hovercraft")
+    data = drives(program, 2, 21, gaps=True)
+    states = found(program, data)
+    enough = (data.observed.sum(-1) >= 3) & data.rows
+    assert bool(enough.any()) and not bool(enough[data.rows].all())
+    assert torch.equal(states[..., :3].isfinite().all(-1), enough)
+    program.landmarks = program.landmarks[:2]
+    with pytest.raises(DataError, match="measurements enough, 3, to tell x, y, heading"):
+        found(program, for_program(program, simulated(rows=21)))
+
+
+def test_a_pendulums_angle_is_told_by_its_encoder() -> None:
+    program = example("pendulum")
+    data = drives(program, 2, 11)
+    states = found(program, data)
+    assert float((states[..., 0] - data.measurements[..., 0]).abs().max()) < 0.2 and bool(states[..., 1].isnan().all())
+
+
+def test_true_states_are_not_looked_at() -> None:
+    program = example("hovercraft")
+    data = drives(program, 2, 11)
+    lies = replace(data, states=torch.full_like(data.states, 7.0))
+    assert torch.equal(found(program, data).nan_to_num(), found(program, lies).nan_to_num())
+    assert torch.equal(found(program, data).nan_to_num(), found(program, data.without_truth()).nan_to_num())
+
+
+def test_fit_tv_differentiates_what_it_finds() -> None:
+    """Sharp bearings of a smooth drive: velocities within what a second of thrust changes."""
+    fit_tv = load_recipe("fit_tv")
+    program = example("hovercraft")
+    program.bearing_sd = 1e-3
+    data = drives(program, 2, 41)
+    states = fit_tv.differentiated(program, data, found(program, data), 1e-3, 100)
+    away = states - data.states
+    away[..., 2] = wrap(away[..., 2])
+    assert bool(states.isfinite().all())
+    assert float(away[..., :2].abs().median()) < 0.02 and float(away[..., 3:5].abs().median()) < 0.1
+
+
+def load_recipe(name: str):
+    from steady_ppl.program_file import run_file
+
+    return run_file(recipe_folder() / f"{name}.py")

@@ -1,0 +1,76 @@
+"""Landmarks that are learned together with the dynamics."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from examples import MODELS, drives, example
+from small import HOVERCRAFT, QUICK, only_start, simulated, steady, written
+
+from steady_ppl import UnknownMap, UsageError, load_program, log_likelihood, simulate
+from steady_ppl.metrics import map_errors
+from steady_ppl.run_recipe import find_recipe
+
+UNKNOWN = f"{MODELS / 'hovercraft_unknown_map.py'}:HovercraftUnknownMap"
+
+
+def test_a_map_is_where_it_was_declared_until_it_is_learned() -> None:
+    known, unknown = example("hovercraft:HovercraftTruth"), example("hovercraft_unknown_map")
+    assert unknown.measurements == known.measurements
+    torch.testing.assert_close(unknown.landmarks, torch.tensor(known.landmarks).double())
+    data = drives(known, 2, 9)
+    settings = {"particles": 50, "known_start": True, "look_ahead": True, "every": 1}
+    values = []
+    for program in (known, unknown):
+        torch.manual_seed(1)
+        values.append(log_likelihood(program, data, **settings))
+    torch.testing.assert_close(*values)
+    assert map_errors(unknown, known) == {"rms": 0.0, "most": 0.0}
+
+
+def test_surveyed_landmarks_stay() -> None:
+    class Surveyed(UnknownMap, type(load_program(HOVERCRAFT))):
+        surveyed = (0, 2)
+
+    program = Surveyed()
+    with torch.no_grad():
+        program.map += 1.0
+    moved = program.landmarks - program.declared
+    assert moved.tolist() == [[0, 0], [1, 1], [0, 0], [1, 1]]
+    (program.landmarks**2).sum().backward()
+    gradient = dict(program.named_parameters())["map"].grad
+    assert gradient.bool().all(1).tolist() == [False, True, False, True]
+
+
+def test_a_wrong_map_is_mended_from_bearings_and_known_starts() -> None:
+    program = load_program(UNKNOWN)
+    truth = load_program(HOVERCRAFT)
+    train = only_start(simulate(load_program(f"{HOVERCRAFT}:HovercraftTruth"), 12))
+    with torch.no_grad():
+        program.map += torch.tensor([[0.8, -0.6], [-0.6, 0.8], [0.6, 0.8], [-0.8, -0.6]])
+    before = map_errors(program, truth)["rms"]
+    settings = {"draws": 5, "steps": 60, "learning_rate": 2e-2, "progress": False}
+    find_recipe("steady")(program, train, known_start=True, **settings)
+    assert before == pytest.approx(1.0) and map_errors(program, truth)["rms"] < 0.5
+
+
+def test_the_maps_error_is_printed(tmp_path, capsys) -> None:
+    table = written(tmp_path / "t.csv", simulated(rows=9))
+    assert steady("fit", UNKNOWN, table, "--recipe", "hand", "--known-start", "--out", tmp_path / "run") == 0
+    capsys.readouterr()
+    command = ("evaluate", tmp_path / "run", table, *QUICK, "--json", tmp_path / "e.json")
+    assert steady(*command, "--map", HOVERCRAFT) == 0
+    assert "run: landmarks off by 0 m rms, 0 m at most" in capsys.readouterr().out
+    (row,) = json.loads((tmp_path / "e.json").read_text())["runs"]
+    assert row["map"] == {"rms": 0.0, "most": 0.0}
+    assert steady(*command, "--map", MODELS / "pendulum.py") == 2
+    assert "Pendulum has no landmarks" in capsys.readouterr().err
+
+
+def test_maps_of_different_sizes_are_not_compared() -> None:
+    few = load_program(HOVERCRAFT)
+    few.landmarks = few.landmarks[:3]
+    with pytest.raises(UsageError, match="4 landmarks cannot be compared with 3"):
+        map_errors(load_program(UNKNOWN), few)

@@ -1,0 +1,183 @@
+"""Guides with parameters: the ELBO is a bound on log p(y), exact where the guide can be; the model is the same."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pyro
+import pytest
+import torch
+from examples import cut, drives, example
+from oracles import assert_mean, cart_parameters, kalman
+from pyro import poutine
+from pyro.infer import Trace_ELBO
+from pyro.infer.autoguide import AutoLowRankMultivariateNormal, AutoNormal
+from test_joint import all_at_once
+from torch import Tensor
+
+from steady_ppl import (
+    AutoRollout,
+    Constant,
+    GaussianGuide,
+    InferenceNetwork,
+    Joint,
+    LinearRamp,
+    Optimization,
+    SMCGuide,
+    SmootherGuide,
+    UsageError,
+    Validation,
+    VariationalGuide,
+    seeded,
+    train,
+)
+
+GUIDES = {
+    "network": InferenceNetwork,
+    "network, centred": lambda *a, **k: InferenceNetwork(*a, centred=True, **k),
+    "mean-field": AutoRollout,
+    "low rank": lambda *a, **k: AutoRollout(*a, auto=AutoLowRankMultivariateNormal, **k),
+    "smoother": SmootherGuide,
+}
+
+
+def elbos(program, guide, data, times: int, *, known_start: bool = False) -> Tensor:
+    """Draws of Pyro's ELBO as the loop computes it, `(times,)`, with their gradients."""
+    guide.refresh(data, 1.0)
+    elbo = Trace_ELBO(num_particles=guide.draws, vectorize_particles=guide.draws > 1, max_plate_nesting=2)
+    joint = Joint(program, known_start=known_start)
+    with pyro.settings.context(module_local_params=True):
+        return torch.stack([-elbo.differentiable_loss(joint, guide, data) for _ in range(times)])
+
+
+@pytest.mark.parametrize("known_start", [False, True])
+@pytest.mark.parametrize("draws", [1, 3])
+def test_the_smoother_is_exact_on_a_linear_program(cart, uneven, draws: int, known_start: bool) -> None:
+    """Every draw of its ELBO is log p(y) itself: gaps, unequal lengths and steps included."""
+    guide = SmootherGuide(cart, uneven, draws=draws, known_start=known_start)
+    exact = kalman(uneven, cart_parameters(cart), known_start=known_start).log_likelihood.sum()
+    found = elbos(cart, guide, uneven, 5, known_start=known_start)
+    torch.testing.assert_close(found, exact.expand(5), rtol=1e-9, atol=1e-8)
+
+
+def test_the_gradient_at_the_exact_posterior_is_that_of_log_p_of_y(uneven) -> None:
+    """Fisher's identity, by paths that move with the parameters."""
+    program = example("linear_gaussian")
+    guide = SmootherGuide(program, uneven)
+    exact = kalman(uneven, cart_parameters(program)).log_likelihood.sum()
+    parameters = list(program.parameters())
+    expected = torch.autograd.grad(exact, parameters)
+    draws = [
+        torch.autograd.grad(value, parameters) for value in (elbos(program, guide, uneven, 1)[0] for _ in range(200))
+    ]
+    for index, gradient in enumerate(expected):
+        assert_mean(torch.stack([draw[index] for draw in draws]), gradient)
+
+
+@pytest.mark.parametrize("name", list(GUIDES))
+@pytest.mark.parametrize("draws", [1, 2])
+def test_every_elbo_is_a_bound(cart, uneven, name: str, draws: int) -> None:
+    guide = GUIDES[name](cart, uneven, draws=draws)
+    values = elbos(cart, guide, uneven, 200).detach()
+    exact = kalman(uneven, cart_parameters(cart)).log_likelihood.sum()
+    assert values.mean() - 4 * values.std() / math.sqrt(len(values)) <= exact + 1e-6
+
+
+@pytest.mark.parametrize(("name", "gap"), [("network", 0.25), ("network, centred", 0.25), ("mean-field", 4.0)])
+def test_training_brings_the_bound_near(cart, even, name: str, gap: float) -> None:
+    """Nats a drive; independent normals cannot say that accelerations make up for each other."""
+    guide = GUIDES[name](cart, even, draws=1 if name == "mean-field" else 8)
+    optimization = Optimization(steps=500, learning_rate=2e-2, gradient_norm=10.0, validate_every=500)
+    train(cart, guide, even, Validation(), optimization, progress=False)
+    exact = kalman(even, cart_parameters(cart)).log_likelihood.sum()
+    values = elbos(cart, guide, even, 300).detach()
+    error = 4 * values.std() / math.sqrt(len(values))
+    assert exact - gap * len(even) - error < values.mean() < exact + error
+
+
+def test_the_kl_weight_is_that_of_the_kl_divergence(cart, even) -> None:
+    """At weight w the objective is E[log p(y | states)] − w KL: linear in w, and the slope is the divergence."""
+    guide = AutoRollout(cart, even, options={"init_scale": 1e-3})  # narrow: the draws hardly differ
+    found = []
+    for weight in (0.0, 0.5, 1.0, 2.0):
+        guide.annealing = Constant(weight)
+        with seeded("the same draws"):
+            found.append(float(elbos(cart, guide, even, 1).detach()))
+    with seeded("the same draws"):
+        guide.refresh(even, 0.0)
+        _, at_start, later = guide.roll_out(even)
+    slopes = [(found[1] - found[0]) / 0.5, (found[2] - found[1]) / 0.5, found[3] - found[2]]
+    assert slopes == pytest.approx([-float((at_start + later).detach())] * 3, rel=1e-6)
+    assert guide.refresh(even, 0.5) == {}
+    guide.annealing = LinearRamp(0.1, 0.5)
+    assert guide.refresh(even, 0.25) == {"kl_weight": pytest.approx(0.55)}
+
+
+@pytest.mark.parametrize("name", ["hovercraft", "truck", "pendulum", "neural_vehicle:NeuralHovercraft"])
+def test_the_guide_changes_nothing_in_the_model(name: str) -> None:
+    """STEADY's and SVI's guides sample the same sites, and the joint density at an SVI guide's paths is that which the
+    same paths have as STEADY's."""
+    program = example(name)
+    data = drives(program, 2, 6, gaps=True)
+    joint, sites = Joint(program), []
+    guides = [SMCGuide(program, particles=50, draws=1), GaussianGuide(program, draws=1)]
+    guides += [make(program, data) for make in GUIDES.values()]
+    with pyro.settings.context(module_local_params=True):
+        for guide in guides:
+            guide.refresh(data, 1.0)
+            if isinstance(guide, VariationalGuide):
+                rolled = guide.roll_out(data)
+                guide.roll_out = lambda data, rolled=rolled: rolled
+            guided = poutine.trace(guide).get_trace(data)
+            model = poutine.trace(poutine.replay(joint, guided)).get_trace(data)
+            sites.append([name for name, site in model.nodes.items() if site["type"] == "sample"])
+            paths = rolled[0] if isinstance(guide, VariationalGuide) else guide.paths
+            torch.testing.assert_close(model.log_prob_sum(), all_at_once(program, data, paths), rtol=1e-9, atol=1e-9)
+    assert all(names == sites[0] for names in sites)
+
+
+def test_the_network_reads_nothing_that_is_missing_and_nothing_past_the_end(cart, uneven) -> None:
+    guide = InferenceNetwork(cart, uneven)
+    with torch.no_grad():
+        for value in guide.parameters():
+            value.normal_(0, 0.3)
+    lies = replace(uneven, measurements=torch.where(uneven.observed, uneven.measurements, 9.0))
+    longer = replace(
+        uneven,
+        controls=torch.where(uneven.rows[..., None], uneven.controls, 5.0),
+        time=torch.where(uneven.rows, uneven.time, uneven.time + 1.0),
+    )
+    guide.begin(uneven)
+    codes, shift = guide.code, guide.shift
+    for data in (lies, longer):
+        guide.begin(data)
+        torch.testing.assert_close(guide.shift[uneven.transitions], shift[uneven.transitions])
+        torch.testing.assert_close(guide.code, codes)
+    guide.begin(cut(uneven.subset([1]), 10))
+    torch.testing.assert_close(guide.code[0], codes[1])
+    torch.testing.assert_close(guide.shift[:, 0], shift[:9, 1])
+
+
+def test_a_guide_of_given_drives_takes_some_of_them_if_it_can_and_no_others(cart, uneven) -> None:
+    few = uneven.subset([2, 0])
+    exact = kalman(few, cart_parameters(cart)).log_likelihood.sum()
+    assert float(elbos(cart, SmootherGuide(cart, uneven), few, 1).detach()) == pytest.approx(float(exact))
+    with pytest.raises(UsageError, match="takes no others and no batch"):
+        elbos(cart, AutoRollout(cart, uneven), few, 1)
+    with pytest.raises(UsageError, match="not for drive 2"):
+        elbos(cart, SmootherGuide(cart, few), uneven, 1)
+
+
+def test_a_guides_parameters_are_its_own(cart, even) -> None:
+    for make in GUIDES.values():
+        guide = make(cart, even)
+        own = {id(value) for value in guide.parameters()}
+        assert own and not own & {id(value) for value in cart.parameters()}
+
+
+def test_the_mean_field_guide_is_pyros(cart, even) -> None:
+    guide = AutoRollout(cart, even, auto=AutoNormal, options={"init_scale": 0.3})
+    assert isinstance(guide.auto, AutoNormal)
+    scales = [value for name, value in guide.named_parameters() if "scales" in name]
+    assert all(bool((value.exp() > 0.29).all()) for value in scales) and len(scales) == 2
