@@ -34,7 +34,7 @@ CELLS = [(metric, group) for metric in ("state_estimation", "forward") for group
 HAND = (
     "The published row of Hand on Hov and Hov+ is an artefact in state estimation and log p(y): the authors' code has "
     "one noise a step for all particles, which then cannot follow a drive; done right the same program has .549 m, "
-    ".038 rad and +32.6 nats (re-simulated), as it has here."
+    ".038 rad and +32.6 nats (re-simulated)."
 )
 Figures = Sequence[Mapping[str, Any]]
 

@@ -6,6 +6,7 @@ which parameters are kept.
 """
 
 import dataclasses
+import functools
 
 from pyro.infer.autoguide import AutoNormal
 
@@ -24,23 +25,13 @@ from steady_ppl import (
     train,
 )
 
-
-def network(program, data: Trajectories, width: int, centred: bool, **more):
-    """A recurrent network that reads the measurements, as in the paper's baseline: one for all drives."""
-    return InferenceNetwork(program, data, width=width, centred=centred, **more)
-
-
-def mean_field(program, data: Trajectories, width: int, centred: bool, **more):
-    """Independent normals for each interval's noise of each drive, by Pyro's AutoNormal."""
-    return AutoRollout(program, data, auto=AutoNormal, **more)
-
-
-def smoother(program, data: Trajectories, width: int, centred: bool, **more):
-    """The linearised posterior of each drive, every number of which is then learned."""
-    return SmootherGuide(program, data, **more)
-
-
-GUIDES = {"network": network, "mean-field": mean_field, "smoother": smoother}
+# A network that reads the measurements, one for all drives, as in the paper's baseline; independent normals for each
+# interval's noise of each drive; the linearised posterior of each drive, every number of which is then learned.
+GUIDES = {
+    "network": InferenceNetwork,
+    "mean-field": functools.partial(AutoRollout, auto=AutoNormal),
+    "smoother": SmootherGuide,
+}
 
 
 def fit(
@@ -50,8 +41,8 @@ def fit(
     *,
     known_start: bool = False,
     guide: str = "network",
-    width: int = 64,
-    centred: bool = False,
+    width: int | None = None,
+    centred: bool | None = None,
     draws: int = 8,
     guide_rate: float = 1.0,
     first_kl_weight: float = 1.0,
@@ -78,8 +69,7 @@ def fit(
         valid: held-out drives.
         known_start: the first row's true state is given.
         guide: one of GUIDES.
-        width: of the network's layers.
-        centred: whether the network proposes accelerations instead of their deviations from the program's mean.
+        width, centred: of the network alone, see `InferenceNetwork`.
         draws: of each drive a step.
         guide_rate: learning rate of the guide's parameters relative to the program's.
         first_kl_weight, annealing: the KL divergence's weight at the first step, and the share of the training over
@@ -91,25 +81,27 @@ def fit(
         run: checkpoint, resume and progress of `train`.
 
     Raises:
-        UsageError: no such guide, or it takes no batch.
+        UsageError: no such guide, or it has no such setting or takes no batch.
         ProgramError: the program's noise is not normal.
         TrainingError: the loss is not finite.
     """
     settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
     if guide not in GUIDES:
         raise UsageError(f"no guide {guide!r}; there are {', '.join(GUIDES)}")
+    own = {name: settings[name] for name in ("width", "centred") if settings[name] is not None}
+    if own and guide != "network":
+        raise UsageError(f"guide {guide} has no {' and no '.join(own)}; network has")
     data = for_program(program, table)
     with seeded(seed, "prepare"):
         program.prepare(data, known_start)
         q = GUIDES[guide](
             program,
             data,
-            width,
-            centred,
             draws=draws,
             known_start=known_start,
             annealing=LinearRamp(first_kl_weight, annealing),
             rate=guide_rate,
+            **own,
         )
     optimization = Optimization(
         **{field.name: settings[field.name] for field in dataclasses.fields(Optimization) if field.name in settings}

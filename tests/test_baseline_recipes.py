@@ -114,6 +114,11 @@ def test_svis_guides_are_named() -> None:
         learned("svi", load_program(HOVERCRAFT), simulated(rows=5), guide="mean-field", batch=2, steps=1)
 
 
+def test_what_is_the_networks_alone_is_refused_elsewhere() -> None:
+    with pytest.raises(UsageError, match="guide mean-field has no width; network has"):
+        learned("svi", load_program(HOVERCRAFT), simulated(rows=5), guide="mean-field", width=8)
+
+
 def test_steady_minus_does_not_temper() -> None:
     fit = learned("steady-minus", load_program(HOVERCRAFT), simulated(rows=9), steps=4, validate_every=1)
     assert [entry["observation_weight"] for entry in fit.trained.history] == [1.0] * 4
