@@ -9,18 +9,15 @@ gone on with. The table of scores is printed at the end and written beside the r
 from __future__ import annotations
 
 import argparse
-import hashlib
-import json
 import math
-import sys
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
 import torch
 from discovery_scores import rivals_table, scores_table
 from discovery_sets import BenchmarkSet, benchmark_sets, owner, quick, tables
+from resumable import digest, run
 
 import steady_ppl
 from steady_ppl import for_program
@@ -43,7 +40,6 @@ def judged(chosen: BenchmarkSet) -> dict[str, Any]:
     seconds = time.perf_counter() - began
     figures = found.figures
     record = {
-        "set": chosen.name,
         "stratum": chosen.stratum,
         "effects": list(chosen.effects),
         "withheld": list(chosen.withheld),
@@ -113,7 +109,7 @@ def rivals_of(chosen: BenchmarkSet, brute: bool) -> dict[str, Any]:
                     "detected": ranking.detected,
                     "seconds": round(ranking.seconds, 1),
                 }
-    return plain({"set": chosen.name, "stratum": chosen.stratum, "effects": list(chosen.effects), "rivals": found})
+    return plain({"stratum": chosen.stratum, "effects": list(chosen.effects), "rivals": found})
 
 
 def plain(value: Any) -> Any:
@@ -127,43 +123,13 @@ def plain(value: Any) -> Any:
     return value
 
 
-def _digest() -> str:
-    """Of the engine's source, as far as `discover` and `prove` import it: a picture or a command changes no figure."""
-    engine = Path(steady_ppl.__file__).parent
-    loaded = [Path(module.__file__) for module in list(sys.modules.values()) if getattr(module, "__file__", None)]
-    files = sorted(file for file in loaded if engine in file.parents)
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
-
-
-ENGINE = _digest()
+ENGINE = digest(Path(steady_ppl.__file__).parent)
 
 
 def run_sets(work: Any, chosen: list[tuple[Any, ...]], file: Path, workers: int) -> list[dict[str, Any]]:
-    """Records of the file and of everything that is not in it yet, appended as it is done."""
-    file.parent.mkdir(exist_ok=True)
-    done = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
-    done = [record for record in done if "failed" not in record]
-    others = {record["version"] for record in done} - {ENGINE}
-    if others:
-        raise SystemExit(f"{file} was made by other versions of the engine ({', '.join(sorted(others))}): move it away")
-    there = {record["set"] for record in done}
-    left = [arguments for arguments in chosen if arguments[0].name not in there]
-    began = time.perf_counter()
-    with ProcessPoolExecutor(workers) as pool, file.open("a") as out:
-        running = {pool.submit(work, *arguments): arguments[0].name for arguments in left}
-        for count, future in enumerate(as_completed(running), 1):
-            try:
-                record = future.result()
-            except Exception as error:
-                record = {"set": running[future], "failed": f"{type(error).__name__}: {error}"}
-            record["version"] = ENGINE
-            done.append(record)
-            out.write(json.dumps(record) + "\n")
-            out.flush()
-            each = (time.perf_counter() - began) / count
-            print(f"{count}/{len(left)} {record['set']}  {each * (len(left) - count) / 60:.0f} min left", flush=True)
-    wanted = {arguments[0].name for arguments in chosen}
-    return [record for record in done if record["set"] in wanted]
+    """Records of all sets, each the first of its arguments, in the order in which they were made."""
+    jobs = {arguments[0].name: arguments for arguments in chosen}
+    return run(work, jobs, file, version=ENGINE, workers=workers)
 
 
 def main() -> None:

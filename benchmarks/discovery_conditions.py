@@ -64,7 +64,6 @@ def judged(case: Case) -> dict[str, Any]:
     keys = ("effect", "class", "coefficient", "interval_90", "heldout_gain")
     return plain(
         {
-            "set": case.name,
             "condition": case.condition,
             "planted": case.effect,
             "verdict": figures["verdict"],
