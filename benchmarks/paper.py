@@ -28,7 +28,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 import torch
 from experiments import LOGS, ROOT, hov, truck
-from paper_methods import VERSION, by_bootstrap, learnt
+from paper_methods import CHOSEN, VERSION, by_bootstrap, learnt
 from paper_tables import EXPERIMENTS, METHODS, missed, tables
 from resumable import Record, run
 
@@ -39,6 +39,7 @@ from steady_ppl.pictures import posterior_velocities
 RESULTS = ROOT / "benchmarks" / "results" / "paper.jsonl"
 SIZES = {"hov": (16, 16, 32), "hov+": (160, 32, 32)}
 RUNS = 3
+QUICK, FEWER = {"steps": 100, "validate_every": 50}, ("svi", "svi-smoother", "steady", "steady-minus")
 KEPT, COLORS = ("steady", "fit-hand"), ("#0072b2", "#d55e00")
 
 
@@ -47,7 +48,8 @@ def judged(experiment: str, method: str, seed: int, logs: Path, quick: bool, out
     torch.set_num_threads(1)
     data = truck(logs, seed) if experiment == "truck" else hov(seed, *SIZES[experiment])
     began = time.perf_counter()
-    fit = learnt(method, experiment, data, seed, quick)
+    settings = CHOSEN.get((method, experiment), {}) | (QUICK if quick and method in FEWER else {})
+    fit = learnt(method, experiment, data, seed, settings)
     seconds = time.perf_counter() - began
     if (experiment, seed) == ("truck", 1) and method in KEPT:
         fit.save(out / f"{experiment}-{method}-{seed}", force=True)

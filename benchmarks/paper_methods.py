@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,45 +16,55 @@ from models.truck import Truck
 from steady_ppl import Fit, Trajectories, for_program, log_likelihood, seeded
 from steady_ppl.metrics import state_estimation
 
+Settings = dict[str, Any]
+RECIPES: dict[str, Callable[..., Fit]] = {
+    "hand": hand.fit,
+    "fit-hand": fit_hand.fit,
+    "fit-tv": fit_tv.fit,
+    "svi": svi.fit,
+    "svi-smoother": svi.fit,
+    "steady": steady.fit,
+    "steady-minus": steady_minus.fit,
+    "steady-bootstrap": steady.fit,
+    "fit-truth": fit_truth.fit,
+    "truth": hand.fit,
+}
+OF_ITS_OWN: dict[str, Settings] = {
+    "svi-smoother": {"guide": "smoother"},
+    "steady": {"guide": "gaussian"},
+    "steady-bootstrap": {"guide": "bootstrap"},
+}
 LINEAGES = {"hov": 8, "hov+": 1, "truck": 7}  # as the authors
-# Not chosen yet: the recipes' defaults. To be chosen by held-out log p(y), as STEADY's were: Hov and Hov+ on the data
-# seeds 101 to 104, the truck on draws 11 and 12 of the bearings.
-SVI_SETTINGS: dict[str, dict] = {"hov": {}, "hov+": {"batch": 32}, "truck": {}}
-SMOOTHER_SETTINGS: dict[str, dict] = {"hov": {}, "hov+": {"batch": 32}, "truck": {}}
-TV_SETTINGS: dict[str, dict] = {"hov": {}, "hov+": {}, "truck": {}}
-QUICK = {"steps": 100, "validate_every": 50}
+# Not chosen yet: the recipes' defaults. To be chosen by `choose.py`, Hov+ as Hov.
+CHOSEN: dict[tuple[str, str], Settings] = {
+    ("svi", "hov+"): {"batch": 32},
+    ("svi-smoother", "hov+"): {"batch": 32},
+}
+CHOSEN |= {("steady", experiment): STEADY_SETTINGS["gaussian", experiment] for experiment in ("hov", "hov+", "truck")}
+CHOSEN |= {
+    ("steady-minus", experiment): {
+        name: value for name, value in CHOSEN["steady", experiment].items() if name != "ramp"
+    }
+    for experiment in LINEAGES
+}
+CHOSEN |= {("steady-bootstrap", experiment): STEADY_SETTINGS["bootstrap", experiment] for experiment in LINEAGES}
+CHOSEN |= {("fit-truth", experiment): settings for experiment, settings in FIT_TRUTH_SETTINGS.items()}
 
 
-def learnt(method: str, experiment: str, data: Split, seed: int, quick: bool) -> Fit:
-    """One method's fit."""
+def learnt(method: str, experiment: str, data: Split, seed: int, settings: Settings) -> Fit:
+    """One method's fit to the train and valid drives, known start."""
     train, valid, _ = data
-    is_truck = experiment == "truck"
-    own, network = (Truck, NeuralTruck) if is_truck else (Hovercraft, NeuralHovercraft)
+    own, network = (Truck, NeuralTruck) if experiment == "truck" else (Hovercraft, NeuralHovercraft)
     with seeded(seed, "program"):
         program = {"hand": own, "truth": HovercraftTruth}.get(method, network)()
-    common: dict[str, Any] = {"known_start": True, "seed": seed}
     if method in ("hand", "truth"):
-        return hand.fit(program, train, valid, **common)
-    common["progress"] = False
-    fewer = QUICK if quick else {}
-    if method == "fit-truth":
-        return fit_truth.fit(program, train, valid, **common | FIT_TRUTH_SETTINGS["truck" if is_truck else "hov"])
-    train, valid = (part.without_truth(keep_start=True) for part in (train, valid))
+        return RECIPES[method](program, train, valid, known_start=True, seed=seed)
+    if method != "fit-truth":
+        train, valid = (part.without_truth(keep_start=True) for part in (train, valid))
+    told = OF_ITS_OWN.get(method, {}) | settings
     if method == "fit-hand":
-        return fit_hand.fit(program, train, valid, hand=own(), lineages=LINEAGES[experiment], **common)
-    if method == "fit-tv":
-        return fit_tv.fit(program, train, valid, **common | TV_SETTINGS[experiment])
-    if method == "svi":
-        return svi.fit(program, train, valid, **common | SVI_SETTINGS[experiment] | fewer)
-    if method == "svi-smoother":
-        return svi.fit(program, train, valid, guide="smoother", **common | SMOOTHER_SETTINGS[experiment] | fewer)
-    if method == "steady-minus":
-        untempered = {
-            k: v for k, v in STEADY_SETTINGS["gaussian", experiment].items() if k not in ("first_weight", "ramp")
-        }
-        return steady_minus.fit(program, train, valid, **common | untempered | fewer)
-    guide = "bootstrap" if method == "steady-bootstrap" else "gaussian"
-    return steady.fit(program, train, valid, guide=guide, **common | STEADY_SETTINGS[guide, experiment] | fewer)
+        told = {"hand": own(), "lineages": LINEAGES[experiment]} | told
+    return RECIPES[method](program, train, valid, known_start=True, seed=seed, progress=False, **told)
 
 
 def by_bootstrap(fit: Fit, table: Trajectories, particles: int = 20_000) -> dict[str, Any]:
@@ -64,7 +75,5 @@ def by_bootstrap(fit: Fit, table: Trajectories, particles: int = 20_000) -> dict
         return {"log_likelihood": likelihood, "state_estimation": state_estimation(fit.program, data, **settings)}
 
 
-VERSION = digest(
-    *(ROOT / room for room in ("steady_ppl", "models", "inference")),
-    files=[Path(__file__), Path(__file__).with_name("experiments.py")],
-)
+SOURCE = [ROOT / room for room in ("steady_ppl", "models", "inference")]
+VERSION = digest(*SOURCE, files=[Path(__file__), Path(__file__).with_name("experiments.py")])

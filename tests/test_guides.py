@@ -15,6 +15,8 @@ from oracles import CartPosterior, assert_mean, cart_parameters, kalman
 from pyro.infer import Trace_ELBO
 from torch import Tensor
 
+from models.hovercraft import HovercraftTruth
+from models.neural_vehicle import NeuralHovercraft
 from steady_ppl import (
     Constant,
     DataError,
@@ -27,10 +29,12 @@ from steady_ppl import (
     ProgramError,
     SMCGuide,
     TruthGuide,
+    for_program,
     seeded,
+    simulate,
     stack,
 )
-from steady_ppl.sites import Replaying
+from steady_ppl.sites import Replaying, running
 from steady_ppl.true_paths import true_paths
 
 
@@ -326,3 +330,17 @@ def test_noise_that_does_not_enter_affinely_is_refused():
     program = Squared().double().requires_grad_(False)
     with pytest.raises(ProgramError, match="not affine in the channel noise"):
         true_paths(program, drives(program, 2, 12))
+
+
+def test_noise_is_told_from_states_that_no_vehicle_has():
+    """What total variation makes of poor fixes, in single precision: hundreds of m/s, thousands of m/s²."""
+    program = NeuralHovercraft().requires_grad_(False)
+    data = for_program(program, simulate(HovercraftTruth(), 4, seed=1))
+    torch.manual_seed(0)
+    wild = replace(
+        data, states=data.states + 200 * torch.randn(data.states.shape) * torch.tensor([0, 0, 0, 1, 1, 0.01])
+    )
+    paths = true_paths(program, wild)
+    with running(1, *wild.states[:-1].shape[:-1]), Replaying(paths.noise):
+        after = program.transition(wild.states[None, :-1], wild.controls[:-1], wild.elapsed[:-1], wild.steps)
+    assert float((after - wild.states[1:])[..., 3:].abs().max()) < 0.5

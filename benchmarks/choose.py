@@ -1,0 +1,127 @@
+"""Settings of the paper's baselines, chosen by held-out log p(y): development drives only, nothing of a test split.
+
+    python benchmarks/choose.py [--methods svi …] [--experiments hov …] [--data FOLDER] [--workers 2]
+
+Hov: simulated drives of the data seeds 101 and 102; truck: train and valid split, draws 11 and 12 of the bearings.
+What is printed is log p(y) of a held-out drive, by the filter that looks ahead at every row, of the parameters that the
+training keeps, and the seconds. The first of a method's candidates is its recipe's default. Resumable.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import torch
+from experiments import LOGS, ROOT, hov, truck
+from paper_methods import SOURCE, learnt
+from resumable import Record, digest, run
+
+RESULTS = ROOT / "benchmarks" / "results" / "choices.jsonl"
+SEEDS = {"hov": (101, 102), "truck": (11, 12)}
+LONGER = {"steps": 1500, "validate_every": 150}
+SUPERVISED: list[dict[str, Any]] = [{}, {"weight_decay": 0.3}, LONGER, LONGER | {"weight_decay": 0.3}]
+VARIATIONS = [{}, *({"regularization": one} for one in (1e-3, 0.1, 1.0))]
+SVI: list[dict[str, Any]] = [
+    {},
+    {"learning_rate": 1e-3},
+    {"learning_rate": 1e-2, "guide_rate": 0.3},
+    {"gradient_norm": 10.0},
+    {"first_kl_weight": 0.1},
+    {"first_kl_weight": 20.0},
+    {"weight_decay": 0.3},
+    {"steps": 3000, "validate_every": 150},
+]
+TEMPERED = {"first_kl_weight": 4.0, "annealing": 3.0}  # as STEADY's observation weight on the truck: it ends near 1 / 3
+CANDIDATES: dict[tuple[str, str], list[dict[str, Any]]] = {
+    ("svi", "hov"): SVI,
+    ("svi", "truck"): [*SVI, TEMPERED],
+    ("svi-smoother", "hov"): SVI[:3],
+    ("svi-smoother", "truck"): [*SVI[:3], TEMPERED],
+    ("fit-hand", "hov"): SUPERVISED,
+    ("fit-hand", "truck"): SUPERVISED,
+    ("fit-tv", "hov"): [*VARIATIONS, *SUPERVISED[1:3]],
+    ("fit-tv", "truck"): [*VARIATIONS, *SUPERVISED[1:3]],
+}
+
+
+def judged(method: str, experiment: str, seed: int, settings: dict[str, Any], logs: Path) -> Record:
+    """Held-out log p(y) of a fit; the test split is not even passed on."""
+    torch.set_num_threads(1)
+    train, valid, _ = truck(logs, seed) if experiment == "truck" else hov(seed, test=1)
+    began = time.perf_counter()
+    fit = learnt(method, experiment, (train, valid, valid), seed, settings)
+    assert fit.trained is not None
+    (kept,) = (entry["log_likelihood"] for entry in fit.trained.history if entry["step"] == fit.trained.kept)
+    return {
+        "method": method,
+        "experiment": experiment,
+        "seed": seed,
+        "settings": settings,
+        "log_likelihood": kept,
+        "kept_step": fit.trained.kept,
+        "seconds": round(time.perf_counter() - began, 1),
+        "notes": fit.notes,
+    }
+
+
+def table(records: list[Record]) -> str:
+    """Settings against held-out log p(y), means over seeds."""
+    lines = [
+        "| method | on | settings | log p(y) of a held-out drive | kept at step | seconds |",
+        "|---|---|---|---|---|---|",
+    ]
+    for (method, experiment), candidates in CANDIDATES.items():
+        for settings in candidates:
+            at = method, experiment, settings
+            own = [r for r in records if (r["method"], r["experiment"], r["settings"]) == at]
+            if own:
+                likelihoods = ", ".join(f"{r['log_likelihood']:.2f}" for r in own)
+                mean = statistics.fmean(r["log_likelihood"] for r in own)
+                steps = ", ".join(f"{r['kept_step']}" for r in own)
+                seconds = statistics.fmean(r["seconds"] for r in own)
+                named = ", ".join(f"{name} {value:g}" for name, value in settings.items()) or "defaults"
+                lines.append(
+                    f"| {method} | {experiment} | {named} | {mean:.2f} ({likelihoods}) | {steps} | {seconds:.0f} |"
+                )
+    return "\n".join([*lines, ""])
+
+
+def main() -> None:
+    """Run what is left and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    methods, experiments = (list(dict.fromkeys(pair[i] for pair in CANDIDATES)) for i in (0, 1))
+    parser.add_argument("--data", type=Path, default=LOGS, help="the AlphaTruck logs: train/ and valid/")
+    parser.add_argument("--methods", nargs="*", choices=methods, default=methods)
+    parser.add_argument("--experiments", nargs="*", choices=experiments, default=experiments)
+    parser.add_argument("--workers", type=int, default=2)
+    options = parser.parse_args()
+    jobs = {}
+    for (method, experiment), candidates in CANDIDATES.items():
+        if method in options.methods and experiment in options.experiments:
+            for settings in candidates:
+                for seed in SEEDS[experiment]:
+                    named = " ".join(f"{name}={value:g}" for name, value in settings.items())
+                    name = f"{method} {experiment} {seed} {named}".strip()
+                    jobs[name] = (method, experiment, seed, settings, options.data)
+    records = run(
+        judged,
+        jobs,
+        RESULTS,
+        version=digest(*SOURCE),
+        workers=options.workers,
+        said=lambda record: f"log p(y) {record['log_likelihood']:.2f}, {record['seconds']:.0f} s",
+    )
+    text = table([record for record in records if "failed" not in record])
+    RESULTS.with_suffix(".md").write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
