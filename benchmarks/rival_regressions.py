@@ -186,7 +186,8 @@ def one_by_one(rows: Rows) -> tuple[list[str], bool]:
         ratio, size = problem.ratio(label, []), problem.size([label])
         tests[label] = (stats.f.logsf(ratio, size, problem.free - size), -ratio)
     order = sorted(tests, key=lambda label: tests[label])
-    return list(dict.fromkeys(problem.names[label] for label in order)), tests[order[0]][0] < np.log(LEVEL / len(order))
+    detected = bool(tests[order[0]][0] < np.log(LEVEL / len(order)))
+    return list(dict.fromkeys(problem.names[label] for label in order)), detected
 
 
 class Least:
