@@ -202,8 +202,8 @@ def rivals_table(records: Sequence[Record], rivals: Sequence[Record]) -> str:
     ours = {record["set"]: record for record in records if "failed" not in record}
     rivals = [record for record in rivals if "failed" not in record and record["set"] in ours]
     lines = [
-        "| method | truth first, at ≥ 2 × | first three | alarms on clean sets | seconds |",
-        "|---|---|---|---|---|",
+        "| method | truth first, at ≥ 2 × | first three | sees something, at ≥ 2 × | alarms on clean sets | seconds |",
+        "|---|---|---|---|---|---|",
     ]
     planted_sets = [r for r in rivals if r["effects"] and clearly(r)]
     clean = [r for r in rivals if not r["effects"]]
@@ -211,6 +211,7 @@ def rivals_table(records: Sequence[Record], rivals: Sequence[Record]) -> str:
     own = [ours[r["set"]] for r in planted_sets]
     lines.append(
         f"| discover | {share(own, lambda r: r['class'][:1] == planted(r))} | {share(own, _among_three)} | "
+        f"{share(own, lambda r: r['verdict'] != 'none')} | "
         f"{share([ours[r['set']] for r in clean], lambda r: r['verdict'] != 'none')} | "
         f"{np.mean([r['seconds'] for r in own]) if own else math.nan:.1f} |"
     )
@@ -220,6 +221,6 @@ def rivals_table(records: Sequence[Record], rivals: Sequence[Record]) -> str:
         seconds = np.mean([r["rivals"][name]["seconds"] for r in with_it + empty])
         first = share(with_it, lambda r, name=name: r["rivals"][name]["first"][:1] == planted(r))
         three = share(with_it, lambda r, name=name: planted(r)[0] in r["rivals"][name]["first"])
-        alarms = share(empty, lambda r, name=name: r["rivals"][name]["detected"])
-        lines.append(f"| {name} | {first} | {three} | {alarms} | {seconds:.1f} |")
+        seen, alarms = (share(part, lambda r, name=name: r["rivals"][name]["detected"]) for part in (with_it, empty))
+        lines.append(f"| {name} | {first} | {three} | {seen} | {alarms} | {seconds:.1f} |")
     return "\n".join([*lines, ""])

@@ -189,3 +189,10 @@ def test_p_values_of_clean_sets_are_uniform_and_one_in_twenty_is_accused(stored)
 
 def test_the_stored_table_is_that_of_the_records(stored):
     assert STORED.with_suffix(".md").read_text().startswith(discovery_scores.scores_table(stored))
+
+
+def test_the_stored_comparison_is_that_of_the_records(stored):
+    beside = STORED.with_stem("discovery-rivals")
+    rivals = [json.loads(line) for line in beside.read_text().splitlines()]
+    assert len(rivals) == 140 and not any("failed" in record for record in rivals)
+    assert beside.with_suffix(".md").read_text() == discovery_scores.rivals_table(stored, rivals)
