@@ -1,14 +1,16 @@
 """How often `discover` is right: the development benchmark, and its rivals on the same tables.
 
-    python benchmarks/discovery.py [--quick] [--rivals] [--results FILE] [--workers 2]
+    python benchmarks/discovery.py [--quick] [--rivals] [--results FILE] [--workers 2] [--scores]
 
 Every set is one line of the results file; sets that are there already are left out, so that it can be interrupted and
-gone on with. The table of scores is printed at the end and written beside the results (`.md`).
+gone on with. The table of scores is printed at the end and written beside the results (`.md`); `--scores` does only
+that, with the records that are there.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import time
 from pathlib import Path
@@ -132,6 +134,11 @@ def run_sets(work: Any, chosen: list[tuple[Any, ...]], file: Path, workers: int)
     return run(work, jobs, file, version=ENGINE, workers=workers)
 
 
+def _stored(work: Any, chosen: list[tuple[Any, ...]], file: Path, workers: int) -> list[dict[str, Any]]:
+    """The records of a file, whichever source made them."""
+    return [json.loads(line) for line in file.read_text().splitlines()]
+
+
 def main() -> None:
     """Run what is left and print the scores."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -139,19 +146,21 @@ def main() -> None:
     parser.add_argument("--rivals", action="store_true", help="the rivals as well")
     parser.add_argument("--results", type=Path, help="benchmarks/results/discovery.jsonl, with --quick …-quick.jsonl")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--scores", action="store_true", help="run nothing")
     options = parser.parse_args()
     sets = quick() if options.quick else benchmark_sets()
     results = options.results or (RESULTS.with_stem(RESULTS.stem + "-quick") if options.quick else RESULTS)
-    records = run_sets(judged, [(one,) for one in sets], results, options.workers)
+    work = run_sets if not options.scores else _stored
+    records = work(judged, [(one,) for one in sets], results, options.workers)
     results.with_suffix(".md").write_text(scores_table(records))
     print(scores_table(records))
     if options.rivals:
         named = [one for one in sets if one.stratum in ("single", "clean")]
         chosen = named[:: max(1, len(named) // RIVAL_SETS)][:RIVAL_SETS]
         every = max(1, len(chosen) // BRUTE_SETS)
-        work = [(one, index % every == 0) for index, one in enumerate(chosen)]
+        judging = [(one, index % every == 0) for index, one in enumerate(chosen)]
         beside = results.with_stem(results.stem + "-rivals")
-        text = rivals_table(records, run_sets(rivals_of, work, beside, options.workers))
+        text = rivals_table(records, work(rivals_of, judging, beside, options.workers))
         beside.with_suffix(".md").write_text(text)
         print(text)
 

@@ -92,13 +92,13 @@ def _swings(time: torch.Tensor) -> torch.Tensor:
 
 
 def right(record: dict[str, Any]) -> bool:
-    """Whether what was planted is in a finding's class; on clean drives, whether no mean effect was found.
+    """Whether what was planted is in a finding's class; on clean drives, whether nothing was found.
 
     Where the declared noise is wrong, a clean program's right verdict is `process_noise`.
     """
     found = [one for one in record["found"] if not one["effect"].startswith("process_noise")]
     if not record["planted"]:
-        return not found and record["verdict"] in ("none", "noise")
+        return not found and record["verdict"] == ("noise" if "noise" in CONDITIONS[record["condition"]] else "none")
     name = record["planted"].rpartition("=")[0]
     return bool(found) and name in found[0]["class"]
 

@@ -1,6 +1,6 @@
 """What the owner of the discovery benchmark believes, and how small an effect its drives can show.
 
-    python benchmarks/discovery_limits.py        measures the limits again, a minute
+    python benchmarks/discovery_limits.py        measures the limits again, two minutes
 
 Detection limits are coefficients found with 95 % power at the family-wise level. They depend on the program and on how
 it is driven, so they are measured once, on drives without any effect, and kept in `discovery_limits.json`.

@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from discovery_sets import multiple_of_limit, owner
+from discovery_limits import alike
+from discovery_sets import UNMISTAKABLE, multiple_of_limit, owner
 from scipy import stats
 
 from steady_ppl.effects import find, parsed
@@ -79,16 +80,23 @@ def uniformity(records: Sequence[Record]) -> str:
     return f"{test.statistic:.3f}, {test.pvalue:.2f} of {len(records)}"
 
 
-def calibration_error(records: Sequence[Record]) -> float:
+def answered(record: Record) -> bool:
+    """Whether the class has the truth or, where that was taken out of the catalogue, a close relative of it."""
+    if record["stratum"] != "withheld":
+        return in_class(record)
+    return any(alike(planted(record)[0], name) >= UNMISTAKABLE for name in record["class"])
+
+
+def calibration_error(records: Sequence[Record], right: Callable[[Record], bool] = in_class) -> float:
     """Expected calibration error of the stated confidence over five bins of equal size (Naeini et al. 2015)."""
     said = np.array([record["confidence"] for record in records])
-    right = np.array([in_class(record) for record in records], dtype=float)
+    true = np.array([right(record) for record in records], dtype=float)
     parts = np.array_split(np.argsort(said), 5)
-    return float(sum(len(p) * abs(said[p].mean() - right[p].mean()) for p in parts if len(p)) / max(1, len(said)))
+    return float(sum(len(p) * abs(said[p].mean() - true[p].mean()) for p in parts if len(p)) / max(1, len(said)))
 
 
-def _calibration(records: Sequence[Record]) -> str:
-    return f"{calibration_error(records):.3f} of {len(records)}" if records else "–"
+def _calibration(records: Sequence[Record], right: Callable[[Record], bool] = in_class) -> str:
+    return f"{calibration_error(records, right):.3f} of {len(records)}" if records else "–"
 
 
 def scores_table(records: Sequence[Record]) -> str:
@@ -121,7 +129,7 @@ def scores_table(records: Sequence[Record]) -> str:
         ("clean p-values: distance from uniform (Kolmogorov–Smirnov), its p", uniformity(of["clean"]), ""),
         ("kind, at ≥ 2 ×", share(single, lambda r: r["verdict"] == kind_of(planted(r)[0])), "≥ 93 %"),
         (
-            "“other” where the effect is withheld and has no alias",
+            "“other” where the effect, not of noise, is withheld and has no alias",
             share(alone, lambda r: r["verdict"] == "other"),
             "≥ 80 %",
         ),
@@ -132,10 +140,13 @@ def scores_table(records: Sequence[Record]) -> str:
             "≥ 90 %",
         ),
         ("90 % interval covers the coefficient", interval(sum(cover), len(cover)), "85–95 %"),
-        ("calibration error of the confidence, withheld effects apart", _calibration(listed), "≤ .07"),
-        ("… with those whose effect was taken out of the catalogue", _calibration(named), ""),
+        ("calibration error of the confidence", _calibration(named, answered), "≤ .07"),
+        ("… where the truth is in the catalogue", _calibration(listed), ""),
+        ("… if a withheld effect's close relative counts as wrong", _calibration(named), ""),
         ("pairs at ≥ 3 ×: both found", share(pairs, both_found), "≥ 80 %"),
         ("seconds a set, one core of two, mean ± sd", f"{np.mean(seconds):.1f} ± {np.std(seconds):.1f}", "≤ 60"),
+        ("sets that took more than 60 s", f"{sum(s > 60 for s in seconds)}, at most {max(seconds):.0f} s", ""),
+        ("warned that the program's own fit has not converged", _by_stratum(records, "converged"), ""),
         ("sets that failed", f"{len(failed)} of {len(records) + len(failed)}", "0"),
     ]
     lines = ["| | figure | must |", "|---|---|---|", *(f"| {a} | {b} | {c} |" for a, b, c in rows)]
@@ -147,6 +158,13 @@ def scores_table(records: Sequence[Record]) -> str:
         "",
     ]
     return "\n".join([*lines, *(f"failed: {r['set']}: {r['failed']}" for r in failed), ""])
+
+
+def _by_stratum(records: Sequence[Record], what: str) -> str:
+    """How many records of each stratum do not have something."""
+    without = [record["stratum"] for record in records if not record[what]]
+    named = ", ".join(f"{stratum} {without.count(stratum)}" for stratum in dict.fromkeys(without))
+    return f"{len(without)} ({named})" if without else "0"
 
 
 def made_by(records: Sequence[Record]) -> str:
@@ -213,7 +231,7 @@ def rivals_table(records: Sequence[Record], rivals: Sequence[Record]) -> str:
         f"| discover | {share(own, lambda r: r['class'][:1] == planted(r))} | {share(own, _among_three)} | "
         f"{share(own, lambda r: r['verdict'] != 'none')} | "
         f"{share([ours[r['set']] for r in clean], lambda r: r['verdict'] != 'none')} | "
-        f"{np.mean([r['seconds'] for r in own]) if own else math.nan:.1f} |"
+        f"{np.mean([ours[r['set']]['seconds'] for r in rivals]) if rivals else math.nan:.1f} |"
     )
     for name in names:
         with_it = [r for r in planted_sets if name in r["rivals"]]
@@ -223,4 +241,11 @@ def rivals_table(records: Sequence[Record], rivals: Sequence[Record]) -> str:
         three = share(with_it, lambda r, name=name: planted(r)[0] in r["rivals"][name]["first"])
         seen, alarms = (share(part, lambda r, name=name: r["rivals"][name]["detected"]) for part in (with_it, empty))
         lines.append(f"| {name} | {first} | {three} | {seen} | {alarms} | {seconds:.1f} |")
+    lines += [
+        "",
+        "Seconds: means over the sets that a method saw. Brute force, smoothed residuals and the tests of innovations "
+        "begin with the fitted program; that fit is in the time of `discover` and not in theirs.",
+        f"Seeds: {seeds([ours[record['set']] for record in rivals])}. "
+        f"Digest of the engine's source: {made_by(rivals)}.",
+    ]
     return "\n".join([*lines, ""])

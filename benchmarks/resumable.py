@@ -23,7 +23,10 @@ def digest(*rooms: Path, files: Iterable[Path] = ()) -> str:
 
 def records(file: Path, version: str) -> dict[str, Record]:
     """What is done, by name; exits where another version did it. What failed is not done."""
-    lines = file.read_text().splitlines() if file.exists() else []
+    lines = file.read_text().splitlines(keepends=True) if file.exists() else []
+    if lines and not lines[-1].endswith("\n"):  # it was stopped while it wrote
+        lines.pop()
+        file.write_text("".join(lines))
     done = [record for record in map(json.loads, lines) if "failed" not in record]
     others = {record["version"] for record in done} - {version}
     if others:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -47,21 +48,22 @@ def discover(
     require_folder(json_file)
     given: Any = Fit.load(source, program) if is_run else program_from(source, seed)
     drives, judges = read_table(table), read_table(valid) if valid else None
-    found = search(
-        given,
-        drives,
-        judges,
-        known_start=known_start,
-        simulations=simulations,
-        seed=seed,
-        report=_progress,
-    )
-    _progress("")
-    print(found)
-    if out is not None:
-        used = {"table_sha256": fingerprint(drives), "valid_sha256": fingerprint(judges) if judges else None}
-        with run_folder(out, force=force):
+    with run_folder(out, force=force) if out else nullcontext():
+        found = search(
+            given,
+            drives,
+            judges,
+            known_start=known_start,
+            simulations=simulations,
+            seed=seed,
+            report=_progress,
+        )
+        _progress("")
+        print(found)
+        if out is not None:
+            used = {"table_sha256": fingerprint(drives), "valid_sha256": fingerprint(judges) if judges else None}
             found.after.save_into(out, begun=used)
+    if out is not None:
         for note in found.after.notes:
             say(note)
         print(f"{out}: {found.after.program}")

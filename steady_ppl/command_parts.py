@@ -37,9 +37,11 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def require_folder(path: Path | None) -> None:
-    """Refuse a file whose folder does not exist, before anything is computed."""
+    """Refuse a file whose folder does not exist, or that is one, before anything is computed."""
     if path is not None and not path.parent.is_dir():
         raise UsageError(f"{path} cannot be written: there is no folder {path.parent}")
+    if path is not None and path.is_dir():
+        raise UsageError(f"{path} cannot be written: it is a folder")
 
 
 def say(line: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from steady_ppl.data import Trajectories
+from steady_ppl.errors import ProgramError
 from steady_ppl.particles import roll_out
 from steady_ppl.program import Program, acting_controls, for_program, names
 from steady_ppl.seeding import seeded
@@ -22,6 +23,9 @@ def simulate(
         trajectories: how many; the program's `duration`, `step` and `example_controls` apply.
         seed: the same seed gives the same table.
         like: take time, controls and gaps in the measurements from these drives instead.
+
+    Raises:
+        ProgramError: a state is not finite.
     """
     with seeded(seed, "simulate"):
         if like is None:
@@ -52,6 +56,7 @@ def simulate(
         ):
             states.append(state)
         path = torch.cat(states)
+        _require_finite(program, path, run)
         seen = Recording()
         with running(rows, drives), seen:
             program.observe(path)
@@ -70,3 +75,14 @@ def simulate(
         measurement_names=run.measurement_names,
         state_names=names(program.states),
     )
+
+
+def _require_finite(program: Program, path: torch.Tensor, data: Trajectories) -> None:
+    broken = (~path.isfinite().all(-1) & data.rows).nonzero()
+    if len(broken):
+        row, drive = broken[0].tolist()
+        raise ProgramError(
+            f"program {type(program).__name__} blows up: in trajectory {data.labels[drive]}, row {row + 1}, its states "
+            "are not finite",
+            site="transition",
+        )

@@ -75,6 +75,13 @@ def test_a_folder_that_does_not_exist_is_said_before_anything_is_computed(tmp_pa
     for command in (("discover", HOVERCRAFT, table), ("check", tmp_path, table), ("prove", tmp_path, tmp_path, table)):
         said = refused(capsys, *command, "--json", tmp_path / "nowhere" / "found.json")
         assert "there is no folder" in said and "nowhere" in said
+        assert "it is a folder" in refused(capsys, *command, "--json", tmp_path)
+
+
+def test_a_run_that_cannot_be_written_is_said_before_anything_is_computed(tmp_path, capsys, monkeypatch):
+    table = written(tmp_path / "drives.csv", simulated(trajectories=12, rows=20))
+    monkeypatch.setattr("steady_ppl.discovery.discover", lambda *a, **k: pytest.fail("it was computed"))
+    assert "cannot be written" in refused(capsys, "discover", HOVERCRAFT, table, "--out", table / "run")
 
 
 def test_controls_that_never_change_get_no_verdict(tmp_path, capsys):

@@ -347,3 +347,10 @@ def test_the_text_says_the_verdict_first(dragged, clean):
     assert "a = -c v |v|" in str(dragged) and "open-loop error −" in str(dragged)
     assert str(clean).startswith("No effect is missing as far as these drives can tell (p = ")
     assert all(len(line) <= 125 for line in str(dragged).splitlines())
+
+
+@pytest.mark.parametrize(("withheld", "says"), [(["linaer_drag"], "did you mean linear_drag"), ("wind", "a list of")])
+def test_what_is_withheld_is_an_effect(withheld, says):
+    program = example("hovercraft")
+    with pytest.raises(st.UsageError, match=says):
+        st.discover(program, st.simulate(program, 10), withheld=withheld)

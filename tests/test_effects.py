@@ -393,6 +393,10 @@ def test_names_are_read(text: str, read) -> None:
         ("hovercraft", "linear_drag=inf", "finite numbers, got inf"),
         ("hovercraft", "process_noise=-1", "a positive number, got -1.0"),
         ("hovercraft", "acceleration_limit=0", "a positive number, got 0.0"),
+        ("hovercraft", "heavy_tails=-1", "a number between 0 and 0.49, got -1"),
+        ("hovercraft", "coloured_noise=2", "a number between -0.99 and 0.99, got 2"),
+        ("truck", "actuator_lag=-0.1", "a number at least 0, got"),
+        ("hovercraft", "sticky_patch:x=nan=0.5", "sticky_patch: x is a finite number, got nan"),
     ],
 )
 def test_a_wrong_name_or_number_is_explained(program: str, text: str, says: str) -> None:
@@ -432,7 +436,9 @@ def test_all_effects_of_the_design_are_there() -> None:
 def test_the_page_of_the_catalogue_is_up_to_date() -> None:
     """`steady effects > docs/effects.md` brings it up to date."""
     assert (MODELS.parent / "docs" / "effects.md").read_text() == page()
-    assert "- `slope`: the program holds the lateral velocity at zero" in page(example("truck"))
+    truck = page(example("truck"))
+    assert "- `slope`: the program holds the lateral velocity at zero" in truck
+    assert "| `landmark_bias` | bearing_0, bearing_1, bearing_2, bearing_3 |" in truck
 
 
 def test_coefficients_have_the_units_of_what_they_act_on() -> None:

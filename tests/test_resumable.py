@@ -41,6 +41,16 @@ def test_a_job_that_is_done_is_not_run_again_and_one_that_failed_is(tmp_path: Pa
     assert few == [{"set": "2", "version": "a", "square": 4}]
 
 
+def test_a_record_that_was_cut_off_is_run_again(tmp_path: Path) -> None:
+    file = tmp_path / "records.jsonl"
+    resumable.run(counted, {"0": (tmp_path, 0), "2": (tmp_path, 2)}, file, version="a", workers=1)
+    file.write_text(file.read_text()[:-5])
+    again = resumable.run(counted, {"0": (tmp_path, 0), "2": (tmp_path, 2)}, file, version="a")
+    assert {r["set"]: r["square"] for r in again} == {"0": 0, "2": 4}
+    assert (tmp_path / "0").read_text() == "1" and (tmp_path / "2").read_text() == "2"
+    assert [json.loads(line)["set"] for line in file.read_text().splitlines()] == ["0", "2"]
+
+
 def test_records_of_another_source_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "records.jsonl"
     file.write_text(json.dumps({"set": "1", "version": "a"}) + "\n")

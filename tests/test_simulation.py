@@ -9,7 +9,7 @@ import torch
 from examples import drives, example
 from oracles import START_MEAN, START_SD, assert_mean
 
-from steady_ppl import simulate
+from steady_ppl import ProgramError, simulate
 
 NAMES = (
     "linear_gaussian",
@@ -66,3 +66,8 @@ def test_drives_like_others_have_their_clock_controls_gaps_and_names():
     assert not data.observed.all() and (data.measurements[~data.observed] == 0).all()
     assert data.states[~data.rows].isnan().all() and data.states[data.rows].isfinite().all()
     assert not torch.equal(data.states[0], like.states[0])
+
+
+def test_a_program_that_blows_up_is_said_to():
+    with pytest.raises(ProgramError, match="WithLinearDrag blows up: in trajectory 1, row [0-9]+, its"):
+        simulate(example("hovercraft").with_effect("linear_drag", 1e15), 1)

@@ -16,8 +16,8 @@ from steady_ppl.discovery.finding import Finding, Shape, findings, shape_of
 from steady_ppl.discovery.next_run import NextRun, next_run
 from steady_ppl.discovery.requirements import FEWEST_DRIVES, require, unexcited
 from steady_ppl.discovery.search import Found, Search, search
-from steady_ppl.effects import record, restore, written_class
-from steady_ppl.errors import DataError
+from steady_ppl.effects import of_name, record, restore, written_class
+from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
 from steady_ppl.program import Program, for_program
 from steady_ppl.proving import Proof, far_off, prove
@@ -105,7 +105,7 @@ def discover(
         report: told what is done.
 
     Raises:
-        UsageError: a network, a program that cannot be linearised, or too few simulations.
+        UsageError: a network, a program that cannot be linearised, too few simulations, or no such effect to leave out.
         DataError: too few drives, no known start, or controls that identify nothing.
         FilterError: the program cannot be fitted.
 
@@ -113,6 +113,10 @@ def discover(
         >>> import steady_ppl as st  # doctest: +SKIP
         >>> print(st.discover(st.load_program("mine.py"), st.read_table("drives.csv")))  # doctest: +SKIP
     """
+    if isinstance(withheld, str):
+        raise UsageError(f"withheld is a list of effects, got {withheld!r}")
+    for name in withheld:
+        of_name(name)
     is_fitted = isinstance(program, Fit) and program.recipe != "hand"
     if isinstance(program, Fit):
         known_start = program.known_start if known_start is None else known_start

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
-from steady_ppl.effects import Variant, attached, coefficient, with_effect
+from steady_ppl.effects import Variant, attach, attached, coefficient
 from steady_ppl.elements import Element, elements, moved
 from steady_ppl.errors import FilterError, SteadyError
 from steady_ppl.gaussian_smoother import find_path, means_as_path, require_found, smooth
@@ -215,7 +215,7 @@ def refit_with(
         worth: what the first fold must reach for the second to be fitted as well.
     """
     try:
-        programs = [with_effect(program, variant, value) for program in base.programs]
+        programs = [attach(copy.deepcopy(program), variant, value) for program in base.programs]
         least = [float(maximum.log_likelihood.sum()) - NOTHING for maximum in base.maxima]
         nothing = [None] * len(programs)
         fit = _refit(programs, base.folds, known_start, nothing, information, least, worth, base.rough)
@@ -234,7 +234,7 @@ def refit_elsewhere(base: Refit, near: Refit, variant: Variant, *, known_start: 
         known_start: the first state is certain.
     """
     try:
-        programs = [with_effect(program, variant) for program in base.programs]
+        programs = [attach(copy.deepcopy(program), variant) for program in base.programs]
         for program, fitted in zip(programs, near.programs, strict=True):
             program.load_state_dict(fitted.state_dict())
         return _refit(programs, near.folds, known_start, [None] * len(programs))

@@ -12,7 +12,7 @@ from steady_ppl.effects.attach import (
     written_class,
 )
 from steady_ppl.effects.declaration import Effect, Variant
-from steady_ppl.effects.registry import catalogue, chosen_variant, find, not_applicable, parsed, register
+from steady_ppl.effects.registry import catalogue, chosen_variant, find, not_applicable, of_name, parsed, register
 from steady_ppl.effects.writing import write_program
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "coefficient",
     "find",
     "not_applicable",
+    "of_name",
     "parsed",
     "record",
     "register",

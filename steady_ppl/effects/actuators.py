@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -201,6 +202,7 @@ ACTUATORS = [
         typical=0.25,
         limit=2.0,
         sign=1,
+        between=(0.0, math.inf),
         probes=(0.1, 0.3, 0.6),
         choices=_everywhere,
         lacks=_no_controls,
@@ -216,6 +218,7 @@ ACTUATORS = [
         typical=0.2,
         limit=2.0,
         sign=1,
+        between=(0.0, math.inf),
         probes=(0.1, 0.2, 0.4),
         choices=_everywhere,
         lacks=_no_controls,

@@ -41,6 +41,7 @@ def with_effect(
         UsageError: no such effect, it does not apply to the program, is there already or takes other numbers.
     """
     variant = effect if isinstance(effect, Variant) else chosen_variant(program, effect, **options)
+    variant.require_meaning(value)
     return attach(copy.deepcopy(program), variant, value)
 
 
@@ -64,6 +65,7 @@ def attach(program: Program, variant: Variant, value: float | Sequence[float] | 
 
 def set_coefficient(program: Program, variant: Variant, value: float | Sequence[float] | Tensor) -> Program:
     """Give the coefficient of an effect that a program has another value."""
+    variant.require_meaning(value)
     setattr(program, variant.parameter, _start(variant, value, coefficient(program, variant)))
     return program
 

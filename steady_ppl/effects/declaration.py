@@ -72,6 +72,7 @@ class Effect:
         sign: of the coefficient where physics fixes it, else 0.
         null: the coefficient at which the effect is absent.
         components: names of a vector coefficient's components.
+        between: coefficients outside of which the equation means nothing; nobody can give one.
         probes: finite coefficients at which it is screened as well, for effects that do not grow in proportion.
         choices: what else it depends on, one mapping of the function's further arguments a choice: which channels,
             controls or component, called `at`, and knees, widths or places.
@@ -93,6 +94,7 @@ class Effect:
     sign: int = 0
     null: float = 0.0
     components: tuple[str, ...] = ()
+    between: tuple[float, float] = (-math.inf, math.inf)
     probes: tuple[float, ...] = ()
     choices: Choices = one_choice
     profiled: tuple[str, ...] = ()
@@ -208,6 +210,19 @@ class Variant:
                 f"{' (' + ', '.join(wanted) + ')' if wanted else ''}, got {given.numel()}"
             )
         return given
+
+    def require_meaning(self, value: float | Sequence[float] | Tensor | None) -> None:
+        """Refuse a coefficient with which the effect's equation means nothing.
+
+        Raises:
+            UsageError: it is outside of the effect's bounds.
+        """
+        least, most = self.effect.between
+        given = torch.as_tensor(self.effect.typical if value is None else value)
+        if bool(((given < least) | (given > most)).any()):
+            bounds = f"at least {least:g}" if math.isinf(most) else f"between {least:g} and {most:g}"
+            numbers = ", ".join(f"{number:.4g}" for number in given.flatten().tolist())
+            raise UsageError(f"effect {self.effect.name} takes a number {bounds}, got {numbers}")
 
     def absent(self, like: Tensor) -> Tensor:
         """The coefficient without the effect."""

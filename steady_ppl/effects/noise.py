@@ -77,6 +77,7 @@ NOISES = [
         typical=1 / 3,
         limit=0.5,
         sign=1,
+        between=(0.0, 0.49),
     ),
     Effect(
         name="measurement_noise",
@@ -143,6 +144,7 @@ NOISES = [
         function=coloured_noise,
         typical=0.6,
         limit=0.9,
+        between=(-0.99, 0.99),
         choices=_groups,
         lacks=_no_states_left,
     ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from steady_ppl.effects.declaration import VERDICTS
+from steady_ppl.effects.declaration import VERDICTS, Effect
 from steady_ppl.effects.registry import catalogue, not_applicable
 from steady_ppl.program import Program
 
@@ -20,12 +20,13 @@ def page(program: Program | None = None) -> str:
     for verdict in dict.fromkeys(VERDICTS.values()):
         chosen = [effect for effect in catalogue(program) if effect.verdict == verdict]
         if chosen:
-            lines += [f"## {verdict.capitalize()}", "", "| name | equation | unit of c | typical c | options | feels |"]
-            lines.append("|---|---|---|---|---|---|")
+            header = ["name", *(["at"] * bool(program)), "equation", "unit of c", "typical c", "options", "feels"]
+            lines += [f"## {verdict.capitalize()}", "", f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
         for effect in chosen:
             typical = effect.typical if isinstance(effect.typical, tuple) else (effect.typical,)
             cells = (
                 f"`{effect.name}`",
+                *([", ".join(_places(effect, program))] if program else []),
                 effect.text.replace("|", r"\|"),
                 effect.unit,
                 ", ".join(f"{value:.3g}" for value in typical),
@@ -38,3 +39,8 @@ def page(program: Program | None = None) -> str:
         lines += [f"## Not for {type(program).__name__}", ""]
         lines += [f"- `{name}`: {reason}" for name, reason in not_applicable(program).items()]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _places(effect: Effect, program: Program) -> list[str]:
+    """Where it can act, the first where nothing is said."""
+    return list(dict.fromkeys(variant.at for variant in effect.variants(program) if variant.at))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -45,8 +46,8 @@ def is_known(text: str) -> bool:
     return parsed(text)[0] in [effect.name for effect in _EFFECTS]
 
 
-def find(name: str, program: Program) -> Effect:
-    """The effect of a name that applies to a program.
+def of_name(name: str) -> list[Effect]:
+    """All effects of a name, which differ in what they apply to.
 
     Raises:
         UsageError: there is none; the nearest name is suggested.
@@ -56,7 +57,16 @@ def find(name: str, program: Program) -> Effect:
         near = difflib.get_close_matches(name, [effect.name for effect in _EFFECTS], n=1, cutoff=0.5)
         meant = f"did you mean {near[0]}? " if near else ""
         raise UsageError(f"no effect {name!r}: {meant}there are {', '.join(sorted({e.name for e in _EFFECTS}))}")
-    for effect in named:
+    return named
+
+
+def find(name: str, program: Program) -> Effect:
+    """The effect of a name that applies to a program.
+
+    Raises:
+        UsageError: there is none; the nearest name is suggested.
+    """
+    for effect in of_name(name):
         reason = effect.lacks(program)
         if reason is None:
             return effect
@@ -109,6 +119,9 @@ def chosen_variant(program: Program, effect: str | Effect, at: str = "", **optio
     if unknown:
         has = f"it has {', '.join(effect.profiled)}" if effect.profiled else "it has none"
         raise UsageError(f"effect {effect.name} has no option {sorted(unknown)[0]}: {has}")
+    for option, number in options.items():
+        if not math.isfinite(number):
+            raise UsageError(f"effect {effect.name}: {option} is a finite number, got {number}")
     choices = effect.variants(program)
     for index, choice in enumerate(choices):
         if at in (choice.at, str(index)) or (not at and index == 0):
