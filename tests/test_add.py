@@ -310,7 +310,7 @@ def test_the_example_of_contributing_runs(folder: Path, capsys) -> None:
     assert steady("simulate", model, "--trajectories", 1, "--effect", "tether:length=3=0.5", "--out", table) == 0
     assert "tether (length 3) = 0.5 1/s² (as given)" in capsys.readouterr().err
     assert steady("effects", model) == 0
-    assert "| `tether` | a = -c max(d - length, 0) towards the origin" in capsys.readouterr().out
+    assert "| `tether` | | a = -c max(d - length, 0) towards the origin" in capsys.readouterr().out
     assert steady("add", model, "tether:length=0.5", "--out", folder / "tethered.py") == 0
     assert "tether (length 0.5): $a = -c\\,\\max(d - l, 0)\\,e_d$" in capsys.readouterr().out
     tethered = load_program(folder / "tethered.py")

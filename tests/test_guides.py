@@ -15,8 +15,6 @@ from oracles import CartPosterior, assert_mean, cart_parameters, kalman
 from pyro.infer import Trace_ELBO
 from torch import Tensor
 
-from models.hovercraft import HovercraftTruth
-from models.neural_vehicle import NeuralHovercraft
 from steady_ppl import (
     Constant,
     DataError,
@@ -334,8 +332,8 @@ def test_noise_that_does_not_enter_affinely_is_refused():
 
 def test_noise_is_told_from_states_that_no_vehicle_has():
     """What total variation makes of poor fixes, in single precision: hundreds of m/s, thousands of m/s²."""
-    program = NeuralHovercraft().requires_grad_(False)
-    data = for_program(program, simulate(HovercraftTruth(), 4, seed=1))
+    program = example("neural_vehicle:NeuralHovercraft", torch.float32).requires_grad_(False)
+    data = for_program(program, simulate(example("hovercraft:HovercraftTruth", torch.float32), 4, seed=1))
     torch.manual_seed(0)
     wild = replace(
         data, states=data.states + 200 * torch.randn(data.states.shape) * torch.tensor([0, 0, 0, 1, 1, 0.01])

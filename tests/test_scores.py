@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 
 import pytest
@@ -10,7 +11,7 @@ from examples import drives, example
 
 from steady_ppl.discovery.columns import Column, Scoring
 from steady_ppl.discovery.curves import curves
-from steady_ppl.effects import chosen_variant, parsed
+from steady_ppl.effects import attach, chosen_variant, parsed
 from steady_ppl.elements import elements, moved
 from steady_ppl.gaussian_smoother import find_path, means_as_path, smooth
 from steady_ppl.scores import Smoothed, parameter_scores, smoothed, typical_spreads
@@ -96,7 +97,7 @@ def test_scores_of_effects_are_slopes_of_log_likelihood_where_they_are_absent(ho
         by = torch.zeros(size).double()
         by[index] = step
         values = [null + sign * by for sign in (1, -1)]
-        sides = [program.with_effect(variant, value.tolist() if size > 1 else float(value[0])) for value in values]
+        sides = [attach(deepcopy(program), variant, v.tolist() if size > 1 else float(v[0])) for v in values]
         up, down = (settled(one, data, path)[0].log_likelihood for one in sides)
         expected = (up - down) / (2 * step)
         both = torch.stack([found[:, index], expected])
