@@ -32,6 +32,7 @@ SVI: list[dict[str, Any]] = [
     {},
     {"learning_rate": 1e-2, "guide_rate": 0.3},
     {"centred": True},
+    {"centred": True, "first_kl_weight": 20.0},
     {"centred": True, "learning_rate": 1e-2, "guide_rate": 0.3},
     {"centred": True, "learning_rate": 1e-2},
     {"learning_rate": 1e-2},
@@ -42,7 +43,7 @@ SVI: list[dict[str, Any]] = [
 TEMPERED = {"first_kl_weight": 4.0, "annealing": 3.0}  # as STEADY's observation weight on the truck: it ends near 1 / 3
 CANDIDATES: dict[tuple[str, str], list[dict[str, Any]]] = {
     ("svi", "hov"): SVI,
-    ("svi", "truck"): [*SVI[:5], SVI[3] | TEMPERED],
+    ("svi", "truck"): [*SVI[:6], SVI[2] | TEMPERED],
     ("svi-smoother", "hov"): SVI[:2],
     ("svi-smoother", "truck"): [*SVI[:2], TEMPERED],
     ("fit-hand", "hov"): SUPERVISED,
