@@ -4,7 +4,8 @@
 
 Hov: simulated drives of the data seeds 101 and 102; truck: train and valid split, draws 11 and 12 of the bearings.
 What is printed is log p(y) of a held-out drive, by the filter that looks ahead at every row, of the parameters that the
-training keeps, and the seconds. The first of a method's candidates is its recipe's default. Resumable.
+training keeps, and the seconds. The first of a method's candidates is its recipe's default; others were added after
+those before them had been seen. Resumable.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import torch
 from experiments import LOGS, ROOT, hov, truck
 from paper_methods import SOURCE, learnt
-from resumable import Record, digest, run
+from resumable import Record, digest, run, stored
 
 RESULTS = ROOT / "benchmarks" / "results" / "choices.jsonl"
 SEEDS = {"hov": (101, 102), "truck": (11, 12)}
@@ -40,12 +41,12 @@ SVI: list[dict[str, Any]] = [
     {"gradient_norm": 10.0},
     {"first_kl_weight": 20.0},
 ]
-TEMPERED = {"first_kl_weight": 4.0, "annealing": 3.0}  # as STEADY's observation weight on the truck: it ends near 1 / 3
+FINAL = {"first_kl_weight": 4.0, "annealing": 3.0}  # as STEADY's observation weight on the truck: it ends near 1 / 3
 CANDIDATES: dict[tuple[str, str], list[dict[str, Any]]] = {
     ("svi", "hov"): SVI,
-    ("svi", "truck"): [*SVI[:6], SVI[2] | TEMPERED],
+    ("svi", "truck"): [*SVI[:6], SVI[2] | FINAL],
     ("svi-smoother", "hov"): SVI[:2],
-    ("svi-smoother", "truck"): [*SVI[:2], TEMPERED],
+    ("svi-smoother", "truck"): [*SVI[:2], FINAL],
     ("fit-hand", "hov"): SUPERVISED,
     ("fit-hand", "truck"): SUPERVISED,
     ("fit-tv", "hov"): [*VARIATIONS, *SUPERVISED[1:3]],
@@ -73,25 +74,32 @@ def judged(method: str, experiment: str, seed: int, settings: dict[str, Any], lo
     }
 
 
-def table(records: list[Record]) -> str:
-    """Settings against held-out log p(y), means over seeds."""
+def named(method: str, experiment: str, seed: int, settings: dict[str, Any]) -> str:
+    """Under what a fit's record is kept."""
+    return " ".join([method, experiment, str(seed), *(f"{name}={value:g}" for name, value in settings.items())])
+
+
+def table(records: dict[str, Record]) -> str:
+    """Settings against held-out log p(y), a figure a seed; a fit that failed has none, and its settings no mean."""
     lines = [
-        "| method | on | settings | log p(y) of a held-out drive | kept at step | seconds |",
-        "|---|---|---|---|---|---|",
+        "| method | on | settings | mean log p(y) of a held-out drive | each seed | kept at step | seconds |",
+        "|---|---|---|---|---|---|---|",
     ]
     for (method, experiment), candidates in CANDIDATES.items():
         for settings in candidates:
-            at = method, experiment, settings
-            own = [r for r in records if (r["method"], r["experiment"], r["settings"]) == at]
-            if own:
-                likelihoods = ", ".join(f"{r['log_likelihood']:.2f}" for r in own)
-                mean = statistics.fmean(r["log_likelihood"] for r in own)
-                steps = ", ".join(f"{r['kept_step']}" for r in own)
-                seconds = statistics.fmean(r["seconds"] for r in own)
-                named = ", ".join(f"{name} {value:g}" for name, value in settings.items()) or "defaults"
-                lines.append(
-                    f"| {method} | {experiment} | {named} | {mean:.2f} ({likelihoods}) | {steps} | {seconds:.0f} |"
-                )
+            names = [named(method, experiment, seed, settings) for seed in SEEDS[experiment]]
+            tried = [records[name] for name in names if name in records]
+            fits = [record for record in tried if "failed" not in record]
+            whole = len(fits) == len(SEEDS[experiment])
+            columns = ([record.get(key) for record in tried] for key in ("log_likelihood", "kept_step", "seconds"))
+            likelihoods, steps, seconds = (
+                ", ".join("failed" if figure is None else f"{figure:.{digits}f}" for figure in column)
+                for column, digits in zip(columns, (2, 0, 0), strict=True)
+            )
+            mean = f"{statistics.fmean(record['log_likelihood'] for record in fits):.2f}" if whole else "–"
+            said = ", ".join(f"{name} {value:g}" for name, value in settings.items()) or "defaults"
+            if tried:
+                lines.append(f"| {method} | {experiment} | {said} | {mean} | {likelihoods} | {steps} | {seconds} |")
     return "\n".join([*lines, ""])
 
 
@@ -109,10 +117,9 @@ def main() -> None:
         if method in options.methods and experiment in options.experiments:
             for settings in candidates:
                 for seed in SEEDS[experiment]:
-                    named = " ".join(f"{name}={value:g}" for name, value in settings.items())
-                    name = f"{method} {experiment} {seed} {named}".strip()
-                    jobs[name] = (method, experiment, seed, settings, options.data)
-    records = run(
+                    job = method, experiment, seed, settings
+                    jobs[named(*job)] = (*job, options.data)
+    run(
         judged,
         jobs,
         RESULTS,
@@ -120,7 +127,7 @@ def main() -> None:
         workers=options.workers,
         said=lambda record: f"log p(y) {record['log_likelihood']:.2f}, {record['seconds']:.0f} s",
     )
-    text = table([record for record in records if "failed" not in record])
+    text = table(stored(RESULTS))
     RESULTS.with_suffix(".md").write_text(text)
     print(text)
 

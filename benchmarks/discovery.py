@@ -10,7 +10,6 @@ that, with the records that are there.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import time
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Any
 import torch
 from discovery_scores import rivals_table, scores_table
 from discovery_sets import BenchmarkSet, benchmark_sets, owner, quick, tables
-from resumable import digest, run
+from resumable import digest, run, stored
 
 import steady_ppl
 from steady_ppl import for_program
@@ -134,11 +133,6 @@ def run_sets(work: Any, chosen: list[tuple[Any, ...]], file: Path, workers: int)
     return run(work, jobs, file, version=ENGINE, workers=workers)
 
 
-def _stored(work: Any, chosen: list[tuple[Any, ...]], file: Path, workers: int) -> list[dict[str, Any]]:
-    """The records of a file, whichever source made them."""
-    return [json.loads(line) for line in file.read_text().splitlines()]
-
-
 def main() -> None:
     """Run what is left and print the scores."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -150,8 +144,11 @@ def main() -> None:
     options = parser.parse_args()
     sets = quick() if options.quick else benchmark_sets()
     results = options.results or (RESULTS.with_stem(RESULTS.stem + "-quick") if options.quick else RESULTS)
-    work = run_sets if not options.scores else _stored
-    records = work(judged, [(one,) for one in sets], results, options.workers)
+
+    def made(work: Any, chosen: list[tuple[Any, ...]], file: Path) -> list[dict[str, Any]]:
+        return [*stored(file).values()] if options.scores else run_sets(work, chosen, file, options.workers)
+
+    records = made(judged, [(one,) for one in sets], results)
     results.with_suffix(".md").write_text(scores_table(records))
     print(scores_table(records))
     if options.rivals:
@@ -160,7 +157,7 @@ def main() -> None:
         every = max(1, len(chosen) // BRUTE_SETS)
         judging = [(one, index % every == 0) for index, one in enumerate(chosen)]
         beside = results.with_stem(results.stem + "-rivals")
-        text = rivals_table(records, work(rivals_of, judging, beside, options.workers))
+        text = rivals_table(records, made(rivals_of, judging, beside))
         beside.with_suffix(".md").write_text(text)
         print(text)
 

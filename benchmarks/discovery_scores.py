@@ -81,10 +81,11 @@ def uniformity(records: Sequence[Record]) -> str:
 
 
 def answered(record: Record) -> bool:
-    """Whether the class has the truth or, where that was taken out of the catalogue, a close relative of it."""
+    """Whether the class has the truth or, where that was taken out of the catalogue, a close relative of it that
+    attains nearly all of the oracle's improvement."""
     if record["stratum"] != "withheld":
         return in_class(record)
-    return any(alike(planted(record)[0], name) >= UNMISTAKABLE for name in record["class"])
+    return _nearly_all(record) and any(alike(planted(record)[0], name) >= UNMISTAKABLE for name in record["class"])
 
 
 def calibration_error(records: Sequence[Record], right: Callable[[Record], bool] = in_class) -> float:

@@ -21,19 +21,27 @@ def digest(*rooms: Path, files: Iterable[Path] = ()) -> str:
     return hashlib.sha256(b"".join(file.read_bytes() for file in source)).hexdigest()[:12]
 
 
-def records(file: Path, version: str) -> dict[str, Record]:
-    """What is done, by name; exits where another version did it. What failed is not done."""
+def stored(file: Path) -> dict[str, Record]:
+    """The last record of each name, whichever source made it; a line that was cut off is none."""
     lines = file.read_text().splitlines(keepends=True) if file.exists() else []
-    if lines and not lines[-1].endswith("\n"):  # it was stopped while it wrote
-        lines.pop()
-        file.write_text("".join(lines))
-    done = [record for record in map(json.loads, lines) if "failed" not in record]
-    others = {record["version"] for record in done} - {version}
+    return {record["set"]: record for record in (json.loads(line) for line in lines if line.endswith("\n"))}
+
+
+def _done(file: Path, version: str) -> dict[str, Record]:
+    """What need not be run again, which what failed need; exits where another source made it."""
+    done = {name: record for name, record in stored(file).items() if "failed" not in record}
+    others = {record["version"] for record in done.values()} - {version}
     if others:
         raise SystemExit(
             f"{file} was made by another version of the source ({', '.join(sorted(others))}): move it away"
         )
-    return {record["set"]: record for record in done}
+    return done
+
+
+def _drop_what_was_cut_off(file: Path) -> None:
+    whole, _, rest = file.read_text().rpartition("\n") if file.exists() else ("", "", "")
+    if rest:
+        file.write_text(f"{whole}\n" if whole else "")
 
 
 def run(
@@ -59,7 +67,8 @@ def run(
         A record a job; one that failed has the reason under `failed`, and is tried again the next time.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
-    done = records(file, version)
+    done = _done(file, version)
+    _drop_what_was_cut_off(file)
     left = {name: arguments for name, arguments in jobs.items() if name not in done}
     began = time.perf_counter()
     with ProcessPoolExecutor(workers) as pool, file.open("a") as out:
