@@ -1,4 +1,4 @@
-"""The paper's methods and the settings by which `paper.py` compares them."""
+"""The paper's methods, as `paper.py` runs them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from experiments import FIT_TRUTH_SETTINGS, ROOT, STEADY_SETTINGS, Split
+from experiments import ROOT, Split
 from resumable import digest
 
 from inference import fit_hand, fit_truth, fit_tv, hand, steady, steady_minus, svi
@@ -35,25 +35,6 @@ OF_ITS_OWN: dict[str, Settings] = {
     "steady-bootstrap": {"guide": "bootstrap"},
 }
 LINEAGES = {"hov": 8, "hov+": 1, "truck": 7}  # as the authors
-# By `choose.py`, Hov+ as Hov. SVI: the best of ten on both seeds of Hov, tried after either half of it alone; on the
-# truck the best of those that fit both draws (the default has 2 nats more on draw 12 and fails on draw 11), three other
-# candidates not being fitted to both. The rest is not chosen yet: the recipes' defaults.
-TEMPERED_NETWORK: Settings = {"centred": True, "first_kl_weight": 20.0}
-CHOSEN: dict[tuple[str, str], Settings] = {
-    ("svi", "hov"): TEMPERED_NETWORK,
-    ("svi", "hov+"): TEMPERED_NETWORK | {"batch": 32},
-    ("svi", "truck"): TEMPERED_NETWORK,
-    ("svi-smoother", "hov+"): {"batch": 32},
-}
-CHOSEN |= {("steady", experiment): STEADY_SETTINGS["gaussian", experiment] for experiment in ("hov", "hov+", "truck")}
-CHOSEN |= {
-    ("steady-minus", experiment): {
-        name: value for name, value in CHOSEN["steady", experiment].items() if name != "ramp"
-    }
-    for experiment in LINEAGES
-}
-CHOSEN |= {("steady-bootstrap", experiment): STEADY_SETTINGS["bootstrap", experiment] for experiment in LINEAGES}
-CHOSEN |= {("fit-truth", experiment): settings for experiment, settings in FIT_TRUTH_SETTINGS.items()}
 
 
 def learnt(method: str, experiment: str, data: Split, seed: int, settings: Settings) -> Fit:
@@ -70,6 +51,12 @@ def learnt(method: str, experiment: str, data: Split, seed: int, settings: Setti
     if method == "fit-hand":
         told = {"hand": own(), "lineages": LINEAGES[experiment]} | told
     return RECIPES[method](program, train, valid, known_start=True, seed=seed, progress=False, **told)
+
+
+def named(method: str, experiment: str, seed: int, settings: Settings) -> str:
+    """Under what a fit's record is kept."""
+    said = (f"{name}={value:g}" for name, value in settings.items())
+    return " ".join([experiment, method, str(seed), *said])
 
 
 def by_bootstrap(fit: Fit, table: Trajectories, particles: int = 20_000) -> dict[str, Any]:

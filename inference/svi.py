@@ -45,7 +45,7 @@ def fit(
     centred: bool | None = None,
     draws: int = 8,
     guide_rate: float = 1.0,
-    first_kl_weight: float = 1.0,
+    first_kl_weight: float = 20.0,
     annealing: float = 0.5,
     steps: int = 1500,
     learning_rate: float = 3e-3,

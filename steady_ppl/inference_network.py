@@ -32,7 +32,7 @@ class InferenceNetwork(VariationalGuide):
     Args:
         data: training drives, as returned by `for_program`.
         width: of the recurrent network.
-        centred: propose the noise's values instead of its deviations from the program's mean, see `VariationalGuide`.
+        centred: propose the noise's values, not its deviations from the program's mean, see `VariationalGuide`.
         more: of `VariationalGuide`.
     """
 
@@ -40,7 +40,7 @@ class InferenceNetwork(VariationalGuide):
     scale: Tensor
 
     def __init__(
-        self, program: Program, data: Trajectories, *, width: int = 64, centred: bool = False, **more: Any
+        self, program: Program, data: Trajectories, *, width: int = 64, centred: bool = True, **more: Any
     ) -> None:
         super().__init__(program, **more)
         self.centred = centred

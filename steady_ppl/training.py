@@ -203,7 +203,7 @@ def _require_finite_gradients(parameters: Mapping[str, Tensor], step: int) -> No
         if value.grad is not None and not bool(torch.isfinite(value.grad).all()):
             raise TrainingError(
                 f"the gradient of {name.removesuffix('_unconstrained')} is not finite at step {step + 1}: look for a "
-                "square root, a division or a norm at zero in the program"
+                "square root, a division or a norm at zero in the program, or for roll-outs that blow up"
             )
 
 

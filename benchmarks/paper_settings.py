@@ -1,0 +1,26 @@
+"""The settings by which `paper.py` compares the methods; defaults where there are none.
+
+Chosen by held-out log p(y) of development drives: those of SVI, FitHand and FitTV by `choose.py`, which prints what was
+tried (`results/choices.md`); those of STEADY and FitTruth are in `experiments.py`. What was chosen on Hov is used on
+Hov+, but that SVI and STEADY take batches there.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from experiments import FIT_TRUTH_SETTINGS, STEADY_SETTINGS
+
+EXPERIMENTS = ("hov", "hov+", "truck")
+CHOSEN: dict[tuple[str, str], dict[str, Any]] = {
+    ("svi", "hov+"): {"batch": 32},
+}
+CHOSEN |= {("steady", experiment): STEADY_SETTINGS["gaussian", experiment] for experiment in EXPERIMENTS}
+CHOSEN |= {
+    ("steady-minus", experiment): {
+        name: value for name, value in CHOSEN["steady", experiment].items() if name != "ramp"
+    }
+    for experiment in EXPERIMENTS
+}
+CHOSEN |= {("steady-bootstrap", experiment): STEADY_SETTINGS["bootstrap", experiment] for experiment in EXPERIMENTS}
+CHOSEN |= {("fit-truth", experiment): settings for experiment, settings in FIT_TRUTH_SETTINGS.items()}
