@@ -1,12 +1,13 @@
 """The paper's two tables: every method on Hov, Hov+ and Truck under one likelihood, beside the published figures.
 
-    python benchmarks/paper.py [--data FOLDER] [--quick] [--results FILE] [--workers 2]      (make paper, QUICK=1)
+    python benchmarks/paper.py [--data FOLDER] [--quick] [--out FOLDER] [--workers 2]      (make paper, QUICK=1)
 
 Three runs of each method, each on drives (for the truck: on a draw of the bearings) of its own, the same for all
-methods; known start, as in the paper. Every run is one line of the results file; runs that are there already, by the
+methods; known start, as in the paper. Every run is one line of OUT/paper.jsonl; runs that are there already, by the
 same source and settings, are left out, so that it can be interrupted and gone on with. Two processes of one thread
-each. The tables are printed at the end and written beside the results (`.md`), with what must hold and does not; the
-fits of the truck's first run are kept in OUT for the picture of velocities.
+each. The tables are printed at the end and written beside (paper.md), with what must hold and does not; the fits of the
+truck's first run are kept there too, for the picture of velocities. What was published with this source is in
+`results/paper.*`.
 
 What each method is allowed to know: Hand nothing; FitTV the measurements; FitHand, SVI and STEADY the measurements and
 the true first state of each drive; FitTruth all true states. Those that learn stop on held-out log p(y) of the valid
@@ -38,7 +39,6 @@ from steady_ppl import Fit
 from steady_ppl.evaluation import evaluate
 from steady_ppl.pictures import posterior_velocities
 
-RESULTS = ROOT / "benchmarks" / "results" / "paper.jsonl"
 SIZES = {"hov": (16, 16, 32), "hov+": (160, 32, 32)}
 RUNS = 3
 QUICK, FEWER = {"steps": 100, "validate_every": 50}, ("svi", "svi-smoother", "steady", "steady-minus")
@@ -70,8 +70,12 @@ def judged(method: str, experiment: str, seed: int, settings: Settings, logs: Pa
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=LOGS, help="the AlphaTruck logs: train/, valid/ and test/")
-    parser.add_argument("--results", type=Path, help="resumable; by default benchmarks/results/paper.jsonl")
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "paper", help="fits and picture of the truck")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=ROOT / "out" / "paper",
+        help="paper.jsonl, which it goes on with, paper.md, fits and picture of the truck",
+    )
     parser.add_argument("--experiments", nargs="*", choices=list(EXPERIMENTS), default=list(EXPERIMENTS))
     parser.add_argument("--methods", nargs="*", choices=list(METHODS), default=list(METHODS))
     parser.add_argument("--runs", type=int, default=RUNS)
@@ -84,8 +88,8 @@ def main() -> int:
         experiments = [experiment for experiment in experiments if experiment != "truck"]
     if arguments.quick:
         runs, methods = 1, [method for method in methods if method != "steady-bootstrap"]
-    results = arguments.results or RESULTS.with_name("paper-quick.jsonl" if arguments.quick else "paper.jsonl")
     out = arguments.out / "quick" if arguments.quick else arguments.out
+    results = out / "paper.jsonl"
     jobs = {}
     for seed in range(1, 1 + runs):
         for experiment, method in itertools.product(experiments, methods):

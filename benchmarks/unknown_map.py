@@ -1,12 +1,12 @@
 """Landmarks learned together with the dynamics on Hov, from a map that is wrong by one metre at every landmark.
 
-    python benchmarks/unknown_map.py [--seeds 5] [--first-seed 1] [--programs mechanistic network]
+    python benchmarks/unknown_map.py [--seeds 5] [--first-seed 1] [--programs mechanistic network] [--out FOLDER]
 
 Known starts fix the frame. First the information bound is computed: the Cramér–Rao bound of the landmarks' root mean
 square error for 16 drives, dynamics unknown as well, at the true parameters. Then, for each data seed, the same program
 learns with the true map and with the wrong one; exits with 1 when the map's error is more than 1.5 times the bound or
 the forward error more than 15 % above that of the known map. The network's bound is that of the mechanistic program,
-which knows more.
+which knows more. One record a seed and program in OUT/unknown_map.jsonl; resumable.
 """
 
 from __future__ import annotations
@@ -17,12 +17,15 @@ import os
 import statistics
 import sys
 import time
+from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
 from accuracy import unknown_drag
-from experiments import STEADY_SETTINGS, hov
+from experiments import ROOT, STEADY_SETTINGS, hov
+from paper_methods import SOURCE
+from resumable import Record, digest, run
 
 from inference import steady
 from models.hovercraft import HovercraftTruth
@@ -66,12 +69,13 @@ def moved(program: UnknownMap, seed: int) -> UnknownMap:
     return program
 
 
-def learnt(name: str, seed: int) -> dict:
+def learnt(name: str, seed: int) -> Record:
     """The fits with the known and with the wrong map, judged."""
+    torch.set_num_threads(1)
     known, unknown, settings = PROGRAMS[name]
     train, valid, test = hov(seed)
     train, valid = (part.without_truth(keep_start=True) for part in (train, valid))
-    figures: dict = {"program": name, "seed": seed}
+    figures: Record = {"program": name, "seed": seed}
     for which, kind in (("known map", known), ("learned map", unknown)):
         with seeded(seed, "program"):
             program = kind()
@@ -87,32 +91,46 @@ def learnt(name: str, seed: int) -> dict:
     return figures
 
 
+def said(record: Record) -> str:
+    """A line of a seed."""
+    known, learned = (record[which] for which in ("known map", "learned map"))
+    return (
+        f"map off by {learned['map']['rms']:.3f} m, forward {learned['forward']['location']:.4f} m "
+        f"(known map {known['forward']['location']:.4f}), log p(y) {learned['log_likelihood']:.2f} "
+        f"({known['log_likelihood']:.2f}), {learned['seconds']:.0f} s"
+    )
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first-seed", type=int, default=1, help="101 to 104 are for choosing settings")
     parser.add_argument("--programs", nargs="*", choices=list(PROGRAMS), default=list(PROGRAMS))
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "unknown_map")
+    parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     best = bound()
     print(f"information bound of the map's root mean square error, {DRIVES} drives: {best:.3f} m", flush=True)
-    missed = 0
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    jobs = {f"{name} seed {seed}": (name, seed) for name in arguments.programs for seed in seeds}
+    records = run(
+        learnt,
+        jobs,
+        arguments.out / "unknown_map.jsonl",
+        version=digest(*SOURCE, files=[Path(__file__), Path(__file__).with_name("experiments.py")]),
+        workers=arguments.workers,
+        said=said,
+    )
+    missed = any("failed" in record for record in records)
     for name in arguments.programs:
-        runs = []
-        for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds):
-            runs.append(learnt(name, seed))
-            known, learned = (runs[-1][which] for which in ("known map", "learned map"))
-            print(
-                f"{name} seed {seed}: map off by {learned['map']['rms']:.3f} m, "
-                f"forward {learned['forward']['location']:.4f} m (known map {known['forward']['location']:.4f}), "
-                f"log p(y) {learned['log_likelihood']:.2f} "
-                f"({known['log_likelihood']:.2f}), {learned['seconds']:.0f} s",
-                flush=True,
-            )
-        errors = [run["learned map"]["map"]["rms"] for run in runs]
+        runs = [record for record in records if record.get("program") == name]
+        if not runs:
+            continue
+        errors = [one["learned map"]["map"]["rms"] for one in runs]
         rms = math.sqrt(statistics.fmean(error**2 for error in errors))
         ahead = [
-            statistics.fmean(run[which]["forward"]["location"] for run in runs)
+            statistics.fmean(one[which]["forward"]["location"] for one in runs)
             for which in ("known map", "learned map")
         ]
         far, worse = rms > 1.5 * best, ahead[1] > 1.15 * ahead[0]

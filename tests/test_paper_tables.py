@@ -9,6 +9,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
+from choose import CANDIDATES, SEEDS, table
+from paper_methods import named
 from paper_tables import EXPERIMENTS, METHODS, PUBLISHED, missed, tables
 
 
@@ -53,3 +55,14 @@ def test_the_benchmark_starts() -> None:
     command = [sys.executable, PUBLISHED.parent / "paper.py", "--help"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "usage: paper.py" in done.stdout
+
+
+def test_settings_that_failed_or_are_not_fitted_to_every_draw_have_no_mean() -> None:
+    first, second = (CANDIDATES["svi", "truck"][i] for i in (0, 1))
+    seeds = SEEDS["truck"]
+    fitted = {"log_likelihood": 370.0, "kept_step": 5, "seconds": 2.0}
+    both = {named("svi", "truck", seed, first): fitted for seed in seeds}
+    assert "| 370.00 | 370.00, 370.00 | 5, 5 | 2, 2 |" in table(both)
+    failed = both | {named("svi", "truck", seeds[0], first): {"failed": "why"}}
+    assert "| – | failed, 370.00 | failed, 5 | failed, 2 |" in table(failed)
+    assert "| – | 370.00 | 5 | 2 |" in table({named("svi", "truck", seeds[1], second): fitted})
