@@ -65,7 +65,7 @@ def moved(program: UnknownMap, seed: int) -> UnknownMap:
     with seeded(seed, "wrong map"):
         turn = 2 * math.pi * torch.rand(len(program.declared))
     program.declared += AWAY * torch.stack([turn.cos(), turn.sin()], -1)
-    program.map = program.declared.clone()
+    program.map.data.copy_(program.declared)
     return program
 
 

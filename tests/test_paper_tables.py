@@ -7,11 +7,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+import torch
+
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 from choose import CANDIDATES, SEEDS, table
 from paper_methods import named
 from paper_tables import EXPERIMENTS, METHODS, PUBLISHED, missed, tables
+from unknown_map import moved
+
+from models.hovercraft import HovercraftTruth
+from models.hovercraft_unknown_map import HovercraftUnknownMap
 
 
 def record(method: str, seed: int, size: float) -> dict:
@@ -66,3 +73,10 @@ def test_settings_that_failed_or_are_not_fitted_to_every_draw_have_no_mean() -> 
     failed = both | {named("svi", "truck", seeds[0], first): {"failed": "why"}}
     assert "| – | failed, 370.00 | failed, 5 | failed, 2 |" in table(failed)
     assert "| – | 370.00 | 5 | 2 |" in table({named("svi", "truck", seeds[1], second): fitted})
+
+
+def test_the_wrong_map_is_a_metre_off_at_every_landmark_and_what_is_learned_begins_there() -> None:
+    program = moved(HovercraftUnknownMap(), seed=1)
+    away = torch.tensor(HovercraftTruth.landmarks) - program.map
+    assert away.norm(dim=-1).tolist() == pytest.approx([1.0] * len(away), abs=1e-5)
+    assert torch.equal(program.landmarks, program.map) and torch.equal(program.declared, program.map)
