@@ -12,8 +12,14 @@ from typing import Any
 from experiments import FIT_TRUTH_SETTINGS, STEADY_SETTINGS
 
 EXPERIMENTS = ("hov", "hov+", "truck")
+LONGER = {"steps": 1500, "validate_every": 150}
 CHOSEN: dict[tuple[str, str], dict[str, Any]] = {
     ("svi", "hov+"): {"batch": 32},
+    ("fit-hand", "hov"): LONGER,
+    ("fit-hand", "hov+"): LONGER,
+    ("fit-hand", "truck"): LONGER | {"weight_decay": 0.3},
+    ("fit-tv", "hov"): {"regularization": 0.3},
+    ("fit-tv", "hov+"): {"regularization": 0.3},
 }
 CHOSEN |= {("steady", experiment): STEADY_SETTINGS["gaussian", experiment] for experiment in EXPERIMENTS}
 CHOSEN |= {
@@ -24,3 +30,4 @@ CHOSEN |= {
 }
 CHOSEN |= {("steady-bootstrap", experiment): STEADY_SETTINGS["bootstrap", experiment] for experiment in EXPERIMENTS}
 CHOSEN |= {("fit-truth", experiment): settings for experiment, settings in FIT_TRUTH_SETTINGS.items()}
+CHOSEN["fit-truth", "hov+"] = LONGER | {"weight_decay": 0.3}

@@ -1,9 +1,10 @@
 """An inference network as a guide: what a drive's later measurements say of its noise, learned for all drives at once.
 
-Backward in time a recurrent network reads measurements and controls. Its code, of all rows at once, is turned into a
-proposal for each interval: normal, with a mean that depends on the state reached so far, in an affine way, as a linear
-program asks for, and through a small hidden layer (the structured approximation DKS of Krishnan, Shalit and Sontag
-2017). Its output layers begin at zero: it first proposes noise of the size that the program then has.
+Backward in time a recurrent network reads measurements and controls. Its code, of all rows at once, is turned with the
+interval's own control and step into a proposal for each interval: normal, with a mean that depends on the state reached
+so far, in an affine way, as a linear program asks for, and through a small hidden layer (the structured approximation
+DKS of Krishnan, Shalit and Sontag 2017). Its output layers begin at zero: centred, it first proposes mean and spread of
+the noise's smoothed values, otherwise noise of the size that the program then has.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from steady_ppl.data import Trajectories
-from steady_ppl.filtering import smoothed_states
+from steady_ppl.gaussian_smoother import find_and_smooth, means_as_path
 from steady_ppl.predictions import on_a_circle
 from steady_ppl.probe import start_size, step_size
 from steady_ppl.program import Program, names
@@ -26,8 +27,7 @@ HIDDEN, BOUND = 16, 3.0  # units beside the affine mean, and how many of the fir
 
 
 class InferenceNetwork(VariationalGuide):
-    """The guide; measurements and states are scaled by the moments of `data` and of its smoothed states, centred noise
-    by the standard deviations that the program then has.
+    """The guide; measurements, states and centred noise are scaled by the moments of `data` and of its smoothed path.
 
     Args:
         data: training drives, as returned by `for_program`.
@@ -37,6 +37,7 @@ class InferenceNetwork(VariationalGuide):
     """
 
     circular: Tensor
+    middle: Tensor
     scale: Tensor
 
     def __init__(
@@ -44,12 +45,14 @@ class InferenceNetwork(VariationalGuide):
     ) -> None:
         super().__init__(program, **more)
         self.centred = centred
-        states = smoothed_states(program, data, known_start=self.known_start)
+        path = means_as_path(find_and_smooth(program, data, known_start=self.known_start), data)
+        states = path.states
         self.angles = [names(program.states).index(angle) for angle in program.angles]
         self.register_buffer("circular", on_a_circle(program, data, states))
-        with torch.no_grad():
-            spread = channel_moments(program, data, states[:-1].unsqueeze(0))[1][0]
-        self.register_buffer("scale", spread[data.transitions].mean(0))
+        mean, spread = (moment[0][data.transitions] for moment in channel_moments(program, data, states[None, :-1]))
+        values = mean + spread * path.noise[data.transitions]
+        self.register_buffer("middle", values.mean(0))
+        self.register_buffer("scale", (values.var(0, correction=0) + spread.square().mean(0)).sqrt())
         inside, features = data.rows[..., None], self._features(states)
         self.scales = nn.ModuleDict(
             {
@@ -59,14 +62,16 @@ class InferenceNetwork(VariationalGuide):
             }
         )
         first, later, size = start_size(program), step_size(program), features.shape[-1]
-        inputs = 3 * data.measurements.shape[-1] + data.controls.shape[-1] + 1
+        acting = data.controls.shape[-1] + 1
+        inputs = 3 * data.measurements.shape[-1] + acting
         self.step_scale = data.median_step
-        self.sizes = {"first": first, "later": later, "features": size}
+        self.sizes = {"first": first, "later": later, "features": size, "acting": acting}
         self.encoder = nn.Linear(inputs, width)
         self.recurrent = nn.GRU(width, width)
         self.first = nn.Linear(width, 2 * first + _below(first))
-        self.affine = nn.Linear(width + inputs, later * (2 + size) + _below(later))
-        self.by_code, self.by_state = nn.Linear(width + inputs, HIDDEN), nn.Linear(size, HIDDEN, bias=False)
+        given = width + inputs + acting
+        self.affine = nn.Linear(given, later * (2 + size) + _below(later))
+        self.by_code, self.by_state = nn.Linear(given, HIDDEN), nn.Linear(size, HIDDEN, bias=False)
         self.head = nn.Linear(HIDDEN, later, bias=False)
         for layer in (self.first, self.affine, self.head):
             for value in layer.parameters():
@@ -80,7 +85,7 @@ class InferenceNetwork(VariationalGuide):
         codes = self.recurrent(turned)[0].take_along_dim(backward[..., None], 0)
         self.code = codes[0]
         later, size = self.sizes["later"], self.sizes["features"]
-        given = torch.cat([codes[1:], inputs[1:]], -1)
+        given = torch.cat([codes[1:], inputs[1:], inputs[:-1, :, -self.sizes["acting"] :]], -1)
         self.shift, self.log_sd, gain, below = self.affine(given).split([later, later, later * size, _below(later)], -1)
         self.gain, self.hidden = gain.unflatten(-1, (later, size)), self.by_code(given)
         self.random = torch.randn(self.draws, *self.shift.shape, dtype=gain.dtype, device=gain.device)
@@ -104,7 +109,7 @@ class InferenceNetwork(VariationalGuide):
         mean = mean + self.head((self.hidden[row] + self.by_state(features)).tanh())
         noise = BOUND * (mean / BOUND).tanh() + self.around[:, row]
         if self.centred:
-            return self.scale * noise, state.new_zeros(())
+            return self.middle + self.scale * noise, state.new_zeros(())
         return noise, log_ratio(noise, self.random[:, row], self.log_sd[row])
 
     def _inputs(self, data: Trajectories) -> Tensor:
