@@ -41,10 +41,9 @@ class AutoRollout(VariationalGuide):
         super().__init__(program, **more)
         self.sizes, self.labels = (start_size(program), step_size(program)), data.labels
         self.now: dict[str, Tensor] = {}
+        zeros = {name: data.controls.new_zeros(shape) for name, shape in self._shapes(data).items()}
         with pyro.settings.context(module_local_params=True), poutine.block():
-            self.auto = auto(
-                self._noise, **{"init_loc_fn": init_to_value(values=self._noise_at_zero(data))} | (options or {})
-            )
+            self.auto = auto(self._noise, **{"init_loc_fn": init_to_value(values=zeros)} | (options or {}))
             self.auto(data)  # makes its parameters
 
     def begin(self, data: Trajectories) -> Tensor:
@@ -63,24 +62,24 @@ class AutoRollout(VariationalGuide):
             normal = [dist.Normal(0.0, 1.0).log_prob(value).sum() for value in drawn.values()]
             ratios.append(trace.log_prob_sum() - torch.stack(normal).sum())
         self.now = {name: torch.stack([drawn[name] for drawn in values]) for name in values[0]}
+        padded = data.controls.new_zeros(self.draws, *data.transitions.shape, self.sizes[1])
+        padded[:, data.transitions] = self.now["noise"]
+        self.now["noise"] = padded
         return torch.stack(ratios)
 
     def start(self) -> tuple[Tensor, Tensor]:
-        noise = self.now["start"][:, 0]
+        noise = self.now["start"]
         return noise, noise.new_zeros(noise.shape[:2])
 
     def step(self, row: int, state: Tensor) -> tuple[Tensor, Tensor | float]:
         return self.now["noise"][:, row], state.new_zeros(())
 
     def _noise(self, data: Trajectories) -> None:
-        """The prior of the noise of start and intervals."""
-        with pyro.plate("trajectory", len(data), dim=-1):
-            for name, zero in self._noise_at_zero(data).items():
-                with pyro.plate(f"{name}_row", len(zero), dim=-2):
-                    pyro.sample(name, dist.Normal(zero, torch.ones_like(zero)).to_event(1))
+        """The prior of the noise of start and intervals, of those alone that the drives have."""
+        for name, (count, size) in self._shapes(data).items():
+            with pyro.plate(f"{name}s", count, dim=-1):
+                pyro.sample(name, dist.Normal(data.controls.new_zeros(count, size), 1.0).to_event(1))
 
-    def _noise_at_zero(self, data: Trajectories) -> dict[str, Tensor]:
-        rows = {"noise": (len(data.time) - 1, self.sizes[1])}
-        if not self.known_start:
-            rows = {"start": (1, self.sizes[0])} | rows
-        return {name: data.controls.new_zeros(count, len(data), size) for name, (count, size) in rows.items()}
+    def _shapes(self, data: Trajectories) -> dict[str, tuple[int, int]]:
+        shapes = {"noise": (int(data.transitions.sum()), self.sizes[1])}
+        return shapes if self.known_start else {"start": (len(data), self.sizes[0])} | shapes

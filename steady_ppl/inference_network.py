@@ -3,8 +3,8 @@
 Backward in time a recurrent network reads measurements and controls. Its code, of all rows at once, is turned with the
 interval's own control and step into a proposal for each interval: normal, with a mean that depends on the state reached
 so far, in an affine way, as a linear program asks for, and through a small hidden layer (the structured approximation
-DKS of Krishnan, Shalit and Sontag 2017). Its output layers begin at zero: centred, it first proposes mean and spread of
-the noise's smoothed values, otherwise noise of the size that the program then has.
+DKS of Krishnan, Shalit and Sontag 2017). Its output layers begin at zero: it first proposes noise of the size that the
+program then has, around its mean or, centred, around zero.
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ from steady_ppl.program import Program, names
 from steady_ppl.scores import channel_moments
 from steady_ppl.variational_guides import VariationalGuide, log_ratio, times
 
-HIDDEN, BOUND = 16, 3.0  # units beside the affine mean, and how many of the first standard deviations it reaches
+HIDDEN, BOUND = 16, 3.0  # units beside the affine mean, and how many times the usual size it reaches
 
 
 class InferenceNetwork(VariationalGuide):
-    """The guide; measurements, states and centred noise are scaled by the moments of `data` and of its smoothed path.
+    """The guide; measurements and states are scaled by the moments of `data` and of its smoothed states, and so is the
+    mean of centred noise; its spread begins as that which the program then has.
 
     Args:
         data: training drives, as returned by `for_program`.
@@ -37,7 +38,7 @@ class InferenceNetwork(VariationalGuide):
     """
 
     circular: Tensor
-    middle: Tensor
+    size: Tensor
     scale: Tensor
 
     def __init__(
@@ -51,8 +52,9 @@ class InferenceNetwork(VariationalGuide):
         self.register_buffer("circular", on_a_circle(program, data, states))
         mean, spread = (moment[0][data.transitions] for moment in channel_moments(program, data, states[None, :-1]))
         values = mean + spread * path.noise[data.transitions]
-        self.register_buffer("middle", values.mean(0))
-        self.register_buffer("scale", (values.var(0, correction=0) + spread.square().mean(0)).sqrt())
+        squares = values.square().mean(0) + spread.square().mean(0)
+        self.register_buffer("size", squares.sqrt() if centred else torch.ones_like(squares))
+        self.register_buffer("scale", spread.mean(0) if centred else torch.ones_like(squares))
         inside, features = data.rows[..., None], self._features(states)
         self.scales = nn.ModuleDict(
             {
@@ -107,9 +109,9 @@ class InferenceNetwork(VariationalGuide):
         features = self.scales["state"](self._features(state))
         mean = self.shift[row] + times(self.gain[row], features)
         mean = mean + self.head((self.hidden[row] + self.by_state(features)).tanh())
-        noise = BOUND * (mean / BOUND).tanh() + self.around[:, row]
+        noise = self.size * BOUND * (mean / BOUND).tanh() + self.scale * self.around[:, row]
         if self.centred:
-            return self.middle + self.scale * noise, state.new_zeros(())
+            return noise, state.new_zeros(())
         return noise, log_ratio(noise, self.random[:, row], self.log_sd[row])
 
     def _inputs(self, data: Trajectories) -> Tensor:
