@@ -175,7 +175,8 @@ def evaluate(
     rollouts: Annotated[int, typer.Option(help="Noisy roll-outs from each true state.", min=1)] = 1000,
     seed: Seed = 0,
     surveyed: Annotated[
-        str | None, typer.Option("--map", help="A program with the true landmarks, for runs that learned theirs.")
+        str | None,
+        typer.Option("--map", help="The same vehicle with the true landmarks, for runs that learned theirs."),
     ] = None,
     program: Annotated[
         list[str] | None,
@@ -185,8 +186,7 @@ def evaluate(
     ] = None,
 ) -> None:
     """The paper's errors where true states exist; errors in measurement space always."""
-    from steady_ppl.evaluation import evaluate as judge
-    from steady_ppl.evaluation import table_of
+    from steady_ppl.evaluation import evaluate_all, incomparable, table_of
     from steady_ppl.fit import Fit
     from steady_ppl.program_file import load_program
     from steady_ppl.table import read_table
@@ -201,16 +201,19 @@ def evaluate(
     drives = read_table(table)
     true_map = load_program(surveyed) if surveyed else None
     settings: dict[str, Any] = {"particles": particles, "rollouts": rollouts, "seed": seed, "surveyed": true_map}
-    results = [judge(fit, drives, **settings) for fit in fits]
+    folders = [str(run) for run in runs]
+    results = evaluate_all(fits, folders, drives, **settings)
     print(table_of(results, [f"{run.name} ({result['recipe']})" for run, result in zip(runs, results, strict=True)]))
+    for reason in incomparable(results, folders):
+        say(reason)
     for run, result in zip(runs, results, strict=True):
         if true_map is not None:
-            error = result["map"]
-            print(f"{run.name}: landmarks off by {error['rms']:.3g} m rms, {error['most']:.3g} m at most")
+            error, how = result["map"], "" if result["map"]["learned"] else " (declared, not learned)"
+            print(f"{run.name}: landmarks off by {error['rms']:.3g} m rms, {error['most']:.3g} m at most{how}")
         if result["filter"] != "lookahead":
             say(f"{run}: judged by the filter {result['filter']}")
     if json_file is not None:
-        rows = [{"run": str(run), **result} for run, result in zip(runs, results, strict=True)]
+        rows = [{"run": folder, **result} for folder, result in zip(folders, results, strict=True)]
         write_json(json_file, {"runs": rows})
 
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
 
 from steady_ppl.data import Trajectories
+from steady_ppl.errors import SteadyError, UsageError
 from steady_ppl.filtering import choose_filter, log_likelihood
 from steady_ppl.fit import Fit
 from steady_ppl.measurement_errors import measurement_errors
 from steady_ppl.metrics import forward, forward_mean, map_errors, state_estimation
-from steady_ppl.program import Program, for_program
+from steady_ppl.planar_vehicle import UnknownMap
+from steady_ppl.program import Program, for_program, names
 from steady_ppl.seeding import seeded
 
 
@@ -35,22 +38,29 @@ def evaluate(
         rollouts: noisy roll-outs from each true state.
         look_ahead: whether log p(y) and the states come from a filter that looks ahead; None where the program allows.
         seed: of the Monte-Carlo draws.
-        surveyed: a program with the true landmarks, if the map is to be judged.
+        surveyed: a program of the same vehicle with the true landmarks, if the map is to be judged.
 
     Returns:
-        `filter` ("lookahead", or "bootstrap" and why), `log_likelihood` (mean per trajectory at every tenth row),
-        `forward`, `forward_mean`, `state_estimation` (error groups; empty without true states), `measurement` and, if
-        asked for, `map` (see `map_errors`).
+        `known_start` and `measured` (what log p(y) is given and is of), `filter` ("lookahead", or "bootstrap" and why),
+        `log_likelihood` (mean per trajectory at every tenth row), `forward`, `forward_mean`, `state_estimation` (error
+        groups; empty without true states), `measurement` and, if asked for, `map` (see `map_errors`; `learned`: whether
+        the landmarks are elsewhere than declared).
+
+    Raises:
+        DataError: the table lacks a column or a known start.
+        UsageError: the map is none, or another vehicle's.
+        FilterError: the filter broke down.
     """
     program, known_start = fit.program, fit.known_start
-    data = for_program(program, table)
+    data = _checked(fit, table, surveyed)
     choice = choose_filter(program, data, known_start=known_start, particles=particles, look_ahead=look_ahead)
     settings: dict[str, Any] = {
         "particles": choice.particles,
         "look_ahead": choice.look_ahead,
         "known_start": known_start,
     }
-    result: dict[str, Any] = {"recipe": fit.recipe, "filter": choice.name}
+    result: dict[str, Any] = {"recipe": fit.recipe, "known_start": known_start}
+    result |= {"measured": list(data.measurement_names), "filter": choice.name}
     with seeded(seed, "log_likelihood"):
         values = log_likelihood(program, data, **settings)
         result["log_likelihood"] = float(values.mean())
@@ -64,8 +74,93 @@ def evaluate(
     with seeded(seed, "measurement"):
         result["measurement"] = measurement_errors(program, data, particles=2000, known_start=known_start)
     if surveyed is not None:
-        result["map"] = map_errors(program, surveyed)
+        result["map"] = _judged_map(program, surveyed)
     return result
+
+
+def evaluate_all(
+    fits: Sequence[Fit],
+    labels: Sequence[str],
+    table: Trajectories,
+    *,
+    surveyed: Program | None = None,
+    **settings: Any,
+) -> list[dict[str, Any]]:
+    """`evaluate` of several fits, all checked before anything is computed.
+
+    Raises:
+        SteadyError: as `evaluate` does, the fit's label before the message.
+    """
+    for fit, label in zip(fits, labels, strict=True):
+        with _labelled(label):
+            _checked(fit, table, surveyed)
+    results = []
+    for fit, label in zip(fits, labels, strict=True):
+        with _labelled(label):
+            results.append(evaluate(fit, table, surveyed=surveyed, **settings))
+    return results
+
+
+@contextmanager
+def _labelled(label: str) -> Iterator[None]:
+    try:
+        yield
+    except SteadyError as error:
+        error.args = (f"{label}: {error}",)
+        raise
+
+
+def _checked(fit: Fit, table: Trajectories, surveyed: Program | None) -> Trajectories:
+    """The columns that the program reads, if table and map suit it."""
+    data = for_program(fit.program, table)
+    if fit.known_start:
+        _ = data.known_start
+    if surveyed is not None:
+        _judged_map(fit.program, surveyed)
+    return data
+
+
+def _judged_map(program: Program, surveyed: Program) -> dict[str, Any]:
+    for one in (program, surveyed):
+        if not len(getattr(one, "landmarks", ())):
+            raise UsageError(f"program {type(one).__name__} has no landmarks: judge it without a map")
+    errors = map_errors(program, surveyed)
+    for what, own, other in zip(("states", "controls", "measurements"), _form(program), _form(surveyed), strict=True):
+        if own != other:
+            raise UsageError(
+                f"the map is another vehicle's: {type(surveyed).__name__} has the {what} {', '.join(other)}, "
+                f"{type(program).__name__} has {', '.join(own)}; name a program of the same vehicle"
+            )
+    learned = isinstance(program, UnknownMap) and not torch.equal(program.landmarks, program.declared)
+    return {**errors, "learned": learned}
+
+
+def _form(program: Program) -> tuple[tuple[str, ...], ...]:
+    """States, controls and measurements, without the states that an added effect brings."""
+    resting = names(program.resting)
+    states = tuple(name for name in names(program.states) if name not in resting)
+    return states, names(program.controls), names(program.measurements)
+
+
+def incomparable(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> list[str]:
+    """Why log p(y) of one fit says nothing beside that of another, a line a reason."""
+    runs = list(zip(labels, results, strict=True))
+    columns = dict.fromkeys(name for result in results for name in result["measured"])
+    unread = {label: [f"y.{name}" for name in columns if name not in result["measured"]] for label, result in runs}
+    known = [label for label, result in runs if result["known_start"]]
+    drawn = [label for label, result in runs if not result["known_start"]]
+    reasons = []
+    if any(unread.values()):
+        said = "; ".join(f"{label} does not read {', '.join(lacking)}" for label, lacking in unread.items() if lacking)
+        reasons.append(
+            f"log p(y) is not comparable, nor are errors in measurement space: {said}; compare runs that read the same"
+        )
+    if known and drawn:
+        reasons.append(
+            f"log p(y) is not comparable: the start is known to {', '.join(known)} and from the prior in "
+            f"{', '.join(drawn)}; compare runs that were given the same"
+        )
+    return reasons
 
 
 def has_truth(data: Trajectories) -> bool:
@@ -76,18 +171,21 @@ def has_truth(data: Trajectories) -> bool:
 def table_of(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> str:
     """The results as one table of text, a line a program.
 
-    Columns: log p(y); for the first two error groups the forward error with noisy roll-outs, of the mean roll-out, and
-    the state-estimation error; then the errors in measurement space.
+    Columns: the start, where it is known to some of them only; log p(y); for the first two error groups the forward
+    error with noisy roll-outs, of the mean roll-out, and the state-estimation error; then the errors in measurement
+    space.
     """
     groups = list(next((r["forward"] for r in results if r["forward"]), {}))[:2]
-    header = ["", "log p(y)"]
+    started = len({result["known_start"] for result in results}) > 1
+    header = ["", *(["start"] if started else []), "log p(y)"]
     for name in ("forward", "mean", "state"):
         header += [f"{name} {group}" for group in groups]
     measured = ["one_step", "open_loop_1s", "open_loop_3s", "coverage_90"]
     header += measured
     lines = [header]
     for label, result in zip(labels, results, strict=True):
-        line = [label, f"{result['log_likelihood']:.2f}"]
+        start = "known" if result["known_start"] else "prior"
+        line = [label, *([start] if started else []), f"{result['log_likelihood']:.2f}"]
         for name in ("forward", "forward_mean", "state_estimation"):
             line += [_figure(result[name].get(group)) for group in groups]
         line += [_figure(result["measurement"].get(name)) for name in measured]

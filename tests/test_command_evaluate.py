@@ -8,9 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from examples import MODELS, example
 from small import HOVERCRAFT, QUICK, contents, impossible, only_start, simulated, steady, written
 
-from steady_ppl import Fit, read_table
+from steady_ppl import Fit, load_program, read_table
 from steady_ppl.evaluation import evaluate
 
 ERRORS = {"location", "angle", "velocity", "yaw_rate"}
@@ -27,7 +28,9 @@ def test_evaluate_writes_the_figures_of_every_run_as_json(tmp_path: Path, work: 
     ]
     for row in content["runs"]:
         groups = {"forward", "forward_mean", "state_estimation"}
-        assert row.keys() == {"run", "recipe", "filter", "log_likelihood", "measurement"} | groups
+        about = {"run", "recipe", "known_start", "measured", "filter"}
+        assert row.keys() == about | {"log_likelihood", "measurement"} | groups
+        assert row["known_start"] is False and row["measured"] == [f"bearing_{i}" for i in range(4)]
         assert all(row[group].keys() == ERRORS for group in groups)
         assert row["measurement"].keys() == {"one_step", "open_loop_1s", "open_loop_3s", "coverage_90"}
         figures = [
@@ -35,7 +38,9 @@ def test_evaluate_writes_the_figures_of_every_run_as_json(tmp_path: Path, work: 
             *(value for group in (*groups, "measurement") for value in row[group].values()),
         ]
         assert all(math.isfinite(figure) for figure in figures)
-    lines = capsys.readouterr().out.splitlines()
+    out, error = capsys.readouterr()
+    lines = out.splitlines()
+    assert "comparable" not in error and "start" not in lines[0]
     assert len(lines) == 3 and "log p(y)" in lines[0] and "open_loop_3s" in lines[0]
     assert [line.split("  ")[0] for line in lines[1:]] == ["hand (hand)", "steady (steady)"]
     assert f"{content['runs'][0]['forward']['location']:.4f}" in lines[1]
@@ -50,6 +55,65 @@ def test_evaluate_gives_what_the_library_gives(tmp_path: Path, work: Path) -> No
         "run": str(work / "hand"),
         **evaluate(Fit.load(work / "hand"), drives, particles=40, rollouts=3, seed=7),
     }
+
+
+def test_runs_of_different_starts_are_marked_as_incomparable(tmp_path: Path, work: Path, capsys) -> None:
+    runs, file = (work / "hand", tmp_path / "known"), tmp_path / "e.json"
+    Fit(load_program(HOVERCRAFT), "hand", known_start=True).save(runs[1])
+    assert steady("evaluate", *runs, work / "train.csv", "--json", file, *QUICK) == 0
+    assert [row["known_start"] for row in json.loads(file.read_text())["runs"]] == [False, True]
+    out, error = capsys.readouterr()
+    header, *lines = [line.split() for line in out.splitlines()]
+    assert header[0] == "start" and [line[2] for line in lines] == ["prior", "known"]
+    said = f"log p(y) is not comparable: the start is known to {runs[1]} and from the prior in {runs[0]}"
+    assert said in error and len(error.splitlines()) == 1
+
+
+def test_runs_that_read_different_columns_are_marked_as_incomparable(tmp_path: Path, work: Path, capsys) -> None:
+    runs, file = (work / "hand", tmp_path / "few"), tmp_path / "e.json"
+    few = tmp_path / "hovercraft.py"
+    few.write_text(HOVERCRAFT.read_text().replace(", (-4.0, 10.0), (6.0, 7.0))", ")"))
+    Fit(load_program(few), "hand").save(runs[1])
+    assert steady("evaluate", *runs, work / "train.csv", "--json", file, *QUICK) == 0
+    assert [len(row["measured"]) for row in json.loads(file.read_text())["runs"]] == [4, 2]
+    out, error = capsys.readouterr()
+    said = "log p(y) is not comparable, nor are errors in measurement space: "
+    assert f"{said}{runs[1]} does not read y.bearing_2, y.bearing_3; " in error
+    assert len(error.splitlines()) == 1 and "start" not in out
+
+
+@pytest.fixture
+def nothing_computed(monkeypatch) -> None:
+    def too_late(*_, **__):
+        raise AssertionError("computed before everything was checked")
+
+    monkeypatch.setattr("steady_ppl.evaluation.choose_filter", too_late)
+
+
+@pytest.mark.usefixtures("nothing_computed")
+def test_every_run_is_checked_before_anything_is_computed(tmp_path: Path, work: Path, refused) -> None:
+    table, blind = work / "train.csv", written(tmp_path / "blind.csv", simulated().without_truth())
+    truck, known = tmp_path / "truck", tmp_path / "known"
+    Fit(example("truck"), "hand").save(truck)
+    Fit(example("hovercraft"), "hand", known_start=True).save(known)
+    refused(2, f"{truck}: the table has no column u.speed", "evaluate", work / "hand", truck, table)
+    refused(2, f"{known}: a known start needs the true states", "evaluate", work / "hand", known, blind)
+
+
+@pytest.mark.usefixtures("nothing_computed")
+def test_a_map_that_does_not_suit_a_run_is_refused_before_anything_is_computed(
+    tmp_path: Path, work: Path, refused
+) -> None:
+    run, cart, few = work / "hand", tmp_path / "cart", tmp_path / "hovercraft.py"
+    drives = written(tmp_path / "cart.csv", simulated("linear_gaussian"))
+    Fit(example("linear_gaussian"), "hand").save(cart)
+    few.write_text(HOVERCRAFT.read_text().replace(", (6.0, 7.0))", ")"))
+    says = f"{cart}: program LinearGaussian has no landmarks"
+    refused(2, says, "evaluate", cart, drives, "--map", HOVERCRAFT)
+    says = f"{run}: the map is another vehicle's: Truck has the controls speed, turn, Hovercraft has left, right"
+    refused(2, says, "evaluate", run, work / "train.csv", "--map", MODELS / "truck.py")
+    says = f"{run}: 4 landmarks cannot be compared with 3"
+    refused(2, says, "evaluate", run, work / "train.csv", "--map", few)
 
 
 def test_evaluate_without_true_states_judges_the_measurements_only(tmp_path: Path, work: Path, capsys) -> None:
@@ -83,7 +147,8 @@ def test_figures_are_written_whole_or_not_at_all(tmp_path: Path, work: Path, cap
     table = written(tmp_path / "bad.csv", impossible(simulated(), trajectory=1, row=10))
     before = contents(tmp_path)
     assert steady("evaluate", work / "hand", table, "--json", file, *QUICK) == 1
-    assert capsys.readouterr().err.startswith("steady: trajectory 2 at 1 s: every particle's weight is zero")
+    said = f"steady: {work / 'hand'}: trajectory 2 at 1 s: every particle's weight is zero"
+    assert capsys.readouterr().err.startswith(said)
     assert contents(tmp_path) == before
 
 
