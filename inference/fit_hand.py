@@ -5,6 +5,7 @@ import dataclasses
 import torch
 
 from steady_ppl import Fit, Trajectories, UsageError, choose_filter, for_program, load_program, run_filter, seeded
+from steady_ppl.errors import require
 from steady_ppl.program import names
 
 from . import fit_truth
@@ -46,6 +47,7 @@ def fit(
         UsageError: no program is given, or its states are others.
     """
     settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
+    require(lineages >= 1, "lineages", lineages, "at least 1")
     if hand is None:
         raise UsageError("fit-hand needs the program written by hand: --hand MODEL, or hand=")
     if isinstance(hand, str):
@@ -60,7 +62,7 @@ def fit(
             hand, data, particles=choice.particles, known_start=known_start, look_ahead=choice.look_ahead
         )
         paths = filtered.paths(lineages).within(data)
-    copies = data.subset(torch.arange(len(data)).repeat(lineages))
+    copies = for_program(program, table).subset(torch.arange(len(data)).repeat(lineages))
     believed = dataclasses.replace(copies, states=paths.states.transpose(0, 1).flatten(1, 2))
     supervised = {name: value for name, value in settings.items() if name not in ("hand", "lineages", "particles")}
     fitted = fit_truth.fit(program, believed, valid, **supervised, **run)

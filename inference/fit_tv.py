@@ -5,12 +5,14 @@ poses are `fixes`. Chartrand's total-variation derivative (2011) is pynumdiff's.
 """
 
 import dataclasses
+import math
 import warnings
 
 import numpy as np
 import torch
 
 from steady_ppl import Fit, Trajectories, UsageError, fixes, for_program, seeded
+from steady_ppl.errors import ComputationError, require
 from steady_ppl.program import names
 
 from . import fit_truth
@@ -55,6 +57,8 @@ def fit(
         UsageError: the program does not say which components are derivatives of which.
     """
     settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
+    require(0 < regularization < math.inf, "regularization", regularization, "above 0")
+    require(iterations >= 1, "iterations", iterations, "at least 1")
     data = for_program(program, table).without_truth()
     with seeded(seed, "fixes"):
         poses = fixes(program, data)
@@ -86,6 +90,11 @@ def differentiated(program, data: Trajectories, poses: torch.Tensor, regularizat
             smooth, derivative = iterative_velocity(
                 np.interp(even, time[there], known), even[1] - even[0], iterations, regularization
             )
+            if not np.isfinite(derivative).all():
+                raise ComputationError(
+                    f"fit-tv: the derivative of {position} in trajectory {data.labels[drive]} is not finite: try "
+                    f"another regularization than {regularization:g}"
+                )
             for name, found in ((position, smooth), (rate, derivative)):
                 states[:rows, drive, order.index(name)] = torch.from_numpy(np.interp(time, even, found))
     return states

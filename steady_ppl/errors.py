@@ -79,3 +79,13 @@ def one_line(error: BaseException) -> str:
     """An error's type and the first line of its message."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
+def require(holds: bool, setting: str, value: object, wanted: str) -> None:
+    """Refuse a setting's value unless it is what is wanted, such as "at least 1".
+
+    Raises:
+        UsageError: it is not.
+    """
+    if not holds:
+        raise UsageError(f"{setting} is {value}: it must be {wanted}")

@@ -1,8 +1,8 @@
 """A fix, as navigators call it: what a row's measurements say of the state without any others.
 
 Where there are as many of them as components that they depend on, the most probable state of each row is found by
-itself, by Levenberg and Marquardt's method from several places at once. The prior is where the program would take the
-vehicle, unobserved, from its `initial`; no true state is looked at.
+itself, by Levenberg and Marquardt's method from several places at once. The prior is one for all rows: the region that
+the program would visit, unobserved, from its `initial`. How it moves there says nothing; no true state is looked at.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError
-from steady_ppl.linearization import Path, linearize
+from steady_ppl.linearization import linearize_sensors
 from steady_ppl.predictions import simulate_again
 from steady_ppl.probe import step_size
 from steady_ppl.program import Program, names
 from steady_ppl.sites import broadcast_event, running
 
 DAMPING = 1e-2  # of the first step, relative to the curvature
+AT_ONCE = 50_000  # rows of all places and drives
 
 
 @torch.no_grad()
@@ -39,29 +40,67 @@ def fixes(program: Program, data: Trajectories, *, places: int = 32, passes: int
         with fewer measurements than components that they do depend on.
 
     Raises:
-        DataError: fewer than two rows of a drive have enough measurements.
+        DataError: nothing is measured, or fewer than two rows of a drive have enough measurements.
     """
     data = data.without_truth()
+    guesses = _guesses(program, data, places)
+    told = _told(program, data, guesses[:, 0])
+    _require_enough(program, data, told)
+    angles = [names(program.states).index(name) for name in program.angles]
+    prior = _Prior.of(guesses[data.rows[:, None].expand(guesses.shape[:3])], angles)
+    drives = max(1, AT_ONCE // (places * len(data.time)))
+    parts = torch.arange(len(data)).split(drives)
+    states = torch.cat(
+        [_found(program, data.subset(part), guesses[:, :, part], told, prior, passes) for part in parts], 1
+    )
+    enough = (data.observed.sum(-1) >= told.sum()) & data.rows
+    return torch.where(enough[..., None] & told, states, torch.nan)
+
+
+def _guesses(program: Program, data: Trajectories, places: int) -> Tensor:
+    """Where the search begins, `(T + 1, S, B, D)`: drives that the program makes up."""
     left = torch.Size((places, len(data)))
     with running(*left):
         starts = broadcast_event(program.initial(), left, 1)
-    _, guesses = simulate_again(program, data, starts, step_size(program))
-    copies = data.subset(torch.arange(len(data)).repeat(places))
-    prior = _Prior.of(guesses.states.unflatten(1, left), [names(program.states).index(name) for name in program.angles])
+    _, made_up = simulate_again(program, data, starts, step_size(program))
+    return made_up.states.unflatten(1, left)
+
+
+def _told(program: Program, data: Trajectories, states: Tensor) -> Tensor:
+    """Which components some measurement depends on, `(D,)`."""
+    return (linearize_sensors(program, data, states).measurement != 0).flatten(0, 2).any(0)
+
+
+def _require_enough(program: Program, data: Trajectories, told: Tensor) -> None:
+    poor = ((data.observed.sum(-1) >= told.sum()) & data.rows).sum(0) < 2
+    if not bool(data.observed.any()):
+        raise DataError("nothing is measured: every y. cell of the table is empty")
+    if bool(poor.any()):
+        label = data.labels[int(poor.nonzero()[0])]
+        dependent = ", ".join(name for name, tells in zip(names(program.states), told.tolist(), strict=True) if tells)
+        raise DataError(
+            f"trajectory {label}: in fewer than two rows there are measurements enough, {int(told.sum())}, to tell "
+            f"{dependent} from that row alone; leave such drives out",
+            trajectory=label,
+        )
+
+
+def _found(program: Program, data: Trajectories, guesses: Tensor, told: Tensor, prior: _Prior, passes: int) -> Tensor:
+    """The most probable states `(T + 1, B, D)` of some drives, from guesses `(T + 1, S, B, D)`."""
+    left = guesses.shape[1:3]
+    copies = data.subset(torch.arange(len(data)).repeat(left[0]))
 
     def judged(states: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The states, the cost there, and its negative gradient and curvature."""
-        seen = linearize(program, copies, Path(states, guesses.noise))
+        seen = linearize_sensors(program, copies, states)
         weighted = seen.measurement.mT * seen.precision.unsqueeze(-2)
-        apart = (prior.mean - states.unflatten(1, left)).flatten(1, 2)
-        precision = prior.precision.repeat(1, places, 1)
+        apart = prior.mean - states
         cost = (seen.precision * seen.residual.square()).sum(-1) / 2 - seen.log_scale
-        cost = cost + (precision * apart.square()).sum(-1) / 2
-        downhill = (weighted @ seen.residual.unsqueeze(-1)).squeeze(-1) + precision * apart
-        return states, cost, downhill, weighted @ seen.measurement + torch.diag_embed(precision)
+        cost = cost + (prior.precision * apart.square()).sum(-1) / 2
+        downhill = (weighted @ seen.residual.unsqueeze(-1)).squeeze(-1) + prior.precision * apart
+        return states, cost, downhill, weighted @ seen.measurement + torch.diag_embed(prior.precision)
 
-    best = judged(guesses.states)
-    told = (linearize(program, copies, guesses).measurement != 0).flatten(0, 2).any(0)
+    best = judged(guesses.flatten(1, 2))
     damping = torch.full_like(best[1], DAMPING)
     for _ in range(passes):
         states, cost, downhill, curvature = best
@@ -72,26 +111,15 @@ def fixes(program: Program, data: Trajectories, *, places: int = 32, passes: int
         best = tuple(_where(better, new, old) for new, old in zip(tried, best, strict=True))  # type: ignore[assignment]
     states, cost = (part.unflatten(1, left) for part in best[:2])
     chosen = cost.nan_to_num(torch.inf).argmin(1)
-    states = states.take_along_dim(chosen[:, None, :, None], 1).squeeze(1)
-    enough = (data.observed.sum(-1) >= told.sum()) & data.rows
-    poor = ~(enough.sum(0) >= 2)
-    if bool(poor.any()):
-        label = data.labels[int(poor.nonzero()[0])]
-        dependent = ", ".join(name for name, tells in zip(names(program.states), told.tolist(), strict=True) if tells)
-        raise DataError(
-            f"trajectory {label}: in fewer than two rows there are measurements enough, {int(told.sum())}, to tell "
-            f"{dependent} from that row alone",
-            trajectory=label,
-        )
-    return torch.where(enough[..., None] & told, states, torch.nan)
+    return states.take_along_dim(chosen[:, None, :, None], 1).squeeze(1)
 
 
 @dataclass(frozen=True)
 class _Prior:
-    """Normal, of each row and drive by itself, flat over angles.
+    """Normal, flat over angles.
 
     Attributes:
-        mean, precision: `(T + 1, 1, B, D)` and `(T + 1, B, D)`.
+        mean, precision: `(D,)`.
     """
 
     mean: Tensor
@@ -99,10 +127,10 @@ class _Prior:
 
     @classmethod
     def of(cls, drawn: Tensor, angles: Sequence[int]) -> _Prior:
-        """Of states `(T + 1, S, B, D)`."""
-        precision = 1 / drawn.double().var(1).clamp(min=1e-12)
-        precision[..., list(angles)] = 0.0
-        return cls(drawn.double().mean(1, keepdim=True), precision)
+        """Of states `(·, D)`."""
+        precision = 1 / drawn.double().var(0).clamp(min=1e-12)
+        precision[list(angles)] = 0.0
+        return cls(drawn.double().mean(0), precision)
 
 
 def _where(which: Tensor, one: Tensor, other: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from steady_ppl.data import Trajectories
+from steady_ppl.errors import require
 from steady_ppl.gaussian_smoother import find_and_smooth, means_as_path
 from steady_ppl.predictions import on_a_circle
 from steady_ppl.probe import start_size, step_size
@@ -45,6 +46,7 @@ class InferenceNetwork(VariationalGuide):
         self, program: Program, data: Trajectories, *, width: int = 64, centred: bool = True, **more: Any
     ) -> None:
         super().__init__(program, **more)
+        require(width >= 1, "width", width, "at least 1")
         self.centred = centred
         path = means_as_path(find_and_smooth(program, data, known_start=self.known_start), data)
         states = path.states

@@ -48,6 +48,25 @@ class Path:
 
 
 @dataclass(frozen=True)
+class Sensors:
+    """What is measured, to first order around states, in double precision.
+
+    Attributes:
+        residual: r̄ `(T + 1, B, K)`, on the circle where the measurement is an angle; zero where missing.
+        measurement: H `(T + 1, B, K, D)`.
+        precision: `(T + 1, B, K)` observation weight over variance; zero where missing.
+        log_scale: `(T + 1, B)` the measurements' log-density at residual zero, times the observation weight.
+        in_plain_torch: why no kernels served; None where they did or were not worth it.
+    """
+
+    residual: Tensor
+    measurement: Tensor
+    precision: Tensor
+    log_scale: Tensor
+    in_plain_torch: str | None = None
+
+
+@dataclass(frozen=True)
 class Linearization:
     """The program to first order along a path, in double precision; nothing moves past a trajectory's end.
 
@@ -114,10 +133,7 @@ def linearize(
     start_turn = torch.zeros_like(start_offset, dtype=torch.float64)
     for angle in angles:
         start_turn[:, angle] = start_offset[:, angle].double() - wrap(start_offset[:, angle].double())
-    measured = _measurement(program, data, states, kernels)
-    residuals, log_sd, log_density = measured.value.chunk(3, -1)
-    by_measured = -measured.by[0][..., : residuals.shape[-1], :]
-    observed = data.observed & torch.isfinite(by_measured).all(-1)  # a bearing to where one stands has no derivative
+    seen = linearize_sensors(program, data, states, observation_weight=observation_weight, kernels=kernels)
     return Linearization(
         path=path,
         angles=angles,
@@ -127,11 +143,34 @@ def linearize(
         offset=torch.where(data.transitions[..., None], offset, 0.0),
         state=torch.where(data.transitions[..., None, None], by_state, 0.0).double(),
         noise=torch.where(data.transitions[..., None, None], by_noise, 0.0).double(),
+        residual=seen.residual,
+        measurement=seen.measurement,
+        precision=seen.precision,
+        log_scale=seen.log_scale,
+        in_plain_torch=moved.in_plain_torch or seen.in_plain_torch,
+    )
+
+
+@torch.no_grad()
+def linearize_sensors(
+    program: Program,
+    data: Trajectories,
+    states: Tensor,
+    *,
+    observation_weight: float = 1.0,
+    kernels: bool | None = None,
+) -> Sensors:
+    """The part of `linearize` that is about what is measured, around states `(T + 1, B, D)`."""
+    measured = _measurement(program, data, states, kernels)
+    residuals, log_sd, log_density = measured.value.chunk(3, -1)
+    by_measured = -measured.by[0][..., : residuals.shape[-1], :]
+    observed = data.observed & torch.isfinite(by_measured).all(-1)  # a bearing to where one stands has no derivative
+    return Sensors(
         residual=torch.where(observed, residuals, 0.0).double(),
         measurement=torch.where(observed[..., None], by_measured, 0.0).double(),
         precision=observation_weight * torch.where(observed, (-2 * log_sd).exp(), 0.0).double(),
         log_scale=observation_weight * torch.where(observed, log_density, 0.0).double().sum(-1),
-        in_plain_torch=moved.in_plain_torch or measured.in_plain_torch,
+        in_plain_torch=measured.in_plain_torch,
     )
 
 

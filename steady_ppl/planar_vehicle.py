@@ -12,7 +12,8 @@ import torch
 from pyro.distributions import constraints
 from torch import Tensor, nn
 
-from steady_ppl.errors import ProgramError
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import ProgramError, UsageError
 from steady_ppl.program import Program, names
 
 
@@ -198,15 +199,18 @@ def _kept_on_device(landmarks: tuple[tuple[float, float], ...], dtype: torch.dty
 class UnknownMap(PlanarVehicle):
     """A vehicle whose landmarks are not where they were declared: they are learned together with its dynamics.
 
-    To be put before a vehicle that declares them: `class Mine(UnknownMap, Hovercraft)`. What fixes the frame is known
-    starts, or else landmarks that are `surveyed` (two leave nothing free but what the start's prior says).
+    To be put before a vehicle that declares them: `class Mine(UnknownMap, Hovercraft)`. Bearings alone leave the frame
+    open, so that a map is learned only with known starts, with two landmarks that are `surveyed`, or where it is said
+    to be relative to where drives begin (`framed_by_start`), which is worth as much as `initial` is narrow.
 
     Attributes:
         surveyed: which landmarks are where they are declared, by index.
+        framed_by_start: where and how drives begin is known well enough by `initial` alone.
         map: `(K, 2)` m, learnable.
     """
 
     surveyed: Sequence[int] = ()
+    framed_by_start = False
     declared: Tensor
     stays: Tensor
 
@@ -219,6 +223,13 @@ class UnknownMap(PlanarVehicle):
                 "class Mine(UnknownMap, Hovercraft)",
                 site="__init__",
             )
+        beyond = [index for index in self.surveyed if not 0 <= index < len(declared)]
+        if beyond:
+            raise ProgramError(
+                f"program {type(self).__name__}: surveyed names landmark {beyond[0]}, there are 0 to "
+                f"{len(declared) - 1}",
+                site="surveyed",
+            )
         stays = torch.zeros(len(declared), 1, dtype=torch.bool)
         stays[list(self.surveyed)] = True
         self.register_buffer("declared", torch.tensor(declared), persistent=False)
@@ -229,3 +240,17 @@ class UnknownMap(PlanarVehicle):
     def landmarks(self) -> Tensor:  # type: ignore[override]
         """Where they are taken to be, `(K, 2)` m."""
         return torch.where(self.stays, self.declared, self.map)
+
+    def prepare(self, data: Trajectories, known_start: bool) -> None:
+        """Refuse to learn a map whose frame nothing fixes.
+
+        Raises:
+            UsageError: no known starts, fewer than two surveyed landmarks, and no word that `initial` is enough.
+        """
+        if not (known_start or len(set(self.surveyed)) >= 2 or self.framed_by_start):
+            raise UsageError(
+                f"program {type(self).__name__}: nothing fixes the frame of its map: give known starts "
+                "(--known-start), name two landmarks that are `surveyed`, or set `framed_by_start = True` where "
+                "`initial` is narrow"
+            )
+        super().prepare(data, known_start)

@@ -8,13 +8,13 @@ import json
 import sysconfig
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import torch
 
 from steady_ppl.checkpoint import read_tensors
 from steady_ppl.data import Trajectories
-from steady_ppl.errors import RunError, UsageError
+from steady_ppl.errors import RunError, UsageError, require
 from steady_ppl.fit import Fit, program_source, sha256, versions
 from steady_ppl.program import Program, for_program
 from steady_ppl.program_file import run_file
@@ -30,6 +30,17 @@ def recipe_folder() -> Path:
         if (folder / "steady.py").is_file():
             return folder
     raise UsageError(f"the recipes are missing from this installation ({sysconfig.get_path('purelib')})")
+
+
+def _require_kind(recipe: Recipe, option: str, value: Any) -> None:
+    """A number where the recipe's annotation says so, and so on; what it does not annotate can be anything."""
+    hint = get_type_hints(recipe).get(option, Any)
+    kinds = get_args(hint) or (hint,)
+    words = {int: "a whole number", float: "a number", bool: "true or false", str: "a word", type(None): "none"}
+    if not all(kind in words for kind in kinds):
+        return
+    fits = type(value) in kinds or (type(value) is int and float in kinds)
+    require(fits, option, repr(value), " or ".join(words[kind] for kind in kinds))
 
 
 def find_recipe(name: str) -> Recipe:
@@ -89,9 +100,10 @@ def run_recipe(
         for setting, parameter in list(takes.items())[3:]
         if parameter.kind is not parameter.VAR_KEYWORD and setting not in ("known_start", "seed")
     ]
-    for option in options:
+    for option, value in options.items():
         if option not in settings:
             raise UsageError(f"recipe {name} has no setting {option}; it has {', '.join(settings) or 'none'}")
+        _require_kind(recipe, option, value)
     if device == "cuda" and not torch.cuda.is_available():
         raise UsageError("--device cuda: this machine has no CUDA device")
     program.to(device)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
+
+from steady_ppl.errors import require
 
 
 class Tempering(Protocol):
@@ -31,6 +34,10 @@ class LinearRamp:
 
     first: float = 0.001
     share: float = 1.0
+
+    def __post_init__(self) -> None:
+        require(0 <= self.first < math.inf, "the first weight", self.first, "0 or more")
+        require(0 <= self.share < math.inf, "the ramp's share of the training", self.share, "0 or more")
 
     def __call__(self, progress: float) -> float:
         return self.first + (1 - self.first) * min(1.0, progress / self.share) if self.share > 0 else 1.0

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from steady_ppl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from steady_ppl.data import Trajectories
-from steady_ppl.errors import TrainingError
+from steady_ppl.errors import TrainingError, require
 from steady_ppl.joint import Joint
 from steady_ppl.program import Program
 from steady_ppl.seeding import seeded
@@ -70,6 +70,17 @@ class Optimization:
     batch: int | None = None
     validate_every: int = 25
     patience: int = 30
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "gradient_steps", "validate_every", "patience", "batch"):
+            value = getattr(self, name)
+            require(value is None or value >= 1, name, value, "at least 1")
+        for name in ("learning_rate", "weight_decay"):
+            require(0 <= getattr(self, name) < math.inf, name, getattr(self, name), "0 or more")
+        for name in ("final_rate", "averaging"):
+            require(0 <= getattr(self, name) <= 1, name, getattr(self, name), "between 0 and 1")
+        require(self.gradient_norm is None or self.gradient_norm > 0, "gradient_norm", self.gradient_norm, "above 0")
+        require(all(0 <= beta < 1 for beta in self.betas), "betas", self.betas, "two numbers from 0 to below 1")
 
 
 @dataclass

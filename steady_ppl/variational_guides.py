@@ -6,6 +6,7 @@ every other guide. Kingma and Welling (2014); Krishnan, Shalit and Sontag (2017)
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pyro
@@ -14,6 +15,7 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor, nn
 
 from steady_ppl.data import Trajectories
+from steady_ppl.errors import require
 from steady_ppl.guides import sample_known
 from steady_ppl.paths import Paths
 from steady_ppl.program import Program, acting_controls
@@ -49,6 +51,8 @@ class VariationalGuide(nn.Module):
         rate: float = 1.0,
     ) -> None:
         super().__init__()
+        require(draws >= 1, "draws", draws, "at least 1")
+        require(0 < rate < math.inf, "the guide's rate", rate, "above 0")
         self._program = (program,)  # in a tuple it is no submodule: its parameters are not the guide's
         self.draws, self.known_start, self.rate = draws, known_start, rate
         self.annealing = annealing or Constant()

@@ -19,7 +19,7 @@ QUIET = {"progress": False}
 LEARN = {"steps": 60, "learning_rate": 0.05}
 SVI = {"steps": 150, "learning_rate": 0.02, "gradient_norm": None}
 RECIPES = {
-    "svi": {"steps": 300, "learning_rate": 0.05},
+    "svi": {"steps": 400, "learning_rate": 0.02},
     "svi not centred": {**SVI, "centred": False, "first_kl_weight": 1.0},
     "svi mean-field": {**SVI, "guide": "mean-field"},
     "svi smoother": {**SVI, "guide": "smoother"},
@@ -50,7 +50,7 @@ def test_each_beats_hand(name: str) -> None:
     train, valid = (only_start(simulate(truth, count, seed=seed)) for count, seed in ((12, 0), (4, 1)))
     program = vehicle(degrees)
     program.mass = torch.tensor(3.0)
-    options, far = dict(RECIPES[name]), abs(3.0 - 1.5) / (2 if name == "svi" else 4)  # centred: as slow as EM
+    options, far = dict(RECIPES[name]), abs(3.0 - 1.5) / 4
     if name == "fit-hand":  # nearer than the hand, whose paths it believes
         options["hand"], far = vehicle(degrees), abs(2.2 - 1.5)
         options["hand"].mass = torch.tensor(2.2)
@@ -118,6 +118,51 @@ def test_svis_guides_are_named() -> None:
 def test_what_is_the_networks_alone_is_refused_elsewhere() -> None:
     with pytest.raises(UsageError, match="guide mean-field has no width; network has"):
         learned("svi", load_program(HOVERCRAFT), simulated(rows=5), guide="mean-field", width=8)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "setting", "value", "wanted"),
+    [
+        ("svi", "draws", 0, "at least 1"),
+        ("svi", "width", 0, "at least 1"),
+        ("svi", "guide_rate", -1.0, "above 0"),
+        ("svi", "first_kl_weight", math.nan, "0 or more"),
+        ("svi", "gradient_norm", -1.0, "above 0"),
+        ("svi", "validate_every", 0, "at least 1"),
+        ("svi", "batch", -3, "at least 1"),
+        ("svi", "averaging", 2.0, "between 0 and 1"),
+        ("fit-tv", "regularization", 0.0, "above 0"),
+        ("fit-tv", "iterations", 0, "at least 1"),
+        ("fit-hand", "lineages", 0, "at least 1"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(recipe: str, setting: str, value: float, wanted: str) -> None:
+    given = {"hand": str(HOVERCRAFT)} if recipe == "fit-hand" else {}
+    with pytest.raises(UsageError, match=f"is {value}: it must be {wanted}"):
+        learned(recipe, load_program(HOVERCRAFT), simulated(rows=5), **given, **{setting: value})
+
+
+@pytest.mark.parametrize(
+    ("setting", "wanted"),
+    [
+        ("learning_rate=abc", "learning_rate is 'abc': it must be a number"),
+        ("width=2.5", "width is 2.5: it must be a whole number or none"),
+        ("centred=no", "centred is 'no': it must be true or false or none"),
+    ],
+)
+def test_settings_of_another_kind_are_refused(tmp_path, capsys, setting: str, wanted: str) -> None:
+    table = written(tmp_path / "t.csv", simulated(rows=5))
+    command = ("fit", HOVERCRAFT, table, "--recipe", "svi", "--set", setting, "--out", tmp_path / "run")
+    assert steady(*command) == 2
+    assert wanted in capsys.readouterr().err and not (tmp_path / "run").exists()
+
+
+def test_fit_hand_by_a_hand_that_reads_less() -> None:
+    """Its paths are fitted to all that the other program reads."""
+    hand = load_program(HOVERCRAFT)
+    hand.landmarks = hand.landmarks[:3]
+    fit = learned("fit-hand", load_program(HOVERCRAFT), simulated(rows=9), hand=hand, lineages=2, steps=2)
+    assert fit.trained.kept == 2
 
 
 def test_steady_minus_does_not_temper() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import pytest
@@ -40,6 +41,33 @@ def test_what_does_not_tell_it_is_left_open() -> None:
     program.landmarks = program.landmarks[:2]
     with pytest.raises(DataError, match="measurements enough, 3, to tell x, y, heading"):
         found(program, for_program(program, simulated(rows=21)))
+
+
+def test_how_the_program_moves_says_nothing_of_a_row() -> None:
+    """The same measurements in reverse order have the same fixes."""
+    program = example("hovercraft")
+    data = drives(program, 3, 21)
+    first = found(program, data)
+    turned = replace(data, measurements=data.measurements.flip(0), observed=data.observed.flip(0))
+    again = found(program, turned).flip(0)
+    away = (again - first)[..., :3]
+    away[..., 2] = wrap(away[..., 2])
+    assert float(away.abs().max()) < 1e-3
+
+
+def test_no_measurement_at_all_is_said() -> None:
+    program = example("hovercraft")
+    data = drives(program, 2, 11)
+    with pytest.raises(DataError, match="nothing is measured"):
+        found(program, replace(data, observed=torch.zeros_like(data.observed)))
+
+
+def test_many_drives_go_in_parts(monkeypatch) -> None:
+    program = example("hovercraft")
+    data = drives(program, 5, 11)
+    whole = found(program, data)
+    monkeypatch.setattr(sys.modules[fixes.__module__], "AT_ONCE", 2 * 32 * 11)
+    torch.testing.assert_close(found(program, data), whole, equal_nan=True)
 
 
 def test_a_pendulums_angle_is_told_by_its_encoder() -> None:

@@ -9,7 +9,7 @@ import torch
 from examples import MODELS, drives, example
 from small import HOVERCRAFT, QUICK, only_start, simulated, steady, written
 
-from steady_ppl import Fit, UnknownMap, UsageError, load_program, log_likelihood, simulate
+from steady_ppl import Fit, ProgramError, UnknownMap, UsageError, load_program, log_likelihood, simulate
 from steady_ppl.evaluation import evaluate
 from steady_ppl.metrics import map_errors
 from steady_ppl.run_recipe import find_recipe
@@ -43,6 +43,20 @@ def test_surveyed_landmarks_stay() -> None:
     (program.landmarks**2).sum().backward()
     gradient = dict(program.named_parameters())["map"].grad
     assert gradient.bool().all(1).tolist() == [False, True, False, True]
+
+
+def test_a_map_in_no_frame_is_not_learned() -> None:
+    table, vehicle = simulated(rows=9), type(load_program(HOVERCRAFT))
+    for about, fixed in (({}, False), ({"surveyed": (0,)}, False), ({"surveyed": (0, 2)}, True)):
+        program = type("Surveyed", (UnknownMap, vehicle), about)()
+        for known_start in (True, False):
+            program.prepare(table, known_start) if known_start or fixed else None
+        if not fixed:
+            with pytest.raises(UsageError, match="nothing fixes the frame of its map"):
+                find_recipe("steady")(program, table, steps=1, progress=False)
+    type("Framed", (UnknownMap, vehicle), {"framed_by_start": True})().prepare(table, False)
+    with pytest.raises(ProgramError, match="surveyed names landmark 7, there are 0 to 3"):
+        type("Beyond", (UnknownMap, vehicle), {"surveyed": (7,)})()
 
 
 def test_a_wrong_map_is_mended_from_bearings_and_known_starts() -> None:
