@@ -127,7 +127,7 @@ def require_found(ahead: Lookahead, data: Trajectories) -> None:
         label = data.labels[int(broken.nonzero()[0])]
         raise FilterError(
             f"trajectory {label}: the linearised program's log p(y) is not finite: its parameters or states have blown "
-            "up, or it cannot be linearised there (--guide bootstrap does not)",
+            "up, or it cannot be linearised there (--recipe steady --guide bootstrap does not)",
             trajectory=label,
         )
 

@@ -323,5 +323,7 @@ def _gradients(component: Tensor, leaves: list[Tensor], again: bool) -> list[Ten
         found = torch.autograd.grad(component.sum(), leaves, retain_graph=again, allow_unused=True)
     except (NotImplementedError, RuntimeError) as error:
         why = str(error).splitlines()[0]
-        raise ProgramError(f"the program cannot be linearised: {why} (--guide bootstrap takes any)") from error
+        raise ProgramError(
+            f"the program cannot be linearised: {why} (--recipe steady --guide bootstrap takes any)"
+        ) from error
     return [torch.zeros_like(leaf) if part is None else part.detach() for leaf, part in zip(leaves, found, strict=True)]

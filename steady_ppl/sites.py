@@ -263,7 +263,8 @@ def normal_moments(fn: Any, site: str) -> tuple[Tensor, Tensor]:
     if not isinstance(base, dist.Normal) or fn.event_dim > 1:
         raise ProgramError(
             f"site {site!r} is {type(base).__name__} with event shape {tuple(fn.event_shape)}: looking ahead needs "
-            "normal noise with independent components (a scalar or a vector); --guide bootstrap takes any",
+            "normal noise with independent components (a scalar or a vector); --recipe steady --guide bootstrap takes "
+            "any",
             site=site,
         )
     return base.loc, base.scale
