@@ -4,8 +4,8 @@
 
 Hov: simulated drives of the data seeds 101 and 102; truck: train and valid split, draws 11 and 12 of the bearings.
 What is printed is log p(y) of a held-out drive, by the filter that looks ahead at every row, of the parameters that the
-training keeps, and the seconds. The first of a method's candidates is its recipe's default; others were added after
-those before them had been seen. Resumable.
+training keeps, and the seconds. Candidates were added after those before them had been seen. Resumable: goes on with
+the records in OUT; those by which was chosen are in `results/choices.*`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from paper_methods import VERSION, learnt, named
 from paper_settings import CHOSEN
 from resumable import Record, run, stored
 
-RESULTS = ROOT / "benchmarks" / "results" / "choices.jsonl"
 SEEDS = {"hov": (101, 102), "hov+": (101, 102), "truck": (11, 12)}
 SIZES = {"hov": (16, 16), "hov+": (160, 32)}
 LONGER = {"steps": 1500, "validate_every": 150}
@@ -105,6 +104,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=LOGS, help="the AlphaTruck logs: train/ and valid/")
     parser.add_argument("--methods", nargs="*", choices=methods, default=methods)
     parser.add_argument("--experiments", nargs="*", choices=experiments, default=experiments)
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "choices")
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
     jobs = {}
@@ -117,13 +117,13 @@ def main() -> None:
     run(
         judged,
         jobs,
-        RESULTS,
+        options.out / "choices.jsonl",
         version=VERSION,
         workers=options.workers,
         said=lambda record: f"log p(y) {record['log_likelihood']:.2f}, {record['seconds']:.0f} s",
     )
-    text = table(stored(RESULTS))
-    RESULTS.with_suffix(".md").write_text(text)
+    text = table(stored(options.out / "choices.jsonl"))
+    (options.out / "choices.md").write_text(text)
     print(text)
 
 

@@ -1,8 +1,9 @@
 """The settings by which `paper.py` compares the methods; defaults where there are none.
 
 Chosen by held-out log p(y) of development drives: those of SVI, FitHand and FitTV by `choose.py`, which prints what was
-tried (`results/choices.md`); those of STEADY and FitTruth are in `experiments.py`. What was chosen on Hov is used on
-Hov+, but that SVI and STEADY take batches there.
+tried (`results/choices.md`); those of STEADY and FitTruth are in `experiments.py`. On Hov+ STEADY's steps and decay and
+FitTruth's were chosen there, by its own development drives; SVI, FitHand and FitTV take what was chosen on Hov, SVI in
+batches.
 """
 
 from __future__ import annotations
