@@ -22,6 +22,9 @@ with warnings.catch_warnings():
     from pynumdiff.total_variation_regularization import iterative_velocity
 
 
+BEYOND = 10  # rows that a series is continued at both ends, turned about them: the solver errs in the first rows
+
+
 def fit(
     program,
     table: Trajectories,
@@ -87,8 +90,12 @@ def differentiated(program, data: Trajectories, poses: torch.Tensor, regularizat
             if not there.any():
                 raise UsageError(f"fit-tv: {position} cannot be told from one row's measurements")
             known = np.unwrap(values[there]) if position in program.angles else values[there]
-            smooth, derivative = iterative_velocity(
-                np.interp(even, time[there], known), even[1] - even[0], iterations, regularization
+            series = np.interp(even, time[there], known)
+            beyond = min(BEYOND, rows - 1)
+            turned = np.pad(series, beyond, mode="reflect", reflect_type="odd")
+            smooth, derivative = (
+                found[beyond : beyond + rows]
+                for found in iterative_velocity(turned, even[1] - even[0], iterations, regularization)
             )
             if not np.isfinite(derivative).all():
                 raise ComputationError(

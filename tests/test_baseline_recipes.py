@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from dataclasses import replace
 
@@ -163,6 +164,26 @@ def test_fit_hand_by_a_hand_that_reads_less() -> None:
     hand.landmarks = hand.landmarks[:3]
     fit = learned("fit-hand", load_program(HOVERCRAFT), simulated(rows=9), hand=hand, lineages=2, steps=2)
     assert fit.trained.kept == 2
+
+
+def test_steady_minus_has_steadys_settings_but_the_tempering() -> None:
+    takes = {
+        name: {
+            setting: parameter.default for setting, parameter in inspect.signature(find_recipe(name)).parameters.items()
+        }
+        for name in ("steady", "steady-minus")
+    }
+    assert takes["steady-minus"] == {k: v for k, v in takes["steady"].items() if k not in ("first_weight", "ramp")}
+
+
+def test_fit_hand_fits_to_different_paths(monkeypatch) -> None:
+    recipe, given = find_recipe("fit-hand"), []
+    supervised = recipe.__globals__["fit_truth"]
+    whole = supervised.fit
+    monkeypatch.setattr(supervised, "fit", lambda *told, **more: given.append(told[1]) or whole(*told, **more))
+    recipe(load_program(HOVERCRAFT), simulated(rows=9), hand=str(HOVERCRAFT), lineages=3, steps=2, **QUIET)
+    states = given[0].states.unflatten(1, (3, -1))
+    assert bool((states[1:].std(1) > 0).any(-1).all())
 
 
 def test_steady_minus_does_not_temper() -> None:

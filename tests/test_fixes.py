@@ -98,6 +98,22 @@ def test_fit_tv_differentiates_what_it_finds() -> None:
     assert float(away[..., :2].abs().median()) < 0.02 and float(away[..., 3:5].abs().median()) < 0.1
 
 
+def test_fit_tv_bridges_gaps_and_uneven_steps() -> None:
+    """Poses of a steady motion, at uneven times, some of them missing: its velocity everywhere."""
+    program = example("hovercraft")
+    data = drives(program, 2, 41, gaps=True)
+    poses = torch.full((*data.time.shape, 6), torch.nan, dtype=torch.float64)
+    for column, velocity in enumerate((2.0, -1.0, 3.0)):  # it turns half a dozen times over the circle's end
+        poses[..., column] = velocity * data.elapsed
+    poses[..., 2] = wrap(poses[..., 2])
+    missing = torch.rand(data.time.shape, generator=torch.Generator().manual_seed(0)) < 0.2
+    missing[0], missing[38:] = False, False  # nothing is known of the motion before the first pose and after the last
+    poses[missing | ~data.rows] = torch.nan
+    states = load_recipe("fit_tv").differentiated(program, data, poses, 1e-3, 100)
+    found = states[..., 3:][data.rows]
+    torch.testing.assert_close(found, torch.tensor([2.0, -1.0, 3.0]).double().expand(len(found), -1), rtol=0, atol=0.2)
+
+
 def load_recipe(name: str):
     from steady_ppl.program_file import run_file
 
