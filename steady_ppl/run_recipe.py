@@ -8,6 +8,7 @@ import json
 import sysconfig
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import UnionType
 from typing import Any, get_args, get_type_hints
 
 import torch
@@ -35,7 +36,7 @@ def recipe_folder() -> Path:
 def _require_kind(recipe: Recipe, option: str, value: Any) -> None:
     """A number where the recipe's annotation says so, and so on; what it does not annotate can be anything."""
     hint = get_type_hints(recipe).get(option, Any)
-    kinds = get_args(hint) or (hint,)
+    kinds = get_args(hint) if isinstance(hint, UnionType) else (hint,)
     words = {int: "a whole number", float: "a number", bool: "true or false", str: "a word", type(None): "none"}
     if not all(kind in words for kind in kinds):
         return
