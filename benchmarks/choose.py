@@ -29,7 +29,7 @@ SEEDS = {"hov": (101, 102), "hov+": (101, 102), "truck": (11, 12)}
 SIZES = {"hov": (16, 16), "hov+": (160, 32)}
 LONGER = {"steps": 1500, "validate_every": 150}
 SUPERVISED: list[dict[str, Any]] = [{}, {"weight_decay": 0.3}, LONGER, LONGER | {"weight_decay": 0.3}]
-VARIATIONS = [{"regularization": one} for one in (0.01, 0.1, 0.3, 1.0)]
+VARIATIONS = [{"regularization": one} for one in (0.01, 0.1, 0.3, 1.0, 3.0)]
 SVI: list[dict[str, Any]] = [
     {},
     {"first_kl_weight": 1.0},

@@ -19,8 +19,9 @@ CHOSEN: dict[tuple[str, str], dict[str, Any]] = {
     ("fit-hand", "hov"): LONGER,
     ("fit-hand", "hov+"): LONGER,
     ("fit-hand", "truck"): LONGER | {"weight_decay": 0.3},
-    ("fit-tv", "hov"): {"regularization": 0.3},
-    ("fit-tv", "hov+"): {"regularization": 0.3},
+    ("fit-tv", "hov"): {"regularization": 1.0},
+    ("fit-tv", "hov+"): {"regularization": 1.0},
+    ("fit-tv", "truck"): {"regularization": 0.1},
 }
 CHOSEN |= {("steady", experiment): STEADY_SETTINGS["gaussian", experiment] for experiment in EXPERIMENTS}
 CHOSEN |= {
