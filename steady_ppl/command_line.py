@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from steady_ppl import command_check, command_demo, command_discover, command_effects, command_prove
-from steady_ppl.command_parts import program_from, say, write_json
+from steady_ppl.command_parts import program_from, require_folder, say, write_json
 from steady_ppl.errors import SteadyError, UsageError
 
 INTERRUPTED = 130  # what typer returns for Ctrl-C
@@ -193,6 +193,7 @@ def evaluate(
 
     if len(arguments) < 2:
         raise UsageError("evaluate needs at least one RUN and then a TABLE")
+    require_folder(json_file)
     *runs, table = arguments
     if program and len(program) != len(runs):
         raise UsageError(f"--program is given {len(program)} times for {len(runs)} runs: name one for each, in order")

@@ -185,3 +185,10 @@ def test_evaluate_refuses_what_is_no_run_and_no_table(tmp_path: Path, work: Path
     refused(2, "there is no such file", "evaluate", work / "hand", tmp_path / "nothing.csv")
     refused(2, "at least one RUN and then a TABLE", "evaluate", work / "hand")
     refused(2, "the table has no column u.left", "evaluate", work / "hand", tmp_path / "truck.csv")
+
+
+def test_figures_that_cannot_be_written_are_refused_first(tmp_path: Path, work: Path, capsys) -> None:
+    file = tmp_path / "nowhere" / "e.json"
+    assert steady("evaluate", work / "hand", work / "train.csv", "--json", file) == 2
+    said = capsys.readouterr()
+    assert "cannot be written: there is no folder" in said.err and not said.out
