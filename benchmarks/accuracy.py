@@ -26,7 +26,7 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
-from experiments import CONDITIONS, LOGS, STANDARD, STEADY_SETTINGS, Condition, hov, truck
+from experiments import CONDITIONS, LOGS, SIZES, STANDARD, STEADY_SETTINGS, Condition, hov, truck
 from foundation import Bound, report, run_jobs
 
 from inference import steady
@@ -46,7 +46,6 @@ def unknown_drag() -> Program:
 
 
 PROGRAMS = {"hov": NeuralHovercraft, "hov-mechanistic": unknown_drag, "hov+": NeuralHovercraft, "truck": NeuralTruck}
-SIZES = {"hov": (16, 16, 32), "hov-mechanistic": (16, 16, 32), "hov+": (160, 32, 32)}
 MUSTS = {
     ("hov", "forward location"): Bound(0.039, published=".0428"),
     ("hov", "forward angle"): Bound(0.0125, published=".0140"),

@@ -20,14 +20,12 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
-from experiments import LOGS, ROOT, hov, truck
+from experiments import LOGS, ROOT, SIZES, hov, truck
 from paper_methods import VERSION, learnt, named
-from paper_settings import CHOSEN
+from paper_settings import CHOSEN, LONGER
 from resumable import Record, run, stored
 
 SEEDS = {"hov": (101, 102), "hov+": (101, 102), "truck": (11, 12)}
-SIZES = {"hov": (16, 16), "hov+": (160, 32)}
-LONGER = {"steps": 1500, "validate_every": 150}
 SUPERVISED: list[dict[str, Any]] = [{}, {"weight_decay": 0.3}, LONGER, LONGER | {"weight_decay": 0.3}]
 VARIATIONS = [{"regularization": one} for one in (0.01, 0.1, 0.3, 1.0, 3.0)]
 SVI: list[dict[str, Any]] = [
@@ -56,7 +54,7 @@ CANDIDATES: dict[tuple[str, str], list[dict[str, Any]]] = {
 def judged(method: str, experiment: str, seed: int, settings: dict[str, Any], logs: Path) -> Record:
     """Held-out log p(y) of a fit; the test split is not even passed on."""
     torch.set_num_threads(1)
-    train, valid, _ = truck(logs, seed) if experiment == "truck" else hov(seed, *SIZES[experiment], test=1)
+    train, valid, _ = truck(logs, seed) if experiment == "truck" else hov(seed, *SIZES[experiment][:2], test=1)
     began = time.perf_counter()
     fit = learnt(method, experiment, (train, valid, valid), seed, settings)
     assert fit.trained is not None

@@ -65,6 +65,7 @@ class Condition:
         return vehicle
 
 
+SIZES = {"hov": (16, 16, 32), "hov-mechanistic": (16, 16, 32), "hov+": (160, 32, 32)}  # train, valid, test
 STANDARD = Condition()
 CONDITIONS = {
     "standard": STANDARD,

@@ -30,7 +30,7 @@ import matplotlib as mpl
 
 mpl.use("Agg")
 import torch
-from experiments import LOGS, ROOT, hov, truck
+from experiments import LOGS, ROOT, SIZES, hov, truck
 from paper_methods import VERSION, Settings, by_bootstrap, learnt, named
 from paper_musts import all_met
 from paper_records import EXPERIMENTS, METHODS, RUNS, done
@@ -42,7 +42,6 @@ from steady_ppl import Fit
 from steady_ppl.evaluation import evaluate
 from steady_ppl.pictures import posterior_velocities
 
-SIZES = {"hov": (16, 16, 32), "hov+": (160, 32, 32)}
 QUICK, FEWER = {"steps": 100, "validate_every": 50}, ("svi", "svi-smoother", "steady", "steady-minus")
 LEFT_OUT = {("truth", "truck"), ("svi-smoother", "hov+")}  # nobody knows it; hours
 KEPT, COLORS = ("steady", "fit-hand"), ("#0072b2", "#d55e00")

@@ -14,10 +14,10 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import pathlib
 import statistics
 import sys
 import time
-from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -37,6 +37,7 @@ from models.neural_vehicle import NeuralHovercraft
 from steady_ppl import Constant, Joint, LookaheadGuide, UnknownMap, for_program, seeded, simulate
 from steady_ppl.evaluation import evaluate
 from steady_ppl.gaussian_smoother import standard_noise
+from steady_ppl.linearization import Path
 from steady_ppl.true_paths import true_paths
 
 DRIVES, SIMULATED, DRAWS, RESAMPLED, AWAY = 16, 640, 200, 200, 1.0
@@ -74,10 +75,7 @@ def bound() -> tuple[float, float]:
         one = data.subset([drive])
         guide = LookaheadGuide(program, particles=2 * DRAWS, draws=DRAWS, tempering=Constant(), known_start=True)
         true = true_paths(program, one)
-        (label,) = one.labels
-        path = {"states": true.states[0, :, 0], "noise": standard_noise(program, one, true)[0, :, 0]}
-        guide.memory |= {f"{kind}/{label}": values for kind, values in path.items()}
-        guide.memory[f"searched/{label}"] = torch.tensor(0.0)
+        guide.remember(Path(true.states[0], standard_noise(program, one, true)[0]), one)
         for half in halves:
             with seeded("bound", drive, len(half), half is halves[0]), pyro.settings.context(module_local_params=True):
                 guide.refresh(one, 0.0)
@@ -146,7 +144,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first-seed", type=int, default=1, help="101 to 104 are for choosing settings")
     parser.add_argument("--programs", nargs="*", choices=list(PROGRAMS), default=list(PROGRAMS))
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "unknown_map")
+    parser.add_argument("--out", type=pathlib.Path, default=ROOT / "out" / "unknown_map")
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -158,7 +156,7 @@ def main() -> int:
         learnt,
         jobs,
         arguments.out / "unknown_map.jsonl",
-        version=digest(*SOURCE, files=[Path(__file__), Path(__file__).with_name("experiments.py")]),
+        version=digest(*SOURCE, files=[pathlib.Path(__file__), pathlib.Path(__file__).with_name("experiments.py")]),
         workers=arguments.workers,
         said=said,
     )

@@ -18,6 +18,7 @@ from steady_ppl import command_check, command_demo, command_discover, command_ef
 from steady_ppl.command_parts import program_from, require_folder, say, write_json
 from steady_ppl.errors import SteadyError, UsageError
 
+WORDS = {"true": True, "false": False, "none": None}
 INTERRUPTED = 130  # what typer returns for Ctrl-C
 
 app = typer.Typer(
@@ -219,7 +220,7 @@ def evaluate(
 
 
 def _settings(pairs: list[str], options: dict[str, Any]) -> dict[str, Any]:
-    """Add `NAME=VALUE` settings to the named options; a value is a Python literal, or else a word."""
+    """Add `NAME=VALUE` settings to the named options: Python literals, true, false, none, or else words."""
     for pair in pairs:
         name, equals, text = pair.partition("=")
         name = name.strip().replace("-", "_")
@@ -227,10 +228,11 @@ def _settings(pairs: list[str], options: dict[str, Any]) -> dict[str, Any]:
             raise UsageError(f"--set {pair}: expected NAME=VALUE")
         if name in options:
             raise UsageError(f"--set {pair}: {name} is given twice")
+        word = text.strip()
         try:
-            options[name] = ast.literal_eval(text.strip())
+            options[name] = ast.literal_eval(word)
         except (ValueError, SyntaxError):
-            options[name] = text.strip()
+            options[name] = WORDS.get(word, word)
     return options
 
 

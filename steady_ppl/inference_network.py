@@ -39,7 +39,7 @@ class InferenceNetwork(VariationalGuide):
     """
 
     circular: Tensor
-    size: Tensor
+    reach: Tensor
     scale: Tensor
 
     def __init__(
@@ -55,7 +55,7 @@ class InferenceNetwork(VariationalGuide):
         mean, spread = (moment[0][data.transitions] for moment in channel_moments(program, data, states[None, :-1]))
         values = mean + spread * path.noise[data.transitions]
         squares = values.square().mean(0) + spread.square().mean(0)
-        self.register_buffer("size", squares.sqrt() if centred else torch.ones_like(squares))
+        self.register_buffer("reach", squares.sqrt() if centred else torch.ones_like(squares))
         self.register_buffer("scale", spread.mean(0) if centred else torch.ones_like(squares))
         inside, features = data.rows[..., None], self._features(states)
         self.scales = nn.ModuleDict(
@@ -111,7 +111,7 @@ class InferenceNetwork(VariationalGuide):
         features = self.scales["state"](self._features(state))
         mean = self.shift[row] + times(self.gain[row], features)
         mean = mean + self.head((self.hidden[row] + self.by_state(features)).tanh())
-        noise = self.size * BOUND * (mean / BOUND).tanh() + self.scale * self.around[:, row]
+        noise = self.reach * BOUND * (mean / BOUND).tanh() + self.scale * self.around[:, row]
         if self.centred:
             return noise, state.new_zeros(())
         return noise, log_ratio(noise, self.random[:, row], self.log_sd[row])

@@ -47,7 +47,7 @@ class Path:
     noise: Tensor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Sensors:
     """What is measured, to first order around states, in double precision.
 
@@ -66,9 +66,9 @@ class Sensors:
     in_plain_torch: str | None = None
 
 
-@dataclass(frozen=True)
-class Linearization:
-    """The program to first order along a path, in double precision; nothing moves past a trajectory's end.
+@dataclass(frozen=True, kw_only=True)
+class Linearization(Sensors):
+    """The whole program to first order along a path; nothing moves past a trajectory's end.
 
     Attributes:
         path: what it was taken along.
@@ -78,11 +78,6 @@ class Linearization:
         start_noise: G₀ `(B, D, C₀)`; zero where the start is known.
         offset: `(T, B, D)` where the program arrives without noise, less the path's next state, angles on the circle.
         state, noise: F `(T, B, D, D)` and G `(T, B, D, C)`.
-        residual: r̄ `(T + 1, B, K)`, on the circle where the measurement is an angle; zero where missing.
-        measurement: H `(T + 1, B, K, D)`.
-        precision: `(T + 1, B, K)` observation weight over variance; zero where missing.
-        log_scale: `(T + 1, B)` the measurements' log-density at residual zero, times the observation weight.
-        in_plain_torch: why no kernels served; None where they did or were not worth it.
     """
 
     path: Path
@@ -93,11 +88,6 @@ class Linearization:
     offset: Tensor
     state: Tensor
     noise: Tensor
-    residual: Tensor
-    measurement: Tensor
-    precision: Tensor
-    log_scale: Tensor
-    in_plain_torch: str | None = None
 
 
 @torch.no_grad()
@@ -134,6 +124,7 @@ def linearize(
     for angle in angles:
         start_turn[:, angle] = start_offset[:, angle].double() - wrap(start_offset[:, angle].double())
     seen = linearize_sensors(program, data, states, observation_weight=observation_weight, kernels=kernels)
+    both = vars(seen) | {"in_plain_torch": moved.in_plain_torch or seen.in_plain_torch}
     return Linearization(
         path=path,
         angles=angles,
@@ -143,11 +134,7 @@ def linearize(
         offset=torch.where(data.transitions[..., None], offset, 0.0),
         state=torch.where(data.transitions[..., None, None], by_state, 0.0).double(),
         noise=torch.where(data.transitions[..., None, None], by_noise, 0.0).double(),
-        residual=seen.residual,
-        measurement=seen.measurement,
-        precision=seen.precision,
-        log_scale=seen.log_scale,
-        in_plain_torch=moved.in_plain_torch or seen.in_plain_torch,
+        **both,
     )
 
 

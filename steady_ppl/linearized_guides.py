@@ -67,7 +67,7 @@ class LinearizedGuide(PathGuide):
             self.counts["searches_failed"] = 1
         if lost or due:
             ahead = self._smooth(data, progress)
-        self._remember(means_as_path(ahead, data), data)
+        self.remember(means_as_path(ahead, data), data)
         self.in_plain_torch = ahead.linearization.in_plain_torch
         return ahead
 
@@ -88,7 +88,7 @@ class LinearizedGuide(PathGuide):
         better = ahead.log_likelihood > (-torch.inf if known is None else known[trajectories])  # not where it is a nan
         kept = better.nonzero().flatten().tolist()
         if kept:
-            self._remember(Path(found.states[:, kept], found.noise[:, kept]), part.subset(kept))
+            self.remember(Path(found.states[:, kept], found.noise[:, kept]), part.subset(kept))
 
     def _smooth(self, data: Trajectories, progress: float) -> Lookahead:
         path = Path(self._recall("states", data), self._recall("noise", data))
@@ -108,8 +108,10 @@ class LinearizedGuide(PathGuide):
             raise ValueError("this guide remembers other drives of the same labels: make a new one for these")
         return torch.stack(known, 1).to(data.controls)
 
-    def _remember(self, path: Path, data: Trajectories) -> None:
+    def remember(self, path: Path, data: Trajectories) -> None:
+        """Begin the next `refresh` at this path of the trajectories of `data` instead of searching for one."""
         for i, label in enumerate(data.labels):
+            self.memory.setdefault(f"searched/{label}", torch.tensor(0.0, dtype=torch.float64))
             self.memory[f"states/{label}"] = path.states[:, i]
             self.memory[f"noise/{label}"] = path.noise[:, i]
 

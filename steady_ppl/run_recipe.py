@@ -8,8 +8,7 @@ import json
 import sysconfig
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import UnionType
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import torch
 
@@ -35,12 +34,13 @@ def recipe_folder() -> Path:
 
 def _require_kind(recipe: Recipe, option: str, value: Any) -> None:
     """A number where the recipe's annotation says so, and so on; what it does not annotate can be anything."""
-    hint = get_type_hints(recipe).get(option, Any)
-    kinds = get_args(hint) if isinstance(hint, UnionType) else (hint,)
-    words = {int: "a whole number", float: "a number", bool: "true or false", str: "a word", type(None): "none"}
+    annotation = inspect.formatannotation(inspect.signature(recipe).parameters[option].annotation)
+    kinds = annotation.strip("'").split(" | ")  # by name: a recipe's annotations may not be there to be evaluated
+    words = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a word", "None": "none"}
     if not all(kind in words for kind in kinds):
         return
-    fits = type(value) in kinds or (type(value) is int and float in kinds)
+    given = "None" if value is None else type(value).__name__
+    fits = given in kinds or (given == "int" and "float" in kinds)
     require(fits, option, repr(value), " or ".join(words[kind] for kind in kinds))
 
 

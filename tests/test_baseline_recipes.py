@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import math
 from dataclasses import replace
 
@@ -156,6 +157,14 @@ def test_settings_of_another_kind_are_refused(tmp_path, capsys, setting: str, wa
     command = ("fit", HOVERCRAFT, table, "--recipe", "svi", "--set", setting, "--out", tmp_path / "run")
     assert steady(*command) == 2
     assert wanted in capsys.readouterr().err and not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(("word", "value"), [("false", False), ("true", True), ("none", None), ("False", False)])
+def test_a_word_for_yes_and_no_is_one(tmp_path, word: str, value: bool | None) -> None:
+    table, run = written(tmp_path / "t.csv", simulated(rows=5)), tmp_path / "run"
+    few = ("--steps", 1, "--known-start", "--set", f"centred={word}", "--out", run)
+    assert steady("fit", HOVERCRAFT, table, "--recipe", "svi", *few) == 0
+    assert json.loads((run / "run.json").read_text())["options"]["centred"] is value
 
 
 def test_fit_hand_by_a_hand_that_reads_less() -> None:
