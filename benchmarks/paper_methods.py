@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from models.hovercraft import Hovercraft, HovercraftTruth
 from models.neural_vehicle import NeuralHovercraft, NeuralTruck
 from models.truck import Truck
 from steady_ppl import Fit, Trajectories, for_program, log_likelihood, seeded
+from steady_ppl.errors import FilterError
 from steady_ppl.metrics import state_estimation
 
 Settings = dict[str, Any]
@@ -22,7 +24,6 @@ RECIPES: dict[str, Callable[..., Fit]] = {
     "fit-hand": fit_hand.fit,
     "fit-tv": fit_tv.fit,
     "svi": svi.fit,
-    "svi-smoother": svi.fit,
     "steady": steady.fit,
     "steady-minus": steady_minus.fit,
     "steady-bootstrap": steady.fit,
@@ -30,7 +31,6 @@ RECIPES: dict[str, Callable[..., Fit]] = {
     "truth": hand.fit,
 }
 OF_ITS_OWN: dict[str, Settings] = {
-    "svi-smoother": {"guide": "smoother"},
     "steady": {"guide": "gaussian"},
     "steady-bootstrap": {"guide": "bootstrap"},
 }
@@ -47,24 +47,32 @@ def learnt(method: str, experiment: str, data: Split, seed: int, settings: Setti
         return RECIPES[method](program, train, valid, known_start=True, seed=seed)
     if method != "fit-truth":
         train, valid = (part.without_truth(keep_start=True) for part in (train, valid))
-    told = OF_ITS_OWN.get(method, {}) | settings
+    options = OF_ITS_OWN.get(method, {}) | settings
     if method == "fit-hand":
-        told = {"hand": own(), "lineages": LINEAGES[experiment]} | told
-    return RECIPES[method](program, train, valid, known_start=True, seed=seed, progress=False, **told)
+        options = {"hand": own(), "lineages": LINEAGES[experiment]} | options
+    return RECIPES[method](program, train, valid, known_start=True, seed=seed, progress=False, **options)
 
 
 def named(method: str, experiment: str, seed: int, settings: Settings) -> str:
     """Under what a fit's record is kept."""
-    said = (f"{name}={value:g}" for name, value in settings.items())
-    return " ".join([experiment, method, str(seed), *said])
+    return " ".join([experiment, method, str(seed), *told(settings)])
+
+
+def told(settings: Settings) -> list[str]:
+    """NAME=VALUE of each setting."""
+    return [f"{name}={value if isinstance(value, str) else format(value, 'g')}" for name, value in settings.items()]
 
 
 def by_bootstrap(fit: Fit, table: Trajectories, particles: int = 20_000) -> dict[str, Any]:
-    """What the filter that looks ahead is held against."""
+    """What the filter that looks ahead is held against; where this one fails, no numbers and why."""
     data, settings = for_program(fit.program, table), {"particles": particles, "known_start": fit.known_start}
     with seeded("bootstrap"):
-        likelihood = float(log_likelihood(fit.program, data, **settings).mean())
-        return {"log_likelihood": likelihood, "state_estimation": state_estimation(fit.program, data, **settings)}
+        try:
+            likelihood = float(log_likelihood(fit.program, data, **settings).mean())
+            return {"log_likelihood": likelihood, "state_estimation": state_estimation(fit.program, data, **settings)}
+        except FilterError as error:
+            none = {"location": math.nan, "angle": math.nan}
+            return {"log_likelihood": math.nan, "state_estimation": none, "why_not": str(error)}
 
 
 SOURCE = [ROOT / room for room in ("steady_ppl", "models", "inference")]

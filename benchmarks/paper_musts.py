@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import statistics
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
-from paper_filters import by_bootstrap
+from paper_filters import judged
 from paper_records import CELLS, EXPERIMENTS, METHODS, RIVALS, Records, published, spread, values
 
 MET, MISSED, NOT_RUN = "met", "MISSED", "not run"
@@ -55,15 +55,9 @@ MUSTS = [
 
 
 def verdicts(records: Records, runs: int) -> list[Verdict]:
-    """Of every must, by the means of so many runs; also by the bootstrap filter's figures where the filters differ."""
-    other = by_bootstrap(records)
-    found = []
-    for must in MUSTS:
-        verdict, again = _verdict(must, records, runs), _verdict(must, other, runs)
-        if verdict.outcome == MET and again.outcome != MET:
-            verdict = replace(again, why=f"{again.why} (by the bootstrap filter)")
-        found.append(verdict)
-    return found
+    """Of every must, by the means of so many runs, by the bootstrap filter's figures where the filters differ."""
+    by_filter = judged(records)
+    return [_verdict(must, by_filter, runs) for must in MUSTS]
 
 
 def all_met(records: Records, runs: int) -> bool:

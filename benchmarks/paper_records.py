@@ -17,7 +17,6 @@ METHODS = {
     "fit-hand": "FitHand",
     "fit-tv": "FitTV",
     "svi": "SVI",
-    "svi-smoother": "SVI, smoother guide",
     "steady": "STEADY",
     "steady-minus": "STEADY−",
     "steady-bootstrap": "STEADY, bootstrap",

@@ -64,6 +64,6 @@ def fit(
         paths = filtered.paths(lineages).within(data)
     copies = for_program(program, table).subset(torch.arange(len(data)).repeat(lineages))
     believed = dataclasses.replace(copies, states=paths.states.transpose(0, 1).flatten(1, 2))
-    supervised = {name: value for name, value in settings.items() if name not in ("hand", "lineages", "particles")}
-    fitted = fit_truth.fit(program, believed, valid, **supervised, **run)
-    return dataclasses.replace(fitted, recipe="fit-hand", settings=settings)
+    with seeded(seed, "prepare"):
+        program.prepare(believed, known_start)
+    return fit_truth.supervised(program, believed, valid, "fit-hand", settings, **run)

@@ -4,6 +4,8 @@ The guide's sites are Deltas at the true states and the channel noise that expla
 supervised learning. It still stops on held-out log p(y), as every other recipe does.
 """
 
+import dataclasses
+
 from steady_ppl import Fit, Optimization, Trajectories, TruthGuide, Validation, for_program, seeded, train
 
 
@@ -38,24 +40,17 @@ def fit(
     data = for_program(program, table)
     with seeded(seed, "prepare"):
         program.prepare(data, known_start)
+    return supervised(program, data, valid, "fit-truth", settings, **run)
+
+
+def supervised(program, data: Trajectories, valid: Trajectories | None, recipe: str, settings: dict, **run) -> Fit:
+    """Fit a prepared `program` to the states of `data`, whoever says that they are these; `settings` as of `fit`."""
+    seed, known_start = settings["seed"], settings["known_start"]
     optimization = Optimization(
-        steps=steps,
-        learning_rate=learning_rate,
-        weight_decay=weight_decay,
-        averaging=averaging,
-        validate_every=validate_every,
-        patience=patience,
+        **{field.name: settings[field.name] for field in dataclasses.fields(Optimization) if field.name in settings}
     )
-    validation = Validation.suited(program, valid, known_start=known_start, particles=validation_particles)
+    validation = Validation.suited(program, valid, known_start=known_start, particles=settings["validation_particles"])
     trained = train(
         program, TruthGuide(program), data, validation, optimization, known_start=known_start, seed=seed, **run
     )
-    return Fit(
-        program,
-        "fit-truth",
-        settings,
-        seed=seed,
-        known_start=known_start,
-        trained=trained,
-        notes=validation.notes,
-    )
+    return Fit(program, recipe, settings, seed=seed, known_start=known_start, trained=trained, notes=validation.notes)

@@ -1,7 +1,8 @@
 """FitTV: a pose from each row's own measurements, its derivative by total variation, and the program fitted to both.
 
-What one does without a model of the motion. Nothing of the drives' true states is looked at, not even their start: the
-poses are `fixes`. Chartrand's total-variation derivative (2011) is pynumdiff's.
+What one does without a model of the motion. Nothing of the drives' true states is looked at, not even their start (a
+known start is for the held-out drives alone): the poses are `fixes`. Chartrand's total-variation derivative (2011) is
+pynumdiff's.
 """
 
 import dataclasses
@@ -31,7 +32,7 @@ def fit(
     valid: Trajectories | None = None,
     *,
     known_start: bool = False,
-    regularization: float = 0.01,
+    regularization: float = 0.1,
     iterations: int = 20,
     steps: int = 500,
     learning_rate: float = 1e-2,
@@ -50,7 +51,7 @@ def fit(
         table: the training drives; true states are not looked at.
         valid: held-out drives.
         known_start: the first row's true state is given to the filter of the validation.
-        regularization: weight of the derivative's total variation (α in the paper).
+        regularization: weight of the derivative's total variation (α in the paper, which has .01).
         iterations: of the derivative's solver.
         steps, learning_rate, weight_decay, averaging, validate_every, validation_particles, patience, run: as in
             `fit_truth`.
@@ -66,9 +67,9 @@ def fit(
     with seeded(seed, "fixes"):
         poses = fixes(program, data)
     estimated = dataclasses.replace(data, states=differentiated(program, data, poses, regularization, iterations))
-    supervised = {name: value for name, value in settings.items() if name not in ("regularization", "iterations")}
-    fitted = fit_truth.fit(program, estimated, valid, **supervised, **run)
-    return dataclasses.replace(fitted, recipe="fit-tv", settings=settings)
+    with seeded(seed, "prepare"):
+        program.prepare(data, known_start=False)
+    return fit_truth.supervised(program, estimated, valid, "fit-tv", settings, **run)
 
 
 def differentiated(program, data: Trajectories, poses: torch.Tensor, regularization: float, iterations: int):

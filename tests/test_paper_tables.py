@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import json
 import math
 import subprocess
 import sys
@@ -15,7 +16,9 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import paper
+import paper_methods
 from choose import CANDIDATES, SEEDS, table
+from experiments import hov
 from paper_filters import filters
 from paper_methods import named
 from paper_musts import all_met, shown
@@ -23,8 +26,10 @@ from paper_records import EXPERIMENTS, METHODS, PUBLISHED
 from paper_tables import tables
 from unknown_map import moved
 
-from models.hovercraft import HovercraftTruth
+from inference import hand
+from models.hovercraft import Hovercraft, HovercraftTruth
 from models.hovercraft_unknown_map import HovercraftUnknownMap
+from steady_ppl.errors import FilterError
 
 
 def record(method: str, seed: int, size: float, experiment: str = "hov+", **more: object) -> dict:
@@ -170,9 +175,9 @@ def test_the_published_average_must_be_passed_on_truck_within_one_sd_of_ours() -
     )
 
 
-def checked(method: str, nats: float, location: float, angle: float = 0.0) -> dict:
-    """A first run with a bootstrap that is so far away."""
-    one = record(method, 1, 0.3)
+def checked(method: str, nats: float, location: float, angle: float = 0.0, seed: int = 1) -> dict:
+    """A run with a bootstrap that is so far away."""
+    one = record(method, seed, 0.3)
     errors = {"location": 0.3 + location, "angle": 0.03 + angle}
     return one | {"bootstrap": {"log_likelihood": one["log_likelihood"] - nats, "state_estimation": errors}}
 
@@ -186,30 +191,78 @@ def test_a_bootstrap_that_differs_is_shown_with_its_figures(nats: float, locatio
     assert lines[0] == "1 of 2 equal" and len(lines) == 2
     likelihood, place, direction = -0.3 - nats, 0.3 + location, 0.03 + angle
     assert lines[1] == (
-        "NOT EQUAL Hov+, STEADY: -0.30 nats, 0.3000 m, 0.0300 rad, "
+        "NOT EQUAL Hov+, STEADY, run 1: -0.30 nats, 0.3000 m, 0.0300 rad, "
         f"by the bootstrap {likelihood:.2f} nats, {place:.4f} m, {direction:.4f} rad"
     )
 
 
-def test_methods_without_a_bootstrap_are_named() -> None:
+def test_runs_without_a_bootstrap_are_named() -> None:
     records = [checked("hand", 0.0, 0.0), record("hand", 2, 0.5), record("steady", 1, 0.1)]
-    lines = ["1 of 1 equal", "not held against the bootstrap: Hov+, STEADY"]
+    lines = [
+        "1 of 1 equal",
+        "not held against the bootstrap: Hov+, Hand, run 2",
+        "not held against the bootstrap: Hov+, STEADY, run 1",
+    ]
     assert list(filters(records)) == lines and all(f"- {line}\n" in tables(records) for line in lines)
     assert "within 0.5 nats of log p(y) and 5 % of both" in tables(records)
 
 
-def test_where_the_bootstrap_differs_a_must_has_to_be_met_by_its_figures_too() -> None:
+def test_where_one_run_differs_all_are_shown_by_the_bootstrap_and_marked() -> None:
+    same, apart = checked("hand", 0.0, 0.002, seed=1), checked("hand", 1.0, 0.1, 0.01, seed=2)
+    text = tables([same, apart, checked("steady", 0.0, 0.001)], 2)
+    location, angle, forward, *_ = text.split("### ")[1:]
+    assert "| 0.351 ± 0.069 (0.302)ᵇ |" in location and "| 0.300 (1 of 2) |" in location
+    assert "| 0.0350 ± 0.0071 (0.0300)ᵇ |" in angle
+    assert "ᵇ" not in forward and "-0.80 ± 0.71 (-0.30)ᵇ" in text
+
+
+def test_where_the_bootstrap_differs_a_must_is_judged_by_its_figures() -> None:
     records = whole()
     one = of(records, "truck", "steady")[0]
     same = {"log_likelihood": one["log_likelihood"], "state_estimation": dict(one["state_estimation"])}
     one["bootstrap"] = same
     assert all_met(records, 3)
     one["bootstrap"] = {"log_likelihood": -50.0, "state_estimation": {"location": 4.8, "angle": 0.002}}
-    assert (
-        "MISSED Truck, STEADY better than Hand, state estimation location: STEADY 1.6133, Hand 0.5000 "
-        "(by the bootstrap filter)"
-    ) in named_as("MISSED", records)
-    assert "NOT EQUAL Truck, STEADY" in tables(records)
+    assert ("MISSED Truck, STEADY better than Hand, state estimation location: STEADY 1.6133, Hand 0.5000") in named_as(
+        "MISSED", records
+    )
+    assert "NOT EQUAL Truck, STEADY, run 1" in tables(records)
+
+
+@pytest.mark.parametrize("method", ["steady", "svi"])
+def test_a_bootstrap_that_breaks_down_is_said_and_meets_no_must(method: str) -> None:
+    records = whole()
+    none = {"location": math.nan, "angle": math.nan}
+    of(records, "hov", method)[1]["bootstrap"] = {
+        "log_likelihood": math.nan,
+        "state_estimation": none,
+        "why_not": "every weight is zero",
+    }
+    assert named_as("MISSED", records)
+    assert "by the bootstrap nothing (every weight is zero)" in tables(records)
+
+
+@pytest.mark.parametrize("method", ["hand", "fit-truth"])
+def test_a_run_from_drives_to_record(method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(paper.SIZES, "hov", (2, 2, 2))
+    settings = {"steps": 2, "validate_every": 2} if method == "fit-truth" else {}
+    made = json.loads(json.dumps(paper.judged(method, "hov", 1, settings, tmp_path, True, tmp_path)))
+    made["set"] = named(method, "hov", 1, settings)
+    assert made["kept_step"] == (2 if settings else None) and "steps=2" * bool(settings) in made["set"]
+    assert paper.said(made).startswith("forward 0.") and math.isfinite(made["bootstrap"]["log_likelihood"])
+    text = tables([made], 1)
+    assert f"| {METHODS[method]} | {made['forward']['location']:.4f} | " in text
+    assert " of 1 equal" in text and "not held against" not in text and not list(tmp_path.iterdir())
+
+
+def test_a_filter_that_fails_is_a_record_without_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise FilterError("every weight is zero")
+
+    monkeypatch.setattr(paper_methods, "log_likelihood", broken)
+    test = hov(1, 1, 1, 1)[2]
+    found = paper_methods.by_bootstrap(hand.fit(Hovercraft(), None, known_start=True), test, particles=10)
+    assert math.isnan(found["log_likelihood"]) and found["why_not"] == "every weight is zero"
 
 
 def test_a_quick_run_judges_nothing() -> None:
