@@ -149,7 +149,8 @@ def main() -> int:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     best, error = bound()
-    print(f"information bound of the map's rms error, {DRIVES} drives: {best:.3f} ± {error:.3f} m", flush=True)
+    lines = [f"information bound of the map's rms error, {DRIVES} drives: {best:.3f} ± {error:.3f} m"]
+    print(lines[0], flush=True)
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     jobs = {f"{name} seed {seed}": (name, seed) for name in arguments.programs for seed in seeds}
     records = run(
@@ -169,12 +170,14 @@ def main() -> int:
         rms = math.sqrt(statistics.fmean(error**2 for error in errors))
         changes = {group: _mean(runs, "learned map", group) / _mean(runs, "known map", group) for group in GROUPS}
         far, worse = rms > 1.5 * best, max(changes.values()) > 1.15
-        print(
+        lines.append(
             f"{name}: map off by {rms:.3f} m rms over {len(runs)} seeds, {rms / best:.2f} times the bound"
             f"{' MISSED' if far else ''}; forward error against the known map {changes['location'] - 1:+.1%} "
             f"(location), {changes['angle'] - 1:+.1%} (angle){' MISSED' if worse else ''}"
         )
+        print(lines[-1])
         missed |= far or worse
+    (arguments.out / "unknown_map.md").write_text("".join(f"- {line}\n" for line in lines))
     return int(missed)
 
 

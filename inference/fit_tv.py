@@ -68,7 +68,7 @@ def fit(
         poses = fixes(program, data)
     estimated = dataclasses.replace(data, states=differentiated(program, data, poses, regularization, iterations))
     with seeded(seed, "prepare"):
-        program.prepare(data, known_start=False)
+        program.prepare(estimated, known_start)  # a start that is known is the estimated one: no other is looked at
     return fit_truth.supervised(program, estimated, valid, "fit-tv", settings, **run)
 
 
