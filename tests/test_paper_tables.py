@@ -4,32 +4,22 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import json
 import math
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-import torch
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import paper
-import paper_methods
 from choose import CANDIDATES, SEEDS, table
-from experiments import hov
 from paper_filters import filters
 from paper_methods import named
 from paper_musts import all_met, shown
 from paper_records import EXPERIMENTS, METHODS, PUBLISHED
 from paper_tables import tables
-from unknown_map import moved
-
-from inference import hand
-from models.hovercraft import Hovercraft, HovercraftTruth
-from models.hovercraft_unknown_map import HovercraftUnknownMap
-from steady_ppl.errors import FilterError
 
 
 def record(method: str, seed: int, size: float, experiment: str = "hov+", **more: object) -> dict:
@@ -242,29 +232,6 @@ def test_a_bootstrap_that_breaks_down_is_said_and_meets_no_must(method: str) -> 
     assert "by the bootstrap nothing (every weight is zero)" in tables(records)
 
 
-@pytest.mark.parametrize("method", ["hand", "fit-truth"])
-def test_a_run_from_drives_to_record(method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(paper.SIZES, "hov", (2, 2, 2))
-    settings = {"steps": 2, "validate_every": 2} if method == "fit-truth" else {}
-    made = json.loads(json.dumps(paper.judged(method, "hov", 1, settings, tmp_path, True, tmp_path)))
-    made["set"] = named(method, "hov", 1, settings)
-    assert made["kept_step"] == (2 if settings else None) and "steps=2" * bool(settings) in made["set"]
-    assert paper.said(made).startswith("forward 0.") and math.isfinite(made["bootstrap"]["log_likelihood"])
-    text = tables([made], 1)
-    assert f"| {METHODS[method]} | {made['forward']['location']:.4f} | " in text
-    assert " of 1 equal" in text and "not held against" not in text and not list(tmp_path.iterdir())
-
-
-def test_a_filter_that_fails_is_a_record_without_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object, **__: object) -> None:
-        raise FilterError("every weight is zero")
-
-    monkeypatch.setattr(paper_methods, "log_likelihood", broken)
-    test = hov(1, 1, 1, 1)[2]
-    found = paper_methods.by_bootstrap(hand.fit(Hovercraft(), None, known_start=True), test, particles=10)
-    assert math.isnan(found["log_likelihood"]) and found["why_not"] == "every weight is zero"
-
-
 def test_a_quick_run_judges_nothing() -> None:
     text = tables([record("steady", 1, 0.6), record("hand", 1, 0.5)], 1, quick=True)
     assert "A quick run judges nothing" in text and "MISSED" not in text and " met" not in text
@@ -317,10 +284,3 @@ def test_settings_that_failed_or_are_not_fitted_to_every_draw_have_no_mean() -> 
     failed = both | {named("svi", "truck", seeds[0], first): {"failed": "why"}}
     assert "| – | failed, 370.00 | failed, 5 | failed, 2 |" in table(failed)
     assert "| – | 370.00 | 5 | 2 |" in table({named("svi", "truck", seeds[1], second): fitted})
-
-
-def test_the_wrong_map_is_a_metre_off_at_every_landmark_and_what_is_learned_begins_there() -> None:
-    program = moved(HovercraftUnknownMap(), seed=1)
-    away = torch.tensor(HovercraftTruth.landmarks) - program.map
-    assert away.norm(dim=-1).tolist() == pytest.approx([1.0] * len(away), abs=1e-5)
-    assert torch.equal(program.landmarks, program.map) and torch.equal(program.declared, program.map)
