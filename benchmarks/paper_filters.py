@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from paper_records import EXPERIMENTS, METHODS, Record, Records, done
+from paper_records import EXPERIMENTS, GROUPS, METHODS, Record, Records, done
 
 NATS, PART = 0.5, 0.05
-GROUPS = ("location", "angle")
 MARK = "ᵇ"
 TEXT = (
     "All runs are judged by the filter that looks ahead, and by a bootstrap of 20,000 particles too. Equal is within "

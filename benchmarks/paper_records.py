@@ -24,7 +24,8 @@ METHODS = {
     "truth": "true program",
 }
 RIVALS = ("hand", "fit-hand", "fit-tv", "svi")
-CELLS = [(metric, group) for metric in ("state_estimation", "forward") for group in ("location", "angle")]
+GROUPS = ("location", "angle")
+CELLS = [(metric, group) for metric in ("state_estimation", "forward") for group in GROUPS]
 Record = Mapping[str, Any]
 Records = Sequence[Record]
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import paper_filters
 import paper_musts
-from paper_records import EXPERIMENTS, METHODS, RUNS, Records, published, spread, values
+from paper_records import EXPERIMENTS, GROUPS, METHODS, RUNS, Records, published, spread, values
 
 TABLES = {
     "State estimation from bearings at 1 Hz (smoothed): location [m]": ("state_estimation", "location", 3),
@@ -24,11 +24,13 @@ HAND = (
     "one noise a step for all particles, which then cannot follow a drive; done right the same program has .549 m, "
     ".038 rad and +32.6 nats (re-simulated)."
 )
+SHORT = (("forward", "forward prediction, noisy roll-outs", 4), ("state_estimation", "state estimation at 1 Hz", 3))
 TRUCK = (
     "Truck: controls act with a lag that a program without memory cannot hold, so the likelihood asks for wide process "
     "noise, and a noisy roll-out's error counts that width; the mean roll-out does not, nor does log p(y) punish it. "
     "STEADY's observation weight ends near 1 / 3 there, which was chosen on the valid split."
 )
+Marks = Mapping[tuple[str, str, str], str]
 FILTERED = ("state_estimation", "log_likelihood")
 QUICK = "A quick run judges nothing: it is one run of few steps, without the bootstrap filter. No must was looked at."
 
@@ -44,12 +46,14 @@ def tables(records: Records, runs: int = RUNS, *, quick: bool = False) -> str:
     theirs = {cell: _theirs(row) for cell, row in published().items()}
     failed = {record["set"]: " ".join(record["failed"].split()) for record in records if "failed" in record}
     tried = {tuple(name.split()[:2]) for name in failed}
-    by_filter, marked = paper_filters.judged(records), paper_filters.differing(records)
+    by_filter = paper_filters.judged(records)
+    marks = {(metric, *cell): paper_filters.MARK for metric in FILTERED for cell in paper_filters.differing(records)}
     parts = [
         "Ours: mean ± sd over runs, each on drives (for the truck: a draw of the bearings) of its own; the best in "
         "brackets, and how many runs there are where some lack. Published: average of three runs; ± and the best, in "
         "brackets, where printed.\n"
     ]
+    parts += [_in_short(by_filter, marks, *short) for short in SHORT]
     for title, (metric, group, digits) in TABLES.items():
         lines = [f"### {title}\n", f"| | {' | '.join(f'{name} | published' for name in EXPERIMENTS.values())} |"]
         lines.append("|---|" + "---|---|" * len(EXPERIMENTS))
@@ -58,7 +62,7 @@ def tables(records: Records, runs: int = RUNS, *, quick: bool = False) -> str:
             for experiment in EXPERIMENTS:
                 figures = values(by_filter, metric, group, experiment, method)
                 asked = runs if figures or (experiment, method) in tried else 0
-                mark = paper_filters.MARK if metric in FILTERED and (experiment, method) in marked else ""
+                mark = marks.get((metric, experiment, method), "")
                 cells.append(_ours(figures, digits, asked, higher=metric == "log_likelihood") + mark)
                 cells.append(theirs.get((metric, group, experiment, method), "–"))
             if any(cell != "–" for cell in cells):
@@ -73,6 +77,27 @@ def tables(records: Records, runs: int = RUNS, *, quick: bool = False) -> str:
         parts += ["### The filter\n", paper_filters.TEXT + "\n", _listed(paper_filters.filters(records))]
         parts += ["### What must hold\n", _listed(paper_musts.shown(records, runs))]
     return "\n".join(parts).rstrip() + "\n"
+
+
+def _in_short(records: Records, marks: Marks, metric: str, title: str, digits: int) -> str:
+    """Means alone, location / angle, ours and in brackets the published."""
+    lines = [f"### In short: {title}, location [m] / angle [rad], ours (published)\n"]
+    lines += [f"| | {' | '.join(EXPERIMENTS.values())} |", "|---" * (len(EXPERIMENTS) + 1) + "|"]
+    for method, name in METHODS.items():
+        cells = []
+        for experiment in EXPERIMENTS:
+            ours = [values(records, metric, group, experiment, method) for group in GROUPS]
+            rows = [published().get((metric, group, experiment, method)) for group in GROUPS]
+            cell = _pair(map(statistics.fmean, ours), digits) if all(ours) else "–"
+            theirs = _pair([float(row["average"]) for row in rows if row], digits)
+            cells.append(cell + marks.get((metric, experiment, method), "") + (f" ({theirs})" if theirs else ""))
+        if any(cell[0] != "–" for cell in cells):
+            lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _pair(figures: Iterable[float], digits: int) -> str:
+    return " / ".join(f"{figure:.{digits}f}" for figure in figures)
 
 
 def _listed(lines: Iterable[str]) -> str:
