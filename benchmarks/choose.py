@@ -20,9 +20,9 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
-from experiments import LOGS, ROOT, SIZES, hov, truck
+from experiments import LOGS, ROOT, SIZES, STEADY_SETTINGS, hov, truck
 from paper_methods import VERSION, learnt, named, told
-from paper_settings import CHOSEN, LONGER
+from paper_settings import LONGER
 from resumable import Record, run, stored
 
 SEEDS = {"hov": (101, 102), "hov+": (101, 102), "truck": (11, 12)}
@@ -33,6 +33,7 @@ SVI: list[dict[str, Any]] = [
     {"first_kl_weight": 1.0},
     {"learning_rate": 1e-2, "guide_rate": 0.3},
     {"centred": False},
+    {"steps": 3000, "validate_every": 150},
 ]
 # As STEADY's observation weight on the truck, which ends near 1 / 3; without patience it would stop where it began.
 FINAL = {"annealing": 1.12, "patience": 20}
@@ -44,11 +45,18 @@ CANDIDATES: dict[tuple[str, str], list[dict[str, Any]]] = {
     ("fit-hand", "hov"): SUPERVISED,
     ("fit-hand", "hov+"): SUPERVISED,
     ("fit-hand", "truck"): SUPERVISED,
-    ("fit-tv", "hov"): [*VARIATIONS, *({"regularization": 1.0} | one for one in SUPERVISED[1:3])],
+    ("fit-tv", "hov"): [
+        *VARIATIONS,
+        *({"regularization": part} | one for part in (0.3, 1.0) for one in SUPERVISED[1:3]),
+    ],
     ("fit-tv", "truck"): [*VARIATIONS, *({"regularization": 0.1} | one for one in SUPERVISED[1:3])],
     ("fit-truth", "hov+"): SUPERVISED,
-    ("steady", "hov"): [CHOSEN["steady", "hov"], CHOSEN["steady", "hov"] | LOOKAHEAD],
-    ("steady", "truck"): [CHOSEN["steady", "truck"], CHOSEN["steady", "truck"] | LOOKAHEAD],
+    ("steady", "hov+"): [STEADY_SETTINGS["gaussian", "hov+"]],
+}
+CANDIDATES |= {
+    ("steady", experiment): [settings, settings | LOOKAHEAD]
+    for experiment in ("hov", "truck")
+    for settings in (STEADY_SETTINGS["gaussian", experiment],)
 }
 
 

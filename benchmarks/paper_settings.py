@@ -1,9 +1,8 @@
 """The settings by which `paper.py` compares the methods; defaults where there are none.
 
-Chosen by held-out log p(y) of development drives: those of SVI, FitHand and FitTV by `choose.py`, which prints what was
-tried (`results/choices.md`); those of STEADY and FitTruth are in `experiments.py`. On Hov+ STEADY's steps and decay and
-FitTruth's were chosen there, by its own development drives; SVI, FitHand and FitTV take what was chosen on Hov, SVI in
-batches.
+Chosen by held-out log p(y) of development drives, the best mean of two seeds, most of them by `choose.py`, which prints
+what was tried (`results/choices.md`). Those of STEADY but its guide, and FitTruth's on the truck, are in
+`experiments.py`. On Hov+ FitTV takes what was chosen on Hov.
 """
 
 from __future__ import annotations
@@ -15,15 +14,17 @@ from experiments import FIT_TRUTH_SETTINGS, STEADY_SETTINGS
 EXPERIMENTS = ("hov", "hov+", "truck")
 LONGER = {"steps": 1500, "validate_every": 150}
 CHOSEN: dict[tuple[str, str], dict[str, Any]] = {
-    ("svi", "hov+"): {"batch": 32},
+    ("svi", "hov+"): {"batch": 32, "steps": 3000, "validate_every": 150},
+    ("svi", "truck"): {"learning_rate": 1e-2, "guide_rate": 0.3},
     ("fit-hand", "hov"): LONGER,
-    ("fit-hand", "hov+"): LONGER,
+    ("fit-hand", "hov+"): {"weight_decay": 0.3},
     ("fit-hand", "truck"): LONGER | {"weight_decay": 0.3},
     ("fit-tv", "hov"): {"regularization": 1.0},
     ("fit-tv", "hov+"): {"regularization": 1.0},
-    ("fit-tv", "truck"): {"regularization": 0.1},
+    ("fit-tv", "truck"): {"regularization": 0.1, "weight_decay": 0.3},
 }
 CHOSEN |= {("steady", experiment): STEADY_SETTINGS["gaussian", experiment] for experiment in EXPERIMENTS}
+CHOSEN["steady", "truck"] = STEADY_SETTINGS["lookahead", "truck"] | {"guide": "lookahead"}
 CHOSEN |= {
     ("steady-minus", experiment): {
         name: value for name, value in CHOSEN["steady", experiment].items() if name != "ramp"
