@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 
 from paper_filters import judged
-from paper_records import CELLS, EXPERIMENTS, METHODS, RIVALS, Records, published, spread, values
+from paper_records import CELLS, EXPERIMENTS, METHODS, RIVALS, Records, deviation, published, values
 
 MET, MISSED, NOT_RUN = "met", "MISSED", "not run"
 
@@ -96,7 +96,7 @@ def _verdict(must: Must, records: Records, runs: int) -> Verdict:
         if must.method == "svi":
             met = ours <= average
         elif must.experiment == "truck":
-            met = ours <= average + spread(figures[must.method])
+            met = ours <= average + deviation(figures[must.method])
         else:
             met = ours < average
     return Verdict(must, MET if met else MISSED, f"{METHODS[must.method]} {ours:.4f}, {bar}")

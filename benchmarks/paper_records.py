@@ -36,13 +36,16 @@ def done(records: Records) -> list[Record]:
 
 
 def values(records: Records, metric: str, group: str, experiment: str, method: str) -> list[float]:
-    """One figure of each run of a method that did not fail."""
+    """One figure of each run of a method that did not fail; of `spread` how far noise carries a roll-out."""
     at = experiment, method
-    found = [record[metric] for record in done(records) if (record["experiment"], record["method"]) == at]
-    return [float(figure[group] if group else figure) for figure in found]
+    found = [record for record in done(records) if (record["experiment"], record["method"]) == at]
+    if metric == "spread":  # the noisy roll-outs' mean square is that of their mean and their variance
+        variances = [record["forward"][group] ** 2 - record["forward_mean"][group] ** 2 for record in found]
+        return [math.sqrt(variance) if variance >= 0 else math.nan for variance in variances]
+    return [float(record[metric][group] if group else record[metric]) for record in found]
 
 
-def spread(figures: Sequence[float]) -> float:
+def deviation(figures: Sequence[float]) -> float:
     """The sd; 0 of one figure, NaN where one is not finite (`statistics` raises there)."""
     if not all(map(math.isfinite, figures)):
         return math.nan

@@ -77,6 +77,14 @@ def test_ours_are_means_spreads_and_the_best() -> None:
     assert "| STEADY, bootstrap" not in text
 
 
+def test_the_spread_is_what_the_noise_adds_to_the_mean_roll_out() -> None:
+    one = record("steady", 1, 0.5)
+    one["forward_mean"] = {"location": 0.4, "angle": 0.03}
+    text = tables([one], 1)
+    location, angle = (part for part in text.split("### ") if part.startswith("Spread"))
+    assert "| STEADY | – | – | 0.3000 | – | – | – |" in location and "| 0.0400 |" in angle
+
+
 def test_the_published_spread_is_shown() -> None:
     text = tables([])
     assert "| SVI | – | 25.9 | – | 31.4 | – | -21 ± 38 |" in text
