@@ -14,7 +14,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import paper
-from choose import CANDIDATES, SEEDS, table
+from choose import CANDIDATES, SEEDS, seeds, table
 from paper_filters import filters
 from paper_methods import named
 from paper_musts import all_met, shown
@@ -287,11 +287,19 @@ def test_the_benchmark_starts() -> None:
 
 
 def test_settings_that_failed_or_are_not_fitted_to_every_draw_have_no_mean() -> None:
-    first, second = (CANDIDATES["svi", "truck"][i] for i in (0, 1))
-    seeds = SEEDS["truck"]
+    first, second = (CANDIDATES["svi", "hov"][i] for i in (0, 1))
+    one, other = SEEDS["hov"]
     fitted = {"log_likelihood": 370.0, "kept_step": 5, "seconds": 2.0}
-    both = {named("svi", "truck", seed, first): fitted for seed in seeds}
+    both = {named("svi", "hov", seed, first): fitted for seed in (one, other)}
     assert "| 370.00 | 370.00, 370.00 | 5, 5 | 2, 2 |" in table(both)
-    failed = both | {named("svi", "truck", seeds[0], first): {"failed": "why"}}
+    failed = both | {named("svi", "hov", one, first): {"failed": "why"}}
     assert "| – | failed, 370.00 | failed, 5 | failed, 2 |" in table(failed)
-    assert "| – | 370.00 | 5 | 2 |" in table({named("svi", "truck", seeds[1], second): fitted})
+    assert "| – | 370.00 | 5 | 2 |" in table({named("svi", "hov", other, second): fitted})
+
+
+def test_settings_that_tied_are_judged_by_more_draws() -> None:
+    first, second = ((one, seeds("svi", "truck", one)) for one in CANDIDATES["svi", "truck"][:2])
+    assert first[1] == (11, 12, 13, 14) and second[1] == (11, 12)
+    fitted = {"log_likelihood": 370.0, "kept_step": 5, "seconds": 2.0}
+    two = {named("svi", "truck", seed, settings): fitted for settings, _ in (first, second) for seed in (11, 12)}
+    assert "| svi | truck | defaults | – |" in table(two) and "| first_kl_weight 1 | 370.00 |" in table(two)
