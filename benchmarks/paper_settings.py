@@ -15,7 +15,6 @@ EXPERIMENTS = ("hov", "hov+", "truck")
 LONGER = {"steps": 1500, "validate_every": 150}
 CHOSEN: dict[tuple[str, str], dict[str, Any]] = {
     ("svi", "hov+"): {"batch": 32, "steps": 3000, "validate_every": 150},
-    ("svi", "truck"): {"learning_rate": 1e-2, "guide_rate": 0.3},
     ("fit-hand", "hov"): LONGER,
     ("fit-hand", "hov+"): {"weight_decay": 0.3},
     ("fit-hand", "truck"): LONGER | {"weight_decay": 0.3},
