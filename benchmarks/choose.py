@@ -2,7 +2,8 @@
 
     python benchmarks/choose.py [--methods svi …] [--experiments hov …] [--data FOLDER] [--workers 2]
 
-Hov: simulated drives of the data seeds 101 and 102; truck: train and valid split, draws 11 and 12 of the bearings.
+Hov: simulated drives of the data seeds 101 and 102; truck: train and valid split, draws 11 and 12 of the bearings,
+and 13 and 14 for settings that tied.
 What is printed is log p(y) of a held-out drive, by the filter that looks ahead at every row, of the parameters that the
 training keeps, and the seconds. Candidates were added after those before them had been seen. Resumable: goes on with
 the records in OUT; those by which was chosen are in `results/choices.*`.
@@ -29,20 +30,34 @@ SEEDS = {"hov": (101, 102), "hov+": (101, 102), "truck": (11, 12)}
 TIED = {("svi", "truck"): ([{}, {"learning_rate": 1e-2, "guide_rate": 0.3}], (13, 14))}  # within .03 nats: more seeds
 SUPERVISED: list[dict[str, Any]] = [{}, {"weight_decay": 0.3}, LONGER, LONGER | {"weight_decay": 0.3}]
 VARIATIONS = [{"regularization": one} for one in (0.01, 0.1, 0.3, 1.0, 3.0)]
+TWICE = {"steps": 3000, "validate_every": 150}
 SVI: list[dict[str, Any]] = [
     {},
     {"first_kl_weight": 1.0},
     {"learning_rate": 1e-2, "guide_rate": 0.3},
     {"centred": False},
-    {"steps": 3000, "validate_every": 150},
+    TWICE,
+    TWICE | {"patience": 20, "annealing": 0.25},  # the default's tempering, then three times as many steps
 ]
 # As STEADY's observation weight on the truck, which ends near 1 / 3; without patience it would stop where it began.
 FINAL = {"annealing": 1.12, "patience": 20}
-LOOKAHEAD = {"guide": "lookahead"}
+GUIDES: list[dict[str, Any]] = [{}, {"guide": "lookahead"}]  # STEADY's own is the Gaussian one
+# Tried when SVI's figures on the test drives had been seen, as STEADY's noise in location is too wide on Hov; not used.
+AFTERWARDS: list[dict[str, Any]] = [
+    {"ramp": 0.25},
+    {"ramp": 0.5},
+    {"ramp": 2.0},
+    {"weight_decay": 3.0},
+    {"weight_decay": 3.0, "ramp": 0.5},
+    {"weight_decay": 3.0, "steps": 500},
+    {"learning_rate": 3e-3, "steps": 500},
+    {"steps": 500, "patience": 10},
+    {"draws": 100},
+]
 CANDIDATES: dict[tuple[str, str], list[dict[str, Any]]] = {
     ("svi", "hov"): SVI,
     ("svi", "truck"): [*SVI, FINAL],
-    ("svi", "hov+"): [{"batch": 32}, {"batch": 32, "steps": 3000, "validate_every": 150}],
+    ("svi", "hov+"): [{"batch": 32}, {"batch": 32} | TWICE],
     ("fit-hand", "hov"): SUPERVISED,
     ("fit-hand", "hov+"): SUPERVISED,
     ("fit-hand", "truck"): SUPERVISED,
@@ -52,12 +67,9 @@ CANDIDATES: dict[tuple[str, str], list[dict[str, Any]]] = {
     ],
     ("fit-tv", "truck"): [*VARIATIONS, *({"regularization": 0.1} | one for one in SUPERVISED[1:3])],
     ("fit-truth", "hov+"): SUPERVISED,
+    ("steady", "hov"): [*(STEADY_SETTINGS["gaussian", "hov"] | guide for guide in GUIDES), *AFTERWARDS],
     ("steady", "hov+"): [STEADY_SETTINGS["gaussian", "hov+"]],
-}
-CANDIDATES |= {
-    ("steady", experiment): [settings, settings | LOOKAHEAD]
-    for experiment in ("hov", "truck")
-    for settings in (STEADY_SETTINGS["gaussian", experiment],)
+    ("steady", "truck"): [STEADY_SETTINGS["gaussian", "truck"] | guide for guide in GUIDES],
 }
 
 

@@ -84,16 +84,17 @@ def tables(records: Records, runs: int = RUNS, *, quick: bool = False) -> str:
 
 def _in_short(records: Records, marks: Marks, metric: str, title: str, digits: int) -> str:
     """Means alone, location / angle, ours and in brackets the published."""
+    theirs = published()
     lines = [f"### In short: {title}, location [m] / angle [rad], ours (published)\n"]
     lines += [f"| | {' | '.join(EXPERIMENTS.values())} |", "|---" * (len(EXPERIMENTS) + 1) + "|"]
     for method, name in METHODS.items():
         cells = []
         for experiment in EXPERIMENTS:
             ours = [values(records, metric, group, experiment, method) for group in GROUPS]
-            rows = [published().get((metric, group, experiment, method)) for group in GROUPS]
+            rows = [theirs.get((metric, group, experiment, method)) for group in GROUPS]
             cell = _pair(map(statistics.fmean, ours), digits) if all(ours) else "–"
-            theirs = _pair([float(row["average"]) for row in rows if row], digits)
-            cells.append(cell + marks.get((metric, experiment, method), "") + (f" ({theirs})" if theirs else ""))
+            beside = _pair([float(row["average"]) for row in rows if row], digits)
+            cells.append(cell + marks.get((metric, experiment, method), "") + (f" ({beside})" if beside else ""))
         if any(cell[0] != "–" for cell in cells):
             lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"

@@ -64,6 +64,4 @@ def fit(
         paths = filtered.paths(lineages).within(data)
     copies = for_program(program, table).subset(torch.arange(len(data)).repeat(lineages))
     believed = dataclasses.replace(copies, states=paths.states.transpose(0, 1).flatten(1, 2))
-    with seeded(seed, "prepare"):
-        program.prepare(believed, known_start)
     return fit_truth.supervised(program, believed, valid, "fit-hand", settings, **run)

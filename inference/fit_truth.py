@@ -4,8 +4,6 @@ The guide's sites are Deltas at the true states and the channel noise that expla
 supervised learning. It still stops on held-out log p(y), as every other recipe does.
 """
 
-import dataclasses
-
 from steady_ppl import Fit, Optimization, Trajectories, TruthGuide, Validation, for_program, seeded, train
 
 
@@ -37,18 +35,15 @@ def fit(
         run: checkpoint, resume and progress of `train`.
     """
     settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
-    data = for_program(program, table)
-    with seeded(seed, "prepare"):
-        program.prepare(data, known_start)
-    return supervised(program, data, valid, "fit-truth", settings, **run)
+    return supervised(program, for_program(program, table), valid, "fit-truth", settings, **run)
 
 
 def supervised(program, data: Trajectories, valid: Trajectories | None, recipe: str, settings: dict, **run) -> Fit:
-    """Fit a prepared `program` to the states of `data`, whoever says that they are these; `settings` as of `fit`."""
+    """Fit `program` to the states of `data`, whoever says that they are these; `settings` as of `fit`."""
     seed, known_start = settings["seed"], settings["known_start"]
-    optimization = Optimization(
-        **{field.name: settings[field.name] for field in dataclasses.fields(Optimization) if field.name in settings}
-    )
+    with seeded(seed, "prepare"):
+        program.prepare(data, known_start)
+    optimization = Optimization.among(settings)
     validation = Validation.suited(program, valid, known_start=known_start, particles=settings["validation_particles"])
     trained = train(
         program, TruthGuide(program), data, validation, optimization, known_start=known_start, seed=seed, **run

@@ -1,8 +1,8 @@
 """FitTV: a pose from each row's own measurements, its derivative by total variation, and the program fitted to both.
 
-What one does without a model of the motion. Nothing of the drives' true states is looked at, not even their start (a
-known start is for the held-out drives alone): the poses are `fixes`. Chartrand's total-variation derivative (2011) is
-pynumdiff's.
+What one does without a model of the motion. Nothing of the drives' true states is looked at, not even their start: the
+poses are `fixes`, and where a start is to be known theirs is taken (only held-out drives have a true one). Chartrand's
+total-variation derivative (2011) is pynumdiff's.
 """
 
 import dataclasses
@@ -67,8 +67,6 @@ def fit(
     with seeded(seed, "fixes"):
         poses = fixes(program, data)
     estimated = dataclasses.replace(data, states=differentiated(program, data, poses, regularization, iterations))
-    with seeded(seed, "prepare"):
-        program.prepare(estimated, known_start)  # a start that is known is the estimated one: no other is looked at
     return fit_truth.supervised(program, estimated, valid, "fit-tv", settings, **run)
 
 

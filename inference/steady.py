@@ -5,7 +5,6 @@ paths' joint log-density (the M step). The observations' weight grows from `firs
 decides which parameters are kept. The paper's E step is the bootstrap particle filter; the others linearise it.
 """
 
-import dataclasses
 import math
 
 from steady_ppl import (
@@ -126,9 +125,7 @@ def fit(
         known_start=known_start,
         **{name: settings[name] for name in ("particles", "draws") if name in DEFAULTS[guide]},
     )
-    optimization = Optimization(
-        **{field.name: settings[field.name] for field in dataclasses.fields(Optimization) if field.name in settings}
-    )
+    optimization = Optimization.among(settings)
     validation = Validation.suited(program, valid, known_start=known_start, particles=validation_particles)
     notes += validation.notes
     trained = train(program, e_step, data, validation, optimization, known_start=known_start, seed=seed, **run)

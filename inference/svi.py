@@ -5,7 +5,6 @@ for state-space models Krishnan, Shalit and Sontag 2017). Held-out log p(y), fro
 which parameters are kept.
 """
 
-import dataclasses
 import functools
 
 from pyro.infer.autoguide import AutoNormal
@@ -103,9 +102,7 @@ def fit(
             rate=guide_rate,
             **own,
         )
-    optimization = Optimization(
-        **{field.name: settings[field.name] for field in dataclasses.fields(Optimization) if field.name in settings}
-    )
+    optimization = Optimization.among(settings)
     validation = Validation.suited(program, valid, known_start=known_start, particles=validation_particles)
     trained = train(program, q, data, validation, optimization, known_start=known_start, seed=seed, **run)
     return Fit(program, "svi", settings, seed=seed, known_start=known_start, trained=trained, notes=validation.notes)

@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -70,6 +70,11 @@ class Optimization:
     batch: int | None = None
     validate_every: int = 25
     patience: int = 30
+
+    @classmethod
+    def among(cls, settings: Mapping[str, Any]) -> Optimization:
+        """Of those settings of a recipe that are about it; the others are the defaults."""
+        return cls(**{field.name: settings[field.name] for field in fields(cls) if field.name in settings})
 
     def __post_init__(self) -> None:
         for name in ("steps", "gradient_steps", "validate_every", "patience", "batch"):

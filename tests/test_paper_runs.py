@@ -16,7 +16,7 @@ import choose
 import paper
 import paper_methods
 import unknown_map
-from experiments import LOGS, hov, truck
+from experiments import LOGS, SIZES, hov, truck
 from paper_methods import named
 from paper_records import METHODS
 from paper_tables import tables
@@ -32,8 +32,7 @@ FEW = {"steps": 2, "validate_every": 2}
 
 @pytest.fixture(autouse=True)
 def few_drives(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (paper, choose):
-        monkeypatch.setitem(module.SIZES, "hov", (2, 2, 2))
+    monkeypatch.setitem(SIZES, "hov", (2, 2, 2))
     monkeypatch.setattr(unknown_map, "hov", lambda seed: hov(seed, 2, 2, 2))
 
 
