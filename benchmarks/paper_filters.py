@@ -39,7 +39,7 @@ def judged(records: Records) -> list[Record]:
 def filters(records: Records) -> Iterator[str]:
     """How many are equal, every one that is not, and every method that was not held against the bootstrap."""
     held = [record for record in done(records) if "bootstrap" in record]
-    apart = [record for record in held if not equal(record)]
+    apart = sorted((record for record in held if not equal(record)), key=_run)
     yield f"{len(held) - len(apart)} of {len(held)} equal"
     for record in apart:
         yield f"NOT EQUAL {_run(record)}: {_said(record)}, by the bootstrap {_said(record['bootstrap'])}"
