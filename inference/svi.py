@@ -31,6 +31,7 @@ GUIDES = {
     "mean-field": functools.partial(AutoRollout, auto=AutoNormal),
     "smoother": SmootherGuide,
 }
+NETWORK = ("width", "centred")  # settings that it alone has
 
 
 def fit(
@@ -68,7 +69,7 @@ def fit(
         valid: held-out drives.
         known_start: the first row's true state is given.
         guide: one of GUIDES.
-        width, centred: of the network alone, see `InferenceNetwork`.
+        width, centred: of the network alone, see `InferenceNetwork`, which has their defaults.
         draws: of each drive a step.
         guide_rate: learning rate of the guide's parameters relative to the program's.
         first_kl_weight, annealing: the KL divergence's weight at the first step, and the share of the training over
@@ -87,7 +88,7 @@ def fit(
     settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
     if guide not in GUIDES:
         raise UsageError(f"no guide {guide!r}; there are {', '.join(GUIDES)}")
-    own = {name: settings[name] for name in ("width", "centred") if settings[name] is not None}
+    own = {name: settings[name] for name in NETWORK if settings[name] is not None}
     if own and guide != "network":
         raise UsageError(f"guide {guide} has no {' and no '.join(own)}; network has")
     data = for_program(program, table)
@@ -102,6 +103,8 @@ def fit(
             rate=guide_rate,
             **own,
         )
+    if guide == "network":
+        settings |= {name: getattr(q, name) for name in NETWORK}
     optimization = Optimization.among(settings)
     validation = Validation.suited(program, valid, known_start=known_start, particles=validation_particles)
     trained = train(program, q, data, validation, optimization, known_start=known_start, seed=seed, **run)

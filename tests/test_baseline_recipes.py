@@ -168,7 +168,14 @@ def test_a_word_for_yes_and_no_is_one(tmp_path, word: str, value: bool | None) -
     table, run = written(tmp_path / "t.csv", simulated(rows=5)), tmp_path / "run"
     few = ("--steps", 1, "--known-start", "--set", f"centred={word}", "--out", run)
     assert steady("fit", HOVERCRAFT, table, "--recipe", "svi", *few) == 0
-    assert json.loads((run / "run.json").read_text())["options"]["centred"] is value
+    record = json.loads((run / "run.json").read_text())
+    assert record["options"]["centred"] is value
+    assert record["settings"]["centred"] is (value is not False) and record["settings"]["width"] == 64
+
+
+def test_what_a_guide_has_not_is_none_among_its_settings() -> None:
+    fit = learned("svi", load_program(HOVERCRAFT), simulated(rows=5), guide="mean-field", steps=1)
+    assert fit.settings["width"] is fit.settings["centred"] is None
 
 
 def test_fit_hand_by_a_hand_that_reads_less() -> None:
