@@ -6,7 +6,7 @@ import torch
 
 from steady_ppl import Fit, Trajectories, UsageError, choose_filter, for_program, load_program, run_filter, seeded
 from steady_ppl.errors import require
-from steady_ppl.program import names
+from steady_ppl.program import Program, names
 
 from . import fit_truth
 
@@ -52,6 +52,7 @@ def fit(
         raise UsageError("fit-hand needs the program written by hand: --hand MODEL, or hand=")
     if isinstance(hand, str):
         hand = load_program(hand)
+    require(isinstance(hand, Program), "hand", hand, "a program, or where it is (MODEL.py)")
     settings["hand"] = type(hand).__name__
     if names(hand.states) != names(program.states):
         raise UsageError(f"fit-hand: {type(hand).__name__} and {type(program).__name__} have different states")

@@ -12,7 +12,7 @@ import warnings
 import numpy as np
 import torch
 
-from steady_ppl import Fit, Trajectories, UsageError, fixes, for_program, seeded
+from steady_ppl import DataError, Fit, Trajectories, UnknownMap, UsageError, fixes, for_program, seeded
 from steady_ppl.errors import ComputationError, require
 from steady_ppl.program import names
 
@@ -57,17 +57,27 @@ def fit(
             `fit_truth`.
 
     Raises:
-        DataError: a row's measurements do not tell the pose.
-        UsageError: the program does not say which components are derivatives of which.
+        DataError: a drive's first or last row does not tell the pose by itself, see `fixes`; rows between that do not
+            are interpolated, and the fit's notes say how many.
+        UsageError: the program does not say which components are derivatives of which, or learns a map whose frame
+            only the true starts would fix.
     """
     settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
     require(0 < regularization < math.inf, "regularization", regularization, "above 0")
     require(iterations >= 1, "iterations", iterations, "at least 1")
+    if isinstance(program, UnknownMap) and not program.surveyed_frame:
+        raise UsageError("fit-tv looks at no true start: name two landmarks of the unknown map that are `surveyed`")
     data = for_program(program, table).without_truth()
     with seeded(seed, "fixes"):
         poses = fixes(program, data)
     estimated = dataclasses.replace(data, states=differentiated(program, data, poses, regularization, iterations))
-    return fit_truth.supervised(program, estimated, valid, "fit-tv", settings, **run)
+    fitted = fit_truth.supervised(program, estimated, valid, "fit-tv", settings, **run)
+    told = poses.isfinite().any(-1)
+    if bool((data.rows & ~told).any()):
+        fitted.notes.append(
+            f"of {int(data.rows.sum())} rows {int((data.rows & ~told).sum())} do not tell the pose: interpolated"
+        )
+    return fitted
 
 
 def differentiated(program, data: Trajectories, poses: torch.Tensor, regularization: float, iterations: int):
@@ -88,6 +98,12 @@ def differentiated(program, data: Trajectories, poses: torch.Tensor, regularizat
             there = np.isfinite(values)
             if not there.any():
                 raise UsageError(f"fit-tv: {position} cannot be told from one row's measurements")
+            if not (there[0] and there[-1]):
+                raise DataError(
+                    f"fit-tv: trajectory {data.labels[drive]}: its {'last' if there[0] else 'first'} row does not tell "
+                    f"{position} by itself, and nothing says how it moved there: cut the drive to rows that do",
+                    trajectory=data.labels[drive],
+                )
             known = np.unwrap(values[there]) if position in program.angles else values[there]
             series = np.interp(even, time[there], known)
             beyond = min(BEYOND, rows - 1)

@@ -22,6 +22,7 @@ from steady_ppl import (
     for_program,
     seeded,
     train,
+    why_not_linear,
 )
 
 # A network that reads the measurements, one for all drives, as in the paper's baseline; independent normals for each
@@ -31,6 +32,7 @@ GUIDES = {
     "mean-field": functools.partial(AutoRollout, auto=AutoNormal),
     "smoother": SmootherGuide,
 }
+LINEARIZING = ("network", "smoother")  # where measurements, transitions and start have to be normal
 NETWORK = ("width", "centred")  # settings that it alone has
 
 
@@ -64,7 +66,8 @@ def fit(
     """Fit `program` to the measurements of `table`; `valid` decides when to stop.
 
     Args:
-        program: the state-space model with normal noise, changed in place.
+        program: the state-space model, changed in place; its noise is normal, but for the mean-field guide, which takes
+            any that is reparameterised.
         table: the training drives; true states, where there are any, are used for a known start only.
         valid: held-out drives.
         known_start: the first row's true state is given.
@@ -81,8 +84,8 @@ def fit(
         run: checkpoint, resume and progress of `train`.
 
     Raises:
-        UsageError: no such guide, or it has no such setting or takes no batch.
-        ProgramError: the program's noise is not normal.
+        UsageError: no such guide, or it has no such setting or takes no batch, or the program's noise is not normal
+            and the guide needs it to be.
         TrainingError: the loss is not finite.
     """
     settings = {name: value for name, value in locals().items() if name not in ("program", "table", "valid", "run")}
@@ -92,6 +95,9 @@ def fit(
     if own and guide != "network":
         raise UsageError(f"guide {guide} has no {' and no '.join(own)}; network has")
     data = for_program(program, table)
+    reason = why_not_linear(program, data, known_start=known_start) if guide in LINEARIZING else None
+    if reason:
+        raise UsageError(f"guide {guide} begins at the linearised program: {reason}; guide mean-field needs none")
     with seeded(seed, "prepare"):
         program.prepare(data, known_start)
         q = GUIDES[guide](

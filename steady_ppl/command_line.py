@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from steady_ppl import command_check, command_demo, command_discover, command_effects, command_prove
-from steady_ppl.command_parts import program_from, require_folder, say, write_json
+from steady_ppl.command_parts import program_from, require_folder, run_labels, say, used_before, write_json
 from steady_ppl.errors import SteadyError, UsageError
 
 WORDS = {"true": True, "false": False, "none": None}
@@ -190,12 +190,14 @@ def evaluate(
     from steady_ppl.evaluation import evaluate_all, incomparable, table_of
     from steady_ppl.fit import Fit
     from steady_ppl.program_file import load_program
+    from steady_ppl.run_recipe import fingerprint
     from steady_ppl.table import read_table
 
     if len(arguments) < 2:
         raise UsageError("evaluate needs at least one RUN and then a TABLE")
     require_folder(json_file)
     *runs, table = arguments
+    labels = run_labels(runs)
     if program and len(program) != len(runs):
         raise UsageError(f"--program is given {len(program)} times for {len(runs)} runs: name one for each, in order")
     sources: list[str | None] = [*program] if program else [None] * len(runs)
@@ -205,13 +207,13 @@ def evaluate(
     settings: dict[str, Any] = {"particles": particles, "rollouts": rollouts, "seed": seed, "surveyed": true_map}
     folders = [str(run) for run in runs]
     results = evaluate_all(fits, folders, drives, **settings)
-    print(table_of(results, [f"{run.name} ({result['recipe']})" for run, result in zip(runs, results, strict=True)]))
-    for reason in incomparable(results, folders):
+    print(table_of(results, [f"{label} ({found['recipe']})" for label, found in zip(labels, results, strict=True)]))
+    for reason in incomparable(results, folders) + used_before(labels, fingerprint(drives)):
         say(reason)
-    for run, result in zip(runs, results, strict=True):
+    for (label, run), result in zip(labels.items(), results, strict=True):
         if true_map is not None:
             error, how = result["map"], "" if result["map"]["learned"] else " (declared, not learned)"
-            print(f"{run.name}: landmarks off by {error['rms']:.3g} m rms, {error['most']:.3g} m at most{how}")
+            print(f"{label}: landmarks off by {error['rms']:.3g} m rms, {error['most']:.3g} m at most{how}")
         if result["filter"] != "lookahead":
             say(f"{run}: judged by the filter {result['filter']}")
     if json_file is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,3 +48,31 @@ def require_folder(path: Path | None) -> None:
 def say(line: str) -> None:
     """A word to the person, beside what a script reads."""
     print(f"steady: {line}", file=sys.stderr)
+
+
+def run_labels(runs: Sequence[Path], taken: Collection[str] = ()) -> dict[str, Path]:
+    """Names of the rows of runs: the folders', or the whole paths where these are alike or `taken` by another row."""
+    names = [run.name for run in runs]
+    if len(set(names)) == len(names) and not set(taken) & set(names):
+        return dict(zip(names, runs, strict=True))
+    labels = {str(run): run for run in runs}
+    if len(labels) < len(runs) or set(taken) & labels.keys():
+        raise UsageError(
+            f"the runs {', '.join(map(str, runs))} cannot be told apart by name, or are called as another row"
+        )
+    return labels
+
+
+def used_before(runs: Mapping[str, Path], table: str) -> list[str]:
+    """Which runs, by label, have already learned from the table of this fingerprint."""
+    from steady_ppl.run_folder import read_record
+
+    notes = []
+    for label, run in runs.items():
+        record = read_record(run)
+        if record["recipe"] == "hand":
+            continue  # was given it, and learned nothing
+        for key, how in (("table_sha256", "fitted to"), ("valid_sha256", "chosen by")):
+            if record.get(key) == table:
+                notes.append(f"{label} was {how} this very table: take drives that were not used, this proves nothing")
+    return notes

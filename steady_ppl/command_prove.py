@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,7 +27,7 @@ def prove(
     seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
 ) -> None:
     """Prove that runs are better than the first one: log p(y), open-loop errors and noise, with paired intervals."""
-    from steady_ppl.command_parts import program_from, require_folder, write_json
+    from steady_ppl.command_parts import program_from, require_folder, run_labels, used_before, write_json
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
     from steady_ppl.proving import prove as judge
@@ -39,7 +39,7 @@ def prove(
         raise UsageError("prove needs at least one RUN and then a TABLE")
     require_picture(picture)
     require_folder(json_file)
-    labels = _labels(runs) | ({"oracle": oracle} if oracle else {})
+    labels = run_labels(runs, taken={"oracle", "truth"}) | ({"oracle": oracle} if oracle else {})
     if program and len(program) != len(labels):
         raise UsageError(f"--program is given {len(program)} times for {len(labels)} runs: name one for each, in order")
     sources: Sequence[str | None] = program or [None] * len(labels)
@@ -50,7 +50,7 @@ def prove(
         rows["truth"] = program_from(truth, seed)
     drives = read_table(table)
     found = judge(rows, drives, truth="truth" if truth is not None else None, seed=seed)
-    found.notes[:0] = _used(labels, fingerprint(drives))
+    found.notes[:0] = used_before(labels, fingerprint(drives))
     if json_file is not None:
         write_json(json_file, {"runs": {label: str(run) for label, run in labels.items()}, **found.figures})
     if picture is not None:
@@ -62,30 +62,3 @@ def prove(
         open_loop_picture(found, axes=figure.subplots())
         write_picture(figure, picture)
     print(found)
-
-
-def _labels(runs: Sequence[Path]) -> dict[str, Path]:
-    """Names of the rows: the folders', or the whole paths where these are alike or belong to another row."""
-    names = [run.name for run in runs]
-    taken = {"oracle", "truth"}
-    if len(set(names)) == len(names) and not taken & set(names):
-        return dict(zip(names, runs, strict=True))
-    labels = {str(run): run for run in runs}
-    if len(labels) < len(runs) or taken & labels.keys():
-        raise UsageError(
-            f"the runs {', '.join(map(str, runs))} cannot be told apart by name, or are called as another row"
-        )
-    return labels
-
-
-def _used(runs: Mapping[str, Path], table: str) -> list[str]:
-    """Runs that have already seen the table."""
-    from steady_ppl.run_folder import read_record
-
-    notes = []
-    for label, run in runs.items():
-        record = read_record(run)
-        for key, how in (("table_sha256", "fitted to"), ("valid_sha256", "chosen by")):
-            if record.get(key) == table:
-                notes.append(f"{label} was {how} this very table: take drives that were not used, this proves nothing")
-    return notes

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
-from steady_ppl.errors import DataError
+from steady_ppl.errors import DataError, require
 from steady_ppl.gaussian_smoother import find_and_smooth, means_as_path
 from steady_ppl.linearization import why_not_linear
 from steady_ppl.lookahead import Lookahead
@@ -75,7 +75,9 @@ def choose_filter(
     reason = why_not_linear(program, data, known_start=known_start) if look_ahead is None else "as asked"
     ahead = reason is None if look_ahead is None else look_ahead
     name = "lookahead" if ahead else f"bootstrap ({reason})"
-    return FilterChoice(particles or (200 if ahead else 5000), ahead, name)
+    count = (200 if ahead else 5000) if particles is None else particles
+    require(count >= 1, "particles", count, "at least 1")
+    return FilterChoice(count, ahead, name)
 
 
 def neglected(

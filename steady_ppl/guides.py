@@ -7,7 +7,7 @@ import pyro.distributions as dist
 import torch
 
 from steady_ppl.data import Trajectories
-from steady_ppl.errors import FilterError
+from steady_ppl.errors import FilterError, require
 from steady_ppl.particles import STEPS_WORTH_COMPILING, particle_filter
 from steady_ppl.paths import Paths
 from steady_ppl.program import Program
@@ -30,6 +30,7 @@ class PathGuide:
     """
 
     def __init__(self, draws: int) -> None:
+        require(draws >= 1, "draws", draws, "at least 1")
         self.draws = draws
         self.paths: Paths | None = None
         self.memory: dict[str, torch.Tensor] = {}
@@ -119,6 +120,7 @@ class SMCGuide(FilteringGuide):
         resample_below: float = 0.5,
     ) -> None:
         super().__init__(draws)
+        require(particles >= 1, "particles", particles, "at least 1")
         self.program, self.particles = program, particles
         self.tempering = tempering or LinearRamp()
         self.known_start, self.resample_below = known_start, resample_below

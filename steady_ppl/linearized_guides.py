@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
-from steady_ppl.errors import FilterError
+from steady_ppl.errors import FilterError, require
 from steady_ppl.gaussian_smoother import find_and_try, means_as_path, require_found, smooth, smoother_paths
 from steady_ppl.guides import FilteringGuide, PathGuide
 from steady_ppl.linearization import Path
@@ -180,6 +180,7 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
             passes=passes,
             search_again=search_again,
         )
+        require(particles >= 1, "particles", particles, "at least 1")
         self.particles, self.resample_below = particles, resample_below
         self.untwisted, self.tempered = untwisted, tempered
 

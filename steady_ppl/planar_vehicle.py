@@ -232,7 +232,7 @@ class UnknownMap(PlanarVehicle):
             )
         stays = torch.zeros(len(declared), 1, dtype=torch.bool)
         stays[list(self.surveyed)] = True
-        self.register_buffer("declared", torch.tensor(declared), persistent=False)
+        self.register_buffer("declared", torch.as_tensor(declared, dtype=torch.get_default_dtype()), persistent=False)
         self.register_buffer("stays", stays, persistent=False)
         self.map = nn.Parameter(self.declared.clone())
 
@@ -241,13 +241,18 @@ class UnknownMap(PlanarVehicle):
         """Where they are taken to be, `(K, 2)` m."""
         return torch.where(self.stays, self.declared, self.map)
 
+    @property
+    def surveyed_frame(self) -> bool:
+        """Whether landmarks fix the frame of the map: two of them are where they are declared."""
+        return len(set(self.surveyed)) >= 2
+
     def prepare(self, data: Trajectories, known_start: bool) -> None:
         """Refuse to learn a map whose frame nothing fixes.
 
         Raises:
             UsageError: no known starts, fewer than two surveyed landmarks, and no word that `initial` is enough.
         """
-        if not (known_start or len(set(self.surveyed)) >= 2 or self.framed_by_start):
+        if not (known_start or self.surveyed_frame or self.framed_by_start):
             raise UsageError(
                 f"program {type(self).__name__}: nothing fixes the frame of its map: give known starts "
                 "(--known-start), name two landmarks that are `surveyed`, or set `framed_by_start = True` where "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -85,7 +85,8 @@ class Optimization:
         for name in ("final_rate", "averaging"):
             require(0 <= getattr(self, name) <= 1, name, getattr(self, name), "between 0 and 1")
         require(self.gradient_norm is None or self.gradient_norm > 0, "gradient_norm", self.gradient_norm, "above 0")
-        require(all(0 <= beta < 1 for beta in self.betas), "betas", self.betas, "two numbers from 0 to below 1")
+        pair = isinstance(self.betas, Sequence) and len(self.betas) == 2 and all(0 <= beta < 1 for beta in self.betas)
+        require(pair, "betas", self.betas, "two numbers from 0 to below 1")
 
 
 @dataclass

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from steady_ppl.data import Trajectories
+from steady_ppl.errors import require
 from steady_ppl.filtering import log_likelihood
 from steady_ppl.linearization import why_not_linear
 from steady_ppl.particles import STEPS_WORTH_COMPILING
@@ -59,9 +60,12 @@ class Validation:
             return cls(None, known_start=known_start)
         data = for_program(program, table)
         reason = why_not_linear(program, data, known_start=known_start)
+        usual = 100 if reason is None else 2000
+        count = usual if particles is None else particles
+        require(count >= 1, "validation_particles", count, "at least 1")
         if reason is not None:
-            return cls(data, particles or 2000, known_start, reason=reason)
-        return cls(data, particles or 100, known_start, every=1, look_ahead=True)
+            return cls(data, count, known_start, reason=reason)
+        return cls(data, count, known_start, every=1, look_ahead=True)
 
     def __call__(self, program: Program, seed: int) -> list[float]:
         """Log p(y) of each held-out trajectory."""

@@ -5,15 +5,18 @@ from __future__ import annotations
 import inspect
 import json
 import math
+import re
 from dataclasses import replace
 
+import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 from examples import MODELS
 from small import HOVERCRAFT, only_start, simulated, steady, written
 from test_recipes import held_out, same, values
 
-from steady_ppl import UsageError, load_program, seeded, simulate
+from steady_ppl import UsageError, bearings_to, load_program, seeded, simulate
 from steady_ppl.planar_vehicle import PlanarVehicle
 from steady_ppl.run_recipe import find_recipe
 
@@ -140,12 +143,36 @@ def test_what_is_the_networks_alone_is_refused_elsewhere() -> None:
         ("fit-tv", "regularization", 0.0, "above 0"),
         ("fit-tv", "iterations", 0, "at least 1"),
         ("fit-hand", "lineages", 0, "at least 1"),
+        ("fit-hand", "particles", 0, "at least 1"),
+        ("fit-hand", "validation_particles", 0, "at least 1"),
+        ("steady", "particles", 0, "at least 1"),
+        ("steady", "draws", 0, "at least 1"),
+        ("steady-minus", "validation_particles", -5, "at least 1"),
+        ("svi", "betas", 0.9, "two numbers from 0 to below 1"),
+        ("svi", "betas", (0.9,), "two numbers"),
+        ("svi", "betas", (0.9, 0.99, 0.999), "two numbers"),
+        ("fit-hand", "hand", 5, "a program, or where it is"),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(recipe: str, setting: str, value: float, wanted: str) -> None:
     given = {"hand": str(HOVERCRAFT)} if recipe == "fit-hand" else {}
-    with pytest.raises(UsageError, match=f"is {value}: it must be {wanted}"):
-        learned(recipe, load_program(HOVERCRAFT), simulated(rows=5), **given, **{setting: value})
+    table = simulated(rows=5)
+    with pytest.raises(UsageError, match=re.escape(f"is {value}: it must be {wanted}")):
+        learned(recipe, load_program(HOVERCRAFT), table, table, **given | {setting: value})
+
+
+@pytest.mark.parametrize("guide", ["network", "smoother", "mean-field"])
+def test_noise_that_is_not_normal_needs_the_mean_field_guide(guide: str) -> None:
+    program = load_program(HOVERCRAFT)
+    program.observe = lambda state: pyro.sample(
+        "bearing", dist.Laplace(bearings_to(program.landmarks, state, sd=0.1).mean, 0.1).to_event(1)
+    )
+    call = {"guide": guide, "steps": 1, "known_start": True}
+    if guide == "mean-field":
+        assert learned("svi", program, simulated(rows=5), **call).trained.kept == 1
+        return
+    with pytest.raises(UsageError, match="begins at the linearised program.*guide mean-field needs none"):
+        learned("svi", program, simulated(rows=5), **call)
 
 
 @pytest.mark.parametrize(

@@ -46,6 +46,21 @@ def test_evaluate_writes_the_figures_of_every_run_as_json(tmp_path: Path, work: 
     assert f"{content['runs'][0]['forward']['location']:.4f}" in lines[1]
 
 
+def test_runs_of_one_name_are_told_apart_and_a_table_that_was_used_is_said(tmp_path: Path, work: Path, capsys) -> None:
+    twin = tmp_path / "steady"
+    twin.symlink_to(work / "steady")
+    assert steady("evaluate", work / "steady", twin, work / "train.csv", *QUICK) == 0
+    out, error = capsys.readouterr()
+    assert [line.split("  ")[0] for line in out.splitlines()[1:]] == [
+        f"{run} (steady)" for run in (work / "steady", twin)
+    ]
+    assert f"{twin} was fitted to this very table" in error
+    assert steady("evaluate", work / "steady", work / "valid.parquet", *QUICK) == 0
+    assert "very table" not in capsys.readouterr().err
+    assert steady("evaluate", twin, twin, work / "train.csv", *QUICK) == 2
+    assert "cannot be told apart" in capsys.readouterr().err
+
+
 def test_evaluate_gives_what_the_library_gives(tmp_path: Path, work: Path) -> None:
     options = ("--particles", 40, "--rollouts", 3, "--seed", 7)
     assert steady("evaluate", work / "hand", work / "train.csv", "--json", tmp_path / "e.json", *options) == 0

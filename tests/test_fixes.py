@@ -114,6 +114,26 @@ def test_fit_tv_bridges_gaps_and_uneven_steps() -> None:
     torch.testing.assert_close(found, torch.tensor([2.0, -1.0, 3.0]).double().expand(len(found), -1), rtol=0, atol=0.2)
 
 
+@pytest.mark.parametrize(("row", "end"), [(0, "first"), (40, "last")])
+def test_fit_tv_invents_no_motion_before_the_first_pose_and_after_the_last(row: int, end: str) -> None:
+    program = example("hovercraft")
+    data = drives(program, 2, 41)
+    poses = torch.where(data.states[..., :1] == data.states[row, 1, 0], torch.nan, data.states)
+    with pytest.raises(DataError, match=f"trajectory 2: its {end} row does not tell x by itself"):
+        load_recipe("fit_tv").differentiated(program, data, poses, 1e-3, 10)
+
+
+def test_fit_tv_says_how_many_rows_it_interpolated() -> None:
+    program, data = example("hovercraft"), drives(example("hovercraft"), 2, 9)
+    observed = data.observed.clone()
+    observed[3:5, 1] = False
+    fit = load_recipe("fit_tv").fit
+    assert "of 18 rows 2 do not tell the pose: interpolated" in (
+        fit(program, replace(data, observed=observed), steps=1, progress=False).notes
+    )
+    assert not any("interpolated" in note for note in fit(program, data, steps=1, progress=False).notes)
+
+
 def load_recipe(name: str):
     from steady_ppl.program_file import run_file
 

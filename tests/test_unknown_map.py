@@ -59,6 +59,20 @@ def test_a_map_in_no_frame_is_not_learned() -> None:
         type("Beyond", (UnknownMap, vehicle), {"surveyed": (7,)})()
 
 
+def test_landmarks_in_whole_metres_are_learned_too() -> None:
+    vehicle = type(load_program(HOVERCRAFT))
+    program = type("Whole", (UnknownMap, vehicle), {"landmarks": ((12, -8), (-6, -4), (-4, 10))})()
+    assert program.map.dtype == torch.get_default_dtype() and program.map.requires_grad
+
+
+def test_fit_tv_learns_no_map_that_only_true_starts_would_fix() -> None:
+    vehicle, table = type(load_program(HOVERCRAFT)), simulated(rows=9)
+    fit = find_recipe("fit-tv")
+    with pytest.raises(UsageError, match="fit-tv looks at no true start"):
+        fit(type("Unsurveyed", (UnknownMap, vehicle), {})(), table, known_start=True, steps=1, progress=False)
+    fit(type("Surveyed", (UnknownMap, vehicle), {"surveyed": (0, 2)})(), table, steps=1, progress=False)
+
+
 def test_a_wrong_map_is_mended_from_bearings_and_known_starts() -> None:
     program = load_program(UNKNOWN)
     truth = load_program(HOVERCRAFT)
