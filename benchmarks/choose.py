@@ -2,8 +2,8 @@
 
     python benchmarks/choose.py [--methods svi …] [--experiments hov …] [--data FOLDER] [--workers 2]
 
-Hov: simulated drives of the data seeds 101 and 102; truck: train and valid split, draws 11 and 12 of the bearings,
-and 13 and 14 for settings that tied.
+Hov: simulated drives of the data seeds 101 and 102; truck: train and valid split, draws 11 and 12 of the bearings, and
+13 and 14 for two settings of SVI that tied and of which one had diverged on a test run.
 What is printed is log p(y) of a held-out drive, by the filter that looks ahead at every row, of the parameters that the
 training keeps, and the seconds. Candidates were added after those before them had been seen. Resumable: goes on with
 the records in OUT; those by which was chosen are in `results/choices.*`.

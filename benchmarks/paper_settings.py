@@ -1,8 +1,9 @@
 """The settings by which `paper.py` compares the methods; defaults where there are none.
 
-Chosen by held-out log p(y) of development drives, the best mean of two seeds (four where two settings tied), most by
+Chosen by held-out log p(y) of development drives, the best mean of two seeds (of four for SVI on the truck), most by
 `choose.py`, which prints what was tried (`results/choices.md`). Those of STEADY but its guide, and FitTruth's on the
-truck, are in `experiments.py`. On Hov+ FitTV takes what was chosen on Hov.
+truck, are in `experiments.py`. Not chosen: on Hov+ FitTV takes what was chosen on Hov and STEADY by the bootstrap what
+was chosen for the Gaussian guide; STEADY− takes STEADY's but the ramp.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import paper_filters
 import paper_musts
-from paper_records import EXPERIMENTS, GROUPS, METHODS, RUNS, Records, deviation, published, values
+from paper_records import EXPERIMENTS, GROUPS, METHODS, RUNS, Records, deviation, done, published, values
 
 TABLES = {
     "State estimation from bearings at 1 Hz (smoothed): location [m]": ("state_estimation", "location", 3),
@@ -52,9 +52,9 @@ def tables(records: Records, runs: int = RUNS, *, quick: bool = False) -> str:
     by_filter = paper_filters.judged(records)
     marks = {(metric, *cell): paper_filters.MARK for metric in FILTERED for cell in paper_filters.differing(records)}
     parts = [
-        "Ours: mean ± sd over runs, each on drives (for the truck: a draw of the bearings) of its own; the best in "
-        "brackets, and how many runs there are where some lack. Published: average of three runs; ± and the best, in "
-        "brackets, where printed.\n"
+        "Ours: mean ± sd over runs, each on drives (for the truck: a draw of the bearings) of its own, Hov and Hov+ "
+        "with the same test drives; the best in brackets, and how many runs there are where some lack. Published: "
+        "average of three runs; ± and the best, in brackets, where printed.\n"
     ]
     parts += [_in_short(by_filter, marks, *short) for short in SHORT]
     for title, (metric, group, digits) in TABLES.items():
@@ -71,7 +71,7 @@ def tables(records: Records, runs: int = RUNS, *, quick: bool = False) -> str:
             if any(cell != "–" for cell in cells):
                 lines.append(f"| {name} | {' | '.join(cells)} |")
         parts.append("\n".join(lines) + "\n")
-    parts += [HAND + "\n", NOISE + "\n"]
+    parts += [HAND + "\n", NOISE + "\n", *_guides(records)]
     if failed:
         parts += ["### Runs that failed\n", _listed(f"{name}: {why}" for name, why in failed.items())]
     if quick:
@@ -80,6 +80,17 @@ def tables(records: Records, runs: int = RUNS, *, quick: bool = False) -> str:
         parts += ["### The filter\n", paper_filters.TEXT + "\n", _listed(paper_filters.filters(records))]
         parts += ["### What must hold\n", _listed(paper_musts.shown(records, runs))]
     return "\n".join(parts).rstrip() + "\n"
+
+
+def _guides(records: Records) -> list[str]:
+    """By which guide STEADY learned."""
+    used = {
+        EXPERIMENTS[one["experiment"]]: one["settings"]["guide"]
+        for one in done(records)
+        if one["method"] == "steady" and "settings" in one
+    }
+    said = ", ".join(f"{guide} on {experiment}" for experiment, guide in sorted(used.items()))
+    return [f"STEADY's guide: {said}; STEADY− has the same.\n"] if used else []
 
 
 def _in_short(records: Records, marks: Marks, metric: str, title: str, digits: int) -> str:

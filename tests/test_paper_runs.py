@@ -8,22 +8,19 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import choose
 import paper
 import paper_methods
-import unknown_map
 from experiments import LOGS, SIZES, hov, truck
 from paper_methods import named
 from paper_records import METHODS
 from paper_tables import tables
 
 from inference import hand
-from models.hovercraft import Hovercraft, HovercraftTruth
-from models.hovercraft_unknown_map import HovercraftUnknownMap
+from models.hovercraft import Hovercraft
 from models.truck import Truck
 from steady_ppl.errors import FilterError
 
@@ -33,7 +30,6 @@ FEW = {"steps": 2, "validate_every": 2}
 @pytest.fixture(autouse=True)
 def few_drives(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SIZES, "hov", (2, 2, 2))
-    monkeypatch.setattr(unknown_map, "hov", lambda seed: hov(seed, 2, 2, 2))
 
 
 @pytest.mark.parametrize(("method", "settings"), [("hand", {}), ("fit-truth", FEW)])
@@ -64,21 +60,6 @@ def test_settings_are_judged_by_held_out_drives(monkeypatch: pytest.MonkeyPatch,
     monkeypatch.setitem(choose.CANDIDATES, ("fit-truth", "hov"), [FEW])
     mean = f"{made['log_likelihood']:.2f}"
     assert f"| fit-truth | hov | steps 2, validate_every 2 | {mean} | {mean}, {mean} | 2, 2 |" in choose.table(records)
-
-
-def test_an_unknown_map_is_learned_beside_the_known_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    known, unknown, _ = unknown_map.PROGRAMS["mechanistic"]
-    monkeypatch.setitem(unknown_map.PROGRAMS, "mechanistic", (known, unknown, FEW | {"guide": "gaussian"}))
-    made = json.loads(json.dumps(unknown_map.learnt("mechanistic", 1)))
-    assert 0.5 < made["learned map"]["map"]["rms"] < 1.5
-    assert unknown_map.said(made).startswith(f"map off by {made['learned map']['map']['rms']:.3f} m, forward 0.")
-
-
-def test_the_wrong_map_is_a_metre_off_at_every_landmark_and_what_is_learned_begins_there() -> None:
-    program = unknown_map.moved(HovercraftUnknownMap(), seed=1)
-    away = torch.tensor(HovercraftTruth.landmarks) - program.map
-    assert away.norm(dim=-1).tolist() == pytest.approx([1.0] * len(away), abs=1e-5)
-    assert torch.equal(program.landmarks, program.map) and torch.equal(program.declared, program.map)
 
 
 @pytest.mark.skipif(not LOGS.is_dir(), reason="the AlphaTruck logs are not part of this repository")
