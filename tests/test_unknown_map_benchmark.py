@@ -17,10 +17,12 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 import unknown_map
 from experiments import hov
 from information_bound import information_bound
+from resumable import stored
 
 from models.hovercraft import HovercraftTruth
 from models.hovercraft_unknown_map import HovercraftUnknownMap
 
+RESULTS = Path(unknown_map.__file__).with_name("results")
 FEW = {"steps": 2, "validate_every": 2}
 
 
@@ -76,3 +78,10 @@ def test_a_map_that_is_too_far_off_or_costs_too_much_is_missed(
     lines, good = unknown_map.summary({"rms": 0.1, "sd": 0.01}, records)
     assert lines[0].endswith("0.100 ± 0.010 m") and lines[1].count("MISSED") == missed and good == (missed == 0)
     assert unknown_map.summary({"rms": 0.1, "sd": 0.01}, [*records, {"failed": "why"}])[1] is False
+
+
+def test_what_is_filed_is_what_the_records_give() -> None:
+    records = stored(RESULTS / "unknown_map.jsonl")
+    bound = records.pop(unknown_map.BOUND)
+    lines, _ = unknown_map.summary(bound, list(records.values()))
+    assert len(lines) == 3 and (RESULTS / "unknown_map.md").read_text().splitlines() == [f"- {line}" for line in lines]
