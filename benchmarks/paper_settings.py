@@ -2,8 +2,8 @@
 
 Chosen by held-out log p(y) of development drives, the best mean of two seeds (of four for SVI on the truck), most by
 `choose.py`, which prints what was tried (`results/choices.md`). Those of STEADY but its guide, and FitTruth's on the
-truck, are in `experiments.py`. Not chosen: on Hov+ FitTV takes what was chosen on Hov and STEADY by the bootstrap what
-was chosen for the Gaussian guide; STEADY− takes STEADY's but the ramp.
+truck, are in `experiments.py`. Not chosen: on Hov+ FitTV takes the regularisation chosen on Hov and STEADY by the
+bootstrap what was chosen for the Gaussian guide; STEADY− takes STEADY's but the ramp.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ CHOSEN: dict[tuple[str, str], dict[str, Any]] = {
     ("fit-hand", "hov"): LONGER,
     ("fit-hand", "hov+"): {"weight_decay": 0.3},
     ("fit-hand", "truck"): LONGER | {"weight_decay": 0.3},
-    ("fit-tv", "hov"): {"regularization": 1.0},
+    ("fit-tv", "hov"): {"regularization": 1.0, "validate_every": 10, "patience": 15},
     ("fit-tv", "hov+"): {"regularization": 1.0},
-    ("fit-tv", "truck"): {"regularization": 0.1, "weight_decay": 0.3},
+    ("fit-tv", "truck"): {"regularization": 0.1, "weight_decay": 0.3, "learning_rate": 2e-3},
 }
 CHOSEN |= {("steady", experiment): STEADY_SETTINGS["gaussian", experiment] for experiment in EXPERIMENTS}
 CHOSEN["steady", "truck"] = STEADY_SETTINGS["lookahead", "truck"] | {"guide": "lookahead"}
