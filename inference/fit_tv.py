@@ -72,16 +72,20 @@ def fit(
         poses = fixes(program, data)
     estimated = dataclasses.replace(data, states=differentiated(program, data, poses, regularization, iterations))
     fitted = fit_truth.supervised(program, estimated, valid, "fit-tv", settings, **run)
-    told = poses.isfinite().any(-1)
-    if bool((data.rows & ~told).any()):
-        fitted.notes.append(
-            f"of {int(data.rows.sum())} rows {int((data.rows & ~told).sum())} do not tell the pose: interpolated"
-        )
+    gaps = int((data.rows & poses.isnan().all(-1)).sum())
+    if gaps:
+        fitted.notes.append(f"of {int(data.rows.sum())} rows {gaps} do not tell the pose: interpolated")
     return fitted
 
 
 def differentiated(program, data: Trajectories, poses: torch.Tensor, regularization: float, iterations: int):
-    """The states `(T + 1, B, D)` of poses and their total-variation derivatives; gaps are interpolated."""
+    """The states `(T + 1, B, D)` of poses and their total-variation derivatives; gaps between poses are interpolated.
+
+    Raises:
+        DataError: a drive does not begin and end with a pose.
+        UsageError: a component is no pose's derivative, or is told by no row.
+        ComputationError: a derivative is not finite.
+    """
     order = names(program.states)
     rates = program.derivatives
     missing = [name for name in order if name not in rates and name not in rates.values()]

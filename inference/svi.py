@@ -32,7 +32,7 @@ GUIDES = {
     "mean-field": functools.partial(AutoRollout, auto=AutoNormal),
     "smoother": SmootherGuide,
 }
-LINEARIZING = ("network", "smoother")  # where measurements, transitions and start have to be normal
+LINEARIZING = ("network", "smoother")  # they begin at the linearised program, see `why_not_linear`
 NETWORK = ("width", "centred")  # settings that it alone has
 
 
@@ -97,7 +97,7 @@ def fit(
     data = for_program(program, table)
     reason = why_not_linear(program, data, known_start=known_start) if guide in LINEARIZING else None
     if reason:
-        raise UsageError(f"guide {guide} begins at the linearised program: {reason}; guide mean-field needs none")
+        raise UsageError(f"guide {guide} begins at the linearised program: {reason}; guide mean-field does without")
     with seeded(seed, "prepare"):
         program.prepare(data, known_start)
         q = GUIDES[guide](

@@ -85,7 +85,8 @@ class Optimization:
         for name in ("final_rate", "averaging"):
             require(0 <= getattr(self, name) <= 1, name, getattr(self, name), "between 0 and 1")
         require(self.gradient_norm is None or self.gradient_norm > 0, "gradient_norm", self.gradient_norm, "above 0")
-        pair = isinstance(self.betas, Sequence) and len(self.betas) == 2 and all(0 <= beta < 1 for beta in self.betas)
+        betas = self.betas if isinstance(self.betas, Sequence) else ()
+        pair = len(betas) == 2 and all(isinstance(beta, int | float) and 0 <= beta < 1 for beta in betas)
         require(pair, "betas", self.betas, "two numbers from 0 to below 1")
 
 

@@ -150,6 +150,7 @@ def test_what_is_the_networks_alone_is_refused_elsewhere() -> None:
         ("steady-minus", "validation_particles", -5, "at least 1"),
         ("svi", "betas", 0.9, "two numbers from 0 to below 1"),
         ("svi", "betas", (0.9,), "two numbers"),
+        ("svi", "betas", "ab", "two numbers"),
         ("svi", "betas", (0.9, 0.99, 0.999), "two numbers"),
         ("fit-hand", "hand", 5, "a program, or where it is"),
     ],
@@ -171,7 +172,7 @@ def test_noise_that_is_not_normal_needs_the_mean_field_guide(guide: str) -> None
     if guide == "mean-field":
         assert learned("svi", program, simulated(rows=5), **call).trained.kept == 1
         return
-    with pytest.raises(UsageError, match="begins at the linearised program.*guide mean-field needs none"):
+    with pytest.raises(UsageError, match="begins at the linearised program.*guide mean-field does without"):
         learned("svi", program, simulated(rows=5), **call)
 
 
