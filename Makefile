@@ -6,7 +6,7 @@ INSTALLED := $(VENV)/installed
 OUT ?= out
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test found learn learn-truck paper lint types check clean
+.PHONY: demo test found learn learn-truck truck paper lint types check clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "steady-ppl needs Python 3.11 or newer; name one with make PYTHON=...")'
@@ -24,6 +24,10 @@ learn: $(INSTALLED)
 learn-truck: $(INSTALLED)
 	@test -n "$(DATA)" || { echo "make learn-truck DATA=FOLDER: the folder with train/, valid/ and test/ of the AlphaTruck logs" >&2; exit 2; }
 	$(BIN)/python benchmarks/learn.py truck --data "$(DATA)" --out $(OUT)/learn-truck
+
+truck: $(INSTALLED)
+	@test -n "$(DATA)" || { echo "make truck DATA=FOLDER: the folder with train/, valid/ and test/ of the AlphaTruck logs" >&2; exit 2; }
+	$(BIN)/python benchmarks/truck.py --data "$(DATA)" --out $(OUT)/truck
 
 paper: $(INSTALLED)
 	$(BIN)/python benchmarks/paper.py --out $(OUT)/paper $(if $(DATA),--data "$(DATA)") $(if $(QUICK),--quick)

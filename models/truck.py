@@ -23,6 +23,7 @@ class Truck(PlanarVehicle):
     controls = ("speed [m/s]", "turn [rad/s]")
     landmarks = ((-1.230314, -0.606814), (0.797073, 0.889471), (-3.496525, 0.207874), (0.0, 6.0))
     rates = {"noise": 3.0}
+    guesses = ("noise",)  # wide enough for whatever the equations lack
     slips = False
 
     def __init__(self):

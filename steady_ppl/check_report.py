@@ -74,6 +74,10 @@ def figures(found: Check) -> dict[str, Any]:
                 if math.isfinite(ratio)
             },
         },
+        "stuck": [
+            {"trajectory": one.label, "seconds": list(one.seconds), "columns": list(one.columns), "text": str(one)}
+            for one in found.stuck
+        ],
         "notes": found.notes,
     }
 
@@ -252,6 +256,7 @@ def as_text(content: Mapping[str, Any]) -> str:
     total, cells = len(content["findings"]), content["cells"]
     lines += ["", f"{total} of {cells} cells are outside their simulated bands (false discoveries held at 5 %)"]
     lines += [f"  {finding['z']:+6.1f} sd  {finding['text']}" for finding in shown]
+    lines += [f"the table: {one['text']}" for one in content["stuck"]]
     return "\n".join(lines + [f"note: {note}" for note in content["notes"]])
 
 

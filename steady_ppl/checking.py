@@ -28,6 +28,7 @@ from steady_ppl.predictions import Prediction, named_horizons, predict, simulate
 from steady_ppl.program import Program, for_program, names
 from steady_ppl.reference_motion import Reference, constant_velocity, last_measurement
 from steady_ppl.seeding import seeded
+from steady_ppl.stuck import Stretch, stuck
 from steady_ppl.tracking import Tracked, track
 
 SECONDS = (1.0, 3.0)
@@ -51,6 +52,7 @@ class Check:
         misfit: the maps; every cell with its residual.
         blame: who is at fault.
         residuals: names of the measurement components and, after them, of the channels.
+        stuck: stretches of the table in which nothing was measured though something is written.
         notes: what was left out.
     """
 
@@ -64,6 +66,7 @@ class Check:
     misfit: Misfit
     blame: Blame
     residuals: list[str]
+    stuck: list[Stretch]
     notes: list[str]
 
     @property
@@ -81,7 +84,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
 
     Args:
         fit: the program, its noise normal; with its `known_start` the drives' first x. columns are used, nothing else
-            of the truth ever is.
+            of the truth ever is, but to see whether the table itself has stretches that nobody measured (`stuck`).
         data: drives, best those that were not used for the fit.
         simulations: sets of drives to simulate for the bands.
         seed: of the simulation.
@@ -138,6 +141,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         misfit=misfit,
         blame=blame(scores, _scatter(ours, theirs), misfit.p_value),
         residuals=list(ours.names),
+        stuck=stuck(data),
         notes=notes,
     )
 

@@ -13,6 +13,10 @@ def check(
     table: Annotated[Path, typer.Argument(help="Drives to compare with, best others than those of the fit.")],
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
     picture: Annotated[Path | None, typer.Option(help="Draw the picture into this file, for example .png.")] = None,
+    mask: Annotated[
+        Path | None,
+        typer.Option(help="Write the table without the stretches that nobody measured, for fits and checks, here."),
+    ] = None,
     simulations: Annotated[int, typer.Option(help="Simulated sets for the bands.", min=20)] = 100,
     program: Annotated[str | None, typer.Option(help="The program, if its file moved or changed.")] = None,
     seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
@@ -22,11 +26,14 @@ def check(
     from steady_ppl.command_parts import require_folder, write_json
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
-    from steady_ppl.table import read_table
+    from steady_ppl.stuck import masked
+    from steady_ppl.table import read_table, write_table
 
     require_picture(picture)
     require_folder(json_file)
-    found = compare(Fit.load(run, program), read_table(table), simulations=simulations, seed=seed)
+    require_folder(mask)
+    drives = read_table(table)
+    found = compare(Fit.load(run, program), drives, simulations=simulations, seed=seed)
     figures = found.figures
     if json_file is not None:
         write_json(json_file, {"run": str(run), **figures})
@@ -35,3 +42,6 @@ def check(
 
         write_picture(check_picture(found), picture)
     print(found)
+    if mask is not None:
+        write_table(masked(drives, found.stuck), mask)
+        print(f"{mask}: {table.name} without {len(found.stuck)} stretches that nobody measured")

@@ -22,6 +22,9 @@ def discover(
         bool | None,
         typer.Option(help="Give the first row's x. columns as the exact start; a RUN's own setting when not given."),
     ] = None,
+    mix: Annotated[
+        bool, typer.Option("--mix", help="Put both tables together and keep every second drive to choose by.")
+    ] = False,
     out: Annotated[Path | None, typer.Option("--out", help="Run folder for the improved fit.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
     picture: Annotated[Path | None, typer.Option(help="Draw what was found into this file, for example .png.")] = None,
@@ -54,6 +57,7 @@ def discover(
             drives,
             judges,
             known_start=known_start,
+            mix=mix,
             simulations=simulations,
             seed=seed,
             report=_progress,

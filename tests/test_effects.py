@@ -167,6 +167,15 @@ def test_a_wind_carries_what_is_at_rest_and_stops_when_it_moves_along() -> None:
         ("gain_error:speed", -0.2, (-0.2 * 0.95 / 0.1, 0, 0)),
         ("lever_arm", 0.2, (0, 0.2 * 0.3 / 0.1, 0)),  # v_y is c · yaw rate after one step
         ("curvature_steering", 0.5, (0, 0, 0.5 * 0.5 * 0.4 * (0.95 * FORWARD / (0.95**2 + 0.05**2) - 1) / 0.1)),
+        ("response_time", 0.3, (-0.75 * (0.95 - FORWARD) / 0.1, 0, 0)),  # a step in 0.1 + 0.3 s
+        ("response_time:yaw", 0.1, (0, 0, -0.5 * (0.5 * 0.4 - 0.3) / 0.1)),
+        ("response_time:lateral", 0.1, (0, 0.5 * LATERAL / 0.1, 0)),
+        ("steering_offset", 0.2, (0, 0, 0.5 * 0.2 * FORWARD / 0.1)),
+        ("understeer", 0.2, (0, 0, -0.5 * 0.2 * FORWARD**2 * 0.4 / 0.1)),
+        ("reverse_steering", 0.2, (0, 0, -0.5 * 0.2 * math.tanh(FORWARD / 0.1) * 0.4 / 0.1)),
+        ("crab_angle", 0.2, (0, 0.2 * FORWARD / 0.1, 0)),
+        ("slip_angle", 0.2, (0, -0.2 * FORWARD * 0.3 / 0.1, 0)),
+        ("caster", 0.2, (0, 0, -0.2 * FORWARD * 0.3)),
     ],
 )
 def test_a_truck_is_pushed_as_the_equation_says(effect: str, value: float, pushes: tuple[float, ...]) -> None:

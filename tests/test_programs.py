@@ -433,3 +433,47 @@ def test_dense_is_the_layer_whatever_the_layout(left):
     by_components = stack(*torch.randn(5, *left, dtype=torch.float64))
     for inputs in (by_components, by_components.contiguous()):
         torch.testing.assert_close(dense(layer, inputs), layer(inputs))
+
+
+# --- the discovered truck ---------------------------------------------------------------------------------------------
+
+
+def test_the_discovered_truck_is_the_hand_written_one_with_effects_of_the_catalogue() -> None:
+    """Each equation is the catalogue's, found by name on the path that `make truck` prints."""
+    found, built = example("discovered_truck.py"), example("truck")
+    values = {name: getattr(found, name).detach() for name in ("speed_gain", "turn_gain", "limit", "noise")}
+    for name, value in values.items():
+        setattr(built, name, value)
+    for effect, value in (
+        ("actuator_delay", float(found.delay.detach())),
+        ("lever_arm", float(found.lever.detach())),
+        ("slip_angle", -float(found.slip.detach())),
+        ("caster", float(found.caster.detach())),
+        ("acceleration_bias", found.bias.detach()),
+        ("curvature_steering", float(found.share.detach())),
+        ("command_noise", float(found.erratic.detach())),  # outermost: it compares with what was commanded
+    ):
+        built = built.with_effect(effect, value)
+    data = drives(found, 3, 20)
+    given = data.states[:-1], data.elapsed[:-1], data.steps
+
+    def moments(program):
+        controls = program.actuators(data.controls, data.elapsed)[:-1]
+        recording = Recording()
+        with recording:
+            program.transition(given[0], controls, *given[1:])
+        fn = recording.distributions["acceleration"].base_dist
+        return fn.loc.detach(), fn.scale.detach()
+
+    (mean, sd), (other_mean, other_sd) = moments(found), moments(built)
+    torch.testing.assert_close(mean, other_mean, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(sd, other_sd, rtol=1e-9, atol=1e-9)
+
+
+def test_the_hybrid_truck_begins_as_the_discovered_one() -> None:
+    found, hybrid = example("discovered_truck.py"), example("discovered_truck.py:HybridTruck")
+    data = drives(found, 3, 20)
+    given = data.states[:-1], data.controls[:-1], data.steps
+    for one, other in zip(found.accelerations(*given), hybrid.accelerations(*given), strict=True):
+        torch.testing.assert_close(one, other)
+    assert {name for name, _ in hybrid.named_parameters()} > {name for name, _ in found.named_parameters()}

@@ -19,6 +19,7 @@ from steady_ppl.discovery.search import Found, Search, search
 from steady_ppl.effects import of_name, record, restore, written_class
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
+from steady_ppl.joining import joined
 from steady_ppl.program import Program, for_program
 from steady_ppl.proving import Proof, far_off, prove
 
@@ -80,6 +81,7 @@ def discover(
     valid: Trajectories | None = None,
     *,
     known_start: bool | None = None,
+    mix: bool = False,
     declared: Program | None = None,
     simulations: int = 200,
     withheld: Sequence[str] = (),
@@ -97,6 +99,8 @@ def discover(
         train: drives to test and fit.
         valid: drives to choose by; every second drive of `train` when None.
         known_start: take the first row's x. columns as the exact start; a fit's own setting when None.
+        mix: put both tables together and keep every second drive to choose by; for tables that are not alike, one of
+            them with rougher drives.
         declared: the program with the noise scales that its owner believes; the program's class afresh when a fit is
             given, else `program`.
         simulations: sets of drives for the calibration, at least 50.
@@ -126,6 +130,8 @@ def discover(
     program = copy.deepcopy(program).cpu()
     declared = copy.deepcopy(declared or program).cpu()
     notes: list[str] = []
+    if mix and valid is not None:
+        train, valid = joined(train=train, valid=valid), None
     if valid is None:
         if len(train) < 2 * FEWEST_DRIVES:
             raise DataError(
@@ -134,7 +140,8 @@ def discover(
             )
         valid = train.subset(range(1, len(train), 2))
         train = train.subset(range(0, len(train), 2))
-        notes.append(f"no validation drives were given: {len(valid)} of the {len(train) + len(valid)} drives were kept")
+        kept = f"{len(valid)} of the {len(train) + len(valid)} drives were kept to choose by"
+        notes.append(f"the tables were mixed: {kept}" if mix else f"no validation drives were given: {kept}")
     drives = [for_program(program, table).without_truth(keep_start=known_start) for table in (train, valid)]
     require(program, drives[0], drives[1], known_start, simulations)
     found = search(

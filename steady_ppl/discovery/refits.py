@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
+from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, Fitting, is_doubtful
 from steady_ppl.effects import Variant, attach, attached, coefficient
 from steady_ppl.elements import Element, elements, moved
 from steady_ppl.errors import FilterError, SteadyError
-from steady_ppl.gaussian_smoother import find_path, means_as_path, require_found, smooth
+from steady_ppl.gaussian_smoother import find_path, means_as_path, smooth
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.maximum_likelihood import Maximum, maximise
@@ -47,6 +48,7 @@ class Worth:
 
 
 ALWAYS = Worth()
+BY_LIKELIHOOD, BY_DRAWS, FIRST_BY_DRAWS = ByLikelihood(), ByDraws(), ByDraws(steps=180)
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class Refit:
             of the first only where the rest was not worth fitting.
         rough: the program before its fit made its noise many times wider, from whose parameters fits with an effect
             begin as well; None where it did not.
+        fitting: how it was fitted, and how fits with an effect are.
     """
 
     programs: list[Program]
@@ -68,6 +71,7 @@ class Refit:
     folds: list[Fold]
     held_out: Tensor
     rough: Program | None = None
+    fitting: Fitting = BY_LIKELIHOOD
 
     @property
     def program(self) -> Program:
@@ -116,7 +120,12 @@ def first_refit(program: Program, train: Trajectories, valid: Trajectories, *, k
         second = _led_back(other, valid, second, known_start)
     folds = [Fold(train, one.path, valid, second.path), Fold(valid, second.path, train, one.path)]
     refit = _refit([own, other], folds, known_start, [one, second])
-    return replace(refit, rough=copy.deepcopy(program) if _far_wider(own, program, train) else None)
+    if _far_wider(own, program, train):
+        return replace(refit, rough=copy.deepcopy(program))
+    if is_doubtful(own, train, one.path, known_start):
+        refit = _refit([own, other], folds, known_start, [None, None], fitting=FIRST_BY_DRAWS)
+        return replace(refit, fitting=BY_DRAWS)
+    return refit
 
 
 def _led_back(program: Program, data: Trajectories, maximum: Maximum, known_start: bool) -> Maximum:
@@ -218,10 +227,10 @@ def refit_with(
         programs = [attach(copy.deepcopy(program), variant, value) for program in base.programs]
         least = [float(maximum.log_likelihood.sum()) - NOTHING for maximum in base.maxima]
         nothing = [None] * len(programs)
-        fit = _refit(programs, base.folds, known_start, nothing, information, least, worth, base.rough)
+        fit = _refit(programs, base.folds, known_start, nothing, information, least, worth, base.rough, base.fitting)
     except SteadyError as error:
         return str(error)
-    return replace(fit, rough=base.rough)
+    return replace(fit, rough=base.rough, fitting=base.fitting)
 
 
 def refit_elsewhere(base: Refit, near: Refit, variant: Variant, *, known_start: bool) -> Refit | str:
@@ -237,7 +246,7 @@ def refit_elsewhere(base: Refit, near: Refit, variant: Variant, *, known_start: 
         programs = [attach(copy.deepcopy(program), variant) for program in base.programs]
         for program, fitted in zip(programs, near.programs, strict=True):
             program.load_state_dict(fitted.state_dict())
-        return _refit(programs, near.folds, known_start, [None] * len(programs))
+        return _refit(programs, near.folds, known_start, [None] * len(programs), fitting=near.fitting)
     except SteadyError as error:
         return str(error)
 
@@ -261,6 +270,7 @@ def _refit(
     least: Sequence[float] = (-math.inf, -math.inf),
     worth: Worth = ALWAYS,
     rough: Program | None = None,
+    fitting: Fitting = BY_LIKELIHOOD,
 ) -> Refit:
     fitted, found, held_out, judged_folds = list[Program](), [], [], []
     for program, fold, known, floor in zip(programs, folds, maxima, least, strict=True):
@@ -270,21 +280,20 @@ def _refit(
         afresh = None if rough is None else _afresh(as_declared(rough, program), drives, known_start, floor)
         if afresh is not None:
             floor = max(floor, float(afresh[1].log_likelihood.sum()))
-        maximum = known or maximise(
+        maximum = known or fitting.fit(
             program, drives, wide(fold.path, program), known_start=known_start, information=guess, hopeless=floor
         )
         if afresh is not None and afresh[1].objective > maximum.objective:
             program, maximum = afresh
             path = find_path(program, unseen, known_start=known_start)
-        judged = smooth(program, unseen, path, known_start=known_start, passes=15, tolerance=0.02, kernels=False)
-        require_found(judged, unseen)
+        judged = fitting.judge(program, unseen, path, known_start=known_start)
         fitted.append(program)
         found.append(maximum)
         held_out.append(judged.log_likelihood)
-        judged_folds.append(Fold(drives, maximum.path, unseen, means_as_path(judged, unseen)))
+        judged_folds.append(Fold(drives, maximum.path, unseen, judged.path))
         if float(maximum.log_likelihood.sum()) < worth.drives and float(judged.log_likelihood.sum()) < worth.held_out:
             break
-    return Refit(fitted, found, judged_folds, torch.cat(held_out))
+    return Refit(fitted, found, judged_folds, torch.cat(held_out), fitting=fitting)
 
 
 def _afresh(program: Program, drives: Trajectories, known_start: bool, floor: float) -> tuple[Program, Maximum] | None:

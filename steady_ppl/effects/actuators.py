@@ -104,13 +104,6 @@ def dead_zone(self, control, time, c, controls):
     return control - self.chosen_controls(controls, control) * lost
 
 
-def curvature_steering(self, state, control, time, c):
-    speed, turn = control[..., self.control_index("speed")], control[..., self.control_index("turn")]
-    forward, _, _ = self.body_velocity(state)
-    asked = turn * speed * forward / (speed**2 + 0.05**2)
-    return control + c * (asked - turn).unsqueeze(-1) * self.chosen_controls(("turn",), control)
-
-
 def actuator_lag(self, control, time, c, controls):
     return control + self.chosen_controls(controls, control) * (lagged(control, time, c) - control)
 
@@ -235,17 +228,5 @@ ACTUATORS = [
         limit=1.0,
         sign=1,
         lacks=_no_controls,
-    ),
-    Effect(
-        name="curvature_steering",
-        form="command",
-        equation=r"u_\mathrm{turn} \to (1 - c)\,u_\mathrm{turn} + c\,u_\mathrm{turn}\,v / u_\mathrm{speed}",
-        text="turn → (1 - c) turn + c (turn / speed) v",
-        unit="1",
-        feels="steers a curve, not a turn rate: turns slower while it is slower than it is told",
-        function=curvature_steering,
-        typical=0.5,
-        limit=2.0,
-        lacks=_has("speed", "turn"),
     ),
 ]

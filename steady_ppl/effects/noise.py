@@ -8,6 +8,7 @@ from typing import Any
 from steady_ppl.data import Trajectories
 from steady_ppl.effects.declaration import Effect
 from steady_ppl.effects.planar_forces import not_planar
+from steady_ppl.effects.wheels import needs_commanded_speed
 from steady_ppl.planar_vehicle import PlanarVehicle
 from steady_ppl.program import Program, names
 
@@ -20,12 +21,6 @@ def _groups(program: Program, data: Trajectories | None) -> Sequence[Mapping[str
 
 def _no_channels(program: Program) -> str | None:
     return None if program.channels else "the program has no noise channels"
-
-
-def _no_commanded_speed(program: Program) -> str | None:
-    if {"speed", "turn"} <= set(names(program.controls)):
-        return not_planar(program)
-    return "the controls are not a speed and a turn rate, which the state could be compared with"
 
 
 def _no_states_left(program: Program) -> str | None:
@@ -132,7 +127,7 @@ NOISES = [
         typical=1.0,
         limit=5.0,
         sign=1,
-        lacks=_no_commanded_speed,
+        lacks=needs_commanded_speed,
     ),
     Effect(
         name="coloured_noise",

@@ -25,7 +25,8 @@ def _needs_slip(program: Program) -> str | None:
     return not_planar(program)
 
 
-def _needs_grip(program: Program) -> str | None:
+def needs_grip(program: Program) -> str | None:
+    """Why an effect on vehicles whose program holds the lateral velocity does not apply."""
     if isinstance(program, PlanarVehicle) and program.slips:
         return "the lateral velocity is free"
     return not_planar(program)
@@ -97,11 +98,6 @@ def magnus(self, state, control, time, step, c):
 def lever_arm(self, state, control, time, step, c, mean):
     yaw_rate = state[..., 5]
     return {"forward": c * yaw_rate**2, "lateral": -c * mean["yaw"]}
-
-
-def kinematic_lever_arm(self, state, control, time, step, c):
-    yaw_rate = state[..., 5]
-    return {"lateral": c * yaw_rate / step}
 
 
 def side_slip(self, state, control, time, step, c, lead):
@@ -195,18 +191,6 @@ PLANAR_FORCES = [
         typical=0.15,
         limit=1.0,
         lacks=_needs_slip,
-    ),
-    Effect(
-        name="lever_arm",
-        form="push",
-        equation=r"v_y \to c\,\omega",
-        text="v_y = c ω",
-        unit="m",
-        feels="the tracked point swings around the axle that does not slip",
-        function=kinematic_lever_arm,
-        typical=0.1,
-        limit=1.0,
-        lacks=_needs_grip,
     ),
     Effect(
         name="side_slip",

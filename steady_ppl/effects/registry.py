@@ -13,10 +13,11 @@ from steady_ppl.effects.forces import FORCES
 from steady_ppl.effects.noise import NOISES
 from steady_ppl.effects.planar_forces import PLANAR_FORCES
 from steady_ppl.effects.sensors import SENSORS
+from steady_ppl.effects.wheels import WHEELS
 from steady_ppl.errors import UsageError
 from steady_ppl.program import Program
 
-_EFFECTS: list[Effect] = [*FORCES, *PLANAR_FORCES, *ACTUATORS, *SENSORS, *NOISES]
+_EFFECTS: list[Effect] = [*FORCES, *PLANAR_FORCES, *WHEELS, *ACTUATORS, *SENSORS, *NOISES]
 
 
 def register(effect: Effect) -> Effect:

@@ -1,0 +1,79 @@
+"""The truck's programs, fitted to bearings and judged on the test drives."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from experiments import STEADY_SETTINGS, Split, truck
+
+from inference import hand, steady
+from models.discovered_truck import DiscoveredTruck, HybridTruck
+from models.neural_vehicle import NeuralTruck
+from models.truck import Truck
+from steady_ppl import Fit, Trajectories, for_program, seeded, smoothed_states
+from steady_ppl.evaluation import evaluate
+from steady_ppl.program import acting_controls
+
+# Chosen by held-out log p(y) of the valid split, draws 11 to 14 of the bearings: see docs/truck.md.
+MECHANISTIC = {"guide": "gaussian", "steps": 200, "learning_rate": 0.03, "ramp": 3.0}
+PROGRAMS: dict[str, tuple[Any, dict[str, Any]]] = {
+    "hand": (Truck, {}),
+    "fitted": (Truck, MECHANISTIC),
+    "network": (NeuralTruck, STEADY_SETTINGS["lookahead", "truck"] | {"guide": "lookahead"}),
+    "discovered": (DiscoveredTruck, MECHANISTIC),
+    "hybrid": (HybridTruck, MECHANISTIC),
+}
+
+
+def learnt(name: str, data: Split, draw: int) -> Fit:
+    """A program fitted to the train drives' bearings, the valid drives' deciding when to stop; known starts."""
+    kind, settings = PROGRAMS[name]
+    train, valid = (part.without_truth(keep_start=True) for part in data[:2])
+    with seeded(draw, "program"):
+        program = kind()
+    if not settings:
+        return hand.fit(program, train, valid, known_start=True, seed=draw)
+    return steady.fit(program, train, valid, known_start=True, seed=draw, progress=False, **settings)
+
+
+def judged(logs: Path, name: str, draw: int) -> dict[str, Any]:
+    """Errors of one program on the test drives of one draw of the bearings."""
+    torch.set_num_threads(1)
+    data = truck(logs, draw)
+    began = time.perf_counter()
+    fit = learnt(name, data, draw)
+    seconds = time.perf_counter() - began
+    record = {"program": name, "draw": draw, "seconds": seconds} | evaluate(fit, data[2])
+    if not isinstance(fit.program, NeuralTruck):
+        own = {key: value for key, value in fit.program.named_parameters() if "hidden" not in key and "." not in key}
+        record["parameters"] = {key.removesuffix("_unconstrained"): None for key in own}
+        for key in record["parameters"]:
+            record["parameters"][key] = getattr(fit.program, key).detach().tolist()
+    if isinstance(fit.program, HybridTruck | NeuralTruck):
+        record["network"] = left_to_do(fit.program, data[1])
+    return record
+
+
+@torch.no_grad()
+def left_to_do(program: Any, table: Trajectories) -> dict[str, list[float]]:
+    """Root mean squares of what the network adds to each channel's acceleration and of the whole mean acceleration, on
+    smoothed states of drives."""
+    data = for_program(program, table).without_truth(keep_start=True)
+    states = smoothed_states(program, data, known_start=True)[:-1]
+    given = (states, acting_controls(program, data)[:-1])
+    if isinstance(program, HybridTruck):
+        whole, by_network = program.accelerations(*given, data.steps)[0], program.rest(*given)[0]
+    else:
+        from steady_ppl import channel_means
+
+        means = channel_means(program, program.transition, *given, data.elapsed[:-1], data.steps)
+        whole = by_network = torch.stack([value.expand(states.shape[:-1]) for value in means.values()], -1)
+    inside = data.transitions
+
+    def rms(values: torch.Tensor) -> list[float]:
+        return values[inside].square().mean(0).sqrt().tolist()
+
+    return {"network": rms(by_network), "whole": rms(whole)}

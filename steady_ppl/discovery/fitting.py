@@ -1,0 +1,152 @@
+"""How a program is fitted to some drives and judged on others.
+
+By likelihood: scoring steps of the linearised program, fast and exact where it is nearly linear. By draws: gradient
+steps on paths drawn from its posterior (generalised EM, as the recipe `steady` without tempering), judged by the filter
+that looks ahead, for programs whose linearised log p(y) has kinks or is off: acceleration limits that bind, noise that
+goes with the state.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import FilterError
+from steady_ppl.filtering import neglected
+from steady_ppl.gaussian_smoother import find_path, means_as_path, require_found, smooth
+from steady_ppl.linearization import Path
+from steady_ppl.linearized_guides import GaussianGuide
+from steady_ppl.lookahead import Lookahead
+from steady_ppl.maximum_likelihood import Maximum, maximise
+from steady_ppl.program import Program
+from steady_ppl.seeding import seeded
+from steady_ppl.tempering import Constant
+from steady_ppl.training import Optimization, train
+from steady_ppl.validation import Validation
+
+DOUBTFUL = 0.5  # nats a drive by which the linearised log p(y) may be off
+PARTICLES = 100
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Drives under a program: log p(y), `(B,)`, and the posterior means along which it was linearised."""
+
+    log_likelihood: Tensor
+    path: Path
+
+
+class Fitting(Protocol):
+    """A way of fitting and judging."""
+
+    def fit(
+        self,
+        program: Program,
+        drives: Trajectories,
+        path: Path | None = None,
+        *,
+        known_start: bool,
+        information: Tensor | None = None,
+        hopeless: float = -math.inf,
+    ) -> Maximum:
+        """Move a program's parameters, in place, see `maximise`."""
+        ...
+
+    def judge(self, program: Program, drives: Trajectories, path: Path, *, known_start: bool) -> Judged:
+        """Log p(y) of drives."""
+        ...
+
+
+@dataclass(frozen=True)
+class ByLikelihood:
+    """Scoring steps of the linearised program's log p(y), which judges as well."""
+
+    def fit(
+        self,
+        program: Program,
+        drives: Trajectories,
+        path: Path | None = None,
+        *,
+        known_start: bool,
+        information: Tensor | None = None,
+        hopeless: float = -math.inf,
+    ) -> Maximum:
+        return maximise(program, drives, path, known_start=known_start, information=information, hopeless=hopeless)
+
+    def judge(self, program: Program, drives: Trajectories, path: Path, *, known_start: bool) -> Judged:
+        ahead = _at_rest(program, drives, path, known_start)
+        return Judged(ahead.log_likelihood, means_as_path(ahead, drives))
+
+
+@dataclass(frozen=True)
+class ByDraws:
+    """Gradient steps on draws of the linearised program's posterior; the filter that looks ahead judges.
+
+    Attributes:
+        steps: E steps, each with a gradient step.
+        learning_rate: Adam's at the first step.
+    """
+
+    steps: int = 60
+    learning_rate: float = 0.1
+
+    def fit(
+        self,
+        program: Program,
+        drives: Trajectories,
+        path: Path | None = None,
+        *,
+        known_start: bool,
+        information: Tensor | None = None,
+        hopeless: float = -math.inf,
+    ) -> Maximum:
+        path = path or find_path(program, drives, known_start=known_start)
+        before = self.judge(program, drives, path, known_start=known_start)
+        guide = GaussianGuide(program, tempering=Constant(), known_start=known_start, search_again=math.inf)
+        guide.remember(before.path, drives)
+        optimization = Optimization(self.steps, learning_rate=self.learning_rate, averaging=0.95)
+        began = copy.deepcopy(program.state_dict())
+        with torch.enable_grad():
+            train(program, guide, drives, Validation(), optimization, known_start=known_start, progress=False)
+        after = self.judge(program, drives, before.path, known_start=known_start)
+        if not float(after.log_likelihood.sum()) > float(before.log_likelihood.sum()):
+            program.load_state_dict(began)
+            after = before
+        return Maximum(
+            log_likelihood=after.log_likelihood,
+            objective=float(after.log_likelihood.sum()),
+            path=after.path,
+            names=(),
+            information=torch.zeros(0, 0),
+            steps=self.steps,
+            decrement=0.0,
+            gained=float((after.log_likelihood - before.log_likelihood).sum()),
+        )
+
+    def judge(self, program: Program, drives: Trajectories, path: Path, *, known_start: bool) -> Judged:
+        ahead = _at_rest(program, drives, path, known_start)
+        with seeded(0, "judge"):
+            more = neglected(program, drives, known_start=known_start, particles=PARTICLES, ahead=ahead)
+        return Judged(ahead.log_likelihood + more, means_as_path(ahead, drives))
+
+
+def is_doubtful(program: Program, drives: Trajectories, path: Path, known_start: bool) -> bool:
+    """Whether the linearised program's log p(y) is off by more than half a nat a drive."""
+    ahead = _at_rest(program, drives, path, known_start)
+    try:
+        with seeded(0, "judge"):
+            return float(neglected(program, drives, known_start=known_start, ahead=ahead).abs().mean()) > DOUBTFUL
+    except FilterError:
+        return True
+
+
+def _at_rest(program: Program, drives: Trajectories, path: Path, known_start: bool) -> Lookahead:
+    ahead = smooth(program, drives, path, known_start=known_start, passes=15, tolerance=0.02, kernels=False)
+    require_found(ahead, drives)
+    return ahead

@@ -1,0 +1,193 @@
+"""Vehicles on wheels that are told a speed and a turn rate, as programs without slip have them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+from steady_ppl.data import Trajectories
+from steady_ppl.effects.declaration import Effect
+from steady_ppl.effects.planar_forces import needs_grip, not_planar
+from steady_ppl.program import Program, names
+
+
+def needs_commanded_speed(program: Program) -> str | None:
+    """Why an effect on vehicles that are told a speed and a turn rate does not apply."""
+    if {"speed", "turn"} <= set(names(program.controls)):
+        return not_planar(program)
+    return "the controls are not a speed and a turn rate, which the state could be compared with"
+
+
+def _needs_wheels(program: Program) -> str | None:
+    return needs_commanded_speed(program) or needs_grip(program)
+
+
+def _each_channel(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+    return [{"channels": (name,), "at": name} for name in names(program.channels)]
+
+
+def response_time(self, state, control, time, step, c, channels, mean):
+    return {channel: -mean[channel] * c / (c + step) for channel in channels}
+
+
+def curvature_steering(self, state, control, time, c):
+    speed, turn = control[..., self.control_index("speed")], control[..., self.control_index("turn")]
+    forward, _, _ = self.body_velocity(state)
+    asked = turn * speed * forward / (speed**2 + 0.05**2)
+    return control + c * (asked - turn).unsqueeze(-1) * self.chosen_controls(("turn",), control)
+
+
+def steering_offset(self, state, control, time, c):
+    forward, _, _ = self.body_velocity(state)
+    more = c * forward
+    return control + more.unsqueeze(-1) * self.chosen_controls(("turn",), control)
+
+
+def understeer(self, state, control, time, c):
+    forward, _, _ = self.body_velocity(state)
+    lost = c * forward**2
+    return control * (1 - lost.unsqueeze(-1) * self.chosen_controls(("turn",), control))
+
+
+def reverse_steering(self, state, control, time, c):
+    forward, _, _ = self.body_velocity(state)
+    lost = c * torch.tanh(forward / 0.1)
+    return control * (1 - lost.unsqueeze(-1) * self.chosen_controls(("turn",), control))
+
+
+def lever_arm(self, state, control, time, step, c):
+    yaw_rate = state[..., 5]
+    return {"lateral": c * yaw_rate / step}
+
+
+def crab_angle(self, state, control, time, step, c):
+    forward, _, _ = self.body_velocity(state)
+    return {"lateral": c * forward / step}
+
+
+def slip_angle(self, state, control, time, step, c):
+    forward, _, yaw_rate = self.body_velocity(state)
+    return {"lateral": -c * forward * yaw_rate / step}
+
+
+def caster(self, state, control, time, step, c):
+    forward, _, yaw_rate = self.body_velocity(state)
+    return {"yaw": -c * forward * yaw_rate}
+
+
+WHEELS = [
+    Effect(
+        name="response_time",
+        form="push",
+        equation=r"\dot v = (v_\mathrm{told} - v) / (c + \Delta t)",
+        text="dv/dt = (v_told - v) / (c + step)",
+        unit="s",
+        feels="gets to what it is told, or back to it when pushed off, little by little",
+        function=response_time,
+        typical=0.2,
+        limit=2.0,
+        sign=1,
+        between=(0.0, float("inf")),
+        probes=(0.05, 0.15, 0.4),
+        choices=_each_channel,
+        lacks=_needs_wheels,
+    ),
+    Effect(
+        name="curvature_steering",
+        form="command",
+        equation=r"u_\mathrm{turn} \to (1 - c)\,u_\mathrm{turn} + c\,u_\mathrm{turn}\,v / u_\mathrm{speed}",
+        text="turn → (1 - c) turn + c (turn / speed) v",
+        unit="1",
+        feels="steers a curve, not a turn rate: turns slower while it is slower than it is told",
+        function=curvature_steering,
+        typical=0.5,
+        limit=2.0,
+        lacks=needs_commanded_speed,
+    ),
+    Effect(
+        name="steering_offset",
+        form="command",
+        equation=r"u_\mathrm{turn} \to u_\mathrm{turn} + c\,v",
+        text="turn → turn + c v",
+        unit="rad/m",
+        feels="drives a curve with the steering straight",
+        function=steering_offset,
+        typical=0.05,
+        limit=0.5,
+        lacks=needs_commanded_speed,
+    ),
+    Effect(
+        name="understeer",
+        form="command",
+        equation=r"u_\mathrm{turn} \to (1 - c\,v^2)\,u_\mathrm{turn}",
+        text="turn → (1 - c v²) turn",
+        unit="s²/m²",
+        feels="fast curves are wider than slow ones",
+        function=understeer,
+        typical=0.02,
+        limit=0.5,
+        lacks=needs_commanded_speed,
+    ),
+    Effect(
+        name="reverse_steering",
+        form="command",
+        equation=r"u_\mathrm{turn} \to (1 - c\,\tanh(v / 0.1))\,u_\mathrm{turn}",
+        text="turn → (1 - c tanh(v/0.1)) turn",
+        unit="1",
+        feels="turns tighter backwards than forwards",
+        function=reverse_steering,
+        typical=0.1,
+        limit=1.0,
+        lacks=needs_commanded_speed,
+    ),
+    Effect(
+        name="lever_arm",
+        form="push",
+        equation=r"v_y \to c\,\omega",
+        text="v_y = c ω",
+        unit="m",
+        feels="the tracked point swings around the axle that does not slip",
+        function=lever_arm,
+        typical=0.1,
+        limit=1.0,
+        lacks=needs_grip,
+    ),
+    Effect(
+        name="crab_angle",
+        form="push",
+        equation=r"v_y \to c\,v_x",
+        text="v_y = c v_x",
+        unit="rad",
+        feels="points beside where it goes",
+        function=crab_angle,
+        typical=0.05,
+        limit=0.5,
+        lacks=needs_grip,
+    ),
+    Effect(
+        name="slip_angle",
+        form="push",
+        equation=r"v_y \to -c\,v_x\,\omega",
+        text="v_y = -c v_x ω",
+        unit="s",
+        feels="slides outwards in curves, the more the faster",
+        function=slip_angle,
+        typical=0.05,
+        limit=0.5,
+        lacks=needs_grip,
+    ),
+    Effect(
+        name="caster",
+        form="push",
+        equation=r"a_\mathrm{yaw} = -c\,v_x\,\omega",
+        text="a_yaw = -c v_x ω",
+        unit="1/m",
+        feels="straightens up when driving forwards, swings round when driving backwards",
+        function=caster,
+        typical=0.5,
+        limit=5.0,
+        lacks=_needs_wheels,
+    ),
+]

@@ -1,0 +1,75 @@
+"""Fits by draws: where the linearised log p(y) cannot be trusted, and that they never end below where they began."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from examples import drives, example
+
+import steady_ppl as st
+from steady_ppl.discovery.candidates import NATS
+from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, is_doubtful
+from steady_ppl.discovery.refits import first_refit, refit_with
+from steady_ppl.effects import chosen_variant
+from steady_ppl.gaussian_smoother import find_path
+
+
+def test_both_ways_agree_where_the_program_is_nearly_linear() -> None:
+    program = example("hovercraft", torch.float32)
+    data = drives(example("hovercraft.py:HovercraftTruth", torch.float32), 6, 61, seed=3)
+    path = find_path(program, data, known_start=True)
+    fits = []
+    for fitting in (ByLikelihood(), ByDraws(steps=200)):
+        own = copy.deepcopy(program)
+        fits.append((own, fitting.fit(own, data, path, known_start=True)))
+    (likely, first), (drawn, second) = fits
+    assert not is_doubtful(likely, data, first.path, known_start=True)
+    assert abs(float((first.log_likelihood - second.log_likelihood).sum())) < 1.0
+    assert float(likely.mass.detach()) == pytest.approx(float(drawn.mass.detach()), rel=0.02)
+    assert second.gained > 10 and second.converged
+
+
+def test_a_fit_never_ends_below_where_it_began() -> None:
+    program = example("hovercraft", torch.float32)
+    data = drives(program, 4, 41, seed=1)
+    ByLikelihood().fit(program, data, known_start=True)
+    before = {name: value.clone() for name, value in program.named_parameters()}
+    fit = ByDraws(steps=3, learning_rate=5.0).fit(program, data, known_start=True)
+    assert fit.gained == 0.0
+    assert all(torch.equal(value, before[name]) for name, value in program.named_parameters())
+
+
+def test_a_program_whose_linearised_likelihood_is_off_is_fitted_by_draws(monkeypatch) -> None:
+    truth = example("truck", torch.float32).with_effect("lever_arm", 0.4)
+    truth.noise = torch.tensor([2.0, 1.0, 1.0])
+    train, valid = drives(truth, 6, 61, seed=1), drives(truth, 6, 61, seed=2)
+    program = example("truck", torch.float32)
+    assert is_doubtful(program, train, find_path(program, train, known_start=True), known_start=True)
+    monkeypatch.setattr("steady_ppl.discovery.fitting.DOUBTFUL", 0.0)
+    base = first_refit(program, train, valid, known_start=True, seed=0)
+    assert isinstance(base.fitting, ByDraws)
+    found = refit_with(base, chosen_variant(program, "lever_arm"), 0.1, known_start=True)
+    assert not isinstance(found, str) and found.fitting == base.fitting
+    assert float((found.held_out - base.held_out).sum()) > NATS
+    likely = ByLikelihood().fit(copy.deepcopy(found.program), train, found.folds[0].path, known_start=True)
+    assert abs(float((likely.log_likelihood - found.maxima[0].log_likelihood).sum())) < NATS
+
+
+def test_a_nearly_linear_program_is_fitted_by_likelihood() -> None:
+    program = example("hovercraft")
+    base = first_refit(
+        program, drives(program, 4, 41, seed=1), drives(program, 4, 41, seed=2), known_start=True, seed=0
+    )
+    assert isinstance(base.fitting, ByLikelihood)
+
+
+def test_mixed_tables_are_one_and_every_second_drive_chooses() -> None:
+    program = example("hovercraft", torch.float32)
+    train, valid = drives(program, 6, 21, seed=1), drives(program, 5, 21, seed=2)
+    found = st.discover(program, train, valid, known_start=True, mix=True, simulations=50)
+    first, second = found.search.base.folds
+    assert first.drives.labels == ("train 1", "train 3", "train 5", "valid 1", "valid 3", "valid 5")
+    assert second.drives.labels == ("train 2", "train 4", "train 6", "valid 2", "valid 4")
+    assert "the tables were mixed: 5 of the 11 drives were kept to choose by" in found.notes

@@ -1,0 +1,72 @@
+"""Stretches of a table that nobody measured: found to the row, left out when asked, and nothing else is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from examples import example
+
+import steady_ppl as st
+from steady_ppl.stuck import FEWEST, masked, stuck
+
+
+def table(rows: int = 61) -> st.Trajectories:
+    program = example("hovercraft.py:HovercraftTruth")
+    program.duration = (rows - 1) * program.step
+    return st.simulate(program, 3, seed=4)
+
+
+def interpolated(values: torch.Tensor, first: int, last: int) -> torch.Tensor:
+    """A drive's column with a straight line between two rows."""
+    share = torch.linspace(0, 1, last - first + 1, dtype=values.dtype)
+    values = values.clone()
+    values[first : last + 1] = values[first] + share * (values[last] - values[first])
+    return values
+
+
+def test_a_simulation_has_none() -> None:
+    assert stuck(table()) == []
+
+
+def test_a_gap_filled_by_interpolation_is_found_to_the_row() -> None:
+    data = table()
+    states = data.states.clone()
+    for component in (0, 1):
+        states[:, 1, component] = interpolated(states[:, 1, component], 20, 41)
+    (found,) = stuck(replace(data, states=states))
+    assert (found.drive, found.label, found.rows) == (1, data.labels[1], (20, 41))
+    assert found.columns == ("x.x", "x.y") and found.seconds == pytest.approx((2.0, 4.1))
+    assert "drive 2 between 2.00 and 4.10 s: x.x, x.y" in str(found)
+
+
+def test_a_sensor_that_hangs_is_found_and_a_short_rest_is_not() -> None:
+    data = table()
+    measurements = data.measurements.clone()
+    measurements[10 : 10 + FEWEST, 0, 2] = measurements[10, 0, 2]
+    measurements[30 : 30 + FEWEST - 2, 2, 1] = measurements[30, 2, 1]
+    (found,) = stuck(replace(data, measurements=measurements))
+    assert (found.drive, found.rows, found.columns) == (0, (10, 10 + FEWEST - 1), ("y.bearing_2",))
+
+
+def test_overlapping_stretches_of_a_drive_are_one_and_a_column_that_never_scatters_is_none() -> None:
+    data = table()
+    states = data.states.clone()
+    states[:, 0, 0] = interpolated(states[:, 0, 0], 10, 30)
+    states[:, 0, 1] = interpolated(states[:, 0, 1], 25, 45)
+    states[..., 3] = 0.2
+    (found,) = stuck(replace(data, states=states))
+    assert found.rows == (10, 45) and found.columns == ("x.x", "x.y")
+
+
+def test_masking_takes_measurements_and_states_of_the_stretch_alone() -> None:
+    data = table()
+    states = data.states.clone()
+    states[:, 1, 0] = interpolated(states[:, 1, 0], 0, 21)
+    there = replace(data, states=states)
+    kept = masked(there, stuck(there))
+    assert not kept.observed[:22, 1].any() and kept.observed[22:, 1].all() and kept.observed[:, [0, 2]].all()
+    assert torch.isfinite(kept.states[0]).all()  # a known start stays
+    assert kept.states[1:22, 1].isnan().all() and torch.equal(kept.states[22:, 1], there.states[22:, 1])
+    assert stuck(kept) == []
