@@ -136,6 +136,7 @@ class GaussianGuide(LinearizedGuide):
         """
         weight = self.tempering(progress)
         ahead = self.look_ahead(data, progress)
+        require_found(ahead, data)
         paths = smoother_paths(
             self.program,
             data,
