@@ -44,4 +44,5 @@ def check(
     print(found)
     if mask is not None:
         write_table(masked(drives, found.stuck), mask)
-        print(f"{mask}: {table.name} without {len(found.stuck)} stretches that nobody measured")
+        count = len(found.stuck)
+        print(f"{mask}: {table.name} without {count} stretch{'' if count == 1 else 'es'} that nobody measured")

@@ -15,6 +15,7 @@ from steady_ppl.alpha_truck import LANDMARKS, read_alpha_truck
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.planar_vehicle import wrap
+from steady_ppl.stuck import stuck
 
 REAL = Path(__file__).parents[2] / "shared/data/alpha_truck"
 EPOCH = 1_638_480_235
@@ -279,3 +280,12 @@ def test_the_published_drives_follow_their_commands() -> None:
     gain = (forward[2:] * data.controls[:-2, :, 0]).sum() / data.controls[:-2, :, 0].square().sum()
     assert float(gain) == pytest.approx(0.89, abs=0.02)
     assert float(lateral.square().mean() / forward.square().mean()) < 0.05
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the AlphaTruck logs are not part of this repository")
+@pytest.mark.parametrize(
+    ("split", "expected"),
+    [("train", [("12", (56, 75), ("x.x", "x.y", "x.heading", "x.vx", "x.vy", "x.yaw_rate"))]), ("valid", [])],
+)
+def test_the_drop_out_of_the_motion_capture_is_found_without_being_told(split: str, expected: list) -> None:
+    assert [(one.label, one.rows, one.columns) for one in stuck(read_alpha_truck(REAL / split))] == expected

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from small import only_start, rewritten, simulated, steady, written
+
+from steady_ppl import read_table, write_table
 
 FAST = ("--simulations", 20)
 
@@ -40,3 +44,25 @@ def test_what_it_cannot_read_is_one_line_and_writes_nothing(work: Path, tmp_path
     refused(2, "is not a run", "check", tmp_path / "none", table, *more)
     refused(2, "a picture's name that ends in", "check", work / "hand", table, *FAST, "--picture", tmp_path / "a.doc")
     refused(2, "greater than or equal to 20", "check", work / "hand", table, "--simulations", 5)
+
+
+def test_a_stretch_that_nobody_measured_is_named_and_masked(work: Path, tmp_path: Path, capsys):
+    data = simulated(trajectories=3, rows=33)
+    states = data.states.clone()
+    share = torch.linspace(0, 1, 16, dtype=states.dtype)[:, None]
+    states[10:26, 1, :2] = states[10, 1, :2] + share * (states[25, 1, :2] - states[10, 1, :2])
+    table, kept, figures = (tmp_path / name for name in ("gap.csv", "kept.csv", "check.json"))
+    write_table(replace(data, states=states), table)
+    assert steady("check", work / "hand", table, *FAST, "--mask", kept, "--json", figures) == 0
+    said = capsys.readouterr().out
+    assert "the table: drive 2 between 1.00 and 2.50 s: x.x, x.y on a straight line" in said
+    assert f"{kept}: gap.csv without 1 stretch that nobody measured" in said
+    (one,) = json.loads(figures.read_text())["stuck"]
+    assert one["trajectory"] == "2" and one["seconds"] == pytest.approx([1.0, 2.5])
+    again = read_table(kept)
+    assert not again.observed[10:26, 1].any() and int((~again.observed).sum()) == 16 * 4
+
+
+def test_a_mask_that_cannot_be_written_is_refused_before_anything_is_computed(work: Path, tmp_path: Path, refused):
+    table = written(tmp_path / "table.csv", simulated())
+    refused(2, "there is no folder", "check", work / "hand", table, *FAST, "--mask", tmp_path / "no" / "kept.csv")

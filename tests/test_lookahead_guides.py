@@ -493,3 +493,13 @@ def test_an_evaluation_looks_ahead_where_the_program_allows_and_says_why_not(pro
     assert chosen["filter"] == "bootstrap (as asked)"
     # 100 particles from a known start, four measured rows: the two filters are within some tenths of a nat
     assert chosen["log_likelihood"] == pytest.approx(result["log_likelihood"], abs=1.0)
+
+
+def test_a_program_that_blows_up_is_said_and_not_drawn_from():
+    program = example("hovercraft:HovercraftTruth").requires_grad_(False)
+    data = drives(program, 3, 12)
+    looking = GaussianGuide(program, draws=4, known_start=True, tempering=Constant(), search_again=math.inf)
+    looking.refresh(data, 0.0)
+    program.noise = torch.full((3,), math.nan, dtype=torch.float64)
+    with pytest.raises(FilterError, match=r"not finite|no path|cannot|blown"):
+        looking.refresh(data, 0.5)
