@@ -27,11 +27,12 @@ def check(
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
     from steady_ppl.stuck import masked
-    from steady_ppl.table import read_table, write_table
+    from steady_ppl.table import read_table, require_table_file, write_table
 
     require_picture(picture)
     require_folder(json_file)
-    require_folder(mask)
+    if mask is not None:
+        require_table_file(mask)
     drives = read_table(table)
     found = compare(Fit.load(run, program), drives, simulations=simulations, seed=seed)
     figures = found.figures

@@ -56,9 +56,7 @@ def write_table(data: Trajectories, path: str | Path) -> None:
         DataError: for another suffix, a missing folder, or data that makes no valid table.
     """
     path = Path(path)
-    suffix = _suffix(path)
-    if not path.parent.is_dir():
-        raise DataError(f"{path.name}: cannot be written: there is no folder {path.parent.name}, create it first")
+    suffix = require_table_file(path)
     frame = to_frame(data)
     from_frame(frame, name=path.name)
     part = path.with_name(f".{uuid.uuid4().hex}{suffix}")
@@ -231,6 +229,18 @@ def _read_parquet(path: Path) -> pd.DataFrame:
     with path.open("rb") as file:
         frame = pyarrow.parquet.ParquetFile(file).read().to_pandas(ignore_metadata=True)
     return frame.drop(columns=[column for column in frame if column.startswith("__index_level_")])
+
+
+def require_table_file(path: Path) -> str:
+    """The suffix of a file that a table can be written to.
+
+    Raises:
+        DataError: for another suffix, or a missing folder.
+    """
+    suffix = _suffix(path)
+    if not path.parent.is_dir():
+        raise DataError(f"{path.name}: cannot be written: there is no folder {path.parent.name}, create it first")
+    return suffix
 
 
 def _suffix(path: Path) -> str:

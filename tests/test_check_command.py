@@ -66,3 +66,4 @@ def test_a_stretch_that_nobody_measured_is_named_and_masked(work: Path, tmp_path
 def test_a_mask_that_cannot_be_written_is_refused_before_anything_is_computed(work: Path, tmp_path: Path, refused):
     table = written(tmp_path / "table.csv", simulated())
     refused(2, "there is no folder", "check", work / "hand", table, *FAST, "--mask", tmp_path / "no" / "kept.csv")
+    refused(2, "a .csv or .parquet file", "check", work / "hand", table, *FAST, "--mask", tmp_path / "kept.txt")

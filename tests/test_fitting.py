@@ -73,3 +73,5 @@ def test_mixed_tables_are_one_and_every_second_drive_chooses() -> None:
     assert first.drives.labels == ("train 1", "train 3", "train 5", "valid 1", "valid 3", "valid 5")
     assert second.drives.labels == ("train 2", "train 4", "train 6", "valid 2", "valid 4")
     assert "the tables were mixed: 5 of the 11 drives were kept to choose by" in found.notes
+    with pytest.raises(st.UsageError, match="mix puts two tables together"):
+        st.discover(program, train, known_start=True, mix=True)

@@ -13,6 +13,7 @@ from steady_ppl.data import Trajectories
 from steady_ppl.discovery.candidates import NATS
 from steady_ppl.discovery.discovery_report import as_text, figures
 from steady_ppl.discovery.finding import Finding, Shape, findings, shape_of
+from steady_ppl.discovery.fitting import ByDraws
 from steady_ppl.discovery.next_run import NextRun, next_run
 from steady_ppl.discovery.requirements import FEWEST_DRIVES, require, unexcited
 from steady_ppl.discovery.search import Found, Search, search
@@ -109,7 +110,8 @@ def discover(
         report: told what is done.
 
     Raises:
-        UsageError: a network, a program that cannot be linearised, too few simulations, or no such effect to leave out.
+        UsageError: a network, a program that cannot be linearised, too few simulations, no such effect to leave out, or
+            one table to mix.
         DataError: too few drives, no known start, or controls that identify nothing.
         FilterError: the program cannot be fitted.
 
@@ -130,6 +132,8 @@ def discover(
     program = copy.deepcopy(program).cpu()
     declared = copy.deepcopy(declared or program).cpu()
     notes: list[str] = []
+    if mix and valid is None:
+        raise UsageError("mix puts two tables together: name the second one (--valid)")
     if mix and valid is not None:
         train, valid = joined(train=train, valid=valid), None
     if valid is None:
@@ -214,6 +218,11 @@ def _notes(found: Search, is_fitted: bool) -> list[str]:
     gained = found.base.maxima[0].gained
     if is_fitted and gained > FITTED_FURTHER:
         notes.append(f"the run had not converged on these drives: {gained:.0f} nats were gained by fitting it further")
+    if isinstance(found.base.fitting, ByDraws):
+        notes.append(
+            "the linearised program's log p(y) is off by more than half a nat a drive: fits are gradient steps on "
+            "draws, judged by particles, and whether they have converged is not tested"
+        )
     constant = unexcited(found.base.program, found.base.folds[0].drives)
     if constant:
         notes.append(f"{', '.join(constant)} never changes: what it does cannot be told from what happens anyway")
