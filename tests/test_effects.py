@@ -13,6 +13,7 @@ from examples import MODELS, drives, example
 from pyro.infer import Trace_ELBO
 from small import steady
 
+from inference import steady as recipe
 from steady_ppl import Fit, Joint, TruthGuide, UsageError, channel_means, for_program, load_program, simulate
 from steady_ppl.effects import Effect, attached, catalogue, chosen_variant, find, not_applicable, parsed, record
 from steady_ppl.effects.page import page
@@ -325,6 +326,19 @@ def test_a_class_lists_its_effects(tmp_path: Path) -> None:
     assert program.linear_drag.item() == pytest.approx(0.1)
     torch.testing.assert_close(program.slope.detach(), torch.tensor([0.05, -0.03]))
     probe(program)
+
+
+@pytest.mark.parametrize(
+    ("effect", "rate"), [("actuator_delay:turn", 0.2), ("lever_arm", 0.1), ("measurement_noise", 1.0)]
+)
+def test_a_coefficient_moves_in_steps_of_its_typical_size(effect: str, rate: float) -> None:
+    program = example("truck").with_effect(effect, 0.5)
+    data = simulate(program, seed=0, trajectories=1).without_truth(keep_start=True)
+    coefficient = getattr(program, f"{effect.replace(':', '_')}_unconstrained")
+    before = coefficient.detach().clone()
+    settings = {"guide": "gaussian", "steps": 1, "learning_rate": 0.01, "averaging": 0.0}
+    recipe.fit(program, data, known_start=True, progress=False, **settings)
+    assert float((coefficient.detach() - before).abs()) == pytest.approx(0.01 * rate, rel=0.01)  # Adam's first step
 
 
 def test_the_program_itself_is_left_alone() -> None:

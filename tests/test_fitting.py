@@ -53,8 +53,10 @@ def test_a_program_whose_linearised_likelihood_is_off_is_fitted_by_draws(monkeyp
     found = refit_with(base, chosen_variant(program, "lever_arm"), 0.1, known_start=True)
     assert not isinstance(found, str) and found.fitting == base.fitting
     assert float((found.held_out - base.held_out).sum()) > NATS
-    likely = ByLikelihood().fit(copy.deepcopy(found.program), train, found.folds[0].path, known_start=True)
-    assert abs(float((likely.log_likelihood - found.maxima[0].log_likelihood).sum())) < NATS
+    likely, path = copy.deepcopy(found.program), found.folds[0].path
+    ByLikelihood().fit(likely, train, path, known_start=True)
+    there = found.fitting.judge(likely, train, path, known_start=True)
+    assert float((found.maxima[0].log_likelihood - there.log_likelihood).sum()) > -NATS
 
 
 def test_a_nearly_linear_program_is_fitted_by_likelihood() -> None:

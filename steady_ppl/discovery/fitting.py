@@ -1,9 +1,9 @@
 """How a program is fitted to some drives and judged on others.
 
 By likelihood: scoring steps of the linearised program, fast and exact where it is nearly linear. By draws: gradient
-steps on paths drawn from its posterior (generalised EM, as the recipe `steady` without tempering), judged by the filter
-that looks ahead, for programs whose linearised log p(y) has kinks or is off: acceleration limits that bind, noise that
-goes with the state.
+steps on paths drawn from its posterior by the filter that looks ahead (generalised EM, as the recipe `steady` without
+tempering), which judges as well, for programs whose linearised log p(y) has kinks or is off: acceleration limits that
+bind, noise that goes with the state.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from steady_ppl.errors import FilterError
 from steady_ppl.filtering import neglected
 from steady_ppl.gaussian_smoother import find_path, means_as_path, require_found, smooth
 from steady_ppl.linearization import Path
-from steady_ppl.linearized_guides import GaussianGuide
+from steady_ppl.linearized_guides import LookaheadGuide
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.program import Program
@@ -86,7 +86,10 @@ class ByLikelihood:
 
 @dataclass(frozen=True)
 class ByDraws:
-    """Gradient steps on draws of the linearised program's posterior; the filter that looks ahead judges.
+    """Gradient steps on paths drawn by the filter that looks ahead, which judges as well.
+
+    Draws of the linearised program's posterior would be cheaper, but where limits bind their slopes are not those of
+    log p(y): fits with them end beside its maximum, and whatever moves a fit towards it is then taken for an effect.
 
     Attributes:
         steps: E steps, each with a gradient step.
@@ -108,7 +111,9 @@ class ByDraws:
     ) -> Maximum:
         path = path or find_path(program, drives, known_start=known_start)
         before = self.judge(program, drives, path, known_start=known_start)
-        guide = GaussianGuide(program, tempering=Constant(), known_start=known_start, search_again=math.inf)
+        guide = LookaheadGuide(
+            program, particles=PARTICLES, tempering=Constant(), known_start=known_start, search_again=math.inf
+        )
         guide.remember(before.path, drives)
         optimization = Optimization(self.steps, learning_rate=self.learning_rate, averaging=0.95)
         began = copy.deepcopy(program.state_dict())

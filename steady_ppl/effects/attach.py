@@ -60,7 +60,13 @@ def attach(program: Program, variant: Variant, value: float | Sequence[float] | 
     with pyro.settings.context(module_local_params=True):
         setattr(program, name, PyroParam(start, _constraint(effect)))
     program.priors = {**program.priors, name: prior(effect)}  # type: ignore[misc]
+    program.rates = {name: _rate(variant), **program.rates}  # type: ignore[misc]
     return program
+
+
+def _rate(variant: Variant) -> float:
+    """Its relative learning rate: steps in typical sizes, since a delay in seconds is no gain in hundreds of N."""
+    return float(variant.typical.abs().max()) if variant.effect.null == 0 else 1.0
 
 
 def set_coefficient(program: Program, variant: Variant, value: float | Sequence[float] | Tensor) -> Program:
