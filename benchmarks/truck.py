@@ -53,12 +53,12 @@ def jobs(logs: Path, parts: list[str], draws: range) -> dict[str, tuple[Any, ...
     for draw in draws:
         if "table" in parts:
             found |= {f"{name} {draw}": ("table", logs, name, draw) for name in PROGRAMS}
+        if "path" in parts:
+            found[f"path {draw}"] = ("path", logs, draw)
         if "planted" in parts:
             for fault in FAULTS:
                 for share in (1.0, 0.5) if fault != "none" else (1.0,):
                     found[f"{fault} x {share} {draw}"] = ("planted", logs, fault, share, draw)
-        if "path" in parts:
-            found[f"path {draw}"] = ("path", logs, draw)
     return found
 
 
