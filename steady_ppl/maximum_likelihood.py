@@ -37,7 +37,7 @@ class Maximum:
         names: of the learnable numbers.
         information: `(P, P)` in the unconstrained space.
         steps: scoring steps taken.
-        decrement: what another step would still gain, nats.
+        decrement: what another step would still gain, nats; None where nobody has looked.
         gained: objective above that at the parameters from which it began, nats.
     """
 
@@ -47,13 +47,13 @@ class Maximum:
     names: tuple[str, ...]
     information: Tensor
     steps: int
-    decrement: float
+    decrement: float | None
     gained: float
 
     @property
     def converged(self) -> bool:
         """Whether a step would gain less than a tenth of a nat."""
-        return self.decrement < 0.1
+        return self.decrement is None or self.decrement < 0.1
 
 
 @torch.no_grad()

@@ -1,11 +1,13 @@
 """Stretches of a drive in which what was logged did not move or moved along a ruler: a sensor that hung, or a gap that
 somebody filled by interpolation.
 
-A real sensor scatters: no twelve rows of it lie on a line to one part in a million of what it sees on all drives.
+A real sensor scatters: no twelve rows of it lie on a line to one part in a million of what it sees on all drives. A
+known state that keeps its value is left alone: the vehicle may have stood still.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -44,16 +46,19 @@ class Stretch:
 
 
 def stuck(data: Trajectories) -> list[Stretch]:
-    """Stretches in which a measurement or a known state is on a line though it scatters elsewhere.
+    """Stretches in which a measurement or a known state is on a line over time though it scatters elsewhere.
 
     Known states are looked at because they were logged, too: where somebody's tracking lost the vehicle, whatever was
     made of its poses is made up.
     """
     runs: list[tuple[int, int, int, str]] = []
+    moving: set[tuple[int, int, int, str]] = set()
     for column, values, there in _columns(data):
-        of_column = _runs(values, there)
+        of_column = _runs(data.time, values, there)
         if sum(last - first for _, first, last in of_column) < 0.5 * float(there.sum()):
             runs += [(*run, column) for run in of_column]
+            moving |= {(*run, column) for run in of_column if values[run[1], run[0]] != values[run[2], run[0]]}
+    runs = [run for run in runs if run in moving or run[3].startswith("y.") or _beside(run, moving)]
     found: list[Stretch] = []
     for drive, first, last, column in sorted(runs, key=lambda run: run[:2]):
         before = found[-1] if found and found[-1].drive == drive and found[-1].rows[1] >= first else None
@@ -64,15 +69,27 @@ def stuck(data: Trajectories) -> list[Stretch]:
     return found
 
 
+def _beside(run: tuple[int, int, int, str], moving: set[tuple[int, int, int, str]]) -> bool:
+    """Whether another known state moves along a line meanwhile: then one that keeps its value is made up as well."""
+    drive, first, last, _ = run
+    return any(m[0] == drive and m[1] <= last and first <= m[2] and m[3].startswith("x.") for m in moving)
+
+
 def masked(data: Trajectories, stretches: list[Stretch]) -> Trajectories:
-    """The drives without the measurements of these stretches; true states there are forgotten, but for a first row."""
+    """The drives without what nobody measured.
+
+    Where a measurement hung, it alone is left out. Where the known states are made up, so may be everything that was
+    logged with them: all measurements are left out, and the states, but for a first row's, are forgotten.
+    """
     observed = data.observed.clone()
     states = None if data.states is None else data.states.clone()
     for stretch in stretches:
-        first, last = stretch.rows
-        observed[first : last + 1, stretch.drive] = False
-        if states is not None:
-            states[max(first, 1) : last + 1, stretch.drive] = torch.nan
+        rows = slice(stretch.rows[0], stretch.rows[1] + 1)
+        for name in (column.removeprefix("y.") for column in stretch.columns if column.startswith("y.")):
+            observed[rows, stretch.drive, data.measurement_names.index(name)] = False
+        if states is not None and any(column.startswith("x.") for column in stretch.columns):
+            observed[rows, stretch.drive] = False
+            states[max(rows.start, 1) : rows.stop, stretch.drive] = torch.nan
     return replace(data, observed=observed, measurements=torch.where(observed, data.measurements, 0.0), states=states)
 
 
@@ -87,17 +104,24 @@ def _columns(data: Trajectories) -> list[tuple[str, Tensor, Tensor]]:
     return columns
 
 
-def _runs(values: Tensor, there: Tensor) -> list[tuple[int, int, int]]:
-    """Drive, first and last row of every stretch on a line."""
+def _runs(time: Tensor, values: Tensor, there: Tensor) -> list[tuple[int, int, int]]:
+    """Drive, first and last row of every stretch on a line over time."""
     if len(values) < FEWEST or int(there.sum()) < FEWEST:
         return []
     seen = values[there]
     reach = STRAIGHT * float(seen.max() - seen.min())
-    bend = (values[2:] - 2 * values[1:-1] + values[:-2]).abs()
-    straight = (bend <= reach) & there[2:] & there[1:-1] & there[:-2]
+    share = ((time[1:-1] - time[:-2]) / (time[2:] - time[:-2])).to(values)
+    whole = _turned(values[2:] - values[:-2])
+    bend = _turned(values[1:-1] - values[:-2] - share * whole).abs()
+    straight = (bend <= 0.5 * reach) & there[2:] & there[1:-1] & there[:-2]
     runs = []
     for drive in straight.any(0).nonzero().flatten().tolist():
         edges = torch.diff(straight[:, drive].int(), prepend=torch.zeros(1).int(), append=torch.zeros(1).int())
         begins, ends = (edges == 1).nonzero().flatten().tolist(), (edges == -1).nonzero().flatten().tolist()
         runs += [(drive, b, e + 1) for b, e in zip(begins, ends, strict=True) if e + 2 - b >= FEWEST]
     return runs
+
+
+def _turned(change: Tensor) -> Tensor:
+    """A change of almost a whole turn is an angle that came round."""
+    return torch.where(change.abs() > 2 * math.pi - 1, change - torch.sign(change) * 2 * math.pi, change)

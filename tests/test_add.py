@@ -133,6 +133,7 @@ class HovercraftWithDrag(Hovercraft):
 
     attached = {"linear_drag": "linear_drag"}
     priors = {**Hovercraft.priors, "linear_drag": dist.Cauchy(0.0, 1.0)}
+    rates = {"linear_drag": 0.12, **Hovercraft.rates}
 
     def __init__(self):
         super().__init__()

@@ -70,3 +70,35 @@ def test_masking_takes_measurements_and_states_of_the_stretch_alone() -> None:
     assert torch.isfinite(kept.states[0]).all()  # a known start stays
     assert kept.states[1:22, 1].isnan().all() and torch.equal(kept.states[22:, 1], there.states[22:, 1])
     assert stuck(kept) == []
+
+
+def test_a_vehicle_at_rest_is_left_alone_and_a_sensor_that_hangs_meanwhile_is_masked_alone() -> None:
+    data = table()
+    states, measurements = data.states.clone(), data.measurements.clone()
+    states[20:50, 0] = states[20, 0]
+    assert stuck(replace(data, states=states)) == []
+    measurements[30:45, 0, 2] = measurements[30, 0, 2]
+    there = replace(data, states=states, measurements=measurements)
+    (found,) = stuck(there)
+    assert found.rows == (30, 44) and found.columns == ("y.bearing_2",)
+    kept = masked(there, [found])
+    assert not kept.observed[30:45, 0, 2].any() and int((~kept.observed).sum()) == 15
+    assert torch.equal(kept.states, there.states)
+
+
+def test_an_angle_that_comes_round_is_on_a_line() -> None:
+    data = table()
+    states = data.states.clone()
+    states[10:40, 1, 2] = st.wrap(torch.linspace(2.5, 4.5, 30, dtype=states.dtype))
+    (found,) = stuck(replace(data, states=states))
+    assert found.rows == (10, 39) and found.columns == ("x.heading",)
+
+
+def test_interpolation_goes_with_the_time() -> None:
+    data = table()
+    time = data.time + 0.04 * torch.sin(torch.arange(len(data.time), dtype=torch.float64))[:, None]
+    states = data.states.clone()
+    share = (time[10:41, 1] - time[10, 1]) / (time[40, 1] - time[10, 1])
+    states[10:41, 1, 0] = 1.0 + 3.0 * share
+    (found,) = stuck(replace(data, time=time, states=states))
+    assert found.rows == (10, 40) and found.columns == ("x.x",)

@@ -130,7 +130,7 @@ class ByDraws:
             names=(),
             information=torch.zeros(0, 0),
             steps=self.steps,
-            decrement=0.0,
+            decrement=None,
             gained=float((after.log_likelihood - before.log_likelihood).sum()),
         )
 

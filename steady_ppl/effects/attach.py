@@ -65,7 +65,7 @@ def attach(program: Program, variant: Variant, value: float | Sequence[float] | 
 
 
 def _rate(variant: Variant) -> float:
-    """Its relative learning rate: steps in typical sizes, since a delay in seconds is no gain in hundreds of N."""
+    """Its learning rate relative to the recipe's: Adam's steps are of the size of the rate, whatever the unit."""
     return float(variant.typical.abs().max()) if variant.effect.null == 0 else 1.0
 
 

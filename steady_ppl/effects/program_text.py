@@ -69,6 +69,8 @@ def _class(
     lines += _indented(broken("attached = ", ["{" + ", ".join(pairs) + "}"], 4), 4)
     priors = [f'"{layer.name}": {_prior(program.priors[layer.name])}' for layer in layers]
     lines += _indented(_entries("priors = ", "{}", [f"**{above}.priors", *priors]), 4)
+    rates = [f'"{layer.name}": {program.rates[layer.name]:.6g}' for layer in layers if program.rates[layer.name] != 1]
+    lines += _indented(_entries("rates = ", "{}", [*rates, f"**{above}.rates"]), 4) if rates else []
     options = len(inspect.signature(base.__init__).parameters) > 1 if base else False
     inner = "**options" if options else ""
     lines += ["", f"    def __init__(self{', ' + inner if inner else ''}):", f"        super().__init__({inner})"]
