@@ -23,7 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 from experiments import LOGS, ROOT
 from resumable import Record, digest, run
 from truck_path import path
-from truck_planted import FAULTS, planted
+from truck_planted import FAULTS, is_right, planted
 from truck_programs import PROGRAMS, judged
 
 PARTS = ("table", "planted", "path")
@@ -70,14 +70,17 @@ def work(part: str, *arguments: Any) -> Record:
 def said(record: Record) -> str:
     """A record in a line."""
     if record["part"] == "table":
-        return (
-            f"noisy {_pair(record, 'forward')}, mean {_pair(record, 'forward_mean')}, "
-            f"states {_pair(record, 'state_estimation')}, log p(y) {record['log_likelihood']:.2f}, "
-            f"{record['seconds']:.0f} s"
-        )
+        return f"{_errors(record)}, {record['seconds']:.0f} s"
     if record["part"] == "planted":
-        return f"{'right' if record['right'] else 'WRONG'}: {record['sentence']} {record['seconds']:.0f} s"
+        return f"{'right' if is_right(record) else 'WRONG'}: {record['sentence']} {record['seconds']:.0f} s"
     return " -> ".join(", ".join(effect["effect"] for effect in step["added"]) or "…" for step in record["steps"])
+
+
+def _errors(record: Record) -> str:
+    return (
+        f"noisy {_pair(record, 'forward')}, mean {_pair(record, 'forward_mean')}, "
+        f"states {_pair(record, 'state_estimation')}, log p(y) {record['log_likelihood']:.2f}"
+    )
 
 
 def _pair(record: Record, group: str) -> str:
@@ -95,6 +98,10 @@ def table_of(records: list[Record]) -> tuple[list[str], bool]:
         if runs:
             cells = [f"{_mean_sd(runs, g, 'location')} / {_mean_sd(runs, g, 'angle')}" for g in GROUPS]
             lines.append(f"{name:11s} {'   '.join(cells)}   {_mean_sd(runs, 'log_likelihood')}")
+            if "network" in runs[0]:
+                lines.append(
+                    f"{'':11s} its network {_left(runs, 'network')} of {_left(runs, 'whole')} (rms by channel)"
+                )
     for (name, group, what), (must, aim) in MUSTS.items():
         if values[name]:
             got = statistics.fmean(run[group][what] for run in values[name])
@@ -127,6 +134,13 @@ def _mean_sd(runs: list[Record], *where: str) -> str:
     return f"{statistics.fmean(values):.4f}{spread}"
 
 
+def _left(runs: list[Record], what: str) -> str:
+    """Root mean squares of accelerations by channel, the mean of the runs."""
+    return " / ".join(
+        f"{statistics.fmean(values):.2f}" for values in zip(*(r["network"][what] for r in runs), strict=True)
+    )
+
+
 def _met(good: bool) -> str:
     return "met" if good else "MISSED"
 
@@ -138,20 +152,26 @@ def planted_of(records: list[Record]) -> tuple[list[str], bool]:
         for share in (1.0, 0.5):
             runs = [r for r in records if r.get("fault") == fault and r.get("share") == share]
             if runs:
-                right = sum(run["right"] for run in runs)
-                named = sorted({(r["found"][0]["effect"] if r["found"] else "nothing") for r in runs})
-                lines.append(f"{fault} x {share}: {right} of {len(runs)} ({', '.join(named)})")
+                right = sum(map(is_right, runs))
+                lines.append(f"{fault} x {share}: {right} of {len(runs)} ({'; '.join(map(_found, runs))})")
                 good &= share < 1 or right == len(runs)
     return lines, good
+
+
+def _found(record: Record) -> str:
+    """What was found, in order, with its coefficients."""
+    return ", ".join(f"{e['effect']} {' '.join(f'{c:.3g}' for c in e['coefficient'])}" for e in record["found"]) or "–"
 
 
 def path_of(record: Record) -> list[str]:
     """The path of one draw, a line a step."""
     lines = [f"draw {record['draw']}"]
     for step in record["steps"]:
-        added = "; ".join(f"{e['effect']} = " + ", ".join(f"{c:.3g}" for c in e["coefficient"]) for e in step["added"])
-        errors = f" {said({'part': 'table', 'seconds': 0} | step['test'])[:-5]}" if "test" in step else ""
-        lines.append(f"  + {added or '–'}:{errors}" if step is not record["steps"][0] else f"  as written:{errors}")
+        errors = f": {_errors(step['test'])}" if "test" in step else ""
+        if step["added"] or step is record["steps"][0]:
+            lines.append(f"  {'+ ' + _found({'found': step['added']}) if step['added'] else 'fitted'}{errors}")
+        else:
+            lines.append(f"  {step['sentence']}")
     return lines
 
 
@@ -164,6 +184,9 @@ def main() -> int:
     parser.add_argument("--first-draw", type=int, default=1)
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "truck")
     arguments = parser.parse_args()
+    if arguments.draws < 1:
+        print("--draws: at least one", file=sys.stderr)
+        return 2
     if not arguments.data.is_dir():
         print("name the folder with the AlphaTruck logs: --data, or make truck DATA=FOLDER", file=sys.stderr)
         return 2

@@ -1,6 +1,6 @@
 """The pictures of docs/truck.md: roll-outs without noise over the true paths, errors along the paths of discovery.
 
-    python benchmarks/truck_pictures.py --records benchmarks/results/truck.jsonl [--data FOLDER] [--out docs]
+    python benchmarks/truck_pictures.py --data FOLDER [--records benchmarks/results/truck.jsonl] [--out docs]
 
 Draws truck.png (fits four programs to the first draw of the bearings, two minutes) and truck-path.png.
 """
@@ -102,18 +102,18 @@ def path_picture(records: list[dict[str, Any]], file: Path) -> None:
     figures = (("noisy roll-outs, location [m]", "forward"), ("mean roll-out, location [m]", "forward_mean"), ("", ""))
     figure, axes = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
     paths = sorted((r for r in records if r.get("part") == "path"), key=lambda r: r["draw"])
-    most = max(len(record["steps"]) for record in paths)
+    most = max(sum(bool(step["added"]) for step in record["steps"]) for record in paths) + 1
     for one, (title, group) in zip(axes, figures, strict=True):
         for record in paths:
-            tests = [step["test"] for step in record["steps"]]
+            tests = [step["test"] for step in record["steps"] if step["added"] or step is record["steps"][0]]
             values = [test[group]["location"] if group else test["log_likelihood"] for test in tests]
             one.plot(range(len(values)), values, "o-", color="#0072b2", alpha=0.6, ms=4)
-            if record["steps"][-1]["verdict"] == "other":  # the last step is what a curve without a name would bring
-                one.plot(len(values) - 1, values[-1], "o", color="white", mec="#0072b2", ms=4)
         for name, color in (("network", "0.5"), ("hybrid", "#009e73")):
             runs = [r for r in records if r.get("program") == name]
             values = [r[group]["location"] if group else r["log_likelihood"] for r in runs]
-            one.axhline(sum(values) / len(values), color=color, lw=1, ls="--", label=f"{name}, mean of five draws")
+            one.axhline(
+                sum(values) / len(values), color=color, lw=1, ls="--", label=f"{name}, mean of {len(runs)} draws"
+            )
         one.set_title(title or "log p(y) at 1 Hz, nats a drive")
         one.set_xticks(range(most), ["as written,\nfitted", *(f"+ search {n}" for n in range(1, most))])
         if group:
@@ -129,11 +129,13 @@ def main() -> int:
     parser.add_argument("--draw", type=int, default=1)
     parser.add_argument("--out", type=Path, default=ROOT / "docs")
     arguments = parser.parse_args()
+    if not arguments.data.is_dir():
+        print("name the folder with the AlphaTruck logs: --data", file=sys.stderr)
+        return 2
     torch.set_num_threads(1)
     records = [json.loads(line) for line in arguments.records.read_text().splitlines()]
     path_picture(records, arguments.out / "truck-path.png")
-    if arguments.data.is_dir():
-        roll_out_picture(arguments.data, arguments.draw, arguments.out / "truck.png")
+    roll_out_picture(arguments.data, arguments.draw, arguments.out / "truck.png")
     return 0
 
 

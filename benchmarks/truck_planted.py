@@ -31,12 +31,13 @@ class Fault:
 
     Attributes:
         text: what.
-        named: effects that describe it, of which the first that is found must be one.
+        named: effects that describe it, with their places and the signs of their coefficients, of which the first that
+            is found must be one.
         plant: from the drives and a share of the full size to the altered drives.
     """
 
     text: str
-    named: tuple[str, ...]
+    named: dict[str, int]
     plant: Callable[[Trajectories, float], Trajectories]
 
 
@@ -94,26 +95,30 @@ def _difference(earlier: torch.Tensor, later: torch.Tensor) -> torch.Tensor:
 
 
 FAULTS = {
-    "none": Fault("nothing", (), lambda data, share: data),
+    "none": Fault("nothing", {}, lambda data, share: data),
     "commands logged late": Fault(
         "commands logged .2 s late",
-        ("clock_offset", "actuator_delay", "actuator_lag"),
+        {"clock_offset": -1},  # a negative delay means nothing
         lambda data, share: commands_shifted(data, 0.2 * share),
     ),
     "commands act late": Fault(
         "commands act .2 s later than logged",
-        ("actuator_delay", "actuator_lag", "clock_offset"),
+        {"actuator_delay": 1, "actuator_lag": 1, "clock_offset": 1},
         lambda data, share: commands_shifted(data, -0.2 * share),
     ),
     "turn scaled": Fault(
-        "turn commands logged 8 % too large", ("gain_error",), lambda data, share: turn_scaled(data, 1 + 0.08 * share)
+        "turn commands logged 8 % too large",
+        {"gain_error:turn": -1},
+        lambda data, share: turn_scaled(data, 1 + 0.08 * share),
     ),
     "landmark askew": Fault(
-        "one landmark's bearing 4° off", ("landmark_bias",), lambda data, share: landmark_askew(data, 4 * share)
+        "one landmark's bearing 4° off",
+        {"landmark_bias:bearing_1": 1},
+        lambda data, share: landmark_askew(data, 4 * share),
     ),
     "bearings late": Fault(
         "bearings stamped .15 s late",
-        ("clock_offset", "actuator_delay", "actuator_lag"),
+        {"clock_offset": 1, "actuator_delay": 1, "actuator_lag": 1},
         lambda data, share: bearings_late(data, 0.15 * share),
     ),
 }
@@ -147,6 +152,16 @@ def calibrated(logs: Path) -> Program:
     return steady.fit(program, drives, known_start=True, seed=0, progress=False, **settings).program
 
 
+def is_right(record: dict[str, Any]) -> bool:
+    """Whether the first effect that was found describes the fault, its place and sign included; of drives without a
+    fault, whether nothing was found."""
+    named = FAULTS[record["fault"]].named
+    if not named:
+        return record["verdict"] == "none"
+    first = record["found"][0] if record["found"] else None
+    return first is not None and named.get(first["effect"], 0) * first["coefficient"][0] > 0
+
+
 def planted(logs: Path, fault: str, share: float, draw: int) -> dict[str, Any]:
     """What `discover` says of drives with a fault, by the truck as it was calibrated on the drives without.
 
@@ -159,12 +174,10 @@ def planted(logs: Path, fault: str, share: float, draw: int) -> dict[str, Any]:
     drives = joined(train=train, valid=valid).without_truth(keep_start=True)
     began = time.perf_counter()
     figures = discover(frozen(program), drives, known_start=True, seed=draw).figures
-    first = (figures["effect"] or "").partition(":")[0]
     return {
         "fault": fault,
         "share": share,
         "draw": draw,
-        "right": first in FAULTS[fault].named if FAULTS[fault].named else figures["verdict"] == "none",
         "sentence": figures["sentence"],
         "p_value": figures["p_value"],
         "verdict": figures["verdict"],

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from steady_ppl.errors import UsageError
+
 
 def check(
     run: Annotated[Path, typer.Argument(help="Run folder.")],
@@ -33,6 +35,9 @@ def check(
     require_folder(json_file)
     if mask is not None:
         require_table_file(mask)
+        require_folder(mask)
+        if mask.resolve() == table.resolve():
+            raise UsageError(f"--mask {mask} is the table itself: name another file")
     drives = read_table(table)
     found = compare(Fit.load(run, program), drives, simulations=simulations, seed=seed)
     figures = found.figures

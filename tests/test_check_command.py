@@ -43,6 +43,8 @@ def test_what_it_cannot_read_is_one_line_and_writes_nothing(work: Path, tmp_path
     refused(2, "no column y.bearing_2", "check", work / "hand", lacking, *more)
     refused(2, "is not a run", "check", tmp_path / "none", table, *more)
     refused(2, "a picture's name that ends in", "check", work / "hand", table, *FAST, "--picture", tmp_path / "a.doc")
+    refused(2, "is the table itself", "check", work / "hand", table, *FAST, "--mask", table)
+    refused(2, "there is no folder", "check", work / "hand", table, *FAST, "--mask", tmp_path / "none" / "kept.csv")
     refused(2, "greater than or equal to 20", "check", work / "hand", table, "--simulations", 5)
 
 

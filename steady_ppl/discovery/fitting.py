@@ -31,7 +31,7 @@ from steady_ppl.training import Optimization, train
 from steady_ppl.validation import Validation
 
 DOUBTFUL = 0.5  # nats a drive by which the linearised log p(y) may be off
-PARTICLES = 100
+PARTICLES, JUDGING = 100, 400  # of the guide and of the judge: see docs/discovery.md, step 4
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class ByDraws:
     def judge(self, program: Program, drives: Trajectories, path: Path, *, known_start: bool) -> Judged:
         ahead = _at_rest(program, drives, path, known_start)
         with seeded(0, "judge"):
-            more = neglected(program, drives, known_start=known_start, particles=PARTICLES, ahead=ahead)
+            more = neglected(program, drives, known_start=known_start, particles=JUDGING, ahead=ahead)
         return Judged(ahead.log_likelihood + more, means_as_path(ahead, drives))
 
 
