@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
 OUT ?= out
+DRAWS ?= 1
 export OMP_NUM_THREADS ?= 1
 
 .PHONY: demo test found learn learn-truck truck paper lint types check clean
@@ -27,7 +28,7 @@ learn-truck: $(INSTALLED)
 
 truck: $(INSTALLED)
 	@test -n "$(DATA)" || { echo "make truck DATA=FOLDER: the folder with train/, valid/ and test/ of the AlphaTruck logs" >&2; exit 2; }
-	$(BIN)/python benchmarks/truck.py --data "$(DATA)" --out $(OUT)/truck
+	$(BIN)/python benchmarks/truck.py --data "$(DATA)" --draws $(DRAWS) --out $(OUT)/truck
 
 paper: $(INSTALLED)
 	$(BIN)/python benchmarks/paper.py --out $(OUT)/paper $(if $(DATA),--data "$(DATA)") $(if $(QUICK),--quick)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import statistics
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,18 @@ import pytest
 ROOT = Path(__file__).parents[1]
 RECORDS = [json.loads(line) for line in (ROOT / "benchmarks" / "results" / "truck.jsonl").read_text().splitlines()]
 PAGE = (ROOT / "docs" / "truck.md").read_text()
+PATHS = [record for record in RECORDS if record["part"] == "path"]
+PLANTED = [record for record in RECORDS if record["part"] == "planted"]
+
+
+@pytest.fixture(scope="module")
+def benchmark():
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    try:
+        import truck
+    finally:
+        sys.path.remove(str(ROOT / "benchmarks"))
+    return truck
 
 
 def of(program: str) -> list[dict]:
@@ -19,15 +32,19 @@ def of(program: str) -> list[dict]:
     return runs
 
 
+def short(value: float, places: int) -> str:
+    return f"{value:.{places}f}".replace("-", "−").replace("0.", ".", 1) if abs(value) < 1 else f"{value:.{places}f}"
+
+
 @pytest.mark.parametrize("program", ["hand", "fitted", "network", "discovered", "hybrid"])
 def test_the_table_is_the_mean_of_five_draws(program: str) -> None:
     (row,) = (line for line in PAGE.splitlines() if line.startswith(f"| {program} |"))
     for group, places in (("forward", 4), ("forward_mean", 4), ("state_estimation", 3)):
         for what in ("location", "angle"):
             mean = statistics.fmean(run[group][what] for run in of(program))
-            assert f"{mean:.{places}f}".removeprefix("0") in row, (group, what)
+            assert short(mean, places) in row, (group, what)
     likelihood = [run["log_likelihood"] for run in of(program)]
-    assert f"{statistics.fmean(likelihood):.2f} ± {statistics.stdev(likelihood):.2f}".replace(" 0.", " .") in row
+    assert f"{statistics.fmean(likelihood):.2f} ± {short(statistics.stdev(likelihood), 2)}" in row
 
 
 @pytest.mark.parametrize(
@@ -36,4 +53,45 @@ def test_the_table_is_the_mean_of_five_draws(program: str) -> None:
 )
 def test_gains_are_of_the_same_draws(program: str, other: str) -> None:
     gains = [a["log_likelihood"] - b["log_likelihood"] for a, b in zip(of(program), of(other), strict=True)]
-    assert f"{statistics.fmean(gains):.2f} ± {statistics.stdev(gains):.2f}".replace(" 0.", " .") in PAGE
+    assert f"{statistics.fmean(gains):.2f} ± {short(statistics.stdev(gains), 2)}" in PAGE
+
+
+def test_what_is_left_to_the_networks_is_the_mean_of_five_draws() -> None:
+    for program in ("network", "hybrid"):
+        left = [statistics.fmean(values) for values in zip(*(run["network"]["network"] for run in of(program)), strict=True)]
+        assert ", ".join(short(value, 2) for value in left[:2]) + " m/s²" in PAGE
+        assert f"{short(left[2], 2)} rad/s²" in PAGE
+
+
+def test_every_must_is_met_and_every_fault_of_full_size_is_found(benchmark) -> None:
+    assert benchmark.table_of([record for record in RECORDS if record["part"] == "table"])[1]
+    assert benchmark.planted_of(PLANTED)[1]
+
+
+@pytest.mark.parametrize("path", PATHS, ids=[f"draw {path['draw']}" for path in PATHS])
+def test_the_page_has_every_step_of_every_path(path: dict) -> None:
+    for step in path["steps"]:
+        if not (step["added"] or step is path["steps"][0]):
+            continue
+        test = step["test"]
+        cells = [
+            f"{short(test['forward']['location'], 3)} / {short(test['forward']['angle'], 3)}",
+            f"{short(test['forward_mean']['location'], 3)} / {short(test['forward_mean']['angle'], 3)}",
+            f"{test['log_likelihood']:.2f}",
+        ]
+        (row,) = (line for line in PAGE.splitlines() if f"| {' | '.join(cells)} |" in line)
+        for effect in step["added"]:
+            assert f"`{effect['effect']}`" in row
+            for value in effect["coefficient"]:
+                assert short(float(f"{value:.3g}"), 3 if abs(value) < 1 else 2).rstrip("0") in row
+
+
+def test_the_page_counts_the_faults_that_were_found(benchmark) -> None:
+    from truck_planted import FAULTS, is_right
+
+    for fault, about in FAULTS.items():
+        (row,) = (line for line in PAGE.splitlines() if line.startswith(f"| {about.text} |"))
+        for share in (1.0, 0.5):
+            runs = [record for record in PLANTED if (record["fault"], record["share"]) == (fault, share)]
+            if runs:
+                assert f"{sum(map(is_right, runs))} of {len(runs)}" in row
