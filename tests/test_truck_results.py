@@ -58,7 +58,9 @@ def test_gains_are_of_the_same_draws(program: str, other: str) -> None:
 
 def test_what_is_left_to_the_networks_is_the_mean_of_five_draws() -> None:
     for program in ("network", "hybrid"):
-        left = [statistics.fmean(values) for values in zip(*(run["network"]["network"] for run in of(program)), strict=True)]
+        left = [
+            statistics.fmean(values) for values in zip(*(run["network"]["network"] for run in of(program)), strict=True)
+        ]
         assert ", ".join(short(value, 2) for value in left[:2]) + " m/s²" in PAGE
         assert f"{short(left[2], 2)} rad/s²" in PAGE
 
