@@ -439,7 +439,7 @@ def test_dense_is_the_layer_whatever_the_layout(left):
 
 
 def test_the_discovered_truck_is_the_hand_written_one_with_effects_of_the_catalogue() -> None:
-    """Each equation is the catalogue's, found by name on the path that `make truck` prints."""
+    """Each equation is the catalogue's, found by name on the paths of the draws 11 and 12."""
     found, built = example("discovered_truck.py"), example("truck")
     values = {name: getattr(found, name).detach() for name in ("speed_gain", "turn_gain", "limit", "noise")}
     for name, value in values.items():

@@ -220,8 +220,8 @@ def _notes(found: Search, is_fitted: bool) -> list[str]:
         notes.append(f"the run had not converged on these drives: {gained:.0f} nats were gained by fitting it further")
     if isinstance(found.base.fitting, ByDraws):
         notes.append(
-            "the linearised program's log p(y) is off by more than half a nat a drive: fits are gradient steps on "
-            "draws, judged by particles, and whether they have converged is not tested"
+            "the linearised program's log p(y) is off by more than half a nat a drive, or cannot be judged: fits are "
+            "gradient steps on draws, judged by particles, and whether they have converged is not tested"
         )
     constant = unexcited(found.base.program, found.base.folds[0].drives)
     if constant:

@@ -55,11 +55,20 @@ class Fitting(Protocol):
         information: Tensor | None = None,
         hopeless: float = -math.inf,
     ) -> Maximum:
-        """Move a program's parameters, in place, see `maximise`."""
+        """Move a program's parameters, in place.
+
+        Args:
+            path: to linearise along at first, found when not given.
+            known_start: the drives' first states are exact.
+            information, hopeless: those of `maximise`, by which scoring steps begin and give up; nothing for draws.
+
+        Raises:
+            FilterError: the program cannot follow the drives.
+        """
         ...
 
     def judge(self, program: Program, drives: Trajectories, path: Path, *, known_start: bool) -> Judged:
-        """Log p(y) of drives."""
+        """Log p(y) of drives, linearised along a path that is improved from here."""
         ...
 
 
@@ -142,7 +151,8 @@ class ByDraws:
 
 
 def is_doubtful(program: Program, drives: Trajectories, path: Path, known_start: bool) -> bool:
-    """Whether the linearised program's log p(y) is off by more than half a nat a drive."""
+    """Whether the linearised program's log p(y) is off by more than half a nat a drive, or no particle filter that it
+    leads can follow these drives to say so."""
     ahead = _at_rest(program, drives, path, known_start)
     try:
         with seeded(0, "judge"):
