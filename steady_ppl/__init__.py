@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from steady_ppl.program_file import load_program
     from steady_ppl.proof_pictures import open_loop_picture
     from steady_ppl.proving import Proof, prove
+    from steady_ppl.reporting import Report, report
     from steady_ppl.seeding import seeded
     from steady_ppl.simulation import simulate
     from steady_ppl.smoother_guide import SmootherGuide
@@ -71,6 +72,7 @@ _HOMES = {
     "program_file": ("load_program",),
     "proof_pictures": ("open_loop_picture",),
     "proving": ("Proof", "prove"),
+    "reporting": ("Report", "report"),
     "seeding": ("seeded",),
     "simulation": ("simulate",),
     "smoother_guide": ("SmootherGuide",),

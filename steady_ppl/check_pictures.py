@@ -55,30 +55,37 @@ def predictions(found: Check, drive: int, component: int, axes: Axes) -> None:
     """Measured against the nearest and the farthest prediction, with 90 % bands."""
     data = found.data
     time = data.elapsed[:, drive].numpy(force=True)
-    seen = data.observed[:, drive, component].numpy(force=True)
-    measured = np.where(seen, data.measurements[:, drive, component].double().numpy(force=True), np.nan)
     last = list(found.horizons)[-1]
     for name, color in {"one step": NEAR, last: FAR}.items():
-        horizon = found.horizons[name]
         if name == last and len(found.horizons) == 1:
             continue
-        prediction = found.predictions[horizon]
-        error = prediction.error[:, drive, component].numpy(force=True)
-        there = prediction.observed[:, drive, component].numpy(force=True)
-        center = np.where(there, measured[horizon:] - error, np.nan)
-        half = 1.645 * np.sqrt(np.where(there, prediction.variance[:, drive, component].numpy(force=True), np.nan))
-        center = _broken(center, half)
-        axes.fill_between(time[horizon:], center - half, center + half, color=color, alpha=0.18, lw=0)
-        axes.plot(time[horizon:], center, color=color, lw=1, label=f"{name} ahead, 90 % band")
-    axes.plot(time, measured, ".", color=MEASURED, ms=3, label="measured")
+        middle, half = (values[:, drive, component] for values in band(found, name))
+        axes.fill_between(time, middle - half, middle + half, color=color, alpha=0.18, lw=0)
+        axes.plot(time, middle, color=color, lw=1, label=f"{name} ahead, 90 % band")
+    axes.plot(time, measured(found)[:, drive, component], ".", color=MEASURED, ms=3, label="measured")
     name, unit = names(found.program.measurements)[component], units(found.program.measurements)[component]
     axes.set_ylabel(f"{name} [{unit}]" if unit else name, fontsize=8)
 
 
-def _broken(values: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """A line that does not cross the whole circle where an angle comes round."""
-    jumps = np.abs(np.diff(values, prepend=values[:1])) > np.maximum(np.pi, 3 * np.nan_to_num(half))
-    return np.where(jumps, np.nan, values)
+def measured(found: Check) -> np.ndarray:
+    """What was measured, `(T + 1, B, K)`, NaN where it was not."""
+    data = found.data
+    return np.where(data.observed.numpy(force=True), data.measurements.double().numpy(force=True), np.nan)
+
+
+def band(found: Check, horizon: str) -> tuple[np.ndarray, np.ndarray]:
+    """The middle of the predictions so far ahead and half the width of their 90 % bands, `(T + 1, B, K)` each.
+
+    NaN where nothing was measured, and where a line would cross the whole circle because an angle comes round.
+    """
+    rows = found.horizons[horizon]
+    prediction = found.predictions[rows]
+    there = prediction.observed.numpy(force=True)
+    middle, half = np.full((2, *found.data.measurements.shape), np.nan)
+    middle[rows:] = np.where(there, measured(found)[rows:] - prediction.error.numpy(force=True), np.nan)
+    half[rows:] = 1.645 * np.sqrt(np.where(there, prediction.variance.numpy(force=True), np.nan))
+    jumps = np.abs(np.diff(middle, axis=0, prepend=middle[:1])) > np.maximum(np.pi, 3 * np.nan_to_num(half))
+    return np.where(jumps, np.nan, middle), half
 
 
 def where_and_when(found: Check, axes: Axes) -> None:

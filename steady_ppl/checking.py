@@ -52,6 +52,7 @@ class Check:
         misfit: the maps; every cell with its residual.
         blame: who is at fault.
         residuals: names of the measurement components and, after them, of the channels.
+        standardised: the residuals themselves, one set, with the variables that the regimes are ranges of.
         stuck: stretches of the table in which nothing was measured though something is written.
         notes: what was left out.
     """
@@ -66,6 +67,7 @@ class Check:
     misfit: Misfit
     blame: Blame
     residuals: list[str]
+    standardised: Residuals
     stuck: list[Stretch]
     notes: list[str]
 
@@ -141,6 +143,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         misfit=misfit,
         blame=blame(scores, _scatter(ours, theirs), misfit.p_value),
         residuals=list(ours.names),
+        standardised=ours,
         stuck=stuck(data),
         notes=notes,
     )

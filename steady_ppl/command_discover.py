@@ -38,7 +38,7 @@ def discover(
     from steady_ppl.discovery import discover as search
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
-    from steady_ppl.run_folder import run_folder
+    from steady_ppl.run_folder import DISCOVERY, run_folder
     from steady_ppl.run_recipe import fingerprint
     from steady_ppl.table import read_table
 
@@ -67,6 +67,7 @@ def discover(
         if out is not None:
             used = {"table_sha256": fingerprint(drives), "valid_sha256": fingerprint(judges) if judges else None}
             found.after.save_into(out, begun=used)
+            write_json(out / DISCOVERY, {"source": source, **found.figures})
     if out is not None:
         for note in found.after.notes:
             say(note)

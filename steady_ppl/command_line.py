@@ -14,7 +14,15 @@ from typing import Annotated, Any
 
 import typer
 
-from steady_ppl import command_check, command_demo, command_discover, command_effects, command_prove
+from steady_ppl import (
+    command_check,
+    command_demo,
+    command_discover,
+    command_effects,
+    command_init,
+    command_prove,
+    command_report,
+)
 from steady_ppl.command_parts import program_from, require_folder, run_labels, say, used_before, write_json
 from steady_ppl.errors import SteadyError, UsageError
 
@@ -36,7 +44,9 @@ app.command()(command_demo.demo)
 app.command()(command_discover.discover)
 app.command()(command_effects.add)
 app.command()(command_effects.effects)
+app.command()(command_init.init)
 app.command()(command_prove.prove)
+app.command()(command_report.report)
 
 
 class Device(StrEnum):

@@ -18,8 +18,8 @@ from typing import Any
 from steady_ppl.command_tour import WIDTH, Tour
 from steady_ppl.errors import ComputationError, RunError, UsageError
 from steady_ppl.program_file import load_program
+from steady_ppl.rooms import workbench
 from steady_ppl.run_folder import read_record
-from steady_ppl.run_recipe import recipe_folder
 
 RECORD = "demo.json"  # of a demonstration; a folder without one is not a demonstration's
 OWNERS, TRUTH = "models/hovercraft.py", "models/hovercraft.py:HovercraftTruth"
@@ -82,13 +82,14 @@ def demonstrate(
         grown = add(tour, effects)
         fit_again(tour, size, grown)
         prove(tour)
+        report(tour, size)
         say(
             textwrap.fill(
                 f"What had been hidden: {load_program(TRUTH)}.", WIDTH, initial_indent="\n   ", subsequent_indent="   "
             )
         )
         _write_record({"status": "finished", "seconds": round(tour.seconds, 1), "steps": tour.steps})
-    say(f"\n{out}: check, discovery and proof as .png, .txt and .json; drives; runs; {grown}")
+    say(f"\n{out}: report.html; check, discovery and proof as .png, .txt and .json; drives; runs; {grown}")
     say(f"{tour.seconds:.0f} s in all")
     return tour.steps
 
@@ -175,6 +176,13 @@ def prove(tour: Tour) -> None:
         tour.say(f"     {line}")
 
 
+def report(tour: Tour, size: Size) -> None:
+    """Everything on one page."""
+    tour.step("See it: everything on one page")
+    tour.steady(f"report runs/before runs/after test.csv --discovery runs/found{size.calibration} --out report.html")
+    tour.result("report.html: open it in a browser, it needs no network.")
+
+
 def summary(figures: Mapping[str, Any]) -> list[str]:
     """A few columns of the proof's figures, as aligned lines: log p(y), errors of the measurements and of the first
     error group of the states, and the channel whose noise had to be largest for what was missing."""
@@ -206,7 +214,7 @@ def _open(out: Path, force: bool) -> None:
     """Make the folder, mark it as a demonstration's, and put the owner's program there."""
     if out.exists() and not force and not (out / RECORD).is_file():
         raise RunError(f"{out} exists and is no demo's: choose another folder, or --force to write into it")
-    source = recipe_folder().parent / OWNERS
+    source = workbench() / OWNERS
     try:
         (out / "models").mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, out / OWNERS)

@@ -12,13 +12,14 @@ from typing import Any
 from steady_ppl.checkpoint import read_tensors
 from steady_ppl.errors import RunError
 
-PARAMETERS, RECORD, POSTERIOR, CHECKPOINT = (
+PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY = (
     "parameters.safetensors",
     "run.json",
     "posterior.nc",
     "checkpoint.safetensors",
+    "discovery.json",
 )
-FILES = (PARAMETERS, RECORD, POSTERIOR, CHECKPOINT)
+FILES = (PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY)
 ASIDE = "previous"
 
 
@@ -117,3 +118,21 @@ def read_record(folder: Path) -> dict[str, Any]:
     if not (isinstance(record, dict) and {"program", "recipe", "status"} <= record.keys()):
         raise RunError(f"{folder / RECORD} is damaged: it says neither program nor recipe")
     return record
+
+
+def read_discovery(source: Path) -> dict[str, Any] | None:
+    """What `discover` said when it made this run, or in this file; None where there is nothing.
+
+    Raises:
+        RunError: the file is damaged.
+    """
+    file = source / DISCOVERY if source.is_dir() else source
+    if not file.is_file():
+        return None
+    try:
+        found = json.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise RunError(f"{file} is damaged: {error}") from error
+    if not (isinstance(found, dict) and {"sentence", "candidates", "effects"} <= found.keys()):
+        raise RunError(f"{file} is not what `steady discover` writes: it has neither verdict nor candidates")
+    return found

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
-import sysconfig
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from steady_ppl.errors import RunError, UsageError, require
 from steady_ppl.fit import Fit, program_source, sha256, versions
 from steady_ppl.program import Program, for_program
 from steady_ppl.program_file import run_file
+from steady_ppl.rooms import workbench
 from steady_ppl.run_folder import CHECKPOINT, read_record, run_folder, write_record
 
 Recipe = Callable[..., Fit]
@@ -25,11 +25,7 @@ Recipe = Callable[..., Fit]
 
 def recipe_folder() -> Path:
     """`inference/` of the checkout, else the copy that the wheel carries."""
-    here = Path(__file__).resolve().parent
-    for folder in (here.parent / "inference", here / "workbench" / "inference"):
-        if (folder / "steady.py").is_file():
-            return folder
-    raise UsageError(f"the recipes are missing from this installation ({sysconfig.get_path('purelib')})")
+    return workbench() / "inference"
 
 
 def _require_kind(recipe: Recipe, option: str, value: Any) -> None:

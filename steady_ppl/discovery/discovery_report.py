@@ -83,6 +83,7 @@ def _candidate(found: Discovery, tested: Tested) -> dict[str, Any]:
         "statistic": tested.statistic,
         "p_value": tested.p_value,
         **_one_step(tested),
+        "absent": _finite(variant.effect.null),
         "unit": variant.unit,
         "options": {name: _plain(value) for name, value in variant.profiled.items()},
         "detection_limit": _numbers(limit_of(found, tested)),

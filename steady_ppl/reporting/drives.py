@@ -1,0 +1,121 @@
+"""What a report shows of drives, row by row: measured, predicted, posterior states and, where known, the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from steady_ppl.check_pictures import band, measured
+from steady_ppl.checking import Check
+from steady_ppl.data import Trajectories
+from steady_ppl.fit import Fit
+from steady_ppl.program import Program, names, units
+from steady_ppl.reporting.packing import packed
+
+NUMBERS = 300_000  # of all drives and runs: .8 MB of text
+QUANTILES = (0.05, 0.5, 0.95)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Which drives a report has row by row.
+
+    Attributes:
+        drives: their numbers, in the table's order.
+        every: one row of so many.
+        total: how many drives the table has.
+    """
+
+    drives: list[int]
+    every: int
+    total: int
+
+    @property
+    def note(self) -> str | None:
+        """What is left out, in words."""
+        said = []
+        if len(self.drives) < self.total:
+            said.append(f"{len(self.drives)} of {self.total} drives, those with the strongest misfits")
+        if self.every > 1:
+            said.append(f"every {self.every}th row")
+        return f"The curves show {' and '.join(said)}; the maps and figures are of all." if said else None
+
+    def of(self, values: Any) -> dict[str, Any]:
+        """`(rows, B, ·)` as `(drives, ·, rows)`, packed."""
+        return packed(np.asarray(values)[:: self.every, self.drives].transpose(1, 2, 0))
+
+
+def chosen(checks: list[Check], numbers: int = NUMBERS) -> Shown:
+    """As many drives as there is room for, those whose strips stand out most in any run first."""
+    first = checks[0]
+    rows, count = first.data.time.shape
+    columns = sum(2 * _horizons(one) * len(one.residuals) + 3 * len(names(one.program.states)) for one in checks) + 10
+    every = max(1, -(-rows * columns // numbers))
+    room = max(1, numbers // (-(-rows // every) * columns))
+    worst = np.zeros(count)
+    for one in checks:
+        for i, cell in enumerate(one.misfit.cells):
+            if cell.map == "drive and time":
+                drive = cell.where["drive"]
+                worst[drive] = max(worst[drive], abs(one.misfit.z[i]))
+    order = np.argsort(-worst, kind="stable")[:room]
+    return Shown(sorted(int(i) for i in order), every, count)
+
+
+def _horizons(found: Check) -> int:
+    return min(2, len(found.horizons))
+
+
+def given(found: Check, table: Trajectories, shown: Shown) -> dict[str, Any]:
+    """What is the same for every run: time, measurements, controls and, where the table has it, the truth."""
+    program, data = found.program, found.data
+    truth = table.select(names(program.controls), names(program.measurements), names(program.states)).states
+    known = truth is not None and bool(torch.isfinite(truth[1:]).any())
+    return {
+        "labels": [data.labels[i] for i in shown.drives],
+        "time": shown.of(_inside(data, data.elapsed.unsqueeze(-1))),
+        "measured": shown.of(measured(found)),
+        "measurements": _components(program.measurements),
+        "controls": shown.of(_inside(data, data.controls)),
+        "controlNames": _components(program.controls),
+        "truth": shown.of(truth.numpy(force=True)) if truth is not None and known else None,
+    }
+
+
+def of_run(found: Check, fit: Fit, shown: Shown, *, draws: int, seed: int) -> dict[str, Any]:
+    """Predictions with their bands, and quantiles of the posterior of the states given all measurements."""
+    horizons = list(dict.fromkeys(["one step", list(found.horizons)[-1]]))
+    data = found.data.subset(shown.drives)
+    posterior = fit.posterior(data, draws=draws, seed=seed)["posterior"]
+    states = names(found.program.states)
+    quantiles = np.stack([posterior[name].quantile(QUANTILES, ("chain", "draw")).values for name in states], -1)
+    low, middle, high = (Shown(list(range(len(data))), shown.every, len(data)).of(q.swapaxes(0, 1)) for q in quantiles)
+    return {
+        "predictions": [
+            {"ahead": name, "middle": shown.of(middle), "half": shown.of(half)}
+            for name in horizons
+            for middle, half in [band(found, name)]
+        ],
+        "states": _components(found.program.states),
+        "posterior": {"low": low, "middle": middle, "high": high},
+        "plane": plane(found.program),
+    }
+
+
+def plane(program: Program) -> list[int]:
+    """Two state components that make a map: a pair that errors are counted together for, else a phase plane."""
+    order = names(program.states)
+    pairs = [tuple(group) for group in program.error_groups.values() if len(group) == 2]
+    pairs += [tuple(pair) for pair in program.motion.values()] + [order[:2]]
+    return [order.index(name) for name in next(pair for pair in pairs if all(name in order for name in pair))]
+
+
+def _components(declared: Any) -> list[dict[str, str]]:
+    return [{"name": name, "unit": unit} for name, unit in zip(names(declared), units(declared), strict=True)]
+
+
+def _inside(data: Trajectories, values: torch.Tensor) -> np.ndarray:
+    return np.where(data.rows.unsqueeze(-1).numpy(force=True), values.numpy(force=True), np.nan)

@@ -1,0 +1,130 @@
+"""Gather what a page says: of every run a check, of two or more a proof, and what `discover` found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from steady_ppl.checking import Check, check
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import SteadyError, UsageError
+from steady_ppl.fit import Fit
+from steady_ppl.proving import Proof, prove
+from steady_ppl.reporting.drives import Shown, chosen, given, of_run
+from steady_ppl.reporting.maps import maps
+from steady_ppl.reporting.writing import html, write_page
+
+
+@dataclass(frozen=True)
+class Report:
+    """A page and what it is made of.
+
+    Attributes:
+        title: of the page.
+        fits, checks: by the runs' labels.
+        proof: of the runs against the first one, or why there is none.
+        discovery: the figures of `discover`, if there are any.
+        shown: the drives that the page has row by row.
+        drives: what is shown of them, and of each run's predictions and states.
+        how: lines that say how to repeat it.
+        notes: what a reader must know before believing it.
+    """
+
+    title: str
+    fits: Mapping[str, Fit]
+    checks: Mapping[str, Check]
+    proof: Proof | str
+    discovery: Mapping[str, Any] | None
+    shown: Shown
+    drives: Mapping[str, Any]
+    how: Sequence[str]
+    notes: Sequence[str] = field(default_factory=list)
+
+    @property
+    def html(self) -> str:
+        """The page, whole: style, scripts and data are in it."""
+        return html(self)
+
+    def write(self, path: str | Path) -> None:
+        """Write the page whole or not at all.
+
+        Raises:
+            UsageError: the file cannot be written.
+        """
+        write_page(self.html, Path(path))
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        return f'<iframe srcdoc="{escape(self.html)}" style="width:100%;height:40em;border:0"></iframe>'
+
+
+def report(
+    runs: Mapping[str, Fit],
+    data: Trajectories,
+    *,
+    discovery: Mapping[str, Any] | None = None,
+    title: str = "steady report",
+    how: Sequence[str] = (),
+    notes: Sequence[str] = (),
+    simulations: int = 100,
+    draws: int = 50,
+    seed: int = 0,
+) -> Report:
+    """Say on one page what fitted programs explain of some drives, where they fail and what they lack.
+
+    Args:
+        runs: label → fit, the one before first.
+        data: drives, best those that no run has used. Their true states, where the table has them, are drawn and used
+            for nothing else.
+        discovery: `discover(…).figures`; the page says how to come by them when not given.
+        title: of the page.
+        how: commands that lead here.
+        notes: shown above everything else.
+        simulations: sets of drives simulated for the bands of each run's `check`.
+        draws: of the posterior of each run's states.
+        seed: of simulations, draws and resampling.
+
+    Raises:
+        UsageError: no run, or a program whose noise is not normal.
+        DataError: nothing to compare, or no known start.
+        FilterError: a linearised program broke down.
+
+    Example:
+        >>> import steady_ppl as st  # doctest: +SKIP
+        >>> runs = {name: st.Fit.load(f"runs/{name}") for name in ("before", "after")}  # doctest: +SKIP
+        >>> st.report(runs, st.read_table("test.csv")).write("report.html")  # doctest: +SKIP
+    """
+    if not runs:
+        raise UsageError("a report needs at least one run")
+    checks = {label: check(fit, data, simulations=simulations, seed=seed) for label, fit in runs.items()}
+    shown = chosen(list(checks.values()))
+    first = next(iter(checks.values()))
+    drives = given(first, data, shown) | {
+        "runs": [
+            {"label": label, **of_run(checks[label], fit, shown, draws=draws, seed=seed), **maps(checks[label])}
+            for label, fit in runs.items()
+        ]
+    }
+    return Report(
+        title=title,
+        fits=dict(runs),
+        checks=checks,
+        proof=_proof(runs, data, seed),
+        discovery=discovery,
+        shown=shown,
+        drives=drives,
+        how=list(how),
+        notes=list(notes),
+    )
+
+
+def _proof(runs: Mapping[str, Fit], data: Trajectories, seed: int) -> Proof | str:
+    if len(runs) < 2:
+        return "There is one run only: name the run before and the one after to compare them."
+    try:
+        return prove(runs, data, seed=seed)
+    except SteadyError as error:
+        return f"The runs cannot be compared: {error}."

@@ -1,0 +1,121 @@
+"""The page as one file of HTML; nothing is loaded from anywhere when it is read."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from steady_ppl.check_report import strongest
+from steady_ppl.errors import UsageError
+from steady_ppl.fit import versions
+from steady_ppl.reporting.program_page import program_page
+
+if TYPE_CHECKING:
+    from steady_ppl.reporting.gathering import Report
+
+
+def html(found: Report) -> str:
+    """The page; whatever comes from a table or a program is escaped."""
+    rooms = Environment(
+        loader=PackageLoader("steady_ppl.reporting", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    rooms.filters |= {"number": number, "signed": signed, "interval": interval}
+    content = {
+        "title": found.title,
+        "notes": found.notes,
+        "checks": {label: {**one.figures} for label, one in found.checks.items()},
+        "strongest": {label: _linked(one, found, label) for label, one in found.checks.items()},
+        "proof": found.proof if isinstance(found.proof, str) else found.proof.figures,
+        "curves": {} if isinstance(found.proof, str) else _curves(found.proof),
+        "discovery": found.discovery,
+        "programs": [program_page(label, fit) for label, fit in found.fits.items()],
+        "shown": found.shown.note,
+        "how": found.how,
+        "versions": versions(),
+        "style": _asset("page.css"),
+        "script": _asset("page.js"),
+        "plotly": Markup(get_plotlyjs().replace("</script", "<\\/script")),
+    }
+    content["data"] = _data({**found.drives, "curves": content["curves"], "discovery": found.discovery})
+    return rooms.get_template("page.html").render(content)
+
+
+def write_page(text: str, path: Path) -> None:
+    """Write a page whole or not at all.
+
+    Raises:
+        UsageError: the file cannot be written.
+    """
+    beside = path.with_name(path.name + ".partial")
+    try:
+        beside.write_text(text, encoding="utf-8")
+        os.replace(beside, path)
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise UsageError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _linked(one: Any, found: Report, label: str) -> list[dict[str, Any]]:
+    """The strongest findings of a run, each with the address of its place on the page."""
+    run = list(found.checks).index(label)
+    by_text = {row["text"]: row["place"] for row in found.drives["runs"][run]["findings"]}
+    rows = []
+    for finding in strongest(one.figures["findings"]):
+        place = by_text[finding["text"]]
+        drive = found.shown.drives.index(place[0]) if place and place[0] in found.shown.drives else None
+        link = None if drive is None or place is None else f"#run={run}&drive={drive}&from={place[1]:g}&to={place[2]:g}"
+        rows.append({**finding, "link": link, "drive": one.data.labels[place[0]] if place else None})
+    return rows
+
+
+def _curves(proof: Any) -> dict[str, Any]:
+    """Root mean square error against the seconds ahead: of → row → pairs."""
+    curves: dict[str, dict[str, list[list[float]]]] = {}
+    for name, row in proof.rows.items():
+        for key, sums in sorted(row.sums.items(), key=lambda pair: pair[0].horizon):
+            if key.kind in ("measurement", "state") and sums.value:
+                of = f"measured [{key.of}]" if key.kind == "measurement" else key.of
+                curves.setdefault(of, {}).setdefault(name, []).append([key.horizon * proof.step, sums.value])
+    return curves
+
+
+def _asset(name: str) -> Markup:
+    return Markup((files("steady_ppl.reporting") / name).read_text(encoding="utf-8"))
+
+
+def _data(content: Mapping[str, Any]) -> Markup:
+    """JSON that cannot end the element that holds it."""
+    text = json.dumps(content, separators=(",", ":"), allow_nan=False)
+    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """A figure with so many digits, a list of them, or a dash."""
+    if value is None:
+        return "–"
+    if isinstance(value, list | tuple):
+        return ", ".join(number(one, digits) for one in value)
+    return (f"{value:.{digits}g}" if math.isfinite(value) else "–").replace("-", "−")
+
+
+def signed(value: float | None, digits: int = 1) -> str:
+    """A difference with its sign, or nothing."""
+    return "" if value is None else f"{value:+.{digits}f}".replace("-", "−")
+
+
+def interval(pair: Any, digits: int = 3) -> str:
+    """Both ends, or nothing."""
+    return "" if pair is None else f"[{number(pair[0], digits)}, {number(pair[1], digits)}]"
