@@ -148,7 +148,7 @@ def calibrated(logs: Path) -> Program:
         parts |= {f"train{draw}": train, f"valid{draw}": valid}
     program = DiscoveredTruck().with_effect("response_time:yaw", 0.0)
     drives = joined(**parts).without_truth(keep_start=True)
-    settings = MECHANISTIC | {"guide": "lookahead", "first_weight": 1.0}
+    settings = MECHANISTIC | {"first_weight": 1.0}
     return steady.fit(program, drives, known_start=True, seed=0, progress=False, **settings).program
 
 
@@ -165,8 +165,8 @@ def is_right(record: dict[str, Any]) -> bool:
 def planted(logs: Path, fault: str, share: float, draw: int) -> dict[str, Any]:
     """What `discover` says of drives with a fault, by the truck as it was calibrated on the drives without.
 
-    The calibration has other draws of the bearings, but the same drives: there is one recording. A fault of the first
-    landmark's bearing or of a clock is in the simulated bearings alone; one of the commands is in the recorded ones.
+    The calibration has other draws of the bearings, but the same drives: there is one recording. Faults of a
+    landmark and of the bearings' stamps are in the simulated bearings alone, those of commands in the recorded ones.
     """
     torch.set_num_threads(1)
     program = calibrated(logs)

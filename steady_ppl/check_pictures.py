@@ -137,10 +137,11 @@ def regime_panel(found: Check, axes: Axes) -> None:
     axes.set_xlabel(f"{variable} [{unit}]" if unit else variable, fontsize=8)
     axes.set_ylabel("simulated sd", fontsize=8)
     what = "in which regime" if stand_out else "strongest regime, not significant"
-    axes.set_title(f"{what}: mean residual of {_subject(found, strongest.residual)} (grey: ±2)", fontsize=9)
+    axes.set_title(f"{what}: mean residual of {subject(found, strongest.residual)} (grey: ±2)", fontsize=9)
 
 
-def _subject(found: Check, residual: int) -> str:
+def subject(found: Check, residual: int) -> str:
+    """What a residual is of, in words."""
     name = found.residuals[residual]
     return name if residual < len(names(found.program.measurements)) else f"{name} acceleration"
 

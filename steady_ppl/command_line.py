@@ -23,7 +23,7 @@ from steady_ppl import (
     command_prove,
     command_report,
 )
-from steady_ppl.command_parts import program_from, require_folder, run_labels, say, used_before, write_json
+from steady_ppl.command_parts import load_runs, program_from, require_folder, run_labels, say, used_before, write_json
 from steady_ppl.errors import SteadyError, UsageError
 
 WORDS = {"true": True, "false": False, "none": None}
@@ -198,7 +198,6 @@ def evaluate(
 ) -> None:
     """The paper's errors where true states exist; errors in measurement space always."""
     from steady_ppl.evaluation import evaluate_all, incomparable, table_of
-    from steady_ppl.fit import Fit
     from steady_ppl.program_file import load_program
     from steady_ppl.run_recipe import fingerprint
     from steady_ppl.table import read_table
@@ -208,10 +207,7 @@ def evaluate(
     require_folder(json_file)
     *runs, table = arguments
     labels = run_labels(runs)
-    if program and len(program) != len(runs):
-        raise UsageError(f"--program is given {len(program)} times for {len(runs)} runs: name one for each, in order")
-    sources: list[str | None] = [*program] if program else [None] * len(runs)
-    fits = [Fit.load(run, source) for run, source in zip(runs, sources, strict=True)]
+    fits = list(load_runs(labels, program).values())
     drives = read_table(table)
     true_map = load_program(surveyed) if surveyed else None
     settings: dict[str, Any] = {"particles": particles, "rollouts": rollouts, "seed": seed, "surveyed": true_map}

@@ -63,6 +63,22 @@ def run_labels(runs: Sequence[Path], taken: Collection[str] = ()) -> dict[str, P
     return labels
 
 
+def load_runs(labels: Mapping[str, Path], programs: Sequence[str] | None) -> dict[str, Any]:
+    """The fits of runs by label, with the programs that `--program` names, one for each, or their own.
+
+    Raises:
+        UsageError: another number of programs than of runs.
+    """
+    from steady_ppl.fit import Fit
+
+    if programs and len(programs) != len(labels):
+        raise UsageError(
+            f"--program is given {len(programs)} times for {len(labels)} runs: name one for each, in order"
+        )
+    sources: Sequence[str | None] = programs or [None] * len(labels)
+    return {label: Fit.load(run, source) for (label, run), source in zip(labels.items(), sources, strict=True)}
+
+
 def used_before(runs: Mapping[str, Path], table: str) -> list[str]:
     """Which runs, by label, have already learned from the table of this fingerprint."""
     from steady_ppl.run_folder import read_record

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,8 +26,14 @@ def prove(
     seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
 ) -> None:
     """Prove that runs are better than the first one: log p(y), open-loop errors and noise, with paired intervals."""
-    from steady_ppl.command_parts import program_from, require_folder, run_labels, used_before, write_json
-    from steady_ppl.fit import Fit
+    from steady_ppl.command_parts import (
+        load_runs,
+        program_from,
+        require_folder,
+        run_labels,
+        used_before,
+        write_json,
+    )
     from steady_ppl.picture_files import require_picture, write_picture
     from steady_ppl.proving import prove as judge
     from steady_ppl.run_recipe import fingerprint
@@ -40,12 +45,7 @@ def prove(
     require_picture(picture)
     require_folder(json_file)
     labels = run_labels(runs, taken={"oracle", "truth"}) | ({"oracle": oracle} if oracle else {})
-    if program and len(program) != len(labels):
-        raise UsageError(f"--program is given {len(program)} times for {len(labels)} runs: name one for each, in order")
-    sources: Sequence[str | None] = program or [None] * len(labels)
-    rows: dict[str, Any] = {
-        label: Fit.load(run, source) for (label, run), source in zip(labels.items(), sources, strict=True)
-    }
+    rows: dict[str, Any] = load_runs(labels, program)
     if truth is not None:
         rows["truth"] = program_from(truth, seed)
     drives = read_table(table)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -33,8 +33,7 @@ def report(
 
     What `steady discover … --out RUN` found is shown if one of the runs is such a RUN. The page needs no network.
     """
-    from steady_ppl.command_parts import require_folder, run_labels, used_before
-    from steady_ppl.fit import Fit
+    from steady_ppl.command_parts import load_runs, require_folder, run_labels, used_before
     from steady_ppl.reporting import report as gather
     from steady_ppl.run_folder import read_discovery
     from steady_ppl.run_recipe import fingerprint
@@ -47,10 +46,7 @@ def report(
         raise UsageError(f"{out}: expected a page's name that ends in .html")
     require_folder(out)
     labels = run_labels(runs)
-    if program and len(program) != len(labels):
-        raise UsageError(f"--program is given {len(program)} times for {len(labels)} runs: name one for each, in order")
-    sources: list[Any] = [*program] if program else [None] * len(labels)
-    fits = {label: Fit.load(run, source) for (label, run), source in zip(labels.items(), sources, strict=True)}
+    fits = load_runs(labels, program)
     drives = read_table(table)
     found = [one for run in labels.values() if (one := read_discovery(run)) is not None]
     if discovery is not None and (given := read_discovery(discovery)) is None:

@@ -18,11 +18,11 @@ from typing import Any
 from steady_ppl.command_tour import WIDTH, Tour
 from steady_ppl.errors import ComputationError, RunError, UsageError
 from steady_ppl.program_file import load_program
-from steady_ppl.rooms import workbench
+from steady_ppl.rooms import TRUTH, workbench
 from steady_ppl.run_folder import read_record
 
 RECORD = "demo.json"  # of a demonstration; a folder without one is not a demonstration's
-OWNERS, TRUTH = "models/hovercraft.py", "models/hovercraft.py:HovercraftTruth"
+OWNERS = "models/hovercraft.py"
 BEGINNING = (
     "A hovercraft whose owner's program knows no drag. What it did is known only by noisy bearings to four landmarks, "
     "the controls, and where each drive began (--known-start: exactly, as in the paper)."

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from steady_ppl.check_pictures import subject
 from steady_ppl.check_report import place, sentence, unit_of
 from steady_ppl.checking import Check
 from steady_ppl.misfit_maps import Cell
@@ -18,7 +19,7 @@ Place = tuple[int, float, float]  # drive, and from when to when
 def maps(found: Check) -> dict[str, Any]:
     """The strips (residual × drive × time), the regimes (residual × range) and the findings, strongest first."""
     return {
-        "residuals": [_subject(found, i) for i in range(len(found.residuals))],
+        "residuals": [subject(found, i) for i in range(len(found.residuals))],
         "strips": _strips(found),
         "regimes": _regimes(found),
         "findings": [
@@ -26,11 +27,6 @@ def maps(found: Check) -> dict[str, Any]:
             for one in found.misfit.significant
         ],
     }
-
-
-def _subject(found: Check, residual: int) -> str:
-    name = found.residuals[residual]
-    return name if residual < len(names(found.program.measurements)) else f"{name} acceleration"
 
 
 def _strips(found: Check) -> dict[str, Any] | None:

@@ -33,11 +33,12 @@ def html(found: Report) -> str:
         lstrip_blocks=True,
     )
     rooms.filters |= {"number": number, "signed": signed, "interval": interval}
+    figures = {label: one.figures for label, one in found.checks.items()}
     content = {
         "title": found.title,
         "notes": found.notes,
-        "checks": {label: {**one.figures} for label, one in found.checks.items()},
-        "strongest": {label: _linked(one, found, label) for label, one in found.checks.items()},
+        "checks": figures,
+        "strongest": {label: _linked(one["findings"], found, label) for label, one in figures.items()},
         "proof": found.proof if isinstance(found.proof, str) else found.proof.figures,
         "curves": {} if isinstance(found.proof, str) else _curves(found.proof),
         "discovery": found.discovery,
@@ -68,16 +69,16 @@ def write_page(text: str, path: Path) -> None:
         raise UsageError(f"{path} cannot be written: {error.strerror}") from error
 
 
-def _linked(one: Any, found: Report, label: str) -> list[dict[str, Any]]:
+def _linked(findings: list[dict[str, Any]], found: Report, label: str) -> list[dict[str, Any]]:
     """The strongest findings of a run, each with the address of its place on the page."""
     run = list(found.checks).index(label)
     by_text = {row["text"]: row["place"] for row in found.drives["runs"][run]["findings"]}
     rows = []
-    for finding in strongest(one.figures["findings"]):
+    for finding in strongest(findings):
         place = by_text[finding["text"]]
         drive = found.shown.drives.index(place[0]) if place and place[0] in found.shown.drives else None
         link = None if drive is None or place is None else f"#run={run}&drive={drive}&from={place[1]:g}&to={place[2]:g}"
-        rows.append({**finding, "link": link, "drive": one.data.labels[place[0]] if place else None})
+        rows.append({**finding, "link": link, "drive": found.checks[label].data.labels[place[0]] if place else None})
     return rows
 
 
