@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from steady_ppl.actuation import delayed, lagged
     from steady_ppl.altering import Coloured, blurred, channel_means, heavy_tailed, misread, pushed, widened
+    from steady_ppl.arrays import from_arrays
     from steady_ppl.auto_rollout import AutoRollout
     from steady_ppl.checking import Check, check
     from steady_ppl.data import Trajectories
     from steady_ppl.discovery import Discovery, discover
+    from steady_ppl.dynamics import Dynamics
     from steady_ppl.errors import (
         DataError,
         FilterError,
@@ -43,7 +45,7 @@ if TYPE_CHECKING:
     from steady_ppl.seeding import seeded
     from steady_ppl.simulation import simulate
     from steady_ppl.smoother_guide import SmootherGuide
-    from steady_ppl.table import read_table, write_table
+    from steady_ppl.table import from_frame, read_table, to_frame, write_table
     from steady_ppl.tempering import Constant, LinearRamp
     from steady_ppl.training import Optimization, Trained, train
     from steady_ppl.validation import Validation
@@ -52,10 +54,12 @@ if TYPE_CHECKING:
 _HOMES = {
     "actuation": ("delayed", "lagged"),
     "altering": ("Coloured", "blurred", "channel_means", "heavy_tailed", "misread", "pushed", "widened"),
+    "arrays": ("from_arrays",),
     "auto_rollout": ("AutoRollout",),
     "checking": ("Check", "check"),
     "data": ("Trajectories",),
     "discovery": ("Discovery", "discover"),
+    "dynamics": ("Dynamics",),
     "errors": ("DataError", "FilterError", "ProgramError", "RunError", "SteadyError", "TrainingError", "UsageError"),
     "filtering": ("choose_filter", "log_likelihood", "neglected", "run_filter", "smoothed_states"),
     "fit": ("Fit",),
@@ -77,7 +81,7 @@ _HOMES = {
     "simulation": ("simulate",),
     "smoother_guide": ("SmootherGuide",),
     "tempering": ("Constant", "LinearRamp"),
-    "table": ("read_table", "write_table"),
+    "table": ("from_frame", "read_table", "to_frame", "write_table"),
     "training": ("Optimization", "Trained", "train"),
     "validation": ("Validation",),
     "variational_guides": ("VariationalGuide",),

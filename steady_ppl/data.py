@@ -6,6 +6,7 @@ time goes on at the last step, controls and measurements are zero, nothing is ob
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -128,6 +129,48 @@ class Trajectories:
         keep = (torch.arange(self.time.shape[0], device=self.time.device) % stride == 0)[:, None, None]
         return replace(self, observed=self.observed & keep)
 
+    def continued(self, controls: Tensor, step: float | None = None) -> Trajectories:
+        """The drives with rows after their ends in which nothing is measured: what is planned, to be forecast.
+
+        Args:
+            controls: `(H, U)` for all drives, or `(H, B, U)`; the first acts from each drive's last row on.
+            step: s between the new rows; the median step when None.
+
+        Raises:
+            DataError: other numbers of drives or controls than the table has, or no step forward in time.
+        """
+        step = self.median_step if step is None else step
+        plan = torch.as_tensor(controls).to(self.controls)
+        plan = plan.unsqueeze(1).expand(-1, len(self), -1) if plan.dim() == 2 else plan
+        if plan.dim() != 3 or not len(plan) or plan.shape[1:] != self.controls.shape[1:]:
+            raise DataError(
+                f"planned controls of shape {tuple(controls.shape)}: expected (rows, {self.controls.shape[-1]}) or "
+                f"(rows, {len(self)}, {self.controls.shape[-1]}), for {', '.join(self.control_names) or 'no control'}"
+            )
+        if not 0 < step < math.inf:
+            raise DataError(f"a step of {step} s leads nowhere")
+        later = step * torch.arange(1, len(plan) + 1, dtype=self.time.dtype, device=self.time.device)
+        ends = [int(length) for length in self.lengths]
+
+        def continued(values: Tensor, fill: float = 0.0) -> Tensor:
+            rest = values.new_full((len(plan), *values.shape[2:]), fill)
+            return pad([torch.cat([values[:end, b], rest]) for b, end in enumerate(ends)], fill)
+
+        def acting(drive: int, end: int) -> Tensor:
+            return torch.cat([self.controls[: end - 1, drive], plan[:, drive], plan.new_zeros(1, plan.shape[-1])])
+
+        return replace(
+            self,
+            time=pad_time(
+                [torch.cat([self.time[:end, b], self.time[end - 1, b] + later]) for b, end in enumerate(ends)]
+            ),
+            controls=pad([acting(drive, end) for drive, end in enumerate(ends)]),
+            measurements=continued(self.measurements),
+            observed=continued(self.observed, False),
+            lengths=self.lengths + len(plan),
+            states=None if self.states is None else continued(self.states, torch.nan),
+        )
+
     def without_truth(self, *, keep_start: bool = False) -> Trajectories:
         """Forget the true states, or all but each trajectory's first."""
         if not keep_start or self.states is None:
@@ -205,6 +248,6 @@ def pad_time(times: Sequence[Tensor]) -> Tensor:
     longest = max(len(time) for time in times)
     out = times[0].new_empty((longest, len(times)))
     for i, time in enumerate(times):
-        extra = torch.arange(1, longest - len(time) + 1, dtype=time.dtype)
+        extra = torch.arange(1, longest - len(time) + 1, dtype=time.dtype, device=time.device)
         out[:, i] = torch.cat([time, time[-1] + extra * (time[-1] - time[-2])])
     return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import inspect
 import os
@@ -26,6 +27,8 @@ from steady_ppl.training import Trained
 
 if TYPE_CHECKING:
     import arviz
+
+    from steady_ppl.dynamics import Dynamics
 
 
 @dataclass
@@ -65,6 +68,38 @@ class Fit:
             known_start=self.known_start,
             seed=seed,
         )
+
+    def forecast(
+        self,
+        data: Trajectories,
+        controls: torch.Tensor | None = None,
+        *,
+        after: float | None = None,
+        step: float | None = None,
+        draws: int = 200,
+        particles: int | None = None,
+        seed: int = 0,
+    ) -> arviz.InferenceData:
+        """What planned `controls` lead to, or what comes `after` so many seconds; see `steady_ppl.forecasting`."""
+        from steady_ppl.forecasting import forecast
+
+        return forecast(
+            self.program,
+            data,
+            controls=controls,
+            after=after,
+            step=step,
+            draws=draws,
+            particles=particles,
+            known_start=self.known_start,
+            seed=seed,
+        )
+
+    def dynamics(self, step: float | None = None) -> Dynamics:
+        """A copy of the learned dynamics as a plain torch module; `step` is the program's when not given."""
+        from steady_ppl.dynamics import Dynamics
+
+        return Dynamics(copy.deepcopy(self.program), self.program.step if step is None else step)
 
     def save(self, folder: str | Path, *, train: Trajectories | None = None, force: bool = False) -> None:
         """Write parameters, record and, with the training drives, posterior draws to a run folder.

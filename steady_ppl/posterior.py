@@ -45,13 +45,17 @@ def posterior(
 
     Returns:
         `posterior`: one variable a state component and one a noise site, over (chain, draw, trajectory, row), NaN past
-        a trajectory's end (the noise of row t acts from t to t + 1); `observed_data`: the measurements used;
-        `constant_data`: time, controls and, where known, the true states. Units are in each variable's attributes.
+        a trajectory's end (the noise of row t acts from t to t + 1); `sample_stats`: how many particles the filter had
+        in effect in each row, and how many of the first row's have descendants; `observed_data`: the measurements
+        used; `constant_data`: time, controls and, where known, the true states. Units are in each variable's
+        attributes.
     """
     run = for_program(program, data).observed_every(every)
     states: list[Tensor] = []
     noise: dict[str, list[Tensor]] = {}
     evidence: list[Tensor] = []
+    sizes: list[Tensor] = []
+    roots: list[Tensor] = []
     with seeded(seed, "posterior"):
         choice = choose_filter(program, run, known_start=known_start, particles=particles)
         for part in in_parts(run, choice.particles, look_ahead=choice.look_ahead):
@@ -65,6 +69,8 @@ def posterior(
             paths = filtered.paths(draws)
             states.append(paths.states)
             evidence.append(filtered.log_likelihood)
+            sizes.append(filtered.effective_sizes)
+            roots.append(filtered.roots)
             for site, value in paths.noise.items():
                 noise.setdefault(site, []).append(as_vector(value, paths.event_dims[site]))
     coordinates: dict[str, list | np.ndarray] = {
@@ -93,6 +99,7 @@ def posterior(
     about = {"program": type(program).__name__, "particles": choice.particles, "filter": choice.name}
     return arviz.InferenceData(
         posterior=xarray.Dataset(variables, coordinates, about),
+        sample_stats=_health(run, coordinates, torch.cat(sizes, 1), torch.cat(roots)),
         observed_data=_observed(program, run, coordinates),
         constant_data=_constants(program, run, coordinates, torch.cat(evidence)),
     )
@@ -105,6 +112,18 @@ def _draws(values: Tensor) -> np.ndarray:
 
 def _by_trajectory(values: Tensor) -> np.ndarray:
     return values.t().double().numpy(force=True).copy()
+
+
+def _health(data: Trajectories, coordinates: dict, sizes: Tensor, roots: Tensor) -> xarray.Dataset:
+    """Of the filter, over the one chain."""
+    inside = torch.where(data.rows, sizes.to(torch.float64), torch.nan)
+    return xarray.Dataset(
+        {
+            "effective_size": (("chain", "trajectory", "row"), _by_trajectory(inside)[None], {"units": "particles"}),
+            "roots": (("chain", "trajectory"), roots.double().numpy(force=True)[None], {"units": "particles"}),
+        },
+        {name: coordinates[name] for name in ("chain", "trajectory", "row")},
+    )
 
 
 def _observed(program: Program, data: Trajectories, coordinates: dict) -> xarray.Dataset:

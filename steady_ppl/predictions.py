@@ -12,6 +12,7 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.linearization import Path
 from steady_ppl.program import Program, acting_controls
+from steady_ppl.simulation import measure
 from steady_ppl.sites import AtMean, Observing, Recording, as_vector, residual, running
 from steady_ppl.stepping import Stepping
 from steady_ppl.tracking import Tracked
@@ -114,14 +115,11 @@ def simulate_again(program: Program, data: Trajectories, starts: Tensor, channel
         states.append(torch.where(data.transitions[row, :, None], moved, starts.to(moved)))
         noises.append(torch.where(data.transitions[row, :, None], noise, 0.0))
     path = torch.stack(states).flatten(1, 2)
-    seen = Recording()
-    with running(*path.shape[:-1]), seen:
-        program.observe(path)
-    drawn = [as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()]
+    drawn = measure(program, path)
     again = data.subset(torch.arange(drives).repeat(sets))
     known = torch.full_like(path, torch.nan)
     known[0] = path[0]
-    again = replace(again, measurements=torch.where(again.observed, torch.cat(drawn, -1), 0.0), states=known)
+    again = replace(again, measurements=torch.where(again.observed, drawn, 0.0), states=known)
     return again, Path(path, torch.stack(noises).flatten(1, 2))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import ProgramError
@@ -57,11 +58,7 @@ def simulate(
             states.append(state)
         path = torch.cat(states)
         _require_finite(program, path, run)
-        seen = Recording()
-        with running(rows, drives), seen:
-            program.observe(path)
-        parts = [as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()]
-        measurements = torch.cat(parts, -1)
+        measurements = measure(program, path)
     nothing = path.new_full((), torch.nan)
     return Trajectories(
         time=data.time,
@@ -77,7 +74,15 @@ def simulate(
     )
 
 
-def _require_finite(program: Program, path: torch.Tensor, data: Trajectories) -> None:
+def measure(program: Program, states: Tensor) -> Tensor:
+    """A draw of what the program measures in these states, `(..., K)` of `(..., D)`."""
+    seen = Recording()
+    with running(*states.shape[:-1]), seen:
+        program.observe(states)
+    return torch.cat([as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()], -1)
+
+
+def _require_finite(program: Program, path: Tensor, data: Trajectories) -> None:
     broken = (~path.isfinite().all(-1) & data.rows).nonzero()
     if len(broken):
         row, drive = broken[0].tolist()
