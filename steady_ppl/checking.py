@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.blame import SCATTER, Blame, blame, scored
-from steady_ppl.check_report import as_text, figures
+from steady_ppl.check_report import as_text, figures, verdict
 from steady_ppl.data import Trajectories
 from steady_ppl.directions import directions
 from steady_ppl.errors import DataError, FilterError, UsageError
@@ -37,7 +37,7 @@ PASSES = 4  # linearisations: beside a landmark the truth is far from the mode, 
 MOST = 4.0  # standard deviations of a single residual; beside a landmark the linearised program knows no more
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Check:
     """What `check` found.
 
@@ -78,6 +78,15 @@ class Check:
 
     def __str__(self) -> str:
         return as_text(self.figures)
+
+    def __repr__(self) -> str:
+        return f"Check({verdict(self)!r})"
+
+    def _repr_html_(self) -> str:
+        from steady_ppl.check_pictures import check_picture
+        from steady_ppl.display import of_result
+
+        return of_result(verdict(self), str(self), check_picture(self))
 
 
 @torch.no_grad()

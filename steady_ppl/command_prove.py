@@ -54,11 +54,7 @@ def prove(
     if json_file is not None:
         write_json(json_file, {"runs": {label: str(run) for label, run in labels.items()}, **found.figures})
     if picture is not None:
-        from matplotlib.figure import Figure
+        from steady_ppl.proof_pictures import proof_picture
 
-        from steady_ppl.proof_pictures import open_loop_picture
-
-        figure = Figure(figsize=(6, 4), layout="constrained")
-        open_loop_picture(found, axes=figure.subplots())
-        write_picture(figure, picture)
+        write_picture(proof_picture(found), picture)
     print(found)

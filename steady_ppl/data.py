@@ -58,6 +58,11 @@ class Trajectories:
             f"states {list(self.state_names) if self.states is not None else 'unknown'})"
         )
 
+    def _repr_html_(self) -> str:
+        from steady_ppl.display import of_trajectories
+
+        return of_trajectories(self)
+
     @property
     def rows(self) -> Tensor:
         """`(T + 1, B)` bool: the rows that belong to a trajectory, not to its padding."""

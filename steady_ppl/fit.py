@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from steady_ppl.dynamics import Dynamics
 
 
-@dataclass
+@dataclass(repr=False)
 class Fit:
     """A program with fitted parameters.
 
@@ -52,6 +52,14 @@ class Fit:
     known_start: bool = False
     trained: Trained | None = None
     notes: list[str] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        return f"Fit({self.program}, recipe={self.recipe!r})"
+
+    def _repr_html_(self) -> str:
+        from steady_ppl.display import of_fit
+
+        return of_fit(self)
 
     def posterior(
         self, data: Trajectories, *, draws: int = 100, particles: int | None = None, every: int = 1, seed: int = 0

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from steady_ppl.errors import UsageError
 from steady_ppl.program import units
@@ -54,6 +55,13 @@ def open_loop_picture(found: Proof, *, of: str | None = None, axes: Axes | None 
     axes.set_ylabel(f"{what}, root mean square error{f' [{unit}]' if unit else ''}")
     axes.legend(fontsize=8)
     return axes
+
+
+def proof_picture(found: Proof) -> Figure:
+    """The same as a figure of its own; made without pyplot's list of figures, so that nothing needs to be closed."""
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    open_loop_picture(found, axes=figure.subplots())
+    return figure
 
 
 def _curve(found: Proof, name: str, of: str) -> list[tuple[float, float]]:

@@ -21,7 +21,7 @@ from steady_ppl.fit import Fit
 from steady_ppl.paired_bootstrap import FEWEST
 from steady_ppl.predictions import named_horizons
 from steady_ppl.program import Program, names
-from steady_ppl.proof_report import FLOOR, as_text, figures
+from steady_ppl.proof_report import FLOOR, as_text, figures, verdict
 from steady_ppl.proof_rows import (
     SECONDS,
     Judged,
@@ -36,7 +36,7 @@ COASTING = "constant velocity"
 FAR_OFF = 2.0  # nats of a drive's log p(y) between a particle filter and the linearised program
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Proof:
     """What `prove` found.
 
@@ -67,6 +67,15 @@ class Proof:
 
     def __str__(self) -> str:
         return as_text(self.figures)
+
+    def __repr__(self) -> str:
+        return f"Proof({verdict(self)!r})"
+
+    def _repr_html_(self) -> str:
+        from steady_ppl.display import of_result
+        from steady_ppl.proof_pictures import proof_picture
+
+        return of_result(verdict(self), str(self), proof_picture(self))
 
 
 @torch.no_grad()

@@ -9,6 +9,7 @@ from functools import partial
 import pytest
 import torch
 from examples import example
+from matplotlib.figure import Figure
 from pyro.nn import PyroParam
 from small import finite
 from torch.distributions import constraints
@@ -23,6 +24,7 @@ from steady_ppl.discovery.refits import _led_back
 from steady_ppl.effects import Effect, chosen_variant, parsed
 from steady_ppl.effects.registry import _EFFECTS, register
 from steady_ppl.maximum_likelihood import maximise
+from steady_ppl.pictures import unknown_effect
 
 DRIVES, ROWS, SETS = 10, 81, 50
 
@@ -118,6 +120,9 @@ def test_what_no_effect_explains_is_a_curve():
     for point, height, band in zip(shape.points, shape.curve, shape.band, strict=True):
         assert abs(height + 0.12 * point) < 3 * band + 0.02
     assert found.figures["class"] == [] and found.figures["effect"] is None
+    axes = unknown_effect(found, axes=Figure().subplots())
+    (curve,) = (line for line in axes.get_lines() if line.get_label() == "curve")
+    assert curve.get_ydata().tolist() == pytest.approx(list(shape.curve)) and "yaw_rate [rad/s]" in axes.get_xlabel()
 
 
 def test_noise_that_is_not_the_declared_is_said_to_be():

@@ -9,13 +9,24 @@ import torch
 from examples import example
 from small import simulated
 
+from steady_ppl import Fit, UsageError, check
 from steady_ppl.posterior import posterior
+from steady_ppl.training import Trained
 
 matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 
-from steady_ppl.pictures import posterior_trajectories, posterior_velocities
+from steady_ppl.pictures import (
+    effective_sizes,
+    forecast_band,
+    held_out_curve,
+    innovations,
+    observation_noise,
+    particle_curve,
+    posterior_trajectories,
+    posterior_velocities,
+)
 
 
 @pytest.fixture(scope="module")
@@ -90,3 +101,75 @@ def test_velocities_are_those_of_the_body(drawn) -> None:
     for one, expected in zip(axes, (turned.real, turned.imag), strict=True):
         (line,) = (line for line in one.get_lines() if line.get_label() == "truth")
         np.testing.assert_allclose(line.get_ydata(), expected, atol=1e-6)
+
+
+def test_the_particle_curve_of_a_drive(drawn) -> None:
+    axes = effective_sizes(drawn, "2")
+    sizes = drawn["sample_stats"]["effective_size"].sel(trajectory="2", chain=0)
+    line = axes.get_lines()[0]
+    assert line.get_ydata().tolist() == sizes.values.tolist() and line.get_label() == "lookahead"
+    assert ((sizes > 1) & (sizes <= 30)).all() and axes.get_lines()[1].get_ydata()[0] == 30
+
+
+def test_a_forecast_is_a_band_after_what_was_used() -> None:
+    fit = Fit(example("hovercraft", torch.float32), "hand", known_start=True)
+    found = fit.forecast(simulated(rows=8), after=0.35, draws=20, particles=20)
+    axes = forecast_band(found, "1", "bearing_1")
+    assert axes.get_ylabel() == "bearing_1 [rad]" and labels(axes) == ["forecast, median", "used"]
+    median, used = axes.get_lines()
+    assert median.get_xdata().tolist() == pytest.approx([0.4, 0.5, 0.6, 0.7])
+    assert np.isfinite(used.get_ydata()).tolist() == [True] * 4 + [False] * 4
+    assert labels(forecast_band(found, "1", "yaw_rate")) == ["forecast, median", "truth"]
+    with pytest.raises(UsageError, match="no forecast of 'speed'; there are x, y, heading"):
+        forecast_band(found, "1", "speed")
+
+
+def test_innovations_are_the_checks_standardised_errors() -> None:
+    program, data = example("hovercraft"), simulated(rows=30, trajectories=4)
+    data.observed[5, 2, 1] = False
+    found = check(Fit(program, "hand", known_start=True), data, simulations=20)
+    axes = innovations(found, "3")
+    lines = axes.get_lines()
+    assert labels(axes) == [f"bearing_{i}" for i in range(4)] and axes.get_title() == "trajectory 3"
+    scores = found.predictions[1].standardised[:, 2, 1].numpy()
+    drawn = lines[1].get_ydata()
+    assert np.isnan(drawn[4]) and np.array_equal(np.delete(drawn, 4), np.delete(scores, 4))
+    with pytest.raises(UsageError, match="no trajectory '9'; there are 1, 2, 3, 4"):
+        innovations(found, "9")
+
+
+HISTORY = [
+    {"step": 5.0, "observation_weight": 0.25, "ess": 20.0, "roots": 3.0, "log_likelihood": 1.0},
+    {"step": 10.0, "observation_weight": 1.0, "ess": 40.0, "roots": 2.0, "log_likelihood": 2.0},
+]
+
+
+def fitted(history=HISTORY, **settings) -> Fit:
+    return Fit(example("hovercraft"), "steady", settings, trained=Trained(history, kept=10))
+
+
+def test_curves_of_a_fit_are_its_history() -> None:
+    fit = fitted(guide="bootstrap", particles=50)
+    held_out = held_out_curve(fit)
+    assert held_out.get_lines()[0].get_ydata().tolist() == [1.0, 2.0]
+    assert held_out.get_lines()[1].get_xydata().tolist() == [[10.0, 2.0]]
+    assert observation_noise(fit).get_lines()[0].get_ydata().tolist() == [2.0, 1.0]
+    particles = particle_curve(fit)
+    assert labels(particles) == ["effective sample size", "starts with descendants", "N"]
+    assert [line.get_ydata()[0] for line in particles.get_lines()] == [20.0, 3.0, 50]
+    by_svi = fitted([{"step": 1.0, "kl_weight": 4.0}])
+    assert observation_noise(by_svi).get_lines()[0].get_ydata().tolist() == [2.0]
+
+
+@pytest.mark.parametrize(
+    ("draw", "fit", "said"),
+    [
+        (particle_curve, fitted([{"step": 1.0}], guide="gaussian"), "guide gaussian has no particles"),
+        (observation_noise, fitted([{"step": 1.0}]), "not tempered"),
+        (held_out_curve, fitted([{"step": 1.0}]), "without held-out drives"),
+        (held_out_curve, Fit(example("hovercraft"), "hand"), "recipe hand does not train"),
+    ],
+)
+def test_a_curve_that_is_not_there_is_an_error(draw, fit: Fit, said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        draw(fit)

@@ -11,7 +11,7 @@ import torch
 
 from steady_ppl.data import Trajectories
 from steady_ppl.discovery.candidates import NATS
-from steady_ppl.discovery.discovery_report import as_text, figures
+from steady_ppl.discovery.discovery_report import as_text, figures, sentence
 from steady_ppl.discovery.finding import Finding, Shape, findings, shape_of
 from steady_ppl.discovery.fitting import ByDraws
 from steady_ppl.discovery.next_run import NextRun, next_run
@@ -29,7 +29,7 @@ FITTED_FURTHER = 10.0  # nats that fitting a run further may gain before it is s
 NOT_CONVERGED = "the program's own fit has not converged: no ranking below is to be trusted"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Discovery:
     """What `discover` found.
 
@@ -74,6 +74,15 @@ class Discovery:
 
     def __str__(self) -> str:
         return as_text(self)
+
+    def __repr__(self) -> str:
+        return f"Discovery({sentence(self)!r})"
+
+    def _repr_html_(self) -> str:
+        from steady_ppl.discovery.pictures import discovery_picture
+        from steady_ppl.display import of_result
+
+        return of_result(sentence(self), str(self), discovery_picture(self))
 
 
 def discover(

@@ -1,0 +1,94 @@
+"""What Jupyter shows of tables, fits and results when they are a cell's last line."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+if TYPE_CHECKING:
+    from steady_ppl.data import Trajectories
+    from steady_ppl.fit import Fit
+    from steady_ppl.program import Program
+
+MOST = 12  # numbers of a parameter that are shown
+DOTS = 90  # an inch, of pictures
+
+
+def of_trajectories(data: Trajectories) -> str:
+    """How many drives and rows, and what is in each column."""
+    from steady_ppl.table import to_frame
+
+    frame = to_frame(data)
+    lengths = f"{int(data.lengths.min())} to {int(data.lengths.max())}"
+    rows = []
+    for name in frame.columns.drop("trajectory"):
+        values = frame[name].dropna()
+        ends = (f"{values.min():.4g}", f"{values.max():.4g}") if len(values) else ("–", "–")
+        rows.append((name, *ends, f"{1 - len(values) / len(frame):.1%}"))
+    about = f"{len(data)} trajectories of {lengths} rows, a row every {data.median_step:.3g} s"
+    return str(_sentence(about) + _table(("column", "least", "most", "empty"), rows))
+
+
+def of_fit(fit: Fit) -> str:
+    """Program, recipe, parameters, how it was judged, and what must be known of it."""
+    name, trained = type(fit.program).__name__, fit.trained
+    said = _sentence(f"{name}, fitted by {fit.recipe}" if trained else f"{name}, recipe {fit.recipe}, nothing learned")
+    judged = [entry for entry in trained.history if "log_likelihood" in entry] if trained else []
+    if trained and judged:
+        kept = {entry["step"]: entry["log_likelihood"] for entry in judged}[trained.kept]
+        first = judged[0]["log_likelihood"]
+        said += _paragraph(f"held-out log p(y) {first:.2f} → {kept:.2f} nats a drive, kept at step {trained.kept}")
+    said += _table(("parameter", "value"), parameter_rows(fit.program))
+    for note in fit.notes:
+        said += _paragraph(f"note: {note}")
+    return str(said)
+
+
+def of_result(sentence: str, text: str, picture: Figure) -> str:
+    """A verdict, its picture, and all figures as text to unfold."""
+    file = io.BytesIO()
+    picture.savefig(file, format="png", dpi=DOTS)
+    image = base64.b64encode(file.getvalue()).decode()
+    return str(
+        _sentence(sentence)
+        + Markup('<img style="max-width:100%" alt="{}" src="data:image/png;base64,{}">').format(sentence, image)
+        + Markup("<details><summary>all figures</summary><pre>{}</pre></details>").format(text)
+    )
+
+
+@torch.no_grad()
+def parameter_rows(program: Program) -> list[tuple[str, str]]:
+    """Name and value of each learnable parameter; of many numbers the first."""
+    rows = []
+    for name in dict.fromkeys(name.removesuffix("_unconstrained") for name, _ in program.named_parameters()):
+        value: Any = program
+        for part in name.split("."):
+            value = getattr(value, part)
+        numbers = value.flatten().tolist()
+        shape = f" (of {' × '.join(map(str, value.shape))})" if len(numbers) > MOST else ""
+        said = ", ".join(f"{number:.4g}" for number in numbers[:MOST]) + (f", …{shape}" if shape else "")
+        rows.append((name, said))
+    return rows
+
+
+def _sentence(text: str) -> Markup:
+    return Markup("<p><strong>{}</strong></p>").format(text)
+
+
+def _paragraph(text: str) -> Markup:
+    return Markup("<p>{}</p>").format(text)
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Markup:
+    head = Markup("").join(Markup('<th scope="col">{}</th>').format(cell) for cell in header)
+    body = Markup("").join(
+        Markup("<tr>{}</tr>").format(Markup("").join(Markup("<td>{}</td>").format(cell) for cell in row))
+        for row in rows
+    )
+    return Markup("<table><thead><tr>{}</tr></thead><tbody>{}</tbody></table>").format(head, body)
