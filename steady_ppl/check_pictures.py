@@ -166,6 +166,7 @@ def against_references(found: Check, axes: Axes) -> None:
         axes.plot(seconds, values, style, color=color, label=name, ms=4)
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("{x:g}")
     axes.set_title("against references: root mean square error over all measurements", fontsize=9)
     axes.set_xlabel("predicted ahead [s]", fontsize=8)
     axes.set_ylabel("RMSE / noise alone", fontsize=8)

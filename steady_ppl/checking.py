@@ -26,6 +26,7 @@ from steady_ppl.linearization import why_not_linear
 from steady_ppl.misfit_maps import Misfit, Residuals, judge
 from steady_ppl.predictions import Prediction, named_horizons, predict, simulate_again
 from steady_ppl.program import Program, for_program, names
+from steady_ppl.progress import stages
 from steady_ppl.reference_motion import Reference, constant_velocity, last_measurement
 from steady_ppl.seeding import seeded
 from steady_ppl.stuck import Stretch, stuck
@@ -113,31 +114,35 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     run = for_program(program, data).without_truth(keep_start=fit.known_start)
     _require(program, run, fit.known_start, simulations)
     horizons = named_horizons(run, SECONDS)
-    with seeded(seed, "check"):
-        ahead = find_and_smooth(program, run, known_start=fit.known_start)
-        real = track(program, run, ahead.linearization.path, known_start=fit.known_start, passes=1)
-        _, drawn, _ = ahead.draws(simulations)
-        starts = run.known_start.expand(simulations, -1, -1) if fit.known_start else drawn[:, 0]
-        again, truth = simulate_again(program, run, starts, real.noise.shape[-1])
-    near = smooth(program, again, truth, known_start=fit.known_start, passes=PASSES).linearization.path
-    copies = track(program, again, near, known_start=fit.known_start, passes=1)
-    again, copies, sets = _without_broken(again, copies, len(run))
-    rows = list(horizons.values())
-    predictions = predict(program, run, real, rows)
-    simulated = predict(program, again, copies, rows, bands=[1])
-    floor = {horizon: _rmse_of_sets(ahead_of_it, sets) for horizon, ahead_of_it in simulated.items()}
-    ours = replace(_residuals(program, run, real, predictions[1], 1), raw=_array(predictions[1].error))
-    theirs = _residuals(program, again, copies, simulated[1], sets)
-    ours, theirs = _in_own_spreads(ours, theirs)
-    scores = scored(directions(program, run, real), directions(program, again, copies), sets)
-    misfit = judge(
-        ours,
-        theirs,
-        _array(run.elapsed[:-1]),
-        _controls(program, run),
-        _pairs(program, ours),
-        scores.dispersion.mean(-1),
-    )
+    with stages(("finding paths", 1), ("simulating drives", 2), ("judging", 2)) as begin:
+        begin()
+        with seeded(seed, "check"):
+            ahead = find_and_smooth(program, run, known_start=fit.known_start)
+            real = track(program, run, ahead.linearization.path, known_start=fit.known_start, passes=1)
+            _, drawn, _ = ahead.draws(simulations)
+            starts = run.known_start.expand(simulations, -1, -1) if fit.known_start else drawn[:, 0]
+            begin()
+            again, truth = simulate_again(program, run, starts, real.noise.shape[-1])
+        near = smooth(program, again, truth, known_start=fit.known_start, passes=PASSES).linearization.path
+        copies = track(program, again, near, known_start=fit.known_start, passes=1)
+        again, copies, sets = _without_broken(again, copies, len(run))
+        begin()
+        rows = list(horizons.values())
+        predictions = predict(program, run, real, rows)
+        simulated = predict(program, again, copies, rows, bands=[1])
+        floor = {horizon: _rmse_of_sets(ahead_of_it, sets) for horizon, ahead_of_it in simulated.items()}
+        ours = replace(_residuals(program, run, real, predictions[1], 1), raw=_array(predictions[1].error))
+        theirs = _residuals(program, again, copies, simulated[1], sets)
+        ours, theirs = _in_own_spreads(ours, theirs)
+        scores = scored(directions(program, run, real), directions(program, again, copies), sets)
+        misfit = judge(
+            ours,
+            theirs,
+            _array(run.elapsed[:-1]),
+            _controls(program, run),
+            _pairs(program, ours),
+            scores.dispersion.mean(-1),
+        )
     notes = [] if sets == simulations else [f"{simulations - sets} of {simulations} simulated sets blew up"]
     if not scores.parameter_names:
         notes.append("the program's own parameters were not looked at one by one: it has none, or a network's")

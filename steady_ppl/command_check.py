@@ -13,7 +13,9 @@ from steady_ppl.errors import UsageError
 def check(
     run: Annotated[Path, typer.Argument(help="Run folder.")],
     table: Annotated[Path, typer.Argument(help="Drives to compare with, best others than those of the fit.")],
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the figures to this file; - prints them instead of the text.")
+    ] = None,
     picture: Annotated[Path | None, typer.Option(help="Draw the picture into this file, for example .png.")] = None,
     mask: Annotated[
         Path | None,
@@ -25,7 +27,7 @@ def check(
 ) -> None:
     """Compare a run with measurements: where, when and in which regime it fails, and who is at fault."""
     from steady_ppl.checking import check as compare
-    from steady_ppl.command_parts import require_folder, write_json
+    from steady_ppl.command_parts import present, require_folder, say
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
     from steady_ppl.stuck import masked
@@ -36,19 +38,16 @@ def check(
     if mask is not None:
         require_table_file(mask)
         require_folder(mask)
-        if mask.resolve() == table.resolve():
-            raise UsageError(f"--mask {mask} is the table itself: name another file")
+        if mask.resolve() in (table.resolve(), json_file and json_file.resolve()):
+            raise UsageError(f"--mask {mask} is the table itself, or the file of --json: name another file")
     drives = read_table(table)
     found = compare(Fit.load(run, program), drives, simulations=simulations, seed=seed)
-    figures = found.figures
-    if json_file is not None:
-        write_json(json_file, {"run": str(run), **figures})
     if picture is not None:
         from steady_ppl.check_pictures import check_picture
 
         write_picture(check_picture(found), picture)
-    print(found)
+    present(str(found), {"run": str(run), **found.figures}, json_file)
     if mask is not None:
         write_table(masked(drives, found.stuck), mask)
         count = len(found.stuck)
-        print(f"{mask}: {table.name} without {count} stretch{'' if count == 1 else 'es'} that nobody measured")
+        say(f"{mask}: {table.name} without {count} stretch{'' if count == 1 else 'es'} that nobody measured")

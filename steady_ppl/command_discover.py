@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,7 +25,9 @@ def discover(
         bool, typer.Option("--mix", help="Put both tables together and keep every second drive to choose by.")
     ] = False,
     out: Annotated[Path | None, typer.Option("--out", help="Run folder for the improved fit.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the figures to this file; - prints them instead of the text.")
+    ] = None,
     picture: Annotated[Path | None, typer.Option(help="Draw what was found into this file, for example .png.")] = None,
     simulations: Annotated[int, typer.Option(help="Simulated sets for the calibration.", min=50)] = 200,
     program: Annotated[str | None, typer.Option(help="The run's program, if its file moved or changed.")] = None,
@@ -34,7 +35,7 @@ def discover(
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing run.")] = False,
 ) -> None:
     """Learn which physical effect a program lacks: none, one by name, several, or a curve that has no name."""
-    from steady_ppl.command_parts import program_from, require_folder, say, write_json
+    from steady_ppl.command_parts import present, program_from, require_folder, say, write_json
     from steady_ppl.discovery import discover as search
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
@@ -60,26 +61,18 @@ def discover(
             mix=mix,
             simulations=simulations,
             seed=seed,
-            report=_progress,
         )
-        _progress("")
-        print(found)
+        figures = {"source": source, **found.figures}
+        present(str(found), figures, json_file)
         if out is not None:
             used = {"table_sha256": fingerprint(drives), "valid_sha256": fingerprint(judges) if judges else None}
             found.after.save_into(out, begun=used)
-            write_json(out / DISCOVERY, {"source": source, **found.figures})
+            write_json(out / DISCOVERY, figures)
     if out is not None:
         for note in found.after.notes:
             say(note)
-        print(f"{out}: {found.after.program}")
-    if json_file is not None:
-        write_json(json_file, {"source": source, **found.figures})
+        say(f"{out}: {found.after.program}")
     if picture is not None:
         from steady_ppl.discovery.pictures import discovery_picture
 
         write_picture(discovery_picture(found), picture)
-
-
-def _progress(text: str) -> None:
-    if sys.stderr.isatty():
-        print(f"\r\x1b[K{text} …" if text else "\r\x1b[K", end="", file=sys.stderr, flush=True)

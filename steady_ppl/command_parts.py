@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +29,21 @@ def program_from(model: str, seed: int) -> Any:
 def write_json(path: Path, content: Any) -> None:
     """Write a file whole or not at all; a figure that is not finite is an error, JSON has no word for it."""
     beside = path.with_name(path.name + ".partial")
+    text = as_json(content, str(path)) + "\n"
     try:
-        beside.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+        beside.write_text(text)
         os.replace(beside, path)
-    except ValueError as error:
-        raise ComputationError(f"{path} is not written: a figure is not finite, the program has blown up") from error
     except OSError as error:
         beside.unlink(missing_ok=True)
         raise UsageError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def as_json(content: Any, place: str) -> str:
+    """The figures as text; one that is not finite is an error."""
+    try:
+        return json.dumps(content, indent=1, allow_nan=False)
+    except ValueError as error:
+        raise ComputationError(f"{place} is not written: a figure is not finite, the program has blown up") from error
 
 
 def require_folder(path: Path | None) -> None:
@@ -45,9 +54,38 @@ def require_folder(path: Path | None) -> None:
         raise UsageError(f"{path} cannot be written: it is a folder")
 
 
-def say(line: str) -> None:
-    """A word to the person, beside what a script reads."""
-    print(f"steady: {line}", file=sys.stderr)
+_quiet: ContextVar[bool] = ContextVar("quiet", default=False)
+
+
+@contextmanager
+def hushed(quiet: bool) -> Iterator[None]:
+    """Say nothing but errors and results, if asked for."""
+    token = _quiet.set(quiet)
+    try:
+        yield
+    finally:
+        _quiet.reset(token)
+
+
+def is_quiet() -> bool:
+    """Whether only errors and results are wanted."""
+    return _quiet.get()
+
+
+def say(line: str, *, always: bool = False) -> None:
+    """A word to the person, beside what a script reads; errors are said `always`."""
+    if always or not is_quiet():
+        print(f"steady: {line}", file=sys.stderr)
+
+
+def present(text: str, content: Any, json_file: Path | None) -> None:
+    """Print the text and write the figures beside it, or print the figures alone if the file is `-`."""
+    if json_file is not None and str(json_file) == "-":
+        print(as_json(content, "the output"))
+        return
+    print(text)
+    if json_file is not None:
+        write_json(json_file, content)
 
 
 def run_labels(runs: Sequence[Path], taken: Collection[str] = ()) -> dict[str, Path]:

@@ -17,7 +17,9 @@ def prove(
     ],
     truth: Annotated[str | None, typer.Option(help="The program that made the drives, if it is known.")] = None,
     oracle: Annotated[Path | None, typer.Option(help="A run of the true structure, fitted like the others.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the figures to this file; - prints them instead of the text.")
+    ] = None,
     picture: Annotated[Path | None, typer.Option(help="Draw the errors into this file, for example .png.")] = None,
     program: Annotated[
         list[str] | None,
@@ -28,11 +30,11 @@ def prove(
     """Prove that runs are better than the first one: log p(y), open-loop errors and noise, with paired intervals."""
     from steady_ppl.command_parts import (
         load_runs,
+        present,
         program_from,
         require_folder,
         run_labels,
         used_before,
-        write_json,
     )
     from steady_ppl.picture_files import require_picture, write_picture
     from steady_ppl.proving import prove as judge
@@ -51,10 +53,9 @@ def prove(
     drives = read_table(table)
     found = judge(rows, drives, truth="truth" if truth is not None else None, seed=seed)
     found.notes[:0] = used_before(labels, fingerprint(drives))
-    if json_file is not None:
-        write_json(json_file, {"runs": {label: str(run) for label, run in labels.items()}, **found.figures})
     if picture is not None:
         from steady_ppl.proof_pictures import proof_picture
 
         write_picture(proof_picture(found), picture)
-    print(found)
+    runs_by_label = {label: str(run) for label, run in labels.items()}
+    present(str(found), {"runs": runs_by_label, **found.figures}, json_file)

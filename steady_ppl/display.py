@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from steady_ppl.fit import Fit
     from steady_ppl.program import Program
 
-MOST = 12  # numbers of a parameter that are shown
+MOST = 12  # numbers of a parameter that are shown one by one
 DOTS = 90  # an inch, of pictures
 
 
@@ -64,15 +64,16 @@ def of_result(sentence: str, text: str, picture: Figure) -> str:
 
 @torch.no_grad()
 def parameter_rows(program: Program) -> list[tuple[str, str]]:
-    """Name and value of each learnable parameter; of many numbers the first."""
+    """Name and value of each learnable parameter; of many numbers how many, and their range."""
     rows = []
     for name in dict.fromkeys(name.removesuffix("_unconstrained") for name, _ in program.named_parameters()):
         value: Any = program
         for part in name.split("."):
             value = getattr(value, part)
         numbers = value.flatten().tolist()
-        shape = f" (of {' × '.join(map(str, value.shape))})" if len(numbers) > MOST else ""
-        said = ", ".join(f"{number:.4g}" for number in numbers[:MOST]) + (f", …{shape}" if shape else "")
+        said = ", ".join(f"{number:.4g}" for number in numbers)
+        if len(numbers) > MOST:
+            said = f"{' × '.join(map(str, value.shape))} numbers from {min(numbers):.4g} to {max(numbers):.4g}"
         rows.append((name, said))
     return rows
 

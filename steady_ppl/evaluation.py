@@ -16,6 +16,7 @@ from steady_ppl.measurement_errors import measurement_errors
 from steady_ppl.metrics import forward, forward_mean, map_errors, state_estimation
 from steady_ppl.planar_vehicle import UnknownMap
 from steady_ppl.program import Program, for_program, names
+from steady_ppl.progress import stages
 from steady_ppl.seeding import seeded
 
 
@@ -61,18 +62,22 @@ def evaluate(
     }
     result: dict[str, Any] = {"recipe": fit.recipe, "known_start": known_start}
     result |= {"measured": list(data.measurement_names), "filter": choice.name}
-    with seeded(seed, "log_likelihood"):
-        values = log_likelihood(program, data, **settings)
-        result["log_likelihood"] = float(values.mean())
-    result |= {"forward": {}, "forward_mean": {}, "state_estimation": {}}
-    if has_truth(data):
-        with seeded(seed, "forward"):
-            result["forward"] = forward(program, data, rollouts=rollouts)
-        result["forward_mean"] = forward_mean(program, data)
-        with seeded(seed, "state_estimation"):
-            result["state_estimation"] = state_estimation(program, data, **settings)
-    with seeded(seed, "measurement"):
-        result["measurement"] = measurement_errors(program, data, particles=2000, known_start=known_start)
+    with stages(("log p(y)", 1), ("states", 2), ("measurements", 2)) as begin:
+        begin()
+        with seeded(seed, "log_likelihood"):
+            values = log_likelihood(program, data, **settings)
+            result["log_likelihood"] = float(values.mean())
+        result |= {"forward": {}, "forward_mean": {}, "state_estimation": {}}
+        begin()
+        if has_truth(data):
+            with seeded(seed, "forward"):
+                result["forward"] = forward(program, data, rollouts=rollouts)
+            result["forward_mean"] = forward_mean(program, data)
+            with seeded(seed, "state_estimation"):
+                result["state_estimation"] = state_estimation(program, data, **settings)
+        begin()
+        with seeded(seed, "measurement"):
+            result["measurement"] = measurement_errors(program, data, particles=2000, known_start=known_start)
     if surveyed is not None:
         result["map"] = _judged_map(program, surveyed)
     return result
@@ -95,9 +100,11 @@ def evaluate_all(
         with _labelled(label):
             _checked(fit, table, surveyed)
     results = []
-    for fit, label in zip(fits, labels, strict=True):
-        with _labelled(label):
-            results.append(evaluate(fit, table, surveyed=surveyed, **settings))
+    with stages(*((f"evaluating {label}", 1) for label in labels)) as begin:
+        for fit, label in zip(fits, labels, strict=True):
+            begin()
+            with _labelled(label):
+                results.append(evaluate(fit, table, surveyed=surveyed, **settings))
     return results
 
 

@@ -135,12 +135,16 @@ class Program(PyroModule, metaclass=_WithEffects):
     def velocities(self, state: Tensor) -> dict[str, Tensor]:
         """The velocity that each channel accelerates, `(...)`."""
         order = names(self.states)
-        return {channel: state[..., order.index(velocity)] for channel, (_, velocity) in self.motion.items()}
+        return {
+            channel: state[..., order.index(velocity)] for channel, (_, velocity) in self.motion.items() if velocity
+        }
 
     def positions(self, state: Tensor) -> dict[str, Tensor]:
         """The position that each channel moves, `(...)`, where it has one."""
         order = names(self.states)
-        return {channel: state[..., order.index(position)] for channel, (position, _) in self.motion.items()}
+        return {
+            channel: state[..., order.index(position)] for channel, (position, _) in self.motion.items() if position
+        }
 
     def earlier(self, state: Tensor, ago: Tensor) -> Tensor:
         """The state `ago` seconds before, at its velocity, `(..., D)`."""

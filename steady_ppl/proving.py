@@ -21,6 +21,7 @@ from steady_ppl.fit import Fit
 from steady_ppl.paired_bootstrap import FEWEST
 from steady_ppl.predictions import named_horizons
 from steady_ppl.program import Program, names
+from steady_ppl.progress import stages
 from steady_ppl.proof_report import FLOOR, as_text, figures, verdict
 from steady_ppl.proof_rows import (
     SECONDS,
@@ -123,11 +124,14 @@ def prove(
     reference = next(iter(programs), "") if reference is None else reference
     _require(programs, reference, truth, data)
     judged: dict[str, Judged] = {}
-    for name, program in programs.items():
-        same = next((other for other in judged if programs[other] is program), None)
-        judged[name] = judged[same] if same else judge_program(name, program, data, known_start, seed)
-    before, true = judged[reference], judged.get(truth or "")
-    coasting = keeping_velocity(before, known_start) if with_constant_velocity else None
+    with stages(*((f"judging {name}", 1) for name in programs), ("judging the constant velocity", 0.5)) as begin:
+        for name, program in programs.items():
+            begin()
+            same = next((other for other in judged if programs[other] is program), None)
+            judged[name] = judged[same] if same else judge_program(name, program, data, known_start, seed)
+        begin()
+        before, true = judged[reference], judged.get(truth or "")
+        coasting = keeping_velocity(before, known_start) if with_constant_velocity else None
     if isinstance(coasting, Judged):
         judged[COASTING] = coasting
     floor = noise_floor(true, known_start, seed) if true else None

@@ -46,9 +46,11 @@ def observation_noise(fit: Fit, *, axes: Axes | None = None, label: str = "as th
         steps, weights = _logged(fit, "observation_weight", "its observations were not tempered")
         factors = [1 / math.sqrt(weight) for weight in weights]
     axes = _over_steps(axes, "observation noise / the program's")
-    axes.plot(steps, factors, "o-", ms=3, color=COLOR, label=label)
+    axes.plot(steps, factors, "o-", ms=3, label=label)
     axes.axhline(1, color="black", lw=0.6)
     axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("{x:g}")
     return axes
 
 

@@ -56,9 +56,9 @@ def test_a_stretch_that_nobody_measured_is_named_and_masked(work: Path, tmp_path
     table, kept, figures = (tmp_path / name for name in ("gap.csv", "kept.csv", "check.json"))
     write_table(replace(data, states=states), table)
     assert steady("check", work / "hand", table, *FAST, "--mask", kept, "--json", figures) == 0
-    said = capsys.readouterr().out
-    assert "the table: drive 2 between 1.00 and 2.50 s: x.x, x.y on a straight line" in said
-    assert f"{kept}: gap.csv without 1 stretch that nobody measured" in said
+    said = capsys.readouterr()
+    assert "the table: drive 2 between 1.00 and 2.50 s: x.x, x.y on a straight line" in said.out
+    assert f"{kept}: gap.csv without 1 stretch that nobody measured" in said.err
     (one,) = json.loads(figures.read_text())["stuck"]
     assert one["trajectory"] == "2" and one["seconds"] == pytest.approx([1.0, 2.5])
     again = read_table(kept)

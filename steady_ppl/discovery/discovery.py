@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,6 +22,7 @@ from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
 from steady_ppl.joining import joined
 from steady_ppl.program import Program, for_program
+from steady_ppl.progress import stages
 from steady_ppl.proving import Proof, far_off, prove
 
 FITTED_FURTHER = 10.0  # nats that fitting a run further may gain before it is said
@@ -96,7 +97,6 @@ def discover(
     simulations: int = 200,
     withheld: Sequence[str] = (),
     seed: int = 0,
-    report: Callable[[str], None] = lambda text: None,
 ) -> Discovery:
     """Find the physical effects that a program lacks.
 
@@ -116,7 +116,6 @@ def discover(
         simulations: sets of drives for the calibration, at least 50.
         withheld: names of effects to leave out of the catalogue.
         seed: of the simulated sets.
-        report: told what is done.
 
     Raises:
         UsageError: a network, a program that cannot be linearised, too few simulations, no such effect to leave out, or
@@ -157,26 +156,28 @@ def discover(
         notes.append(f"the tables were mixed: {kept}" if mix else f"no validation drives were given: {kept}")
     drives = [for_program(program, table).without_truth(keep_start=known_start) for table in (train, valid)]
     require(program, drives[0], drives[1], known_start, simulations)
-    found = search(
-        program,
-        drives[0],
-        drives[1],
-        known_start=known_start,
-        declared=declared,
-        sets=simulations,
-        seed=seed,
-        withheld=withheld,
-        report=report,
-    )
-    report("comparing before and after")
-    shape = shape_of(found, program)
-    effects = [] if shape else findings(found)
-    final = found.base if shape or found.rounds[0].quiet else found.final
-    settings = {"simulations": simulations, "seed": seed}
-    fits = [Fit(refit.mean_program(), "discover", settings, seed, known_start) for refit in (found.base, final)]
-    proof = _proof(found, shape is not None, drives[1], known_start, seed)
-    unclear = _unclear(found, effects)
-    proposed = next_run(unclear, known_start, seed) if unclear else None
+    with stages(("", 8), ("comparing before and after", 1), ("looking for a better next drive", 1)) as begin:
+        begin()
+        found = search(
+            program,
+            drives[0],
+            drives[1],
+            known_start=known_start,
+            declared=declared,
+            sets=simulations,
+            seed=seed,
+            withheld=withheld,
+        )
+        begin()
+        shape = shape_of(found, program)
+        effects = [] if shape else findings(found)
+        final = found.base if shape or found.rounds[0].quiet else found.final
+        settings = {"simulations": simulations, "seed": seed}
+        fits = [Fit(refit.mean_program(), "discover", settings, seed, known_start) for refit in (found.base, final)]
+        proof = _proof(found, shape is not None, drives[1], known_start, seed)
+        begin()
+        unclear = _unclear(found, effects)
+        proposed = next_run(unclear, known_start, seed) if unclear else None
     if unclear and proposed is None:
         alike = " from ".join(candidate.variant.name for candidate in unclear.alike[:2])
         notes.append(f"no way of driving that was tried tells {alike} better than these drives do")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from steady_ppl.data import Trajectories
@@ -29,12 +29,12 @@ from steady_ppl.discovery.refits import Refit, Worth, first_refit, refit_with
 from steady_ppl.discovery.screening import LEVEL, Tested
 from steady_ppl.effects import attached
 from steady_ppl.program import Program
+from steady_ppl.progress import stages
 
 BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
 MARGIN = 3.0  # nats by which a curve must be better than named effects
 RIVALS = 12.0  # nats behind the best in its round, with which a candidate is looked at again beside other effects
 MOST, CURVES = 3, 3  # effects in a program, and adding curves that are fitted
-Report = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,6 @@ def search(
     later_sets: int = 60,
     seed: int = 0,
     withheld: Sequence[str] = (),
-    report: Report = lambda text: None,
 ) -> Search:
     """Look for the effects that a program lacks.
 
@@ -151,55 +150,64 @@ def search(
         later_sets: of each further one.
         seed: of the simulated sets.
         withheld: names of effects that are left out of the catalogue.
-        report: told what is done.
     """
     settings = Settings(known_start, withheld)
     declared = copy.deepcopy(declared or program)
-    report("fitting the program as it stands")
-    base = first_refit(program, train, valid, known_start=known_start, seed=seed)
-    found = Search(known_start, base, base)
-    for index in range(MOST + 1):
-        count = sets if index == 0 else later_sets
-        report(f"screening, with {count} simulated sets")
-        screening = screen_program(found.final, declared, settings, sets=count, seed=seed + index)
-        ended = Round(screening, [], None)
-        found.rounds.append(ended)
-        if ended.quiet:
-            break
-        if index == 1 and not found.curves:
-            found.curves = _curves(found.base, found.rounds[0].screening, settings, report)
-        if index == MOST:
-            break
-        candidates = _refits(found.final, screening, settings, index == 0, report)
-        able = [c for c in candidates if c.is_judged and not c.against_its_sign]
-        best = next((c for c in able if c.significant(screening.tests.critical)), None)
-        gains = best is not None
-        if index == 0 and not gains:
-            found.curves = _curves(found.base, screening, settings, report)
-        if index == 0 and not gains and found.needs_a_name:
-            best = next((c for c in able if c.total > NATS and c.tested.p_value <= NEARLY), None)
-        if best is None:
-            found.rounds[-1] = Round(screening, candidates, None)
-            break
-        found.rounds[-1] = Round(screening, candidates, best)
-        found.found.append(Found(best, candidates, found.final))
-        assert isinstance(best.refit, Refit)
-        found.final = best.refit
-    if len(found.found) > 1:
-        report("looking at every effect again beside the others")
-        before = [variant.label for variant in attached(found.final.program)]
-        _look_again(found, settings)
-        if [variant.label for variant in attached(found.final.program)] != before:
-            screening = screen_program(found.final, declared, settings, sets=later_sets, seed=seed + MOST + 1)
-            found.rounds.append(Round(screening, [], None))
+    with stages(("fitting the program as it stands", 1), ("", 7), ("looking again", 1)) as begin:
+        begin()
+        base = first_refit(program, train, valid, known_start=known_start, seed=seed)
+        found = Search(known_start, base, base)
+        begin()
+        with stages(*(("testing", 1 / 2**index) for index in range(MOST + 1))) as next_round:
+            for index in range(MOST + 1):
+                next_round()
+                count = sets if index == 0 else later_sets
+                screening = screen_program(found.final, declared, settings, sets=count, seed=seed + index)
+                if not _add_best(found, screening, settings, index):
+                    break
+        begin()
+        if len(found.found) > 1:
+            before = [variant.label for variant in attached(found.final.program)]
+            _look_again(found, settings)
+            if [variant.label for variant in attached(found.final.program)] != before:
+                screening = screen_program(found.final, declared, settings, sets=later_sets, seed=seed + MOST + 1)
+                found.rounds.append(Round(screening, [], None))
     return found
 
 
-def _refits(now: Refit, screening: Screening, settings: Settings, first: bool, report: Report) -> list[Candidate]:
+def _add_best(found: Search, screening: Screening, settings: Settings, index: int) -> bool:
+    """Fit what the tests of a round point at and add the best, if it brings enough; whether anything was added."""
+    found.rounds.append(Round(screening, [], None))
+    if found.rounds[-1].quiet:
+        return False
+    if index == 1 and not found.curves:
+        found.curves = _curves(found.base, found.rounds[0].screening, settings)
+    if index == MOST:
+        return False
+    candidates = _refits(found.final, screening, settings, index == 0)
+    able = [c for c in candidates if c.is_judged and not c.against_its_sign]
+    best = next((c for c in able if c.significant(screening.tests.critical)), None)
+    gains = best is not None
+    if index == 0 and not gains:
+        found.curves = _curves(found.base, screening, settings)
+    if index == 0 and not gains and found.needs_a_name:
+        best = next((c for c in able if c.total > NATS and c.tested.p_value <= NEARLY), None)
+    found.rounds[-1] = Round(screening, candidates, best)
+    if best is None:
+        return False
+    found.found.append(Found(best, candidates, found.final))
+    assert isinstance(best.refit, Refit)
+    found.final = best.refit
+    return True
+
+
+def _refits(now: Refit, screening: Screening, settings: Settings, first: bool) -> list[Candidate]:
     candidates: list[Candidate] = []
-    for tested in leaders(screening.tests, first):
-        report(f"fitting with {tested.variant.label}")
-        candidates.append(fitted(now, tested, screening, settings, _worth(candidates)))
+    chosen = leaders(screening.tests, first)
+    with stages(*((f"fitting with {tested.variant.label}", 1) for tested in chosen)) as begin:
+        for tested in chosen:
+            begin()
+            candidates.append(fitted(now, tested, screening, settings, _worth(candidates)))
     best = max((c for c in candidates if c.is_judged), key=lambda c: c.total, default=None)
     candidates = [c if c.is_judged else replace(c, behind=best) for c in candidates]
     close = max((candidate.total for candidate in candidates), default=0.0) - RIVALS
@@ -215,13 +223,12 @@ def _worth(candidates: Sequence[Candidate]) -> Worth:
     return Worth(max(drives, default=-math.inf) - BEHIND, max(held_out, default=-math.inf) - NATS)
 
 
-def _curves(base: Refit, screening: Screening, settings: Settings, report: Report) -> list[Candidate]:
+def _curves(base: Refit, screening: Screening, settings: Settings) -> list[Candidate]:
     every = screening.tests.curves
     adding = [tested for tested in every if not tested.variant.options.get("times")]
     multiplying = [tested for tested in every if tested.variant.options.get("times")]
     found = []
     for tested in [*adding[:CURVES], *multiplying[:1]]:
-        report(f"fitting with a curve of {tested.variant.at}")
         found.append(fitted(base, tested, screening, settings))
 
     def worth(candidate: Candidate) -> float:

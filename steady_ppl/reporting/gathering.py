@@ -11,6 +11,7 @@ from steady_ppl.checking import Check, check
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import SteadyError, UsageError
 from steady_ppl.fit import Fit
+from steady_ppl.progress import stages
 from steady_ppl.proving import Proof, prove
 from steady_ppl.reporting.drives import Shown, chosen, given, of_run
 from steady_ppl.reporting.maps import maps
@@ -99,20 +100,30 @@ def report(
     """
     if not runs:
         raise UsageError("a report needs at least one run")
-    checks = {label: check(fit, data, simulations=simulations, seed=seed) for label, fit in runs.items()}
-    shown = chosen(list(checks.values()))
-    first = next(iter(checks.values()))
-    drives = given(first, data, shown) | {
-        "runs": [
-            {"label": label, **of_run(checks[label], fit, shown, draws=draws, seed=seed), **maps(checks[label])}
-            for label, fit in runs.items()
-        ]
-    }
+    plan = [
+        *((f"checking {label}", 4) for label in runs),
+        *((f"drawing {label}", 1) for label in runs),
+        ("comparing", len(runs)),
+    ]
+    with stages(*plan) as begin:
+        checks = {}
+        for label, fit in runs.items():
+            begin()
+            checks[label] = check(fit, data, simulations=simulations, seed=seed)
+        shown = chosen(list(checks.values()))
+        drawn = []
+        for label, fit in runs.items():
+            begin()
+            there = of_run(checks[label], fit, shown, draws=draws, seed=seed)
+            drawn.append({"label": label, **there, **maps(checks[label])})
+        begin()
+        proof = _proof(runs, data, seed)
+    drives = given(next(iter(checks.values())), data, shown) | {"runs": drawn}
     return Report(
         title=title,
         fits=dict(runs),
         checks=checks,
-        proof=_proof(runs, data, seed),
+        proof=proof,
         discovery=discovery,
         shown=shown,
         drives=drives,

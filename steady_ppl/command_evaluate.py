@@ -1,0 +1,61 @@
+"""`steady evaluate`: errors of runs on a table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from steady_ppl.errors import UsageError
+
+
+def evaluate(
+    arguments: Annotated[list[Path], typer.Argument(metavar="RUN... TABLE", help="Run folders, then the table.")],
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the figures to this file; - prints them instead of the text.")
+    ] = None,
+    particles: Annotated[int | None, typer.Option(help="Particles of the filters.", min=2)] = None,
+    rollouts: Annotated[int, typer.Option(help="Noisy roll-outs from each true state.", min=1)] = 1000,
+    seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+    surveyed: Annotated[
+        str | None,
+        typer.Option("--map", help="The same vehicle with the true landmarks, for runs that learned theirs."),
+    ] = None,
+    program: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="The program, if its file moved or changed; with several RUNs once for each, in their order."
+        ),
+    ] = None,
+) -> None:
+    """The paper's errors where true states exist; errors in measurement space always."""
+    from steady_ppl.command_parts import load_runs, present, require_folder, run_labels, say, used_before
+    from steady_ppl.evaluation import evaluate_all, incomparable, table_of
+    from steady_ppl.program_file import load_program
+    from steady_ppl.run_recipe import fingerprint
+    from steady_ppl.table import read_table
+
+    if len(arguments) < 2:
+        raise UsageError("evaluate needs at least one RUN and then a TABLE")
+    require_folder(json_file)
+    *runs, table = arguments
+    labels = run_labels(runs)
+    fits = list(load_runs(labels, program).values())
+    drives = read_table(table)
+    true_map = load_program(surveyed) if surveyed else None
+    settings: dict[str, Any] = {"particles": particles, "rollouts": rollouts, "seed": seed, "surveyed": true_map}
+    folders = [str(run) for run in runs]
+    results = evaluate_all(fits, folders, drives, **settings)
+    lines = [table_of(results, [f"{label} ({found['recipe']})" for label, found in zip(labels, results, strict=True)])]
+    if true_map is not None:
+        for label, result in zip(labels, results, strict=True):
+            error, how = result["map"], "" if result["map"]["learned"] else " (declared, not learned)"
+            lines.append(f"{label}: landmarks off by {error['rms']:.3g} m rms, {error['most']:.3g} m at most{how}")
+    rows = [{"run": folder, **result} for folder, result in zip(folders, results, strict=True)]
+    present("\n".join(lines), {"runs": rows}, json_file)
+    for reason in incomparable(results, folders) + used_before(labels, fingerprint(drives)):
+        say(reason)
+    for run, result in zip(runs, results, strict=True):
+        if result["filter"] != "lookahead":
+            say(f"{run}: judged by the filter {result['filter']}")

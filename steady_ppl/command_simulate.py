@@ -1,0 +1,34 @@
+"""`steady simulate`: drives that a program makes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from steady_ppl.errors import UsageError
+
+
+def simulate(
+    model: Annotated[str, typer.Argument(help="Program: models/hovercraft.py, or mine.py:Boat.")],
+    out: Annotated[Path, typer.Option("--out", help="Table to write, .csv or .parquet.")],
+    trajectories: Annotated[int | None, typer.Option(help="How many drives, 16 when not given.", min=1)] = None,
+    seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+    controls: Annotated[Path | None, typer.Option(help="Take time, controls and gaps from this table.")] = None,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME[=VALUE]", help="Add a physical effect, see `steady effects`; as often as needed."),
+    ] = None,
+) -> None:
+    """Simulate drives of a program, with measurements and true states."""
+    from steady_ppl.command_effects import with_effects
+    from steady_ppl.command_parts import program_from, say
+    from steady_ppl.simulation import simulate as run
+    from steady_ppl.table import read_table, write_table
+
+    if controls and trajectories:
+        raise UsageError("--controls has as many drives as its table: leave --trajectories out")
+    program = with_effects(program_from(model, seed), effect or [], say)
+    like = read_table(controls) if controls else None
+    write_table(run(program, trajectories or 16, seed=seed, like=like), out)

@@ -1,0 +1,38 @@
+"""`steady states`: where the vehicle probably was."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def states(
+    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    table: Annotated[Path, typer.Argument(help="Drives.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", help="A table (.csv, .parquet) of medians and 90 % intervals, or all draws for ArviZ (.nc)."
+        ),
+    ],
+    draws: Annotated[int, typer.Option(help="Paths of each drive.", min=1)] = 100,
+    particles: Annotated[int | None, typer.Option(help="Particles of the filter.", min=1)] = None,
+    program: Annotated[str | None, typer.Option(help="The program, if its file moved or changed.")] = None,
+    seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+) -> None:
+    """Write where the vehicle probably was, given all measurements of a drive: posterior draws of its states.
+
+    The table has for each state its median and the ends of its 90 % interval, `…_low` and `…_high`.
+    """
+    from steady_ppl.command_parts import require_folder
+    from steady_ppl.fit import Fit
+    from steady_ppl.posterior_files import require_states_file, write_states
+    from steady_ppl.table import read_table
+
+    require_states_file(out)
+    require_folder(out)
+    fit, drives = Fit.load(run, program), read_table(table)
+    write_states(fit.posterior(drives, draws=draws, particles=particles, seed=seed), out)
+    print(f"{out}: {len(drives)} drives, {draws} draws of each")

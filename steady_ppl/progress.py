@@ -1,0 +1,73 @@
+"""How far a computation has come. Computations say where they are; who wants to know listens.
+
+with stages(("smoothing", 1), ("simulating", 3)) as begin:   # names and their shares of the time
+    begin(); …
+    begin(); …                                               # stages inside a stage divide its share
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, replace
+
+Listener = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where the computation is: what it does, and which part of the whole that is."""
+
+    listener: Listener
+    doing: str = ""
+    first: float = 0.0
+    last: float = 1.0
+
+
+_place: ContextVar[_Place | None] = ContextVar("place", default=None)
+
+
+@contextmanager
+def listening(listener: Listener) -> Iterator[None]:
+    """Tell `listener` what is begun and which share of the whole is done, whenever a stage begins; at the end of the
+    outermost ones it hears no name and a share of 1."""
+    token = _place.set(_Place(listener))
+    try:
+        yield
+    finally:
+        _place.reset(token)
+
+
+@contextmanager
+def stages(*named: tuple[str, float]) -> Iterator[Callable[[], None]]:
+    """Divide what is going on into stages, one after another.
+
+    Args:
+        named: what each does, and how long it takes relative to the others.
+
+    Yields:
+        What is to be called as each stage begins.
+    """
+    outer = _place.get()
+    total, done, remaining = sum(share for _, share in named), 0.0, iter(named)
+
+    def begin() -> None:
+        nonlocal done
+        doing, share = next(remaining)
+        if outer is None:
+            return
+        width = (outer.last - outer.first) / total
+        first, last = outer.first + done * width, outer.first + (done + share) * width
+        done += share
+        said = ": ".join(part for part in (outer.doing, doing) if part)
+        _place.set(replace(outer, doing=said, first=first, last=last))
+        outer.listener(said, first)
+
+    try:
+        yield begin
+    finally:
+        if outer is not None:
+            _place.set(outer)
+            if not outer.doing and outer.first == 0.0:
+                outer.listener("", 1.0)

@@ -1,0 +1,91 @@
+"""One line on a terminal that says what is being done and about how long it will take."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from steady_ppl.command_parts import is_quiet
+
+PATIENCE = 2.0  # s, before anything is said
+CLEAR = "\r\x1b[K"
+
+
+class _Line:
+    """What is shown; drawn anew twice a second by a thread of its own."""
+
+    def __init__(self) -> None:
+        self.begun = time.monotonic()
+        self.doing, self.share, self.since = "", 0.0, self.begun
+        self.drawn = False
+        self.lock, self.ended = threading.Lock(), threading.Event()
+
+    def heard(self, doing: str, share: float) -> None:
+        """A stage begins; the outermost one ends with no name."""
+        with self.lock:
+            self.since = time.monotonic()
+            if not self.doing:
+                self.begun = self.since
+            self.doing, self.share = doing, share
+            if not doing:
+                self._clear()
+
+    def keep_drawing(self) -> None:
+        """Until it is ended."""
+        while not self.ended.wait(0.5):
+            with self.lock:
+                now = time.monotonic()
+                if self.doing and now - self.begun > PATIENCE:
+                    said = in_words(self.doing, self.share, self.since - self.begun, now - self.begun)
+                    print(f"{CLEAR}{said}", end="", file=sys.stderr, flush=True)
+                    self.drawn = True
+
+    def _clear(self) -> None:
+        if self.drawn:
+            print(CLEAR, end="", file=sys.stderr, flush=True)
+            self.drawn = False
+
+    def end(self) -> None:
+        """Leave an empty line."""
+        self.ended.set()
+        with self.lock:
+            self.doing = ""
+            self._clear()
+
+
+@contextmanager
+def progress_line() -> Iterator[Callable[[str, float], None]]:
+    """Yields what is to be told of stages; shows nothing where stderr is no terminal, or in quiet."""
+    if is_quiet() or not sys.stderr.isatty():
+        yield lambda doing, share: None
+        return
+    line = _Line()
+    thread = threading.Thread(target=line.keep_drawing, daemon=True)
+    thread.start()
+    try:
+        yield line.heard
+    finally:
+        line.end()
+        thread.join()
+
+
+def in_words(doing: str, share: float, until_now: float, elapsed: float) -> str:
+    """What is being done, and the time left if all of it goes on as fast as its stages have until now.
+
+    Args:
+        doing: the stage.
+        share: of the whole, done when the stage began.
+        until_now: s from the beginning until then.
+        elapsed: s from the beginning.
+    """
+    if share < 0.02:
+        return f"{doing} … {elapsed:.0f} s so far"
+    left = until_now / share - elapsed
+    return f"{doing} … " + ("about to end" if left < 1 else f"about {_rounded(left)} left")
+
+
+def _rounded(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
