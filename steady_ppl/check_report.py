@@ -185,12 +185,14 @@ def sentence(found: Check, finding: Finding) -> str:
     name, more = found.residuals[cell.residual], finding.z > 0
     where = place(found, cell)
     measurements = names(found.program.measurements)
+    if cell.residual >= len(measurements):
+        name = f"{name} acceleration"
     if cell.map == "memory":
-        return f"the misfit of {name} {'is the same' if more else 'changes its sign'} {where}"
+        return f"the misfit of {name} {'keeps' if more else 'changes'} its sign {where}"
     if cell.map == "lag":
         return f"the misfit of {name} goes {'with' if more else 'against'} {where}"
     if cell.residual >= len(measurements):
-        return f"{name} acceleration {'above' if more else 'below'} the program's{where}"
+        return f"{name} {'above' if more else 'below'} the program's{where}"
     unit = units(found.program.measurements)[cell.residual]
     size = f"{abs(cell.mean or 0.0):.2g} {unit} ".replace("  ", " ")
     return f"{name} measured {size}{'above' if (cell.mean or 0.0) > 0 else 'below'} its prediction{where}"

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from steady_ppl.errors import UsageError
+
+SIMULATIONS = 100
 
 
 def report(
@@ -22,7 +24,7 @@ def report(
         typer.Option(help="What `steady discover` found: its RUN or its --json file, if none of the RUNs has it."),
     ] = None,
     title: Annotated[str | None, typer.Option(help="Of the page; the runs' names when not given.")] = None,
-    simulations: Annotated[int, typer.Option(help="Simulated sets for the bands.", min=20)] = 100,
+    simulations: Annotated[int, typer.Option(help="Simulated sets for the bands.", min=20)] = SIMULATIONS,
     program: Annotated[
         list[str] | None,
         typer.Option(help="The program, if its file moved or changed; once for each RUN, in order."),
@@ -56,9 +58,38 @@ def report(
         drives,
         discovery=given if discovery is not None else found[-1] if found else None,
         title=title or f"{', '.join(labels)} on {table.name}",
-        how=[shlex.join(["steady", "report", *map(str, arguments), "--out", str(out)])],
+        how=_how(arguments, out, discovery, title, program, simulations, seed),
         notes=used_before(labels, fingerprint(drives)),
         simulations=simulations,
         seed=seed,
     ).write(out)
     print(f"{out}: {', '.join(labels)} on {len(drives)} drives")
+
+
+def _how(
+    arguments: list[Path],
+    out: Path,
+    discovery: Path | None,
+    title: str | None,
+    programs: list[str] | None,
+    simulations: int,
+    seed: int,
+) -> list[str]:
+    """The command as it was given, and how each of its runs was fitted."""
+    from steady_ppl.run_folder import read_record
+
+    given: list[tuple[str, Any]] = [
+        ("--discovery", discovery),
+        ("--title", title),
+        *(("--program", one) for one in programs or []),
+    ]
+    given += [("--simulations", simulations if simulations != SIMULATIONS else None), ("--seed", seed or None)]
+    options = [word for name, value in given if value is not None for word in (name, str(value))]
+    fitted = []
+    for run in arguments[:-1]:
+        record = read_record(run)
+        source = record["program"]
+        start = "with" if record["known_start"] else "without"
+        name = f"{source['file']}:{source['class']}" if source else "a program of no file"
+        fitted.append(f"# {run}: {name}, recipe {record['recipe']}, seed {record['seed']}, {start} a known start")
+    return ["\n".join([*fitted, shlex.join(["steady", "report", *map(str, arguments), *options, "--out", str(out)])])]

@@ -9,11 +9,14 @@ import shutil
 import signal
 import subprocess
 from dataclasses import replace
+from html import unescape
 from html.parser import HTMLParser
 from os import environ, killpg
 from pathlib import Path
 
 import numpy as np
+import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 from examples import example
@@ -23,6 +26,7 @@ import steady_ppl as st
 from steady_ppl.reporting.drives import chosen
 from steady_ppl.reporting.maps import where_to_look
 from steady_ppl.reporting.packing import packed
+from steady_ppl.reporting.writing import said, spread
 
 EVIL = "</script><script>window.broken = 1</script>"
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -130,8 +134,8 @@ def test_numbers_come_back_as_finely_as_sixteen_bits_are():
 
 def test_it_has_every_verdict_and_loads_nothing(found, page):
     text = page.read_text()
-    for said in [found.proof.figures["verdict"], *(one.figures["verdict"] for one in found.checks.values())]:
-        assert said.replace("'", "&#39;") in text
+    for verdict in [found.proof.figures["verdict"], *(one.figures["verdict"] for one in found.checks.values())]:
+        assert str(said(verdict)) in text
     assert FOUND["sentence"] in text and "a note" in text and "steady report before after" in text
     elements = Elements(text)
     assert not elements.of("src") and all(link.startswith("#") for link in elements.of("href"))
@@ -172,8 +176,8 @@ def test_what_is_drawn_is_what_was_computed(found, page, runs, data):
     np.testing.assert_allclose(unpacked(drawn["truth"]).transpose(2, 0, 1), data.states.numpy(), atol=1e-3)
     z = found.checks["before"].misfit
     strongest = max(abs(z.z[i]) for i, cell in enumerate(z.cells) if cell.map == "drive and time")
-    shown = np.array(drawn["runs"][0]["strips"]["z"], float)
-    assert np.nanmax(abs(shown)) == pytest.approx(strongest, abs=0.006)
+    shown = unpacked(drawn["runs"][0]["strips"]["z"])
+    assert np.nanmax(abs(shown)) == pytest.approx(strongest, abs=0.001)
 
 
 def test_a_place_to_look_at_is_where_the_misfit_is(runs):
@@ -247,6 +251,47 @@ def test_the_command_writes_it(work: Path, tmp_path: Path, capsys, refused):
     assert not list(tmp_path.glob("*.partial"))
 
 
+def test_sentences_of_a_verdict_are_set_as_text():
+    assert said("`steady discover` <b> between -0.5 and -3 of 90 %") == (
+        "<code>steady discover</code> &lt;b&gt; between −0.5 and −3 of 90\u00a0%"
+    )
+
+
+def test_coefficients_stand_beside_their_own_spread():
+    assert spread({"coefficient": [1.0, -2.0], "sd": [0.1, 0.2]}) == "1 ± 0.1, −2 ± 0.2"
+    assert spread({"coefficient": 1.5, "sd": None}) == "1.5"
+    assert spread({"coefficient": [1.0, 2.0], "sd": None}) == "1, 2"
+
+
+def test_the_command_that_is_shown_is_the_one_that_was_given(work: Path, tmp_path: Path):
+    page, table = tmp_path / "report.html", work / "valid.parquet"
+    asked = ("--simulations", 20, "--title", "my page", "--seed", 3)
+    assert steady("report", work / "hand", table, *asked, "--out", page) == 0
+    text = page.read_text()
+    given = f"steady report {work / 'hand'} {table} --title &#39;my page&#39; --simulations 20 --seed 3 --out {page}"
+    assert given in text
+    assert "Hovercraft, recipe hand, seed 0, without a known start" in text
+
+
+class Motor(st.Program):
+    """One state, one channel."""
+
+    states = ("speed [rad/s]",)
+    controls = ("voltage [V]",)
+    measurements = ("speed [rad/s]",)
+    channels = ("torque [rad/s²]",)
+    motion = {"torque": ("", "speed")}
+
+    def initial(self):
+        return pyro.sample("start", dist.Normal(torch.zeros(1), torch.ones(1)).to_event(1))
+
+    def transition(self, state, control, time, step):
+        return state + step[..., None] * pyro.sample("torque", dist.Normal(control - state, 0.2).to_event(1))
+
+    def observe(self, state):
+        pyro.sample("speed", dist.Normal(state, 0.1).to_event(1))
+
+
 # --- in a browser -----------------------------------------------------------------------------------------------------
 def opened(page: Path, *options: str, anchor: str = "") -> tuple[str, str]:
     """What a headless browser prints on stdout and stderr; its whole process group is ended with it."""
@@ -289,9 +334,9 @@ def test_a_browser_draws_it_without_an_error(page):
 def test_a_link_shows_its_drive_and_seconds(page):
     dom, log = opened(page, "--dump-dom", "--window-size=1280,2000", anchor="#run=0&drive=3&from=1&to=2.5")
     assert "CONSOLE" not in log, log
-    assert 'role="status">drive 4, 1.0 to 2.5 s<' in dom
+    assert 'role="status">before, drive 4, 1.0 to 2.5 s<' in dom
     dom, _ = opened(page, "--dump-dom", anchor="#run=99&drive=-7&from=x&to=y")
-    assert 'role="status">drive 1, all seconds<' in dom
+    assert 'role="status">after, drive 1, all seconds<' in dom
 
 
 @in_a_browser
@@ -314,6 +359,117 @@ def test_clicking_a_place_shows_its_seconds(page):
     assert first.startswith("#run=1&drive=1&from=0.00")
     assert second == "#run=1&drive=4&from=1.00&to=3.00"
     assert third.startswith("#run=1&drive=") and third != second
+
+
+def lines_of(page: Path, script: str, name: str, *options: str, anchor: str = "") -> list[str]:
+    """What a script in the page puts into its title, and no word on the console."""
+    dom, log = opened(with_script(page, script, name), "--dump-dom", *options, anchor=anchor)
+    assert "CONSOLE" not in log, log
+    return unescape(re.findall("<title>(.*?)</title>", dom)[0]).split(" | ")
+
+
+@in_a_browser
+def test_every_place_of_the_maps_is_a_link_as_well(page):
+    script = """
+    for (const id of ["strips-list", "regimes-list"]) document.getElementById(id).open = true;
+    setTimeout(() => {
+      const links = (id) => [...document.querySelectorAll(`#${id} a`)];
+      const said = ["strips-list", "regimes-list"].map((id) => links(id).length);
+      links("strips-list")[1].click();
+      setTimeout(() => { document.title = [...said, location.hash, document.activeElement.id].join(" | "); }, 500);
+    }, 1000);
+    """
+    strips, regimes, place, focused = lines_of(page, script, "lists.html")
+    shown = content(page)["runs"][1]
+    assert int(strips) == 6 * (len(shown["strips"]["edges"]) - 1)
+    assert int(regimes) == len(shown["regimes"]["cells"])
+    assert place.startswith("#run=1&drive=0&from=") and focused == "h-drives"
+
+
+@in_a_browser
+def test_a_link_that_was_followed_can_be_followed_again(page):
+    script = """
+    const link = document.createElement("a");
+    link.href = "#run=0&drive=3&from=1.00&to=2.00";
+    document.body.append(link);
+    const place = () => document.getElementById("place").textContent, said = [];
+    const box = document.getElementById("drive");
+    const steps = [() => link.click(), () => { box.value = 1; box.onchange(); }, () => link.click()];
+    steps.forEach((step, i) => setTimeout(() => { step(); setTimeout(() => said.push(place()), 200); }, 500 * i + 500));
+    setTimeout(() => { document.title = said.join(" | "); }, 3000);
+    """
+    first, chosen_by_hand, again = lines_of(page, script, "again.html")
+    assert first == again == "before, drive 4, 1.0 to 2.0 s" and chosen_by_hand == "before, drive 2, all seconds"
+
+
+@in_a_browser
+def test_addresses_that_are_nonsense_show_what_is_nearest(page):
+    for anchor, shown in (
+        ("#run=99&drive=99&from=500&to=600", "after, drive 6, all seconds"),
+        ("#run=0&drive=0&from=5&to=1e9", "before, drive 1, 5.0 to 10.0 s"),
+        ("#run=0&drive=0&from=-50&to=-40", "before, drive 1, all seconds"),
+    ):
+        dom, log = opened(page, "--dump-dom", anchor=anchor)
+        assert "CONSOLE" not in log and f'role="status">{shown}<' in dom, anchor
+
+
+@in_a_browser
+def test_the_keyboard_meets_no_tools_and_every_picture_has_a_name(page):
+    script = """
+    setTimeout(() => window.dispatchEvent(new Event("beforeprint")), 500);
+    setTimeout(() => {
+      const pictures = [...document.querySelectorAll('[role="img"]')];
+      const tools = document.querySelectorAll(".modebar-btn").length;
+      const unnamed = pictures.filter((one) => !one.getAttribute("aria-label")).length;
+      document.title = [tools, pictures.length, unnamed].join(" | ");
+    }, 4000);
+    """
+    tools, pictures, unnamed = lines_of(page, script, "names.html", "--window-size=1280,9000")
+    assert (tools, unnamed) == ("0", "0") and int(pictures) == 9
+
+
+@in_a_browser
+def test_paper_is_as_wide_as_what_is_drawn_on_it(page, tmp_path):
+    script = """
+    window.dispatchEvent(new Event("beforeprint"));
+    const said = [];
+    setTimeout(() => {
+      said.push([...document.querySelectorAll(".js-plotly-plot")].filter((one) => one.layout.width !== 680).length);
+      said.push(document.querySelectorAll("#program details:not([open])").length);
+      window.dispatchEvent(new Event("afterprint"));
+    }, 3000);
+    setTimeout(() => {
+      said.push([...document.querySelectorAll(".js-plotly-plot")].filter((one) => one.layout.width === 680).length);
+      said.push(document.querySelectorAll("#program details[open]").length);
+      document.title = said.join(" | ");
+    }, 5000);
+    """
+    assert lines_of(page, script, "paper.html", "--window-size=1280,3000") == ["0", "0", "0", "0"]
+    opened(page, f"--print-to-pdf={tmp_path / 'report.pdf'}")
+    assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
+
+
+@in_a_browser
+def test_a_phone_need_not_scroll_sideways(page):
+    script = "setTimeout(() => { document.title = document.documentElement.scrollWidth; }, 3000);"
+    frame = page.with_name("frame.html")
+    file = with_script(page, script.replace("document.title", "parent.document.title"), "inner.html")
+    frame.write_text(f'<title></title><iframe src="{file.name}" style="width:390px;height:800px;border:0"></iframe>')
+    dom, _ = opened(frame, "--dump-dom", "--allow-file-access-from-files", "--window-size=1280,900")
+    assert int(re.findall("<title>(.*?)</title>", dom)[0]) == 390
+
+
+@in_a_browser
+def test_a_system_of_one_state_is_drawn(tmp_path):
+    program = Motor()
+    program.duration = 6.0
+    with st.seeded(0):
+        table = st.simulate(program, 6, seed=0)
+    file = tmp_path / "motor.html"
+    st.report({"motor": st.Fit(program, "hand")}, table, simulations=20, draws=5).write(file)
+    dom, log = opened(file, "--dump-dom", "--window-size=1280,9000")
+    assert "CONSOLE" not in log and "could not be drawn" not in dom.split("<script")[0], log
+    assert "One state alone has no plane" in dom.split("<script")[0]
 
 
 @in_a_browser

@@ -17,6 +17,7 @@ from steady_ppl.reporting.packing import packed
 
 NUMBERS = 300_000  # of all drives and runs: .8 MB of text
 QUANTILES = (0.05, 0.5, 0.95)
+PATHS = 8  # draws in the plane
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ def chosen(checks: list[Check], numbers: int = NUMBERS) -> Shown:
     """As many drives as there is room for, those whose strips stand out most in any run first."""
     first = checks[0]
     rows, count = first.data.time.shape
-    columns = sum(2 * _horizons(one) * len(one.residuals) + 3 * len(names(one.program.states)) for one in checks) + 10
+    columns = sum(_columns(one) for one in checks) + 10
     every = max(1, -(-rows * columns // numbers))
     room = max(1, numbers // (-(-rows // every) * columns))
     worst = np.zeros(count)
@@ -65,8 +66,10 @@ def chosen(checks: list[Check], numbers: int = NUMBERS) -> Shown:
     return Shown(sorted(int(i) for i in order), every, count)
 
 
-def _horizons(found: Check) -> int:
-    return min(2, len(found.horizons))
+def _columns(found: Check) -> int:
+    """Numbers of a row of a drive that a run adds."""
+    horizons, states = min(2, len(found.horizons)), len(names(found.program.states))
+    return 2 * horizons * len(found.residuals) + 3 * states + 2 * PATHS
 
 
 def given(found: Check, table: Trajectories, shown: Shown) -> dict[str, Any]:
@@ -76,6 +79,7 @@ def given(found: Check, table: Trajectories, shown: Shown) -> dict[str, Any]:
     known = truth is not None and bool(torch.isfinite(truth[1:]).any())
     return {
         "labels": [data.labels[i] for i in shown.drives],
+        "shown": shown.drives,
         "time": shown.of(_inside(data, data.elapsed.unsqueeze(-1))),
         "measured": shown.of(measured(found)),
         "measurements": _components(program.measurements),
@@ -92,7 +96,10 @@ def of_run(found: Check, fit: Fit, shown: Shown, *, draws: int, seed: int) -> di
     posterior = fit.posterior(data, draws=draws, seed=seed)["posterior"]
     states = names(found.program.states)
     quantiles = np.stack([posterior[name].quantile(QUANTILES, ("chain", "draw")).values for name in states], -1)
-    low, middle, high = (Shown(list(range(len(data))), shown.every, len(data)).of(q.swapaxes(0, 1)) for q in quantiles)
+    all_of_them = Shown(list(range(len(data))), shown.every, len(data))
+    low, middle, high = (all_of_them.of(quantile.swapaxes(0, 1)) for quantile in quantiles)
+    across = [states[i] for i in plane(found.program)]
+    paths = [posterior[name].values[0, draw].T for draw in range(min(PATHS, draws)) for name in across]
     return {
         "predictions": [
             {"ahead": name, "middle": shown.of(middle), "half": shown.of(half)}
@@ -102,6 +109,7 @@ def of_run(found: Check, fit: Fit, shown: Shown, *, draws: int, seed: int) -> di
         "states": _components(found.program.states),
         "posterior": {"low": low, "middle": middle, "high": high},
         "plane": plane(found.program),
+        "paths": all_of_them.of(np.stack(paths, -1)),
     }
 
 

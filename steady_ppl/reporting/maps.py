@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from steady_ppl.check_pictures import subject
-from steady_ppl.check_report import place, sentence, unit_of
+from steady_ppl.check_report import place, sentence
 from steady_ppl.checking import Check
 from steady_ppl.misfit_maps import Cell
 from steady_ppl.program import names
+from steady_ppl.reporting.packing import packed
 
 AROUND = 0.5  # s shown before and after a stretch
 Place = tuple[int, float, float]  # drive, and from when to when
@@ -45,31 +46,31 @@ def _strips(found: Check) -> dict[str, Any] | None:
     return {
         "edges": [start for start, _ in ranges] + [ranges[-1][1]],
         "drives": list(found.data.labels),
-        "z": _rounded(z),
+        "z": packed(z),
         "significant": significant,
     }
 
 
-def _regimes(found: Check) -> list[dict[str, Any]]:
-    """One entry a variable: its ranges, and each residual's mean in them, in simulated standard deviations."""
-    kept: dict[str, dict[str, Any]] = {}
+def _regimes(found: Check) -> dict[str, Any]:
+    """The ranges of every variable as columns, and of each residual its mean in them, in simulated standard deviations.
+
+    A cell is: residual, column, mean, whether it stands out, and the place to look at.
+    """
+    columns: dict[tuple, dict[str, Any]] = {}
+    cells: list[list[Any]] = []
     significant = {id(one.cell) for one in found.misfit.significant}
-    for i, cell in enumerate(found.misfit.cells):
-        if cell.map != "regime":
-            continue
+    regimes = [(i, cell) for i, cell in enumerate(found.misfit.cells) if cell.map == "regime"]
+    variables = list(dict.fromkeys(variable for _, cell in regimes for variable in cell.where))
+    for _, cell in sorted(regimes, key=lambda one: [(variables.index(v), b) for v, b in one[1].where.items()]):
         ((variable, between),) = cell.where.items()
-        one = kept.setdefault(variable, {"variable": variable, "unit": unit_of(found, variable), "cells": []})
-        one["cells"].append(
-            {
-                "residual": cell.residual,
-                "between": list(between),
-                "z": round(float(found.misfit.z[i]), 2),
-                "significant": id(cell) in significant,
-                "where": place(found, cell).strip(),
-                "place": where_to_look(found, cell),
-            }
-        )
-    return list(kept.values())
+        columns.setdefault((variable, between), {"variable": variable, "where": place(found, cell).strip()})
+    order = list(columns)
+    for i, cell in regimes:
+        ((variable, between),) = cell.where.items()
+        z = round(float(found.misfit.z[i]), 2)
+        column = order.index((variable, between))
+        cells.append([cell.residual, column, z, id(cell) in significant, where_to_look(found, cell)])
+    return {"columns": list(columns.values()), "cells": cells}
 
 
 def where_to_look(found: Check, cell: Cell) -> Place | None:
@@ -116,7 +117,3 @@ def _longest(there: np.ndarray, found: Check, drive: int) -> tuple[float, float]
     longest = int(np.argmax(ends - starts))
     elapsed = found.data.elapsed[:, drive]
     return float(elapsed[starts[longest]]), float(elapsed[min(ends[longest], len(elapsed) - 1)])
-
-
-def _rounded(values: np.ndarray) -> Any:
-    return [[[None if np.isnan(z) else round(float(z), 2) for z in strip] for strip in drive] for drive in values]

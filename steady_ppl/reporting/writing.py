@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from plotly.offline import get_plotlyjs
 
 from steady_ppl.check_report import strongest
@@ -21,6 +22,8 @@ from steady_ppl.reporting.program_page import program_page
 
 if TYPE_CHECKING:
     from steady_ppl.reporting.gathering import Report
+
+SCRIPTS = ("page.js", "curves.js", "maps.js", "choosing.js")
 
 
 def html(found: Report) -> str:
@@ -32,7 +35,7 @@ def html(found: Report) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    rooms.filters |= {"number": number, "signed": signed, "interval": interval}
+    rooms.filters |= {"number": number, "signed": signed, "interval": interval, "spread": spread, "said": said}
     figures = {label: one.figures for label, one in found.checks.items()}
     content = {
         "title": found.title,
@@ -47,11 +50,19 @@ def html(found: Report) -> str:
         "how": found.how,
         "versions": versions(),
         "style": _asset("page.css"),
-        "script": _asset("page.js"),
+        "script": Markup("\n").join(_asset(name) for name in SCRIPTS),
         "plotly": Markup(get_plotlyjs().replace("</script", "<\\/script")),
     }
-    content["data"] = _data({**found.drives, "curves": content["curves"], "discovery": found.discovery})
+    content["data"] = _data({**_drawn(found), "curves": content["curves"]})
     return rooms.get_template("page.html").render(content)
+
+
+def _drawn(found: Report) -> dict[str, Any]:
+    """What the page's scripts read; findings and the rest of a discovery are in its text."""
+    runs = [{name: part for name, part in run.items() if name != "findings"} for run in found.drives["runs"]]
+    kept = ("candidates", "effects", "shape")
+    discovery = {name: found.discovery[name] for name in kept} if found.discovery else None
+    return {**found.drives, "runs": runs, "discovery": discovery}
 
 
 def write_page(text: str, path: Path) -> None:
@@ -115,6 +126,22 @@ def number(value: Any, digits: int = 3) -> str:
 def signed(value: float | None, digits: int = 1) -> str:
     """A difference with its sign, or nothing."""
     return "" if value is None else f"{value:+.{digits}f}".replace("-", "−")
+
+
+def spread(candidate: Mapping[str, Any]) -> str:
+    """Coefficients with their standard deviations, component by component."""
+    values, sds = (one if isinstance(one, list) else [one] for one in (candidate["coefficient"], candidate["sd"]))
+    pairs = zip(values, sds if len(sds) == len(values) else [None] * len(values), strict=True)
+    return ", ".join(number(value) + (f" ± {number(sd, 2)}" if sd is not None else "") for value, sd in pairs)
+
+
+def said(sentence: str) -> Markup:
+    """A sentence of a verdict: commands in it as code, signs as minus, no line broken before a per cent sign."""
+    text = re.sub(r"(?<![\w.])-(?=[\d.])", "−", sentence).replace(" %", "\u00a0%")
+    parts = text.split("`")
+    return Markup("").join(
+        Markup("<code>{}</code>").format(part) if i % 2 else escape(part) for i, part in enumerate(parts)
+    )
 
 
 def interval(pair: Any, digits: int = 3) -> str:
