@@ -66,6 +66,7 @@ class Effect:
         text: the equation in plain text.
         unit: of the coefficient.
         feels: what it feels like on the vehicle, in a line.
+        occurs: on which machines it is met, in a line.
         function: how it acts.
         typical: a coefficient that is clearly felt; `(k,)` values for a vector.
         limit: magnitudes beyond this are hardly physical; the prior's scale.
@@ -91,6 +92,7 @@ class Effect:
     function: Callable[..., Any]
     typical: float | tuple[float, ...]
     limit: float
+    occurs: str = ""
     sign: int = 0
     null: float = 0.0
     components: tuple[str, ...] = ()
