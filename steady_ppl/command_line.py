@@ -19,6 +19,7 @@ from steady_ppl import (
     command_demo,
     command_discover,
     command_effects,
+    command_import_bag,
     command_init,
     command_prove,
     command_report,
@@ -44,6 +45,7 @@ app.command()(command_demo.demo)
 app.command()(command_discover.discover)
 app.command()(command_effects.add)
 app.command()(command_effects.effects)
+app.command("import-bag")(command_import_bag.import_bag)
 app.command()(command_init.init)
 app.command()(command_prove.prove)
 app.command()(command_report.report)
