@@ -26,10 +26,12 @@ class Bag:
     Attributes:
         name: its file's or folder's name, for error messages.
         reader: rosbags' reader, open.
+        defined: the message types that the bag itself defines.
     """
 
     name: str
     reader: Any
+    defined: frozenset[str]
 
     @property
     def store(self) -> Any:
@@ -48,10 +50,6 @@ class Bag:
     def undefined(self, type_name: str) -> list[str]:
         """Which types that messages of a type are made of nobody has defined."""
         return undefined_types(self.store, type_name)
-
-    def defines(self, topic: str) -> bool:
-        """Whether the bag itself says what the messages of a topic are made of."""
-        return all(connection.msgdef.data for connection in self.reader.connections if connection.topic == topic)
 
     def type_of(self, topic: str, where: str) -> str:
         """The type of a topic's messages, defined.
@@ -140,11 +138,12 @@ def open_bag(path: Path, messages: Sequence[Path] = ()) -> Iterator[Bag]:
         reader.open()
     try:
         with _damage(name):
-            defined = reader.typestore.fielddefs
+            speaks = any(connection.msgdef.data for connection in reader.connections)
+            defined = frozenset(reader.typestore.fielddefs) if speaks else frozenset[str]()
             extra = known.fielddefs if reader.is2 else own
             if any(undefined_types(reader.typestore, connection.msgtype) for connection in reader.connections):
-                reader.typestore.register({key: extra[key] for key in extra if key not in defined})
-        yield Bag(name, reader)
+                reader.typestore.register({key: extra[key] for key in extra if key not in reader.typestore.fielddefs})
+        yield Bag(name, reader, defined)
     finally:
         reader.close()
 

@@ -101,7 +101,7 @@ def read_series(bag: Bag, mapping: BagMapping, say: Say = say_aside) -> list[Ser
         if column.clock != "bag" and not has_stamp(bag.store, type_name):
             raise DataError(f'{where}: a {type_name} has no header.stamp; expected clock = "bag"')
         topics.setdefault(column.topic, []).append(column)
-    lacking = sorted({bag.type_of(topic, bag.name) for topic in topics if not bag.defines(topic)})
+    lacking = sorted({bag.type_of(topic, bag.name) for topic in topics} - bag.defined)
     if lacking:
         say(f"{bag.name} does not define {', '.join(lacking)}: taken from `messages`, else from ROS 2 Humble")
     found = {one.column.name: one for topic, columns in topics.items() for one in _of_topic(bag, topic, columns, say)}
