@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from steady_ppl.altering import Coloured, blurred, channel_means, heavy_tailed, misread, pushed, widened
     from steady_ppl.arrays import from_arrays
     from steady_ppl.auto_rollout import AutoRollout
+    from steady_ppl.bag_mapping import BagColumn, BagMapping
+    from steady_ppl.bags import read_bags
     from steady_ppl.checking import Check, check
     from steady_ppl.data import Trajectories
     from steady_ppl.discovery import Discovery, discover
@@ -56,6 +58,8 @@ _HOMES = {
     "altering": ("Coloured", "blurred", "channel_means", "heavy_tailed", "misread", "pushed", "widened"),
     "arrays": ("from_arrays",),
     "auto_rollout": ("AutoRollout",),
+    "bag_mapping": ("BagColumn", "BagMapping"),
+    "bags": ("read_bags",),
     "checking": ("Check", "check"),
     "data": ("Trajectories",),
     "discovery": ("Discovery", "discover"),

@@ -20,6 +20,7 @@ from steady_ppl import (
     command_effects,
     command_evaluate,
     command_fit,
+    command_import_bag,
     command_init,
     command_prove,
     command_report,
@@ -43,10 +44,25 @@ class Command(NamedTuple):
     about: str
     examples: tuple[str, ...]
 
+    @property
+    def name(self) -> str:
+        """As it is typed."""
+        return self.function.__name__.replace("_", "-")
+
 
 COMMANDS = (
     Command(command_demo.demo, "Show the whole loop on drives with a hidden effect.", ("steady demo --out demo",)),
     Command(command_init.init, "Make a folder to work in, with first drives.", ("steady init lab",)),
+    Command(
+        command_import_bag.import_bag,
+        "Turn ROS 1 or 2 bags and MCAP files into a table.",
+        (
+            "steady import-bag drive.bag > mapping.toml",
+            "steady import-bag monday/*.mcap mapping.toml --out drives.csv",
+            "steady import-bag drive.bag --map u.speed=/cmd_vel:linear.x \\",
+            "                            --map y.range=/range:range --step 0.1 --out drive.csv",
+        ),
+    ),
     Command(
         command_simulate.simulate,
         "Simulate drives of a program.",
@@ -127,9 +143,11 @@ app = typer.Typer(
 )
 for command in COMMANDS:
     title = "Example:" if len(command.examples) == 1 else "Examples:"
-    app.command(short_help=command.about, epilog="\n".join(["\b", title, *(f"  {line}" for line in command.examples)]))(
-        command.function
-    )
+    app.command(
+        command.name,
+        short_help=command.about,
+        epilog="\n".join(["\b", title, *(f"  {line}" for line in command.examples)]),
+    )(command.function)
 app.add_typer(command_data.app, name="data", short_help="Published logs to tables.")
 
 

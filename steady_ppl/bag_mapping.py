@@ -1,0 +1,234 @@
+"""What of a bag goes into which column of a table: `BagMapping`, from a TOML file, from `--map`, or built in Python.
+
+    step = 0.1                      # s between rows
+    messages = ["src/my_msgs"]      # optional: definitions that the bag lacks, PACKAGE/msg/NAME.msg or folders of them
+    [columns."u.speed"]             # u. a control, y. a measurement, x. a state that is known
+    topic = "/cmd_vel"
+    field = "linear.x"              # names and indices, such as ranges[0]
+    as = "yaw"                      # optional: a quaternion's heading; "angle": a number that is an angle in rad
+    between = "hold"                # controls only: "hold" (default) or "interpolate"
+    longest = 1.0                   # controls only, s: a longer pause ends the trajectory; two steps at least
+    clock = "bag"                   # "bag" (default), "header" or "aligned"
+    late = 0.0                      # s that are subtracted from the time stamps
+    scale = 1.0                     # value = scale * read + offset
+    offset = 0.0
+
+`steady_ppl/bags.py` says what each of them does to the numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from steady_ppl.bag_fields import Steps, parse_field
+from steady_ppl.errors import UsageError
+
+_CHOICES = {
+    "between": (None, "hold", "interpolate"),
+    "reading": (None, "yaw", "angle"),
+    "clock": ("bag", "header", "aligned"),
+}
+
+
+@dataclass(frozen=True)
+class BagColumn:
+    """One column of the table and the field of a topic that fills it.
+
+    Attributes:
+        name: the column, `u.…`, `y.…` or `x.…`.
+        topic: the topic's full name.
+        field: the field within its messages.
+        reading: None for a number, "yaw" for the heading of a quaternion, "angle" for a number that is an angle, rad;
+            `as` in TOML.
+        between: how a control goes on from message to message, "hold" (None is the same) or "interpolate".
+        longest: s, at least two steps; a longer pause of a control ends the trajectory.
+        clock: "bag", "header" or "aligned".
+        late: s, subtracted from the time stamps.
+        scale, offset: the column's value is `scale * read + offset`.
+
+    Raises:
+        UsageError: naming the column and the key.
+    """
+
+    name: str
+    topic: str
+    field: str
+    reading: str | None = None
+    between: str | None = None
+    longest: float | None = None
+    clock: str = "bag"
+    late: float = 0.0
+    scale: float = 1.0
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        where = f"column {self.name}"
+        if self.name[:2] not in ("u.", "y.", "x.") or len(self.name) < 3:
+            raise UsageError(f"{where}: expected u.NAME (a control), y.NAME (a measurement) or x.NAME (a known state)")
+        for key in ("topic", "field"):
+            value = getattr(self, key)
+            if not isinstance(value, str) or not value:
+                raise UsageError(f"{where}: {key} is {value!r}, expected text")
+        for key, choices in _CHOICES.items():
+            value = getattr(self, key)
+            if value not in choices:
+                known = " or ".join(f'"{choice}"' for choice in choices if choice)
+                raise UsageError(f"{where}: {'as' if key == 'reading' else key} is {value!r}, expected {known}")
+        for key in ("longest", "late", "scale", "offset"):
+            value = getattr(self, key)
+            if not _is_number(value) and not (key == "longest" and value is None):
+                raise UsageError(f"{where}: {key} is {value!r}, expected a finite number")
+        if self.kind != "u" and (self.between is not None or self.longest is not None):
+            key = "between" if self.between is not None else "longest"
+            raise UsageError(f"{where}: {key} is for controls (u.); measurements and states are not held: leave it out")
+        if self.scale == 0:
+            raise UsageError(f"{where}: scale is 0, which leaves nothing of what was read")
+        try:
+            parse_field(self.field)
+        except UsageError as error:
+            raise UsageError(f"{where}: {error}") from None
+
+    @property
+    def kind(self) -> str:
+        """`u`, `y` or `x`."""
+        return self.name[0]
+
+    @property
+    def steps(self) -> Steps:
+        """The names and indices that lead to the field."""
+        return parse_field(self.field)
+
+    @property
+    def where(self) -> str:
+        """What error messages call it."""
+        return f"column {self.name}, topic {self.topic}, field {self.field}"
+
+
+@dataclass(frozen=True)
+class BagMapping:
+    """The columns of a table and the time between its rows.
+
+    Attributes:
+        columns: in the order in which the table has them, among each of u., y. and x.
+        step: s between rows.
+        messages: .msg files, or folders of them, that define message types which a bag does not.
+
+    Raises:
+        UsageError: naming what is wrong.
+    """
+
+    columns: tuple[BagColumn, ...]
+    step: float
+    messages: tuple[Path, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not _is_number(self.step) or self.step <= 0:
+            raise UsageError(f"step is {self.step!r}, expected the seconds between two rows, more than 0")
+        names = [column.name for column in self.columns]
+        for i, column in enumerate(self.columns):
+            if column.name in names[:i]:
+                raise UsageError(f"column {column.name} is given twice")
+            if column.longest is not None and column.longest < 2 * self.step:
+                raise UsageError(  # else a measurement in the pause could be in a row on either side of it
+                    f"column {column.name}: longest is {column.longest} s, expected at least two steps of {self.step} s"
+                )
+        if not any(column.kind == "y" for column in self.columns):
+            raise UsageError("there is no measurement: name at least one column y.NAME")
+
+    @classmethod
+    def read(cls, path: str | Path) -> BagMapping:
+        """Read a mapping from a TOML file.
+
+        Raises:
+            UsageError: naming the file and what is wrong in it.
+        """
+        return cls.parse(read_toml(Path(path)), Path(path).name)
+
+    @classmethod
+    def parse(cls, content: Mapping[str, Any], name: str) -> BagMapping:
+        """The mapping that a TOML file spells; `name` is what error messages call it.
+
+        Raises:
+            UsageError: naming what is wrong.
+        """
+        try:
+            _known(content, ("step", "columns", "messages"), "")
+            if "step" not in content:
+                raise UsageError("there is no step: say how many seconds lie between two rows, for example step = 0.1")
+            columns, messages = content.get("columns", {}), content.get("messages", [])
+            if not isinstance(columns, Mapping) or not all(isinstance(said, Mapping) for said in columns.values()):
+                raise UsageError('columns must be sections such as [columns."u.speed"]; the quotes are needed')
+            if not isinstance(messages, list | tuple) or not all(isinstance(text, str | Path) for text in messages):
+                raise UsageError(f"messages is {messages!r}, expected a list of .msg files or folders of them")
+            found = tuple(_column(column, said) for column, said in columns.items())
+            return cls(found, content["step"], tuple(Path(text) for text in messages))
+        except UsageError as error:
+            raise UsageError(f"{name}: {error}") from None
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """What a TOML file spells; `messages` count from its folder.
+
+    Raises:
+        UsageError: it cannot be read.
+    """
+    import tomllib
+
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"{path.name}: cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise UsageError(f"{path.name}: is not TOML: {str(error).partition(chr(10))[0]}") from error
+    if isinstance(content.get("messages"), list):
+        content["messages"] = [path.parent / text if isinstance(text, str) else text for text in content["messages"]]
+    return content
+
+
+def parse_map(text: str) -> tuple[str, dict[str, Any]]:
+    """The column and its keys that `COLUMN=TOPIC:FIELD[,KEY=VALUE...]` spells.
+
+    Raises:
+        UsageError: it is not spelt so.
+    """
+    source, *pairs = text.split(",")
+    name, equals, rest = source.partition("=")
+    topic, colon, field = rest.rpartition(":")
+    name, topic, field = name.strip(), topic.strip(), field.strip()
+    if not (equals and colon and name and topic and field):
+        raise UsageError(f"--map {text}: expected COLUMN=TOPIC:FIELD[,KEY=VALUE...], such as u.speed=/cmd_vel:linear.x")
+    said: dict[str, Any] = {"topic": topic, "field": field}
+    for pair in pairs:
+        key, equals, value = (part.strip() for part in pair.partition("="))
+        if not (equals and key and value):
+            raise UsageError(f"--map {text}: {pair!r} is not KEY=VALUE")
+        if key in said:
+            raise UsageError(f"--map {text}: {key} is given twice")
+        try:
+            said[key] = float(value)
+        except ValueError:
+            said[key] = value.strip("\"'")
+    return name, said
+
+
+def _column(name: str, said: Mapping[str, Any]) -> BagColumn:
+    keys = ["as" if field.name == "reading" else field.name for field in fields(BagColumn) if field.name != "name"]
+    _known(said, keys, f"column {name}: ")
+    for key in ("topic", "field"):
+        if key not in said:
+            raise UsageError(f"column {name}: there is no {key}")
+    return BagColumn(name, **{"reading" if key == "as" else key: value for key, value in said.items()})
+
+
+def _known(said: Mapping[str, Any], keys: Sequence[str], where: str) -> None:
+    for key in said:
+        if key not in keys:
+            raise UsageError(f"{where}unknown key {key}; there are {', '.join(keys)}")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

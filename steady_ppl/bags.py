@@ -1,0 +1,198 @@
+"""Bags to trajectories: `read_bags`.
+
+A bag has messages at any time; a table has one row every `step` seconds.
+
+- Rows lie on a grid from the first moment at which every control is known to the last measurement. Each trajectory's
+  time starts at zero.
+- A control is held: a row has the last command at or before it. With `between = "interpolate"` it is on the line
+  between the commands before and after, angles the shorter way round; after the last command that one goes on.
+- A measurement is in the row that is nearest to it, thus within half a step. It is never interpolated and never held,
+  which would make up data: a row without one is missing it. Of several the nearest to the row's time is kept (of two as
+  near, the earlier), and how many were left out is said.
+- A state is on the line between its neighbours where these are at most two steps apart, else unknown. Headings come
+  back continuous, the first of a trajectory between −π and π.
+- NaN and infinity, and an array too short in some messages, are missing measurements or states; in a control they are
+  an error.
+- Where the messages of a control pause for more than its `longest`, the trajectory ends with the last command before,
+  and a new one begins with the first after. It is left out, and this is said, if it has fewer than two rows or no
+  measurement.
+- `clock` says whose time counts: the bag's (when a message arrived), the header's (when it was made), or the header's
+  moved onto the bag's (`steady_ppl/bag_clocks.py`). `late` is subtracted last. Messages are then sorted by time; those
+  of one time stay in their order.
+- Every bag is a trajectory named after its file, or several, `name-1`, `name-2`, … where it pauses.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from steady_ppl.bag_clocks import align
+from steady_ppl.bag_fields import check_field, has_stamp, number_at, stamp_of, yaw_at
+from steady_ppl.bag_files import Bag, Say, bag_label, open_bag
+from steady_ppl.bag_mapping import BagColumn, BagMapping
+from steady_ppl.bag_rows import Piece, Series, in_rows
+from steady_ppl.command_parts import say as say_aside
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import DataError, UsageError
+
+
+def read_bags(paths: Sequence[str | Path], mapping: BagMapping, say: Say = say_aside) -> Trajectories:
+    """Read ROS bags into trajectories.
+
+    Args:
+        paths: ROS 1 .bag files, ROS 2 folders, or single .mcap or .db3 files.
+        mapping: which field becomes which column.
+        say: is told what was left out and which clocks were moved; by default on stderr.
+
+    Returns:
+        In the order of the bags, float64, the columns in the order of the mapping.
+
+    Raises:
+        DataError: naming the bag and, where they apply, the column, the topic and the field.
+        UsageError: two bags of one name.
+    """
+    import pandas as pd
+
+    from steady_ppl.table import from_frame
+
+    files = [Path(path) for path in paths]
+    labels = [bag_label(file) for file in files]
+    for i, label in enumerate(labels):
+        if label in labels[:i]:
+            raise UsageError(f"two bags are named {label}, and so would be their trajectories: rename one")
+    if not files:
+        raise UsageError("there is no bag: name at least one")
+    kept: dict[str, Piece] = {}
+    for file, label in zip(files, labels, strict=True):
+        with open_bag(file, mapping.messages) as bag:
+            series = read_series(bag, mapping, say)
+        for name, piece in _pieces(series, mapping, label, say).items():
+            if name in kept:
+                raise UsageError(f"two trajectories are named {name}: rename the bag {file.name}")
+            kept[name] = piece
+    if not kept:
+        raise DataError(
+            f"no trajectory is left of {', '.join(labels)}: no two rows have known controls and a measurement; are the "
+            'clocks the same? clock = "bag" and "aligned" go by that of the recorder'
+        )
+    names = {kind: [one.name for one in mapping.columns if one.kind == kind] for kind in "uyx"}
+    blocks = []
+    for name, piece in kept.items():
+        block = {"trajectory": name, "time": np.arange(piece.rows) * float(mapping.step)}
+        blocks.append(pd.DataFrame(block | {column: piece.cells[column] for kind in "uyx" for column in names[kind]}))
+    return from_frame(pd.concat(blocks, ignore_index=True), name=", ".join(labels))
+
+
+def read_series(bag: Bag, mapping: BagMapping, say: Say = say_aside) -> list[Series]:
+    """What the messages of a bag say in the fields of a mapping, in the order of its columns.
+
+    Raises:
+        DataError: naming the bag's column, topic and field.
+    """
+    topics: dict[str, list[BagColumn]] = {}
+    for column in mapping.columns:
+        where = f"{bag.name}: {column.where}"
+        type_name = bag.type_of(column.topic, where)
+        check_field(bag.store, type_name, column.steps, where, quaternion=column.reading == "yaw")
+        if column.clock != "bag" and not has_stamp(bag.store, type_name):
+            raise DataError(f'{where}: a {type_name} has no header.stamp; expected clock = "bag"')
+        topics.setdefault(column.topic, []).append(column)
+    lacking = sorted({bag.type_of(topic, bag.name) for topic in topics} - bag.defined)
+    if lacking:
+        say(f"{bag.name} does not define {', '.join(lacking)}: taken from `messages`, else from ROS 2 Humble")
+    found = {one.column.name: one for topic, columns in topics.items() for one in _of_topic(bag, topic, columns, say)}
+    return [found[column.name] for column in mapping.columns]
+
+
+def _of_topic(bag: Bag, topic: str, columns: list[BagColumn], say: Say) -> list[Series]:
+    stamped = any(column.clock != "bag" for column in columns)
+    read = [(yaw_at if column.reading == "yaw" else number_at, column.steps) for column in columns]
+    arrivals: list[int] = []
+    headers: list[int] = []
+    values: list[list[float]] = []
+    short = [0] * len(columns)
+    for arrival, message in bag.messages(topic):
+        arrivals.append(arrival)
+        if stamped:
+            headers.append(stamp_of(message))
+        cells = []
+        for i, (value_at, steps) in enumerate(read):
+            try:
+                cells.append(value_at(message, steps))
+            except IndexError:
+                short[i] += 1
+                cells.append(math.nan)
+        values.append(cells)
+    received, stamps = np.array(arrivals, dtype=np.int64), np.array(headers, dtype=np.int64)
+    table = np.array(values, dtype=np.float64).reshape(len(arrivals), len(columns))
+    if stamped and len(stamps) and (stamps == 0).any():
+        raise DataError(
+            f"{bag.name}: topic {topic}: the header.stamp of {int((stamps == 0).sum())} of {len(stamps)} messages is "
+            'zero, nobody set it; use clock = "bag"'
+        )
+    times = {"bag": received, "header": stamps}
+    if any(column.clock == "aligned" for column in columns) and len(stamps):
+        moved = align(stamps, received)
+        times["aligned"] = moved.times
+        say(
+            f"{bag.name}: {topic}: its clock was {abs(moved.offset) * 1e3:.3f} ms "
+            f"{'behind' if moved.offset >= 0 else 'ahead of'} the bag's halfway, the smallest delay included, and "
+            f"{'lost' if moved.drift >= 0 else 'gained'} {abs(moved.drift) * 1e6:.2f} ppm"
+        )
+    found = []
+    for column, read_values, missing in zip(columns, table.T, short, strict=True):
+        if missing:
+            _short_array(bag, column, missing, len(arrivals), say)
+        time = times.get(column.clock, received) - round(column.late * 1e9)
+        found.append(_series(bag, column, time, read_values))
+    return found
+
+
+def _short_array(bag: Bag, column: BagColumn, missing: int, messages: int, say: Say) -> None:
+    """Refuse an index that no message has, or that a control's lacks once; else say how often it is missing."""
+    where = f"{bag.name}: {column.where}"
+    if missing == messages or column.kind == "u":
+        raise DataError(f"{where}: the index is out of range in {missing} of {messages} messages, the array is shorter")
+    say(f"{where}: the array is shorter in {missing} of {messages} messages, where nothing is taken for measured")
+
+
+def _series(bag: Bag, column: BagColumn, time: np.ndarray, values: np.ndarray) -> Series:
+    order = np.argsort(time, kind="stable")
+    time, values = time[order], values[order]
+    good = np.isfinite(values)
+    if column.kind == "u" and not good.all():
+        i = int(good.argmin())
+        raise DataError(
+            f"{bag.name}: {column.where}: got {values[i]} after {(time[i] - time[0]) / 1e9:.3f} s, expected a finite "
+            "number: a control must be known",
+            column=column.name,
+        )
+    if column.kind == "u" and not len(time):
+        raise DataError(f"{bag.name}: {column.where}: there is no message, and a control must be known")
+    return Series(column, time[good], values[good])
+
+
+def _pieces(series: list[Series], mapping: BagMapping, label: str, say: Say) -> dict[str, Piece]:
+    """The trajectories of a bag by name, without those that say nothing; what is left out is said."""
+    found = in_rows(series, mapping.step, label)
+    first = min((int(one.times[0]) for one in series if len(one.times)), default=0)
+    kept = {}
+    for i, piece in enumerate(found):
+        name = label if len(found) == 1 else f"{label}-{i + 1}"
+        if piece.rows >= 2:
+            kept[name] = piece
+            continue
+        what = "has one row" if piece.rows else "has no measurement"
+        say(f"{name}, from {(piece.start - first) / 1e9:.3f} s, {what} and is left out")
+    measured = {one.column.name: len(one.times) for one in series if one.column.kind == "y"}
+    rivals = {name: sum(piece.rivals[name] for piece in found) for name in measured}
+    outside = {name: count - sum(piece.placed[name] for piece in found) for name, count in measured.items()}
+    for counts, why in ((rivals, "another was nearer to their row"), (outside, "some control was not known then")):
+        if any(counts.values()):
+            each = ", ".join(f"{count} of {measured[name]} {name}" for name, count in counts.items() if count)
+            say(f"{label}: measurements left out, because {why}: {each}")
+    return kept
