@@ -7,7 +7,7 @@ OUT ?= out
 DRAWS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test found learn learn-truck truck paper lint types check clean
+.PHONY: demo test found learn learn-truck truck paper lint types check docs clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "steady-ppl needs Python 3.11 or newer; name one with make PYTHON=...")'
@@ -47,6 +47,11 @@ types: $(INSTALLED)
 	$(BIN)/mypy
 
 check: lint types test
+
+docs: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir $(abspath $(OUT))/site
+	@echo "$(OUT)/site/index.html"
 
 clean:
 	rm -rf $(VENV) $(OUT)

@@ -61,7 +61,7 @@ def page() -> str:
 
 def entry(effect: Effect, records: list[dict]) -> list[str]:
     """One effect."""
-    title = f"`{effect.name}`" + (f" of {program_of(effect)[0]}s" if slug(effect) != effect.name else "")
+    title = f"`{effect.name}`" + (f" on a {program_of(effect)[0]}" if slug(effect) != effect.name else "")
     typical = effect.typical if isinstance(effect.typical, tuple) else (effect.typical,)
     unit = "" if effect.unit == "1" else f" {effect.unit}"
     return [

@@ -1,4 +1,5 @@
-"""What users edit: programs in `models/`, recipes in `inference/`; of the checkout, or as the wheel has them."""
+"""What users edit: programs in `models/`, recipes in `inference/`, tours in `notebooks/`; of the checkout, or as the
+wheel has them."""
 
 from __future__ import annotations
 
@@ -8,13 +9,13 @@ from pathlib import Path
 
 from steady_ppl.errors import UsageError
 
-ROOMS = ("models", "inference")
+ROOMS = ("models", "inference", "notebooks")
 DRIVES = {"train": 16, "valid": 16, "test": 32}
 TRUTH = "models/hovercraft.py:HovercraftTruth"
 
 
 def workbench() -> Path:
-    """The folder with both rooms: the checkout, else the copy that the wheel carries.
+    """The folder with the rooms: the checkout, else the copy that the wheel carries.
 
     Raises:
         UsageError: this installation has neither.
@@ -23,11 +24,13 @@ def workbench() -> Path:
     for folder in (here.parent, here / "workbench"):
         if all((folder / room).is_dir() for room in ROOMS) and (folder / "inference" / "steady.py").is_file():
             return folder
-    raise UsageError(f"models and recipes are missing from this installation ({sysconfig.get_path('purelib')})")
+    raise UsageError(
+        f"models, recipes and notebooks are missing from this installation ({sysconfig.get_path('purelib')})"
+    )
 
 
 def furnish(folder: Path) -> list[Path]:
-    """Copy both rooms into a folder and simulate first tables of drives there.
+    """Copy the rooms into a folder and simulate first tables of drives there.
 
     Args:
         folder: is made; may exist if it is empty.
@@ -46,7 +49,9 @@ def furnish(folder: Path) -> list[Path]:
         raise UsageError(f"{folder} exists and is not empty: choose another folder")
     try:
         for room in ROOMS:
-            shutil.copytree(workbench() / room, folder / room, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(
+                workbench() / room, folder / room, ignore=shutil.ignore_patterns("__pycache__", ".ipynb_checkpoints")
+            )
     except OSError as error:
         raise UsageError(f"{folder} cannot be written: {error.strerror} ({error.filename})") from error
     program = load_program(str(folder / TRUTH))

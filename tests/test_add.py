@@ -302,10 +302,11 @@ def test_a_function_that_cannot_be_written_out_is_refused(folder: Path, function
     assert not list(folder.glob("*new.py"))
 
 
-def test_the_example_of_contributing_runs(folder: Path, capsys) -> None:
+def test_the_example_of_the_page_runs(folder: Path, capsys) -> None:
     """Registered by the program's file: simulated, listed, written out; the lines are the reader's own."""
-    section = (ROOT / "CONTRIBUTING.md").read_text().partition("## Add an effect")[2].partition("\n## ")[0]
-    (code,) = re.findall(r"```python\n(.*?)```", section, flags=re.DOTALL)
+    text = (ROOT / "docs" / "own-effect.md").read_text()
+    ((effect,),) = [re.findall(r"(def tether.*?)```", text, flags=re.DOTALL)]
+    code = "from steady_ppl.effects import Effect, register\n\n\n" + effect
     model, table = folder / "hovercraft.py", folder / "drives.csv"
     model.write_text(model.read_text() + "\n\n" + code)
     assert steady("simulate", model, "--trajectories", 1, "--effect", "tether:length=3=0.5", "--out", table) == 0

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from examples import MODELS
 from small import contents, steady
+from test_docs import commands
 
 from steady_ppl import read_table
 from steady_ppl.command_init import NEXT
@@ -24,9 +25,9 @@ def test_it_copies_the_rooms_and_simulates_drives(tmp_path: Path, capsys, refuse
     assert steady("init", lab) == 0
     said = capsys.readouterr().out
     assert "train.csv" in said and all(line in said for line in NEXT)
-    for room in ("models", "inference"):
+    for room in ("models", "inference", "notebooks"):
         ours = {name: text for name, text in contents(lab / room).items() if "__pycache__" not in name}
-        theirs = {path.name: path.read_bytes() for path in (ROOT / room).glob("*.py")}
+        theirs = {path.name: path.read_bytes() for path in (ROOT / room).iterdir() if path.suffix in (".py", ".ipynb")}
         assert ours == theirs
     train, test = read_table(lab / "train.csv"), read_table(lab / "test.csv")
     assert len(train) == 16 and bool(train.states[1:].isnan().all()) and not bool(train.states[0].isnan().any())
@@ -37,7 +38,8 @@ def test_it_copies_the_rooms_and_simulates_drives(tmp_path: Path, capsys, refuse
 
 @pytest.mark.slow
 def test_the_wheel_is_enough(tmp_path: Path):
-    """Built and installed, with the dependencies of this environment and nothing of the checkout."""
+    """Built and installed, with the dependencies of this environment and nothing of the checkout: what `init` proposes
+    runs in its folder, and so do the demonstration and every command of the README, with fewer steps and draws."""
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
     subprocess.run([*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", tmp_path, ROOT], check=True)
     (wheel,) = tmp_path.glob("*.whl")
@@ -65,3 +67,14 @@ def test_the_wheel_is_enough(tmp_path: Path):
         run(f"{line} {fast.get(line.split()[1], fast['check'])}", lab)
     assert (lab / "report.html").stat().st_size < 6_000_000
     assert "effects" in (lab / "runs" / "found" / "discovery.json").read_text()
+    for folder in ("runs", "report.html"):
+        (lab / folder).rename(lab / f"first-{folder}")
+    fast |= {"evaluate": "--rollouts 20", "simulate": "", "add": "", "prove": "", "report": "--simulations 20"}
+    fast |= {"states": "--draws 10", "effects": "", "demo": "--out demo"}
+    done = set()
+    for words in commands(ROOT / "README.md"):
+        if words[0] != "init":
+            run(f"steady {shlex.join(words)} {fast[words[0]]}", lab)
+            done.add(words[0])
+    assert done >= {"demo", "simulate", "fit", "check", "discover", "add", "prove", "report", "evaluate"}
+    run("python -c 'from inference import steady; from models.hovercraft import Hovercraft'", lab)
