@@ -17,12 +17,13 @@ Listener = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class _Place:
-    """Where the computation is: what it does, and which part of the whole that is."""
+    """Where the computation is: what it does, which part of the whole that is, and whether it is in a stage."""
 
     listener: Listener
     doing: str = ""
     first: float = 0.0
     last: float = 1.0
+    inside: bool = False
 
 
 _place: ContextVar[_Place | None] = ContextVar("place", default=None)
@@ -61,7 +62,7 @@ def stages(*named: tuple[str, float]) -> Iterator[Callable[[], None]]:
         first, last = outer.first + done * width, outer.first + (done + share) * width
         done += share
         said = ": ".join(part for part in (outer.doing, doing) if part)
-        _place.set(replace(outer, doing=said, first=first, last=last))
+        _place.set(replace(outer, doing=said, first=first, last=last, inside=True))
         outer.listener(said, first)
 
     try:
@@ -69,5 +70,5 @@ def stages(*named: tuple[str, float]) -> Iterator[Callable[[], None]]:
     finally:
         if outer is not None:
             _place.set(outer)
-            if not outer.doing and outer.first == 0.0:
+            if not outer.inside:
                 outer.listener("", 1.0)

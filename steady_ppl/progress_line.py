@@ -27,10 +27,10 @@ class _Line:
         """A stage begins; the outermost one ends with no name."""
         with self.lock:
             self.since = time.monotonic()
-            if not self.doing:
+            if share == 0.0 and not self.doing:
                 self.begun = self.since
             self.doing, self.share = doing, share
-            if not doing:
+            if share == 1.0:
                 self._clear()
 
     def keep_drawing(self) -> None:

@@ -37,6 +37,16 @@ def test_a_stage_that_fails_leaves_the_outer_one_as_it_was() -> None:
     assert heard == [("a", 0.0), ("a: x", 0.0), ("b", 0.5), ("", 1.0)]
 
 
+def test_a_stage_without_a_name_is_no_end() -> None:
+    heard: list[tuple[str, float]] = []
+    with listening(lambda doing, share: heard.append((doing, share))), stages(("", 1), ("b", 1)) as begin:
+        begin()
+        with stages(("a", 1)) as inner:
+            inner()
+        begin()
+    assert heard == [("", 0.0), ("a", 0.0), ("b", 0.5), ("", 1.0)]
+
+
 def test_nobody_need_listen() -> None:
     with stages(("a", 1)) as begin:
         begin()

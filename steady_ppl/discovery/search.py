@@ -158,11 +158,14 @@ def search(
         base = first_refit(program, train, valid, known_start=known_start, seed=seed)
         found = Search(known_start, base, base)
         begin()
-        with stages(*(("testing", 1 / 2**index) for index in range(MOST + 1))) as next_round:
-            for index in range(MOST + 1):
-                next_round()
+        rounds = range(MOST + 1)
+        parts = [part for index in rounds for part in (("testing every effect", 1 / 2**index), ("", 1 / 2**index))]
+        with stages(*parts) as begin_part:
+            for index in rounds:
+                begin_part()
                 count = sets if index == 0 else later_sets
                 screening = screen_program(found.final, declared, settings, sets=count, seed=seed + index)
+                begin_part()
                 if not _add_best(found, screening, settings, index):
                     break
         begin()
