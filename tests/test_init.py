@@ -74,7 +74,8 @@ def test_the_wheel_is_enough(tmp_path: Path):
     done = set()
     for words in commands(ROOT / "README.md"):
         if words[0] != "init":
-            run(f"steady {shlex.join(words)} {fast[words[0]]}", lab)
+            fewer = "" if words[0] == "fit" and "hand" in words else fast[words[0]]
+            run(f"steady {shlex.join(words)} {fewer}", lab)
             done.add(words[0])
     assert done >= {"demo", "simulate", "fit", "check", "discover", "add", "prove", "report", "evaluate"}
     run("python -c 'from inference import steady; from models.hovercraft import Hovercraft'", lab)
