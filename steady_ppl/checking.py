@@ -19,22 +19,21 @@ from steady_ppl.blame import SCATTER, Blame, blame, scored
 from steady_ppl.check_report import as_text, figures, verdict
 from steady_ppl.data import Trajectories
 from steady_ppl.directions import directions
-from steady_ppl.errors import DataError, FilterError, UsageError
+from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
-from steady_ppl.gaussian_smoother import find_and_smooth, smooth
+from steady_ppl.gaussian_smoother import find_and_smooth
 from steady_ppl.linearization import why_not_linear
 from steady_ppl.misfit_maps import Misfit, Residuals, judge
-from steady_ppl.predictions import Prediction, named_horizons, predict, simulate_again
+from steady_ppl.predictions import Prediction, named_horizons, predict
 from steady_ppl.program import Program, for_program, names
 from steady_ppl.progress import stages
 from steady_ppl.reference_motion import Reference, constant_velocity, last_measurement
 from steady_ppl.seeding import seeded
+from steady_ppl.simulated_sets import FEWEST, residuals, simulate_sets
 from steady_ppl.stuck import Stretch, stuck
-from steady_ppl.tracking import Tracked, track
+from steady_ppl.tracking import track
 
 SECONDS = (1.0, 3.0)
-FEWEST = 20  # simulated sets
-PASSES = 4  # linearisations: beside a landmark the truth is far from the mode, where the measured drives' paths lie
 MOST = 4.0  # standard deviations of a single residual; beside a landmark the linearised program knows no more
 
 
@@ -122,19 +121,14 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
             _, drawn, _ = ahead.draws(simulations)
             starts = run.known_start.expand(simulations, -1, -1) if fit.known_start else drawn[:, 0]
             begin()
-            again, truth = simulate_again(program, run, starts, real.noise.shape[-1])
-        near = smooth(program, again, truth, known_start=fit.known_start, passes=PASSES).linearization.path
-        copies = track(program, again, near, known_start=fit.known_start, passes=1)
-        again, copies, sets = _without_broken(again, copies, len(run))
+            rows = list(horizons.values())
+            channels = real.noise.shape[-1]
+            made = simulate_sets(program, run, starts, channels, rows, known_start=fit.known_start)
         begin()
-        rows = list(horizons.values())
         predictions = predict(program, run, real, rows)
-        simulated = predict(program, again, copies, rows, bands=[1])
-        floor = {horizon: _rmse_of_sets(ahead_of_it, sets) for horizon, ahead_of_it in simulated.items()}
-        ours = replace(_residuals(program, run, real, predictions[1], 1), raw=_array(predictions[1].error))
-        theirs = _residuals(program, again, copies, simulated[1], sets)
-        ours, theirs = _in_own_spreads(ours, theirs)
-        scores = scored(directions(program, run, real), directions(program, again, copies), sets)
+        ours = replace(residuals(program, run, real, predictions[1], 1), raw=_array(predictions[1].error))
+        ours, theirs = _in_own_spreads(ours, made.residuals)
+        scores = scored(directions(program, run, real), made.directions, made.sets)
         misfit = judge(
             ours,
             theirs,
@@ -143,7 +137,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
             _pairs(program, ours),
             scores.dispersion.mean(-1),
         )
-    notes = [] if sets == simulations else [f"{simulations - sets} of {simulations} simulated sets blew up"]
+    notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
     if not scores.parameter_names:
         notes.append("the program's own parameters were not looked at one by one: it has none, or a network's")
     return Check(
@@ -151,7 +145,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         data=run,
         horizons=horizons,
         predictions=predictions,
-        floor=floor,
+        floor=made.floor,
         reference=constant_velocity(program, run, real, rows, known_start=fit.known_start),
         held=last_measurement(program, run, real.smoothed, rows),
         misfit=misfit,
@@ -173,61 +167,6 @@ def _require(program: Program, data: Trajectories, known_start: bool, simulation
     why = why_not_linear(program, data, known_start=known_start)
     if why is not None:
         raise UsageError(f"check needs a program that can be linearised: {why.split(': looking')[0]}")
-
-
-def _without_broken(data: Trajectories, tracked: Tracked, drives: int) -> tuple[Trajectories, Tracked, int]:
-    """Leave out the simulated sets of which a drive blew up."""
-    whole = torch.isfinite(tracked.log_likelihood).view(-1, drives).all(1)
-    if int(whole.sum()) < FEWEST:
-        raise FilterError(
-            f"{int((~whole).sum())} of {len(whole)} simulated sets blew up: the fitted program does not even explain "
-            "drives of its own"
-        )
-    if bool(whole.all()):
-        return data, tracked, len(whole)
-    kept = whole.repeat_interleave(drives).nonzero().flatten()
-    again = data.subset(kept)
-    return again, track_of(tracked, kept), int(whole.sum())
-
-
-def track_of(tracked: Tracked, kept: Tensor) -> Tracked:
-    """Some of the drives."""
-    linear = tracked.linearization
-    path = replace(linear.path, states=linear.path.states[:, kept], noise=linear.path.noise[:, kept])
-    by_row = ("offset", "state", "noise", "residual", "measurement", "precision", "log_scale")
-    by_drive = ("start_offset", "start_turn", "start_noise")
-    parts: dict[str, Any] = {name: getattr(linear, name)[:, kept] for name in by_row}
-    parts |= {name: getattr(linear, name)[kept] for name in by_drive}
-    own = ("states", "covariances", "smoothed", "noise", "arrival", "reading")
-    return replace(
-        tracked,
-        linearization=replace(linear, path=path, **parts),
-        log_likelihood=tracked.log_likelihood[kept],
-        **{name: getattr(tracked, name)[:, kept] for name in own},
-    )
-
-
-def _residuals(program: Program, data: Trajectories, tracked: Tracked, ahead: Prediction, sets: int) -> Residuals:
-    """The standardised one-step errors of the measurements and the scores of the channels, with what they are sorted
-    by: state components, velocities in the channels' own frame and positions."""
-    values = torch.cat([ahead.standardised, tracked.noise], -1)
-    there = torch.cat([ahead.observed, data.transitions.unsqueeze(-1).expand_as(tracked.noise)], -1)
-    states = tracked.path(data).states[:-1]
-    variables = {name: states[..., i] for i, name in enumerate(names(program.states))}
-    for angle in program.angles:
-        variables[angle] = torch.remainder(variables[angle] + torch.pi, 2 * torch.pi) - torch.pi
-    for name, velocity in program.velocities(states).items():
-        if not any(torch.equal(velocity, value) for value in variables.values()):
-            variables[f"{name} velocity"] = velocity
-    channels = names(program.channels)
-    if len(channels) != tracked.noise.shape[-1]:
-        channels = tuple(f"channel {i + 1}" for i in range(tracked.noise.shape[-1]))
-    return Residuals(
-        names=[*names(program.measurements), *channels],
-        values=_by_set(torch.where(there, values, 0.0), sets),
-        there=_by_set(there, sets),
-        variables={name: _by_set(value, sets) for name, value in variables.items()},
-    )
 
 
 def _in_own_spreads(real: Residuals, simulated: Residuals) -> tuple[Residuals, Residuals]:
@@ -270,19 +209,8 @@ def _scatter(real: Residuals, simulated: Residuals) -> dict[str, np.ndarray]:
     return found | {f"tails of {real.names[i]}": tails[:, i] for i in told}
 
 
-def _rmse_of_sets(prediction: Prediction, sets: int) -> np.ndarray:
-    """Root mean square of each component's error in each set, `(M, K)`."""
-    error, there = (values.unflatten(1, (sets, -1)) for values in (prediction.error, prediction.observed))
-    return _array((torch.where(there, error, 0.0).square().sum((0, 2)) / there.sum((0, 2)).clamp(min=1)).sqrt())
-
-
 def _controls(program: Program, data: Trajectories) -> dict[str, np.ndarray]:
     return {name: _array(data.controls[:-1, :, i].double()) for i, name in enumerate(names(program.controls))}
-
-
-def _by_set(values: Tensor, sets: int) -> np.ndarray:
-    """`(T, M · B, ...)` to `(M, T, B, ...)`."""
-    return _array(values.unflatten(1, (sets, -1)).transpose(0, 1))
 
 
 def _array(values: Tensor) -> np.ndarray:

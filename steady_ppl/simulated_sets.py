@@ -1,0 +1,160 @@
+"""What a program makes of the controls of some drives, many times over: what the drives are compared with.
+
+Sets are simulated, smoothed and judged a block at a time, so that memory does not grow with their number times the
+drives': three hundred drives and a hundred sets at once would take fourteen gigabytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.directions import Direction, directions
+from steady_ppl.errors import FilterError
+from steady_ppl.gaussian_smoother import smooth
+from steady_ppl.linearization import Path
+from steady_ppl.misfit_maps import Residuals
+from steady_ppl.predictions import Prediction, predict, simulate_again
+from steady_ppl.program import Program, names
+from steady_ppl.tracking import Tracked, track
+
+FEWEST = 20  # sets
+ROWS = 500_000  # of all drives of a block
+PASSES = 4  # linearisations: beside a landmark the truth is far from the mode, where the measured drives' paths lie
+
+
+@dataclass(frozen=True)
+class SimulatedSets:
+    """`M` sets of the same `B` drives.
+
+    Attributes:
+        sets: M, those that blew up left out.
+        floor: horizon → RMSE of each component in each set, `(M, K)`.
+        residuals: of all sets.
+        directions: with the scores of all `M · B` drives.
+    """
+
+    sets: int
+    floor: dict[int, np.ndarray]
+    residuals: Residuals
+    directions: list[Direction]
+
+
+@torch.no_grad()
+def simulate_sets(
+    program: Program, data: Trajectories, starts: Tensor, channels: int, horizons: Sequence[int], *, known_start: bool
+) -> SimulatedSets:
+    """Simulate, track and predict.
+
+    Args:
+        program: the state-space model.
+        data: `B` drives, as returned by `for_program`.
+        starts: `(M, B, D)`, where each drive of each set begins.
+        channels: C, how many numbers a step's noise has.
+        horizons: rows ahead, one row among them.
+        known_start: the first state is certain.
+
+    Raises:
+        FilterError: too many sets blew up.
+    """
+    at_once = max(1, ROWS // data.time.numel())
+    found = [
+        one
+        for block in starts.split(at_once)
+        if (one := _block(program, data, block, channels, horizons, known_start)) is not None
+    ]
+    whole = sum(one.sets for one in found)
+    if whole < FEWEST:
+        raise FilterError(
+            f"{len(starts) - whole} of {len(starts)} simulated sets blew up: the fitted program does not even explain "
+            "drives of its own"
+        )
+    return found[0] if len(found) == 1 else _joined(found)
+
+
+def _block(
+    program: Program, data: Trajectories, starts: Tensor, channels: int, horizons: Sequence[int], known_start: bool
+) -> SimulatedSets | None:
+    """None where every set blew up."""
+    sets = len(starts)
+    again, truth = simulate_again(program, data, starts, channels)
+    near = smooth(program, again, truth, known_start=known_start, passes=PASSES).linearization.path
+    copies = track(program, again, near, known_start=known_start, passes=1)
+    whole = torch.isfinite(copies.log_likelihood).view(sets, -1).all(1)
+    if not bool(whole.all()):
+        if not bool(whole.any()):
+            return None
+        kept = whole.repeat_interleave(len(data)).nonzero().flatten()
+        again, sets = again.subset(kept), int(whole.sum())
+        near = Path(near.states[:, kept], near.noise[:, kept])
+        copies = track(program, again, near, known_start=known_start, passes=1)
+    simulated = predict(program, again, copies, horizons, bands=[1])
+    return SimulatedSets(
+        sets,
+        {horizon: _rmse_of_sets(ahead, sets) for horizon, ahead in simulated.items()},
+        residuals(program, again, copies, simulated[1], sets),
+        directions(program, again, copies),
+    )
+
+
+def _joined(blocks: Sequence[SimulatedSets]) -> SimulatedSets:
+    """As one; directions that are not in every block are left out."""
+    first, sets = blocks[0].residuals, sum(block.sets for block in blocks)
+    scores = [{one.name: one.scores for one in block.directions} for block in blocks]
+    return SimulatedSets(
+        sets,
+        {horizon: np.concatenate([block.floor[horizon] for block in blocks]) for horizon in blocks[0].floor},
+        replace(
+            first,
+            values=np.concatenate([block.residuals.values for block in blocks]),
+            there=np.concatenate([block.residuals.there for block in blocks]),
+            variables={
+                name: np.concatenate([block.residuals.variables[name] for block in blocks]) for name in first.variables
+            },
+        ),
+        [
+            replace(one, scores=torch.cat([block[one.name] for block in scores]))
+            for one in blocks[0].directions
+            if all(one.name in block for block in scores)
+        ],
+    )
+
+
+def residuals(program: Program, data: Trajectories, tracked: Tracked, ahead: Prediction, sets: int) -> Residuals:
+    """The standardised one-step errors of the measurements and the scores of the channels, with what they are sorted
+    by: state components, velocities in the channels' own frame and positions."""
+    values = torch.cat([ahead.standardised, tracked.noise], -1)
+    there = torch.cat([ahead.observed, data.transitions.unsqueeze(-1).expand_as(tracked.noise)], -1)
+    states = tracked.path(data).states[:-1]
+    variables = {name: states[..., i] for i, name in enumerate(names(program.states))}
+    for angle in program.angles:
+        variables[angle] = torch.remainder(variables[angle] + torch.pi, 2 * torch.pi) - torch.pi
+    for name, velocity in program.velocities(states).items():
+        if not any(torch.equal(velocity, value) for value in variables.values()):
+            variables[f"{name} velocity"] = velocity
+    channels = names(program.channels)
+    if len(channels) != tracked.noise.shape[-1]:
+        channels = tuple(f"channel {i + 1}" for i in range(tracked.noise.shape[-1]))
+    return Residuals(
+        names=[*names(program.measurements), *channels],
+        values=_by_set(torch.where(there, values, 0.0), sets),
+        there=_by_set(there, sets),
+        variables={name: _by_set(value, sets) for name, value in variables.items()},
+    )
+
+
+def _rmse_of_sets(prediction: Prediction, sets: int) -> np.ndarray:
+    """Root mean square of each component's error in each set, `(M, K)`."""
+    error, there = (values.unflatten(1, (sets, -1)) for values in (prediction.error, prediction.observed))
+    squares = torch.where(there, error, 0.0).square().sum((0, 2))
+    return (squares / there.sum((0, 2)).clamp(min=1)).sqrt().numpy(force=True)
+
+
+def _by_set(values: Tensor, sets: int) -> np.ndarray:
+    """`(T, M · B, ...)` to `(M, T, B, ...)`."""
+    return values.unflatten(1, (sets, -1)).transpose(0, 1).numpy(force=True)
