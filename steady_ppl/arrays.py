@@ -32,12 +32,19 @@ def from_arrays(drives: Sequence[Mapping[str, Any]], labels: Sequence[str] | Non
     labels = [str(i + 1) for i in range(len(drives))] if labels is None else list(labels)
     if not drives or len(labels) != len(drives):
         raise DataError(f"arrays: got {len(drives)} drives and {len(labels)} labels")
+    repeated = sorted({label for label in labels if labels.count(label) > 1})
+    if repeated:
+        raise DataError(f"arrays: {len(drives)} drives need {len(drives)} labels, and {repeated[0]} is there twice")
     frames = []
     for label, drive in zip(labels, drives, strict=True):
         columns: dict[str, np.ndarray] = {}
         for name, values in drive.items():
             values = np.asarray(values)
             parts = {name: values} if values.ndim < 2 else {f"{name}_{i}": part for i, part in enumerate(values.T)}
+            twice = sorted(parts.keys() & columns.keys() | ({name} & {"trajectory"}))
+            if twice:
+                why = "is what the labels are called" if name == "trajectory" else "is there twice"
+                raise DataError(f"arrays: column {twice[0]} of trajectory {label} {why}", column=twice[0])
             columns |= parts
         shapes = {name: values.shape for name, values in columns.items()}
         if len(set(shapes.values())) > 1 or any(len(shape) != 1 for shape in shapes.values()):

@@ -38,6 +38,7 @@ from steady_ppl.bag_rows import Piece, Series, in_rows
 from steady_ppl.command_parts import say as say_aside
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError, UsageError
+from steady_ppl.progress import stages
 
 
 def read_bags(paths: Sequence[str | Path], mapping: BagMapping, say: Say = say_aside) -> Trajectories:
@@ -67,13 +68,15 @@ def read_bags(paths: Sequence[str | Path], mapping: BagMapping, say: Say = say_a
     if not files:
         raise UsageError("there is no bag: name at least one")
     kept: dict[str, Piece] = {}
-    for file, label in zip(files, labels, strict=True):
-        with open_bag(file, mapping.messages) as bag:
-            series = read_series(bag, mapping, say)
-        for name, piece in _pieces(series, mapping, label, say).items():
-            if name in kept:
-                raise UsageError(f"two trajectories are named {name}: rename the bag {file.name}")
-            kept[name] = piece
+    with stages(*((f"reading {label}", 1) for label in labels)) as begin:
+        for file, label in zip(files, labels, strict=True):
+            begin()
+            with open_bag(file, mapping.messages) as bag:
+                series = read_series(bag, mapping, say)
+            for name, piece in _pieces(series, mapping, label, say).items():
+                if name in kept:
+                    raise UsageError(f"two trajectories are named {name}: rename the bag {file.name}")
+                kept[name] = piece
     if not kept:
         raise DataError(
             f"no trajectory is left of {', '.join(labels)}: no two rows have known controls and a measurement; are the "
@@ -104,7 +107,11 @@ def read_series(bag: Bag, mapping: BagMapping, say: Say = say_aside) -> list[Ser
     lacking = sorted({bag.type_of(topic, bag.name) for topic in topics} - bag.defined)
     if lacking:
         say(f"{bag.name} does not define {', '.join(lacking)}: taken from `messages`, else from ROS 2 Humble")
-    found = {one.column.name: one for topic, columns in topics.items() for one in _of_topic(bag, topic, columns, say)}
+    found: dict[str, Series] = {}
+    with stages(*((topic, 1) for topic in topics)) as begin:
+        for topic, columns in topics.items():
+            begin()
+            found |= {one.column.name: one for one in _of_topic(bag, topic, columns, say)}
     return [found[column.name] for column in mapping.columns]
 
 

@@ -138,6 +138,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
             scores.dispersion.mean(-1),
         )
     notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
+    notes += run.uneven_steps
     if not scores.parameter_names:
         notes.append("the program's own parameters were not looked at one by one: it has none, or a network's")
     return Check(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +13,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from steady_ppl.errors import RunError
+from steady_ppl.whole_file import whole_file
 
 
 @dataclass
@@ -43,11 +43,12 @@ class Checkpoint:
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: Mapping[str, str] | None = None) -> None:
     """Write tensors and text to a safetensors file, whole or not at all."""
-    beside = path.with_name(path.name + ".partial")
-    save_file(
-        {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}, beside, dict(text or {})
-    )
-    os.replace(beside, path)
+    kept = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    with whole_file(path, RunError) as beside:
+        try:
+            save_file(kept, beside, dict(text or {}))
+        except SafetensorError as error:  # what the file system refuses comes as its own
+            raise RunError(f"{path} cannot be written: {error}") from error
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -27,17 +27,18 @@ def check(
 ) -> None:
     """Compare a run with measurements: where, when and in which regime it fails, and who is at fault."""
     from steady_ppl.checking import check as compare
-    from steady_ppl.command_parts import present, require_folder, say
+    from steady_ppl.command_parts import present, say
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
     from steady_ppl.stuck import masked
     from steady_ppl.table import read_table, require_table_file, write_table
+    from steady_ppl.whole_file import require_place
 
     require_picture(picture)
-    require_folder(json_file)
+    require_place(json_file)
     if mask is not None:
         require_table_file(mask)
-        require_folder(mask)
+        require_place(mask)
         if mask.resolve() in (table.resolve(), json_file and json_file.resolve()):
             raise UsageError(f"--mask {mask} is the table itself, or the file of --json: name another file")
     drives = read_table(table)

@@ -35,13 +35,14 @@ def discover(
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing run.")] = False,
 ) -> None:
     """Learn which physical effect a program lacks: none, one by name, several, or a curve that has no name."""
-    from steady_ppl.command_parts import present, program_from, require_folder, say, write_json
+    from steady_ppl.command_parts import present, program_from, say, write_json
     from steady_ppl.discovery import discover as search
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
     from steady_ppl.run_folder import DISCOVERY, run_folder
     from steady_ppl.run_recipe import fingerprint
     from steady_ppl.table import read_table
+    from steady_ppl.whole_file import require_place
 
     is_run = Path(source).is_dir()
     if program and not is_run:
@@ -49,7 +50,7 @@ def discover(
     if out is not None and out.exists() and not force:
         raise RunError(f"{out} exists: choose another folder, or --force to overwrite")
     require_picture(picture)
-    require_folder(json_file)
+    require_place(json_file)
     given: Any = Fit.load(source, program) if is_run else program_from(source, seed)
     drives, judges = read_table(table), read_table(valid) if valid else None
     with run_folder(out, force=force) if out else nullcontext():

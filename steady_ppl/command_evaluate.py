@@ -30,15 +30,16 @@ def evaluate(
     ] = None,
 ) -> None:
     """The paper's errors where true states exist; errors in measurement space always."""
-    from steady_ppl.command_parts import load_runs, present, require_folder, run_labels, say, used_before
+    from steady_ppl.command_parts import load_runs, present, run_labels, say, used_before
     from steady_ppl.evaluation import evaluate_all, incomparable, table_of
     from steady_ppl.program_file import load_program
     from steady_ppl.run_recipe import fingerprint
     from steady_ppl.table import read_table
+    from steady_ppl.whole_file import require_place
 
     if len(arguments) < 2:
         raise UsageError("evaluate needs at least one RUN and then a TABLE")
-    require_folder(json_file)
+    require_place(json_file)
     *runs, table = arguments
     labels = run_labels(runs)
     fits = list(load_runs(labels, program).values())
@@ -54,7 +55,7 @@ def evaluate(
             lines.append(f"{label}: landmarks off by {error['rms']:.3g} m rms, {error['most']:.3g} m at most{how}")
     rows = [{"run": folder, **result} for folder, result in zip(folders, results, strict=True)]
     present("\n".join(lines), {"runs": rows}, json_file)
-    for reason in incomparable(results, folders) + used_before(labels, fingerprint(drives)):
+    for reason in incomparable(results, folders) + used_before(labels, fingerprint(drives)) + drives.uneven_steps:
         say(reason)
     for run, result in zip(runs, results, strict=True):
         if result["filter"] != "lookahead":

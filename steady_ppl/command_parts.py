@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from steady_ppl.errors import ComputationError, UsageError
+from steady_ppl.whole_file import whole_file
 
 
 def program_from(model: str, seed: int) -> Any:
@@ -28,14 +28,9 @@ def program_from(model: str, seed: int) -> Any:
 
 def write_json(path: Path, content: Any) -> None:
     """Write a file whole or not at all; a figure that is not finite is an error, JSON has no word for it."""
-    beside = path.with_name(path.name + ".partial")
     text = as_json(content, str(path)) + "\n"
-    try:
+    with whole_file(path) as beside:
         beside.write_text(text)
-        os.replace(beside, path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise UsageError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def as_json(content: Any, place: str) -> str:
@@ -44,14 +39,6 @@ def as_json(content: Any, place: str) -> str:
         return json.dumps(content, indent=1, allow_nan=False)
     except ValueError as error:
         raise ComputationError(f"{place} is not written: a figure is not finite, the program has blown up") from error
-
-
-def require_folder(path: Path | None) -> None:
-    """Refuse a file whose folder does not exist, or that is one, before anything is computed."""
-    if path is not None and not path.parent.is_dir():
-        raise UsageError(f"{path} cannot be written: there is no folder {path.parent}")
-    if path is not None and path.is_dir():
-        raise UsageError(f"{path} cannot be written: it is a folder")
 
 
 _quiet: ContextVar[bool] = ContextVar("quiet", default=False)

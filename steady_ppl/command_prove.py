@@ -32,7 +32,6 @@ def prove(
         load_runs,
         present,
         program_from,
-        require_folder,
         run_labels,
         used_before,
     )
@@ -40,12 +39,13 @@ def prove(
     from steady_ppl.proving import prove as judge
     from steady_ppl.run_recipe import fingerprint
     from steady_ppl.table import read_table
+    from steady_ppl.whole_file import require_place
 
     *runs, table = arguments
     if not runs:
         raise UsageError("prove needs at least one RUN and then a TABLE")
     require_picture(picture)
-    require_folder(json_file)
+    require_place(json_file)
     labels = run_labels(runs, taken={"oracle", "truth"}) | ({"oracle": oracle} if oracle else {})
     rows: dict[str, Any] = load_runs(labels, program)
     if truth is not None:

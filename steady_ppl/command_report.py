@@ -35,18 +35,19 @@ def report(
 
     What `steady discover … --out RUN` found is shown if one of the runs is such a RUN. The page needs no network.
     """
-    from steady_ppl.command_parts import load_runs, require_folder, run_labels, used_before
+    from steady_ppl.command_parts import load_runs, run_labels, used_before
     from steady_ppl.reporting import report as gather
     from steady_ppl.run_folder import read_discovery
     from steady_ppl.run_recipe import fingerprint
     from steady_ppl.table import read_table
+    from steady_ppl.whole_file import require_place
 
     *runs, table = arguments
     if not runs:
         raise UsageError("report needs at least one RUN and then a TABLE")
     if out.suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"{out}: expected a page's name that ends in .html")
-    require_folder(out)
+    require_place(out)
     labels = run_labels(runs)
     fits = load_runs(labels, program)
     drives = read_table(table)

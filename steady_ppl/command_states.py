@@ -26,13 +26,13 @@ def states(
 
     The table has for each state its median and the ends of its 90 % interval, `…_low` and `…_high`.
     """
-    from steady_ppl.command_parts import require_folder
     from steady_ppl.fit import Fit
     from steady_ppl.posterior_files import require_states_file, write_states
     from steady_ppl.table import read_table
+    from steady_ppl.whole_file import require_place
 
     require_states_file(out)
-    require_folder(out)
+    require_place(out)
     fit, drives = Fit.load(run, program), read_table(table)
     write_states(fit.posterior(drives, draws=draws, particles=particles, seed=seed), out)
     print(f"{out}: {len(drives)} drives, {draws} draws of each")

@@ -16,6 +16,8 @@ from torch import Tensor
 
 from steady_ppl.errors import DataError
 
+ALIKE = 1.25  # ratio of the drives' steps up to which they count as one
+
 
 @dataclass(frozen=True, eq=False)
 class Trajectories:
@@ -84,8 +86,20 @@ class Trajectories:
         return float((self.time[1:] - self.time[:-1])[self.transitions].median())
 
     def rows_ahead(self, seconds: float) -> int:
-        """How many rows make up a time."""
+        """How many rows make up a time, at the median step of all drives."""
         return round(seconds / self.median_step)
+
+    @property
+    def uneven_steps(self) -> list[str]:
+        """What is to be said of times ahead where drives are sampled at different rates; they are counted in rows."""
+        steps = torch.where(self.transitions, (self.time[1:] - self.time[:-1]), torch.nan).nanmedian(0).values
+        least, most = float(steps.min()), float(steps.max())
+        if most < ALIKE * least:
+            return []
+        return [
+            f"the drives' steps differ, {least:.3g} to {most:.3g} s: a time ahead is so many rows of "
+            f"{self.median_step:.3g} s in every drive; bring the table to one step, or judge its parts by themselves"
+        ]
 
     @property
     def elapsed(self) -> Tensor:

@@ -12,6 +12,8 @@ from steady_ppl.predictions import errors
 from steady_ppl.program import Program, names
 from steady_ppl.sites import AtMean, running
 
+PROBED, PUSHES = 200, (1e-3, 1.0, -1e3)  # rows and sizes of a command that is looked for in what acts later
+
 
 class Dynamics(nn.Module):
     """What a program says happens next, as a function of tensors.
@@ -22,7 +24,7 @@ class Dynamics(nn.Module):
     Attributes:
         state_names, control_names, measurement_names: what the last dimensions hold, in this order.
         step: s between two controls.
-        remembers: whether earlier commands still act (a delay, a lag).
+        remembers: whether earlier commands still act (a delay, a lag), with the parameters as they are.
 
     Example:
         >>> import steady_ppl as st  # doctest: +SKIP
@@ -38,7 +40,21 @@ class Dynamics(nn.Module):
         self.step = step
         self.state_names, self.control_names = names(program.states), names(program.controls)
         self.measurement_names = names(program.measurements)
-        self.remembers = type(program).actuators is not Program.actuators
+
+    @property
+    @torch.no_grad()
+    def remembers(self) -> bool:
+        if type(self.program).actuators is Program.actuators:
+            return False
+        like = next(self.program.parameters(), torch.zeros(()))
+        elapsed = self.step * torch.arange(PROBED, dtype=like.dtype, device=like.device)[:, None]
+        still = like.new_zeros(PROBED, 1, len(self.control_names))
+        for size in PUSHES:
+            once = still.clone()
+            once[0] = size
+            if not torch.equal(self.program.actuators(once, elapsed)[1:], self.program.actuators(still, elapsed)[1:]):
+                return True
+        return False
 
     def forward(
         self,
@@ -53,8 +69,9 @@ class Dynamics(nn.Module):
 
         Args:
             state: `(..., D)`, where the first control begins to act.
-            controls: `(H, ..., U)`, each for one step.
-            past: `(P, ..., U)` the commands before these, latest last; for programs that remember them.
+            controls: `(H, ..., U)`, each for one step; without the middle dimensions the same for all states.
+            past: `(P, ..., U)` the commands before these, latest last, for programs that remember them; without the
+                middle dimensions the same for all plans.
             time: s since the start of the drive at the first control; `P` steps when not given.
             noisy: draw the channel noise instead of taking its mean.
 
@@ -62,12 +79,12 @@ class Dynamics(nn.Module):
             `(H, ..., D)` the state after each control.
 
         Raises:
-            UsageError: another number of states or controls, or the program remembers and `past` is not given.
+            UsageError: another number of states or controls, shapes that do not go together, or the program remembers
+                and `past` is not given.
         """
-        for values, wanted in ((state, self.state_names), (controls, self.control_names)):
-            if values.shape[-1:] != (len(wanted),):
-                expected = f"(..., {len(wanted)}) for {', '.join(wanted)}"
-                raise UsageError(f"got a tensor of shape {tuple(values.shape)}, expected {expected}")
+        _require(state, "(..., {})", self.state_names)
+        for values in (controls, controls[:0] if past is None else past):
+            _require(values, "(rows, ..., {})", self.control_names)
         if past is None:
             if self.remembers:
                 raise UsageError(
@@ -75,8 +92,12 @@ class Dynamics(nn.Module):
                     "an empty tensor (0, ..., U) at the start of a drive"
                 )
             past = controls[:0]
-        shape = torch.broadcast_shapes(state.shape[:-1], controls.shape[1:-1])
-        commands = torch.cat([values.expand(len(values), *shape, -1) for values in (past, controls)])
+        try:
+            shape = torch.broadcast_shapes(state.shape[:-1], controls.shape[1:-1], past.shape[1:-1])
+        except RuntimeError:
+            told = ", ".join(str(tuple(values.shape)) for values in (state, controls, past))
+            raise UsageError(f"state, controls and past of shapes {told} do not go together") from None
+        commands = torch.cat([_for_all(values, shape) for values in (past, controls)])
         begun = len(past) * self.step if time is None else time
         rows = torch.arange(len(commands), dtype=controls.dtype, device=controls.device) - len(past)
         elapsed = (begun + self.step * rows)[:, None].expand(-1, shape.numel())
@@ -87,9 +108,22 @@ class Dynamics(nn.Module):
             with running(len(state)), nullcontext() if noisy else AtMean():
                 state = self.program.transition(state, *given)
             states.append(state)
-        return torch.stack(states).reshape(len(controls), *shape, -1)
+        return torch.stack([*states, state])[:-1].reshape(len(controls), *shape, state.shape[-1])
 
     def measure(self, state: Tensor) -> Tensor:
         """What is measured on average in a state, `(..., K)` of `(..., D)`; angles between −π and π."""
         nothing = state.new_zeros(*state.shape[:-1], len(self.measurement_names))
         return -errors(self.program, state, nothing, torch.ones_like(nothing, dtype=torch.bool))
+
+
+def _require(values: Tensor, wanted: str, components: tuple[str, ...]) -> None:
+    dimensions = wanted.count(",") + 1 - wanted.count("...")
+    if values.dim() < dimensions or values.shape[-1] != len(components):
+        expected = f"{wanted.format(len(components))} for {', '.join(components)}"
+        raise UsageError(f"got a tensor of shape {tuple(values.shape)}, expected {expected}")
+
+
+def _for_all(values: Tensor, shape: torch.Size) -> Tensor:
+    """`(rows, ..., U)` to `(rows, *shape, U)`."""
+    missing = (1,) * (len(shape) - values.dim() + 2)
+    return values.reshape(len(values), *missing, *values.shape[1:]).expand(len(values), *shape, -1)

@@ -24,6 +24,7 @@ from steady_ppl.program import Program
 from steady_ppl.program_file import load_program
 from steady_ppl.run_folder import PARAMETERS, POSTERIOR, read_record, run_folder, write_record
 from steady_ppl.training import Trained
+from steady_ppl.whole_file import whole_file
 
 if TYPE_CHECKING:
     import arviz
@@ -124,9 +125,9 @@ class Fit:
         """Write into an open run folder; `begun` is what its record already says."""
         write_tensors(folder / PARAMETERS, self.program.state_dict())
         if train is not None:
-            beside = folder / (POSTERIOR + ".partial")
-            self.posterior(train, draws=50, seed=self.seed).to_netcdf(str(beside), engine="h5netcdf")
-            os.replace(beside, folder / POSTERIOR)
+            drawn = self.posterior(train, draws=50, seed=self.seed)
+            with whole_file(folder / POSTERIOR, RunError) as beside:
+                drawn.to_netcdf(str(beside), engine="h5netcdf")
         write_record(folder, {**(begun or {}), **self.record(folder)})
 
     def record(self, folder: Path) -> dict[str, Any]:

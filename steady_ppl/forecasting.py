@@ -13,9 +13,11 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError
 from steady_ppl.posterior import DIMENSIONS, posterior
+from steady_ppl.predictions import on_a_circle
 from steady_ppl.program import Program, for_program, names, units
 from steady_ppl.seeding import seeded
 from steady_ppl.simulation import measure
+from steady_ppl.turns import draws_on_one_turn
 
 if TYPE_CHECKING:
     import arviz
@@ -49,8 +51,9 @@ def forecast(
 
     Returns:
         What `posterior` returns, and with it `predictions`: one variable a state component and one `measured_…` a
-        measurement, noise included, over (chain, draw, trajectory, row), NaN but in the rows after that moment; and
-        `predictions_constant_data` with these rows' times.
+        measurement, noise included, over (chain, draw, trajectory, row), NaN but in the rows after that moment, angles
+        within half a turn of their mean; and `predictions_constant_data` with these rows' times and what the table has
+        measured in them, `measured_…`, of which nothing was used.
 
     Raises:
         DataError: a drive has no row after that moment, or a moment before its first row.
@@ -58,7 +61,7 @@ def forecast(
     table = data if controls is None else data.continued(controls, step)
     run = for_program(program, table)
     last = _last_measured(run) if after is None else run.elapsed.new_full((len(run),), after)
-    future = (run.elapsed > last + 1e-9) & run.rows
+    future = (run.elapsed > last + 0.01 * run.median_step) & run.rows  # decimal seconds are not binary ones
     for drive, label in enumerate(run.labels):
         if not bool(future[:, drive].any()):
             raise DataError(
@@ -75,21 +78,24 @@ def forecast(
     with seeded(seed, "forecast"):
         measured = measure(program, path).transpose(1, 2).numpy(force=True)
     there = future.t().numpy(force=True)
-    declared = zip(
-        (*names(program.states), *(f"measured_{name}" for name in names(program.measurements))),
-        (*units(program.states), *units(program.measurements)),
-        np.moveaxis(np.concatenate([states, measured], -1), -1, 0),
-        strict=True,
-    )
-    coordinates = found["posterior"].coords
-    variables = {
-        name: (DIMENSIONS, np.where(there, values[None], np.nan), {"units": unit}) for name, unit, values in declared
-    }
-    shown = {name: coordinates[name] for name in ("trajectory", "row")}
+    later = torch.where(run.observed & future[..., None], run.measurements, torch.nan).transpose(0, 1)
+    of_row = ("trajectory", "row")
     time = np.where(there, run.elapsed.double().t().numpy(force=True), np.nan)
+    constants: dict[str, tuple] = {"time": (of_row, time, {"units": "s"})}
+    variables: dict[str, tuple] = {}
+    for index, (name, unit) in enumerate(zip(names(program.states), units(program.states), strict=True)):
+        variables[name] = (DIMENSIONS, np.where(there, states[None, ..., index], np.nan), {"units": unit})
+    circular = on_a_circle(program, run, path[0]).tolist()
+    for index, (name, unit) in enumerate(zip(names(program.measurements), units(program.measurements), strict=True)):
+        values = draws_on_one_turn(measured[..., index]) if circular[index] else measured[..., index]
+        about = {"units": unit, "circular": int(circular[index])}
+        variables[f"measured_{name}"] = (DIMENSIONS, np.where(there, values[None], np.nan), about)
+        constants[f"measured_{name}"] = (of_row, later[..., index].double().numpy(force=True), {"units": unit})
+    coordinates = found["posterior"].coords
+    shown = {name: coordinates[name] for name in of_row}
     found.add_groups(
         predictions=xarray.Dataset(variables, {name: coordinates[name] for name in DIMENSIONS}),
-        predictions_constant_data=xarray.Dataset({"time": (("trajectory", "row"), time, {"units": "s"})}, shown),
+        predictions_constant_data=xarray.Dataset(constants, shown),
     )
     return found
 

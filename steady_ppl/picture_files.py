@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from steady_ppl.errors import UsageError
+from steady_ppl.whole_file import require_place, whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
 def require_picture(path: Path | None) -> None:
-    """Refuse a name whose ending is no picture's, before anything is computed; None is no picture.
+    """Refuse a name whose ending is no picture's, or a place that there is not, before anything is computed; None is no
+    picture.
 
     Raises:
-        UsageError: naming the endings that matplotlib writes.
+        UsageError: naming the endings that matplotlib writes, or the folder.
     """
+    require_place(path)
     if path is None:
         return
     from matplotlib.figure import Figure
@@ -33,10 +35,5 @@ def write_picture(figure: Figure, path: Path) -> None:
     Raises:
         UsageError: the file cannot be written.
     """
-    beside = path.with_name(path.name + ".partial")
-    try:
+    with whole_file(path) as beside:
         figure.savefig(beside, format=path.suffix.lower()[1:], dpi=150)
-        os.replace(beside, path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise UsageError(f"{path} cannot be written: {error.strerror}") from error

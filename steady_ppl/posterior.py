@@ -12,8 +12,10 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.filtering import choose_filter, in_parts, run_filter
 from steady_ppl.program import Program, for_program, names, units
+from steady_ppl.progress import stages
 from steady_ppl.seeding import seeded
 from steady_ppl.sites import as_vector
+from steady_ppl.turns import paths_on_one_turn
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", FutureWarning)  # an advertisement of arviz 1, once a day
@@ -45,7 +47,8 @@ def posterior(
 
     Returns:
         `posterior`: one variable a state component and one a noise site, over (chain, draw, trajectory, row), NaN past
-        a trajectory's end (the noise of row t acts from t to t + 1); `sample_stats`: how many particles the filter had
+        a trajectory's end (the noise of row t acts from t to t + 1); an angle whose start is not known is on one turn
+        in all draws, beginning between −π and π in the first; `sample_stats`: how many particles the filter had
         in effect in each row, and how many of the first row's have descendants; `observed_data`: the measurements
         used; `constant_data`: time, controls and, where known, the true states. Units are in each variable's
         attributes.
@@ -58,21 +61,24 @@ def posterior(
     roots: list[Tensor] = []
     with seeded(seed, "posterior"):
         choice = choose_filter(program, run, known_start=known_start, particles=particles)
-        for part in in_parts(run, choice.particles, look_ahead=choice.look_ahead):
-            filtered = run_filter(
-                program,
-                part,
-                particles=choice.particles,
-                known_start=known_start,
-                look_ahead=choice.look_ahead,
-            )
-            paths = filtered.paths(draws)
-            states.append(paths.states)
-            evidence.append(filtered.log_likelihood)
-            sizes.append(filtered.effective_sizes)
-            roots.append(filtered.roots)
-            for site, value in paths.noise.items():
-                noise.setdefault(site, []).append(as_vector(value, paths.event_dims[site]))
+        groups = list(in_parts(run, choice.particles, look_ahead=choice.look_ahead))
+        with stages(*(("drawing states", len(part)) for part in groups)) as begin:
+            for part in groups:
+                begin()
+                filtered = run_filter(
+                    program,
+                    part,
+                    particles=choice.particles,
+                    known_start=known_start,
+                    look_ahead=choice.look_ahead,
+                )
+                paths = filtered.paths(draws)
+                states.append(paths.states)
+                evidence.append(filtered.log_likelihood)
+                sizes.append(filtered.effective_sizes)
+                roots.append(filtered.roots)
+                for site, value in paths.noise.items():
+                    noise.setdefault(site, []).append(as_vector(value, paths.event_dims[site]))
     coordinates: dict[str, list | np.ndarray] = {
         "chain": [0],
         "draw": np.arange(draws),
@@ -82,6 +88,8 @@ def posterior(
     inside = run.rows.t().numpy(force=True)
     variables: dict[str, tuple] = {}
     path = _draws(torch.cat(states, 2))
+    for index in () if known_start else (names(program.states).index(angle) for angle in program.angles):
+        path[0, ..., index] = paths_on_one_turn(path[0, ..., index], inside)
     for index, (name, unit) in enumerate(zip(names(program.states), units(program.states), strict=True)):
         values = np.where(inside, path[..., index], np.nan)
         variables[name] = (DIMENSIONS, values, {"units": unit})

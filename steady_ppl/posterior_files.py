@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from steady_ppl.errors import UsageError
+from steady_ppl.whole_file import whole_file
 
 if TYPE_CHECKING:
     import arviz
@@ -58,16 +57,10 @@ def write_states(posterior: arviz.InferenceData, path: Path) -> None:
     """
     require_states_file(path)
     suffix = path.suffix.lower()
-    beside = path.with_name(f".{uuid.uuid4().hex}{suffix}")
-    try:
+    with whole_file(path) as beside:
         if suffix == ".nc":
             posterior.to_netcdf(str(beside), engine="h5netcdf")
         elif suffix == ".csv":
             states_frame(posterior).to_csv(beside, index=False)
         else:
             states_frame(posterior).to_parquet(beside, index=False)
-        os.replace(beside, path)
-    except OSError as error:
-        raise UsageError(f"{path} cannot be written: {error.strerror or error}") from error
-    finally:
-        beside.unlink(missing_ok=True)

@@ -141,6 +141,7 @@ def prove(
     if isinstance(floor, Judged):
         found[FLOOR] = as_row(floor, _counted([floor]))
     horizons = named_horizons(before.data, SECONDS)
+    notes += before.data.uneven_steps + _few_starts(before.data, horizons, known_start)
     return Proof(
         rows=found,
         reference=reference,
@@ -149,7 +150,7 @@ def prove(
         trajectories=len(data),
         known_start=known_start,
         seed=seed,
-        notes=notes + _few_starts(before.data, horizons, known_start) + _blown_up(found) + far_off(found, data),
+        notes=notes + _blown_up(found) + far_off(found, data),
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from steady_ppl.checkpoint import read_tensors
 from steady_ppl.errors import RunError
+from steady_ppl.whole_file import whole_file
 
 PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY = (
     "parameters.safetensors",
@@ -21,6 +22,7 @@ PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY = (
 )
 FILES = (PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY)
 ASIDE = "previous"
+SAID = {"sentence", "candidates", "effects", "shape", "doubts", "notes", "next_run"}  # of a discovery, what is shown
 
 
 @contextmanager
@@ -98,9 +100,8 @@ def _remove(folder: Path) -> None:
 
 def write_record(folder: Path, record: dict[str, Any]) -> None:
     """Write `run.json`, whole or not at all."""
-    beside = folder / (RECORD + ".partial")
-    beside.write_text(json.dumps(record, indent=1) + "\n")
-    os.replace(beside, folder / RECORD)
+    with whole_file(folder / RECORD, RunError) as beside:
+        beside.write_text(json.dumps(record, indent=1) + "\n")
 
 
 def read_record(folder: Path) -> dict[str, Any]:
@@ -133,6 +134,7 @@ def read_discovery(source: Path) -> dict[str, Any] | None:
         found = json.loads(file.read_text())
     except (OSError, ValueError) as error:
         raise RunError(f"{file} is damaged: {error}") from error
-    if not (isinstance(found, dict) and {"sentence", "candidates", "effects"} <= found.keys()):
-        raise RunError(f"{file} is not what `steady discover` writes: it has neither verdict nor candidates")
+    lacking = SAID - found.keys() if isinstance(found, dict) else SAID
+    if lacking:
+        raise RunError(f"{file} is not what `steady discover` writes: it has no {', '.join(sorted(lacking))}")
     return found

@@ -10,8 +10,6 @@ Columns: `trajectory`, `time` (s), `u.<control>`, `y.<measurement>` and, where k
 from __future__ import annotations
 
 import csv
-import os
-import uuid
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -24,6 +22,7 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories, pad, pad_time
 from steady_ppl.errors import DataError
+from steady_ppl.whole_file import whole_file
 
 
 def read_table(path: str | Path) -> Trajectories:
@@ -59,17 +58,11 @@ def write_table(data: Trajectories, path: str | Path) -> None:
     suffix = require_table_file(path)
     frame = to_frame(data)
     from_frame(frame, name=path.name)
-    part = path.with_name(f".{uuid.uuid4().hex}{suffix}")
-    try:
+    with whole_file(path, DataError) as beside:
         if suffix == ".csv":
-            frame.to_csv(part, index=False)
+            frame.to_csv(beside, index=False)
         else:
-            frame.to_parquet(part, index=False)
-        os.replace(part, path)
-    except OSError as error:
-        raise DataError(f"{path.name}: cannot be written: {error.strerror or error}") from error
-    finally:
-        part.unlink(missing_ok=True)
+            frame.to_parquet(beside, index=False)
 
 
 def to_frame(data: Trajectories) -> pd.DataFrame:

@@ -55,6 +55,17 @@ def test_nan_is_a_missing_measurement_and_drives_are_numbered() -> None:
         ),
         ([{"time": np.zeros(2), "y.place": np.ones(2)}], None, "column time, trajectory 1, row 2"),
         ([{"time": np.arange(2.0), "place": np.ones(2)}], None, "column place: unknown column"),
+        (
+            [{"time": np.arange(2.0)}, {"time": 5 + np.arange(2.0)}],
+            ["a", "a"],
+            "2 drives need 2 labels, and a is there",
+        ),
+        (
+            [{"time": np.arange(2.0), "y.b": np.ones((2, 2)), "y.b_0": np.ones(2)}],
+            None,
+            "column y.b_0 of trajectory 1 is there twice",
+        ),
+        ([{"time": np.arange(2.0), "trajectory": np.ones(2)}], None, "column trajectory of trajectory 1 is what the"),
     ],
 )
 def test_wrong_arrays_are_named(drives, labels, said: str) -> None:

@@ -93,9 +93,45 @@ def test_commands_that_act_later_are_remembered(effect: str) -> None:
 
 def test_time_counts_from_the_start_of_the_drive() -> None:
     program, model = dynamics(battery_sag=0.5)
-    assert torch.allclose(model(STATE, PLAN, past=PLAN[:0]), by_hand(program, STATE, PLAN)) or model.remembers
-    late, early = (model(STATE, PLAN, past=PLAN[:0], time=time)[-1] for time in (9.0, 0.0))
+    data = drives(program, 1, 6)
+    given = acting_controls(model.program, data)[:-1, 0]
+    assert not torch.allclose(given, data.controls[:-1, 0])
+    acting = by_hand(program, STATE, given)
+    assert torch.allclose(model(STATE, data.controls[:-1, 0]), acting, atol=1e-6)
+    late, early = (model(STATE, PLAN, time=time)[-1] for time in (9.0, 0.0))
     assert not torch.allclose(late, early)
+
+
+@pytest.mark.parametrize(
+    ("effect", "size", "remembers"),
+    [
+        ("actuator_delay", 0.15, True),
+        ("actuator_delay", 0.0, False),
+        ("actuator_lag", 0.3, True),
+        ("battery_sag", 0.5, False),
+        ("thrust_asymmetry", 0.2, False),
+        ("dead_zone", 0.2, False),
+        ("thrust_saturation", 0.2, False),
+    ],
+)
+def test_only_what_acts_later_is_remembered(effect: str, size: float, remembers: bool) -> None:
+    _, model = dynamics(**{effect: size})
+    assert model.remembers is remembers
+    if not remembers:
+        assert torch.equal(model(STATE, PLAN), model(STATE, PLAN, past=PLAN[:0]))
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_one_past_is_that_of_every_plan(count: int) -> None:
+    """Also where there are as many plans as past commands."""
+    _, model = dynamics(actuator_delay=0.15)
+    plans = PLAN[2:, None] * torch.linspace(1, 2, count).double()[:, None]
+    many = model(STATE, plans, past=PLAN[:2])
+    for index in range(count):
+        assert torch.allclose(many[:, index], model(STATE, plans[:, index], past=PLAN[:2]))
+    states = STATE + torch.arange(count)[:, None]
+    assert torch.allclose(model(states, PLAN[2:], past=PLAN[:2])[:, 1], model(states[1], PLAN[2:], past=PLAN[:2]))
+    assert model(states, PLAN[:0], past=PLAN[:2]).shape == (0, count, 6)
 
 
 def test_what_is_measured_on_average() -> None:
@@ -106,11 +142,20 @@ def test_what_is_measured_on_average() -> None:
     assert model.measure(STATE.expand(4, 3, 6)).shape == (4, 3, 4)
 
 
-@pytest.mark.parametrize(("state", "plan"), [(STATE[:5], PLAN), (STATE, PLAN[:, :1])])
-def test_wrong_sizes_are_named(state, plan) -> None:
+@pytest.mark.parametrize(
+    ("state", "plan", "past", "said"),
+    [
+        (STATE[:5], PLAN, PLAN, r"expected \(\.\.\., 6\) for x, y, heading"),
+        (STATE, PLAN[:, :1], PLAN, r"shape \(5, 1\), expected \(rows, \.\.\., 2\) for left, right"),
+        (STATE, PLAN[0], PLAN, r"shape \(2,\), expected \(rows, \.\.\., 2\)"),
+        (STATE, PLAN, PLAN[0], r"shape \(2,\), expected \(rows, \.\.\., 2\)"),
+        (STATE.expand(3, 6), PLAN[:, None].expand(5, 2, 2), PLAN, r"shapes \(3, 6\), \(5, 2, 2\), \(5, 2\) do not go"),
+    ],
+)
+def test_wrong_sizes_are_named(state, plan, past, said: str) -> None:
     _, model = dynamics()
-    with pytest.raises(st.UsageError, match=r"expected \(\.\.\., (6|2)\) for (x, y, heading|left, right)"):
-        model(state, plan)
+    with pytest.raises(st.UsageError, match=said):
+        model(state, plan, past=past)
 
 
 def test_a_step_goes_forward() -> None:

@@ -24,6 +24,7 @@ from steady_ppl.pictures import (
     innovations,
     observation_noise,
     particle_curve,
+    posterior_states,
     posterior_trajectories,
     posterior_velocities,
 )
@@ -87,8 +88,21 @@ def test_without_truth_or_with_the_start_alone_no_truth_is_drawn() -> None:
 
 
 def test_a_trajectory_that_is_not_there_is_an_error(drawn) -> None:
-    with pytest.raises(KeyError):
-        posterior_trajectories(drawn, "nine")
+    for picture in (posterior_trajectories, posterior_velocities, effective_sizes):
+        with pytest.raises(UsageError, match="no trajectory 'nine'; there are 1, 2"):
+            picture(drawn, "nine")
+    with pytest.raises(UsageError, match="no state speed in this posterior; there are x, y, heading"):
+        posterior_states(drawn, "1", ["x", "speed"])
+
+
+def test_any_components_are_drawn_by_their_names_and_units(drawn) -> None:
+    axes = posterior_states(drawn, "2", ["heading", "yaw_rate"])
+    assert [one.get_ylabel() for one in axes] == ["heading [rad]", "yaw_rate [rad/s]"]
+    assert [labels(one) for one in axes] == [["posterior", "truth"]] * 2
+    median = drawn["posterior"]["heading"].sel(trajectory="2", chain=0).median("draw")
+    np.testing.assert_allclose(axes[0].get_lines()[0].get_ydata(), median, rtol=1e-6)
+    plane = posterior_trajectories(drawn, "2", plane=("heading", "yaw_rate"))
+    assert plane.get_xlabel() == "heading [rad]" and plane.get_aspect() == "auto"
 
 
 def test_velocities_are_those_of_the_body(drawn) -> None:
@@ -115,8 +129,14 @@ def test_a_forecast_is_a_band_after_what_was_used() -> None:
     fit = Fit(example("hovercraft", torch.float32), "hand", known_start=True)
     found = fit.forecast(simulated(rows=8), after=0.35, draws=20, particles=20)
     axes = forecast_band(found, "1", "bearing_1")
-    assert axes.get_ylabel() == "bearing_1 [rad]" and labels(axes) == ["forecast, median", "used"]
-    median, used = axes.get_lines()
+    assert axes.get_ylabel() == "bearing_1 [rad]" and labels(axes) == [
+        "forecast, median",
+        "used",
+        "measured later",
+    ]
+    median, used, later = axes.get_lines()
+    assert later.get_xdata().tolist() == median.get_xdata().tolist()
+    assert (abs(later.get_ydata() - median.get_ydata()) < np.pi).all() and np.isfinite(later.get_ydata()).all()
     assert median.get_xdata().tolist() == pytest.approx([0.4, 0.5, 0.6, 0.7])
     assert np.isfinite(used.get_ydata()).tolist() == [True] * 4 + [False] * 4
     assert labels(forecast_band(found, "1", "yaw_rate")) == ["forecast, median", "truth"]

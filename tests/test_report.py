@@ -161,7 +161,7 @@ def test_every_label_of_a_section_a_select_and_a_table_is_there(page):
 def test_what_is_drawn_is_what_was_computed(found, page, runs, data):
     drawn = content(page)
     check = found.checks["before"]
-    measured = unpacked(drawn["measured"]).transpose(2, 0, 1)
+    measured = unpacked(drawn["runs"][0]["measured"]).transpose(2, 0, 1)
     np.testing.assert_allclose(measured, data.measurements.numpy(), atol=1e-3)
     middle = unpacked(drawn["runs"][0]["predictions"][0]["middle"]).transpose(2, 0, 1)
     error = check.predictions[1].error.numpy()
@@ -173,7 +173,7 @@ def test_what_is_drawn_is_what_was_computed(found, page, runs, data):
         for key, level in {"low": 0.05, "middle": 0.5, "high": 0.95}.items():
             shown = unpacked(drawn["runs"][1]["posterior"][key])[:, index]
             np.testing.assert_allclose(shown, posterior[name].quantile(level, ("chain", "draw")).values, atol=1e-3)
-    np.testing.assert_allclose(unpacked(drawn["truth"]).transpose(2, 0, 1), data.states.numpy(), atol=1e-3)
+    np.testing.assert_allclose(unpacked(drawn["runs"][0]["truth"]).transpose(2, 0, 1), data.states.numpy(), atol=1e-3)
     z = found.checks["before"].misfit
     strongest = max(abs(z.z[i]) for i, cell in enumerate(z.cells) if cell.map == "drive and time")
     shown = unpacked(drawn["runs"][0]["strips"]["z"])

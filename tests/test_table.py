@@ -475,14 +475,14 @@ def test_a_failure_while_writing_leaves_the_old_file(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(pd.DataFrame, f"to_{suffix}", disk_full)
-    with pytest.raises(DataError, match=f"^drives.{suffix}: cannot be written: No space left on device$"):
+    with pytest.raises(DataError, match=f"drives.{suffix} cannot be written: No space left on device$"):
         write_table(example(), path)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 
 def test_a_folder_in_the_way(tmp_path: Path) -> None:
     (tmp_path / "drives.csv").mkdir()
-    with pytest.raises(DataError, match="drives.csv: cannot be written: Is a directory"):
+    with pytest.raises(DataError, match="drives.csv cannot be written: Is a directory"):
         write_table(example(), tmp_path / "drives.csv")
     assert list(tmp_path.iterdir()) == [tmp_path / "drives.csv"]
 

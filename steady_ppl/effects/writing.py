@@ -15,6 +15,7 @@ from steady_ppl.errors import UsageError
 from steady_ppl.probe import probe
 from steady_ppl.program import Program
 from steady_ppl.program_file import load_program
+from steady_ppl.whole_file import whole_file
 
 
 def write_program(program: Program, path: str | Path, *, force: bool = False) -> list[str]:
@@ -39,15 +40,9 @@ def write_program(program: Program, path: str | Path, *, force: bool = False) ->
     fresh = _fresh(base)
     values, notes = _carried_over(program, fresh)
     text = program_text(program, class_name, base, base_file.stem, values)
-    beside = path.with_name(f"partial_{path.name}")
-    try:
+    with whole_file(path, beside=path.with_name(f"partial_{path.name}")) as beside:
         beside.write_text(text, encoding="utf-8")
         probe(load_program(f"{beside}:{class_name}"))
-        os.replace(beside, path)
-    except OSError as error:
-        raise UsageError(f"{path} cannot be written: {error.strerror}") from error
-    finally:
-        beside.unlink(missing_ok=True)
     return notes
 
 

@@ -28,8 +28,8 @@ function stacked(id, components, tracesOf, said) {
 
 function drawPredictions() {
   const run = page.runs[view.run], time = series(page.time, view.drive, 0), apart = element("apart").checked;
-  return stacked("predictions", page.measurements, (k) => {
-    const measured = series(page.measured, view.drive, k), near = series(run.predictions[0].middle, view.drive, k);
+  return stacked("predictions", run.measurements, (k) => {
+    const measured = series(run.measured, view.drive, k), near = series(run.predictions[0].middle, view.drive, k);
     const less = (values) => values.map((value, i) => (!apart ? value : value === null || near[i] === null ? null : value - near[i]));
     const traces = run.predictions.flatMap((one, index) => {
       const middle = less(series(one.middle, view.drive, k)), half = series(one.half, view.drive, k);
@@ -47,8 +47,7 @@ function drawStates() {
   return stacked("states", run.states, (k) => {
     const [low, middle, high] = ["low", "middle", "high"].map((name) => series(run.posterior[name], view.drive, k));
     const traces = [band(time, low, high, COLORS[0], "posterior"), line(time, middle, COLORS[0], "posterior", "solid")];
-    const truth = page.truth && k < page.truth.shape[1];
-    return truth ? [...traces, line(time, series(page.truth, view.drive, k), "black", "truth", "dash")] : traces;
+    return run.truth ? [...traces, line(time, series(run.truth, view.drive, k), "black", "truth", "dash")] : traces;
   }, "Posterior of the states over time");
 }
 
@@ -62,8 +61,8 @@ function drawPaths() {
     const [x, y] = [0, 1].map((axis) => inside(series(run.paths, view.drive, 2 * draw + axis)));
     traces.push({ ...line(x, y, COLORS[0], "posterior draws", "solid"), opacity: 0.35, showlegend: draw === 0 });
   }
-  if (page.truth) {
-    const [x, y] = [across, up].map((k) => inside(series(page.truth, view.drive, k)));
+  if (run.truth) {
+    const [x, y] = [across, up].map((k) => inside(series(run.truth, view.drive, k)));
     traces.push(line(x, y, "black", "truth", "dash"));
   }
   const same = run.states[across].unit === run.states[up].unit;

@@ -14,6 +14,7 @@ from steady_ppl.data import Trajectories
 from steady_ppl.fit import Fit
 from steady_ppl.program import Program, names, units
 from steady_ppl.reporting.packing import packed
+from steady_ppl.turns import nearest_turn
 
 NUMBERS = 300_000  # of all drives and runs: .8 MB of text
 QUANTILES = (0.05, 0.5, 0.95)
@@ -53,7 +54,7 @@ def chosen(checks: list[Check], numbers: int = NUMBERS) -> Shown:
     """As many drives as there is room for, those whose strips stand out most in any run first."""
     first = checks[0]
     rows, count = first.data.time.shape
-    columns = sum(_columns(one) for one in checks) + 10
+    columns = sum(_columns(one) for one in checks) + 1 + len(names(first.program.controls))
     every = max(1, -(-rows * columns // numbers))
     room = max(1, numbers // (-(-rows // every) * columns))
     worst = np.zeros(count)
@@ -69,28 +70,25 @@ def chosen(checks: list[Check], numbers: int = NUMBERS) -> Shown:
 def _columns(found: Check) -> int:
     """Numbers of a row of a drive that a run adds."""
     horizons, states = min(2, len(found.horizons)), len(names(found.program.states))
-    return 2 * horizons * len(found.residuals) + 3 * states + 2 * PATHS
+    return 2 * horizons * len(found.residuals) + len(names(found.program.measurements)) + 4 * states + 2 * PATHS
 
 
-def given(found: Check, table: Trajectories, shown: Shown) -> dict[str, Any]:
-    """What is the same for every run: time, measurements, controls and, where the table has it, the truth."""
-    program, data = found.program, found.data
-    truth = table.select(names(program.controls), names(program.measurements), names(program.states)).states
-    known = truth is not None and bool(torch.isfinite(truth[1:]).any())
+def given(found: Check, shown: Shown) -> dict[str, Any]:
+    """What is the same for every run: the time and the controls, of which a drive's last is followed by nothing."""
+    data = found.data
+    acting = torch.cat([data.transitions, torch.zeros_like(data.transitions[:1])])
     return {
         "labels": [data.labels[i] for i in shown.drives],
         "shown": shown.drives,
-        "time": shown.of(_inside(data, data.elapsed.unsqueeze(-1))),
-        "measured": shown.of(measured(found)),
-        "measurements": _components(program.measurements),
-        "controls": shown.of(_inside(data, data.controls)),
-        "controlNames": _components(program.controls),
-        "truth": shown.of(truth.numpy(force=True)) if truth is not None and known else None,
+        "time": shown.of(_where(data.rows, data.elapsed.unsqueeze(-1))),
+        "controls": shown.of(_where(acting, data.controls)),
+        "controlNames": _components(found.program.controls),
     }
 
 
-def of_run(found: Check, fit: Fit, shown: Shown, *, draws: int, seed: int) -> dict[str, Any]:
-    """Predictions with their bands, and quantiles of the posterior of the states given all measurements."""
+def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: int, seed: int) -> dict[str, Any]:
+    """Measurements, predictions with their bands, quantiles of the posterior of the states given all measurements and,
+    where the table has it, the truth; a run's components are its program's, in their order."""
     horizons = list(dict.fromkeys(["one step", list(found.horizons)[-1]]))
     data = found.data.subset(shown.drives)
     posterior = fit.posterior(data, draws=draws, seed=seed)["posterior"]
@@ -100,7 +98,11 @@ def of_run(found: Check, fit: Fit, shown: Shown, *, draws: int, seed: int) -> di
     low, middle, high = (all_of_them.of(quantile.swapaxes(0, 1)) for quantile in quantiles)
     across = [states[i] for i in plane(found.program)]
     paths = [posterior[name].values[0, draw].T for draw in range(min(PATHS, draws)) for name in across]
+    truth = _truth(found.program, table.subset(shown.drives), quantiles[1])
     return {
+        "measurements": _components(found.program.measurements),
+        "measured": shown.of(measured(found)),
+        "truth": None if truth is None else all_of_them.of(truth.swapaxes(0, 1)),
         "predictions": [
             {"ahead": name, "middle": shown.of(middle), "half": shown.of(half)}
             for name in horizons
@@ -125,5 +127,17 @@ def _components(declared: Any) -> list[dict[str, str]]:
     return [{"name": name, "unit": unit} for name, unit in zip(names(declared), units(declared), strict=True)]
 
 
-def _inside(data: Trajectories, values: torch.Tensor) -> np.ndarray:
-    return np.where(data.rows.unsqueeze(-1).numpy(force=True), values.numpy(force=True), np.nan)
+def _truth(program: Program, table: Trajectories, middle: np.ndarray) -> np.ndarray | None:
+    """The true states `(B, rows, D)`, angles on the turn of the posterior's median; None where the table has no more
+    than starts."""
+    truth = table.select(names(program.controls), names(program.measurements), names(program.states)).states
+    if truth is None or not bool(torch.isfinite(truth[1:]).any()):
+        return None
+    found = truth.transpose(0, 1).double().numpy(force=True).copy()
+    for index in (names(program.states).index(angle) for angle in program.angles):
+        found[..., index] = nearest_turn(found[..., index], middle[..., index])
+    return found
+
+
+def _where(there: torch.Tensor, values: torch.Tensor) -> np.ndarray:
+    return np.where(there.unsqueeze(-1).numpy(force=True), values.numpy(force=True), np.nan)

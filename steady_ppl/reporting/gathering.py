@@ -115,11 +115,11 @@ def report(
         drawn = []
         for label, fit in runs.items():
             begin()
-            there = of_run(checks[label], fit, shown, draws=draws, seed=seed)
+            there = of_run(checks[label], fit, data, shown, draws=draws, seed=seed)
             drawn.append({"label": label, **there, **maps(checks[label])})
         begin()
         proof = _proof(runs, data, seed)
-    drives = given(next(iter(checks.values())), data, shown) | {"runs": drawn}
+    drives = given(next(iter(checks.values())), shown) | {"runs": drawn}
     return Report(
         title=title,
         fits=dict(runs),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
 from collections.abc import Mapping
 from importlib.resources import files
@@ -16,9 +15,9 @@ from markupsafe import Markup, escape
 from plotly.offline import get_plotlyjs
 
 from steady_ppl.check_report import strongest
-from steady_ppl.errors import UsageError
 from steady_ppl.fit import versions
 from steady_ppl.reporting.program_page import program_page
+from steady_ppl.whole_file import whole_file
 
 if TYPE_CHECKING:
     from steady_ppl.reporting.gathering import Report
@@ -71,13 +70,8 @@ def write_page(text: str, path: Path) -> None:
     Raises:
         UsageError: the file cannot be written.
     """
-    beside = path.with_name(path.name + ".partial")
-    try:
+    with whole_file(path) as beside:
         beside.write_text(text, encoding="utf-8")
-        os.replace(beside, path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise UsageError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def _linked(findings: list[dict[str, Any]], found: Report, label: str) -> list[dict[str, Any]]:

@@ -1,0 +1,196 @@
+"""Pictures of a posterior; each function draws on matplotlib axes and returns them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+
+from steady_ppl.errors import UsageError
+
+if TYPE_CHECKING:
+    import arviz
+
+POSTERIOR, TRUTH, LANDMARK = "#0072b2", "black", "#d55e00"
+
+
+def posterior_trajectories(
+    posterior: arviz.InferenceData,
+    trajectory: str,
+    *,
+    plane: tuple[str, str] = ("x", "y"),
+    landmarks: Sequence[Sequence[float]] | torch.Tensor = (),
+    axes: Axes | None = None,
+    color: str = POSTERIOR,
+    label: str = "posterior draws",
+    shown: int = 50,
+) -> Axes:
+    """Draws of one trajectory in the plane, with the truth where it is known, and the landmarks.
+
+    Args:
+        posterior: of `Fit.posterior`.
+        trajectory: its label.
+        plane: the state components that are drawn against each other.
+        landmarks: `(K, 2)`, in the plane's units.
+        axes: drawn on; new ones when not given.
+        shown: draw at most so many paths.
+
+    Raises:
+        UsageError: there is no such trajectory, or the program has no such states.
+    """
+    draws, true = _drawn(posterior, trajectory, plane)
+    axes = axes if axes is not None else plt.subplots(figsize=(5, 5))[1]
+    for index in range(min(shown, draws[0].sizes["draw"])):
+        first = label if index == 0 else None
+        axes.plot(*(one.isel(draw=index) for one in draws), color=color, alpha=0.15, lw=0.8, label=first)
+    if true is not None:
+        axes.plot(*true, color=TRUTH, lw=1.4, ls="--", label="truth")
+    if len(landmarks):
+        xs, ys = torch.as_tensor(landmarks).detach().cpu().unbind(-1)
+        axes.plot(xs, ys, "^", color=LANDMARK, ms=8, label="landmark", clip_on=True)
+    axes.set_xlabel(with_unit(plane[0], draws[0]))
+    axes.set_ylabel(with_unit(plane[1], draws[1]))
+    if draws[0].attrs.get("units") == draws[1].attrs.get("units"):
+        axes.set_aspect("equal", "box")
+    axes.set_title(f"trajectory {trajectory}")
+    for line in axes.get_lines():
+        if line.get_label() == label:
+            line.set_rasterized(True)
+    return axes
+
+
+def posterior_states(
+    posterior: arviz.InferenceData,
+    trajectory: str,
+    components: Sequence[str],
+    *,
+    axes: Sequence[Axes] | None = None,
+    color: str = POSTERIOR,
+    label: str = "posterior",
+) -> Sequence[Axes]:
+    """State components over time: median and 90 % of the draws, and the truth where it is known.
+
+    Args:
+        posterior: of `Fit.posterior`.
+        trajectory: its label.
+        components: of the state.
+        axes: one a component, drawn on; new ones when not given.
+
+    Raises:
+        UsageError: there is no such trajectory, or the program has no such states.
+    """
+    draws, true = _drawn(posterior, trajectory, components)
+    called = [with_unit(name, one) for name, one in zip(components, draws, strict=True)]
+    return _bands(posterior, trajectory, called, draws, true, axes, color, label)
+
+
+def posterior_velocities(
+    posterior: arviz.InferenceData,
+    trajectory: str,
+    *,
+    axes: Sequence[Axes] | None = None,
+    color: str = POSTERIOR,
+    label: str = "posterior",
+) -> Sequence[Axes]:
+    """Longitudinal and lateral velocity in the body frame: median and 90 % of the draws, and the truth where it
+    is known.
+
+    Args:
+        posterior: of `Fit.posterior`, of a planar vehicle; `posterior_states` draws those of any other program.
+        trajectory: its label.
+        axes: two, drawn on; new ones when not given.
+
+    Raises:
+        UsageError: there is no such trajectory, or the program has not the states heading, vx and vy.
+    """
+    draws, true = _drawn(posterior, trajectory, ("heading", "vx", "vy"))
+    called = [with_unit(name, draws[1]) for name in ("longitudinal", "lateral")]
+    bodily = None if true is None else _in_body_frame(*true)
+    return _bands(posterior, trajectory, called, _in_body_frame(*draws), bodily, axes, color, label)
+
+
+def effective_sizes(posterior: arviz.InferenceData, trajectory: str, *, axes: Axes | None = None) -> Axes:
+    """How many particles the filter had in effect in each row, of N.
+
+    Args:
+        posterior: of `Fit.posterior`.
+        trajectory: its label.
+        axes: drawn on; new ones when not given.
+
+    Raises:
+        UsageError: there is no such trajectory.
+    """
+    require_trajectory(posterior, trajectory)
+    axes = axes if axes is not None else plt.subplots(figsize=(6, 3), layout="constrained")[1]
+    sizes = posterior["sample_stats"]["effective_size"].sel(trajectory=trajectory, chain=0)
+    about = posterior["posterior"].attrs
+    axes.plot(
+        posterior["constant_data"]["time"].sel(trajectory=trajectory), sizes, color=POSTERIOR, label=about["filter"]
+    )
+    axes.axhline(about["particles"], color="black", lw=0.6, label="N")
+    axes.set_yscale("log")
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("effective sample size [particles]")
+    axes.legend(fontsize=8)
+    return axes
+
+
+def require_trajectory(found: arviz.InferenceData, trajectory: str) -> None:
+    """Refuse a label that no drive has."""
+    known = found["posterior"]["trajectory"].values
+    if trajectory not in known:
+        raise UsageError(f"no trajectory {trajectory!r}; there are {', '.join(map(str, known))}")
+
+
+def _drawn(posterior: arviz.InferenceData, trajectory: str, components: Sequence[str]) -> tuple[list[Any], Any]:
+    """Draws of these state components, and their true values where all are known beyond a start."""
+    require_trajectory(posterior, trajectory)
+    states = posterior["posterior"]
+    plain = [str(name) for name, values in states.data_vars.items() if values.ndim == 4]
+    lacking = [name for name in components if name not in plain]
+    if lacking:
+        raise UsageError(f"no state {', '.join(lacking)} in this posterior; there are {', '.join(plain)}")
+    constants = posterior["constant_data"].sel(trajectory=trajectory)
+    true = [constants.get(f"true_{name}") for name in components]
+    known = all(one is not None and int(one.notnull().sum()) > 1 for one in true)
+    return [states[name].sel(trajectory=trajectory, chain=0) for name in components], true if known else None
+
+
+def with_unit(name: str, values: Any) -> str:
+    """As it is written at an axis."""
+    unit = values.attrs.get("units")
+    return f"{name} [{unit}]" if unit else name
+
+
+def _bands(
+    posterior: arviz.InferenceData,
+    trajectory: str,
+    called: Sequence[str],
+    draws: Sequence[Any],
+    true: Sequence[Any] | None,
+    axes: Sequence[Axes] | None,
+    color: str,
+    label: str,
+) -> Sequence[Axes]:
+    size = (7, 0.5 + 2 * len(draws))
+    if axes is None:
+        axes = list(plt.subplots(len(draws), 1, figsize=size, sharex=True, squeeze=False)[1][:, 0])
+    time = posterior["constant_data"]["time"].sel(trajectory=trajectory)
+    for index, (one, name) in enumerate(zip(axes, called, strict=True)):
+        low, median, high = draws[index].quantile([0.05, 0.5, 0.95], dim="draw")
+        one.fill_between(time, low, high, color=color, alpha=0.25, lw=0)
+        one.plot(time, median, color=color, lw=1.4, label=label)
+        if true is not None and not any(line.get_label() == "truth" for line in one.get_lines()):
+            one.plot(time, true[index], color=TRUTH, lw=1.2, ls="--", label="truth")
+        one.set_ylabel(name)
+    axes[-1].set_xlabel("time [s]")
+    return axes
+
+
+def _in_body_frame(heading: Any, vx: Any, vy: Any) -> tuple[Any, Any]:
+    cos, sin = np.cos(heading), np.sin(heading)
+    return cos * vx + sin * vy, cos * vy - sin * vx

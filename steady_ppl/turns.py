@@ -1,0 +1,32 @@
+"""Angles that differ by whole turns, brought side by side, so that medians and bands of them mean something."""
+
+from __future__ import annotations
+
+import numpy as np
+
+TURN = 2 * np.pi
+
+
+def paths_on_one_turn(paths: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Draws of an angle over time, each moved as a whole by the turns that part it from the first draw, and that to
+    where it begins between −π and π.
+
+    Args:
+        paths: `(M, B, rows)`, each continuous in time.
+        inside: `(B, rows)` which rows count; the first of each drive does.
+    """
+    first = paths[:1]
+    apart = np.nanmedian(np.where(inside, paths - first, np.nan), -1, keepdims=True)
+    return paths - TURN * (np.round(apart / TURN) + np.round(first[..., :1] / TURN)).astype(paths.dtype)
+
+
+def draws_on_one_turn(draws: np.ndarray) -> np.ndarray:
+    """Draws of an angle, `(M, ...)`, each by itself moved to within half a turn of their circular mean, which is
+    between −π and π; some may then lie beyond these."""
+    middle = np.arctan2(np.sin(draws).mean(0), np.cos(draws).mean(0))
+    return nearest_turn(draws, middle)
+
+
+def nearest_turn(angles: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """Angles moved by whole turns to within half a turn of `middle`."""
+    return angles - TURN * np.round((angles - middle) / TURN)
