@@ -184,6 +184,9 @@ def main(arguments: list[str] | None = None) -> int:
             say("interrupted", always=True)
             return 1
         except Exception as error:
+            if type(error).__name__ == "NoArgsIsHelpError":  # of click, which typer may bring along itself
+                print(error)
+                return 2
             if hasattr(error, "format_message"):
                 if error.format_message():
                     say(f"{error.format_message()} (steady --help shows the usage)", always=True)

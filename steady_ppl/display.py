@@ -25,13 +25,15 @@ def of_trajectories(data: Trajectories) -> str:
     from steady_ppl.table import to_frame
 
     frame = to_frame(data)
-    lengths = f"{int(data.lengths.min())} to {int(data.lengths.max())}"
+    shortest, longest = int(data.lengths.min()), int(data.lengths.max())
+    lengths = f"{longest}" if shortest == longest else f"{shortest} to {longest}"
     rows = []
     for name in frame.columns.drop("trajectory"):
         values = frame[name].dropna()
         ends = (f"{values.min():.4g}", f"{values.max():.4g}") if len(values) else ("–", "–")
         rows.append((name, *ends, f"{1 - len(values) / len(frame):.1%}"))
-    about = f"{len(data)} trajectories of {lengths} rows, a row every {data.median_step:.3g} s"
+    count = "1 trajectory" if len(data) == 1 else f"{len(data)} trajectories"
+    about = f"{count} of {lengths} rows, a row every {data.median_step:.3g} s"
     return str(_sentence(about) + _table(("column", "least", "most", "empty"), rows))
 
 

@@ -7,7 +7,6 @@ import hashlib
 import inspect
 import os
 import platform
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
@@ -235,5 +234,5 @@ def versions() -> dict[str, str]:
         try:
             found[package] = version(package)
         except PackageNotFoundError:
-            print(f"{package} is not installed as a package: its version is not recorded", file=sys.stderr)
+            found[package] = "not installed as a package"
     return found

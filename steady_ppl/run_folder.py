@@ -41,6 +41,7 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
         raise RunError(f"{folder} exists: choose another folder, or --force to overwrite, or --resume to go on")
     if resume and not (folder / CHECKPOINT).is_file():
         raise RunError(f"{folder} has no {CHECKPOINT} to resume from")
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not resume:
@@ -52,6 +53,7 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
     except BaseException:
         if not resume:
             _clean_up(folder)
+            _remove_empty(made)
         raise
     _remove_aside(folder)
 
@@ -84,6 +86,15 @@ def _clean_up(folder: Path) -> None:
     _remove(folder)
     if not any(folder.iterdir()):
         folder.rmdir()
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """The innermost first, up to one that holds something."""
+    for folder in folders:
+        if folder.is_dir():
+            if any(folder.iterdir()):
+                return
+            folder.rmdir()
 
 
 def _remove_aside(folder: Path) -> None:

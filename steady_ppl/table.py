@@ -171,7 +171,8 @@ def _trajectories(cells: pd.Series, name: str) -> tuple[np.ndarray, np.ndarray]:
     """The labels in order of first appearance and the trajectories' numbers of rows."""
     if len(cells) == 0:
         _fail(name, "the table has no rows")
-    labels = np.array([str(cell) for cell in cells], dtype=object)
+    whole = pd.api.types.is_float_dtype(cells.dtype) and bool((cells.dropna() % 1 == 0).all())  # numbers with a gap
+    labels = np.array([f"{cell:.0f}" if whole else str(cell) for cell in cells], dtype=object)
     empty = cells.isna().to_numpy() | np.array([not label.strip() for label in labels])
     if empty.any():
         _fail(name, "got an empty cell, expected a label", column="trajectory", row=int(empty.argmax()) + 1)

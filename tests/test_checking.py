@@ -225,6 +225,14 @@ def test_gaps_uneven_lengths_and_a_drive_of_one_row_leave_finite_figures(cart, u
     assert finite(st.check(fitted(cart, known_start=known_start), short, simulations=20).figures)
 
 
+def test_drives_of_different_rates_are_said_to_be(cart, even):
+    assert not even.uneven_steps
+    faster = even.time.clone()
+    faster[:, 1] *= 0.5
+    notes = st.check(fitted(cart, known_start=False), replace(even, time=faster), simulations=20).notes
+    assert "the drives' steps differ" in notes[0] and "rows of" in notes[0]
+
+
 def test_a_component_that_is_never_measured_has_no_figures():
     data = table(hovercraft(), trajectories=4, rows=21)
     observed = data.observed.clone()

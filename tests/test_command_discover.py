@@ -36,9 +36,13 @@ def table(tmp_path_factory):
 
 def test_a_model_is_fitted_searched_and_kept(table, tmp_path, capsys):
     run, figures, picture = tmp_path / "run", tmp_path / "found.json", tmp_path / "found.png"
-    given = ("--known-start", "--simulations", 50, "--out", run, "--json", figures, "--picture", picture)
-    assert steady("discover", MODEL, table, *given) == 0
+    given = ("--known-start", "--simulations", 50, "--picture", picture)
+    assert steady("discover", MODEL, table, *given, "--json", "-", "-q") == 0
+    printed, noted = capsys.readouterr()
+    assert noted == ""
+    assert steady("discover", MODEL, table, *given, "--out", run, "--json", figures) == 0
     said = capsys.readouterr().out
+    assert json.loads(printed)["sentence"] == json.loads(figures.read_text())["sentence"]
     assert said.startswith("The dynamics lack yaw_bias = 0.")
     assert "6 of the 12 drives were kept" in said
     content = json.loads(figures.read_text())
@@ -76,6 +80,8 @@ def test_a_folder_that_does_not_exist_is_said_before_anything_is_computed(tmp_pa
         said = refused(capsys, *command, "--json", tmp_path / "nowhere" / "found.json")
         assert "there is no folder" in said and "nowhere" in said
         assert "it is a folder" in refused(capsys, *command, "--json", tmp_path)
+        said = refused(capsys, *command, "--picture", tmp_path / "nowhere" / "found.png")
+        assert "there is no folder" in said and "nowhere" in said
 
 
 def test_a_run_that_cannot_be_written_is_said_before_anything_is_computed(tmp_path, capsys, monkeypatch):

@@ -324,6 +324,8 @@ def test_the_command_writes_figures_and_a_picture(tmp_path, work, capsys):
     assert named == ["hand", "steady", "oracle", "truth", "constant velocity", "noise floor"]
     assert (tmp_path / "proof.png").read_bytes().startswith(b"\x89PNG")
     assert " ".join(capsys.readouterr().out.split()).startswith(content["verdict"])
+    assert steady("prove", *runs, table, "--json", "-") == 0
+    assert json.loads(capsys.readouterr().out)["reference"] == "hand"
 
 
 def test_the_command_refuses_without_touching_a_file(tmp_path, work, refused, capsys):

@@ -20,12 +20,15 @@ import pyro.distributions as dist
 import pytest
 import torch
 from examples import example
+from markupsafe import escape
 from small import simulated, steady
 
 import steady_ppl as st
+from steady_ppl.effects import attached
 from steady_ppl.reporting.drives import chosen
 from steady_ppl.reporting.maps import where_to_look
 from steady_ppl.reporting.packing import packed
+from steady_ppl.reporting.program_page import _equation
 from steady_ppl.reporting.writing import said, spread
 
 EVIL = "</script><script>window.broken = 1</script>"
@@ -112,7 +115,11 @@ def page(found, tmp_path_factory) -> Path:
 
 
 def content(page: Path) -> dict:
-    (text,) = re.findall(r'<script id="data" type="application/json">(.*?)</script>', page.read_text(), re.DOTALL)
+    return content_of(page.read_text())
+
+
+def content_of(html: str) -> dict:
+    (text,) = re.findall(r'<script id="data" type="application/json">(.*?)</script>', html, re.DOTALL)
     return json.loads(text, parse_constant=lambda name: pytest.fail(name))
 
 
@@ -229,6 +236,53 @@ def test_a_system_that_is_no_vehicle_has_a_report(tmp_path):
     table = st.simulate(program, 5, seed=0)
     found = st.report({"pendulum": st.Fit(program, "hand")}, table, simulations=20, draws=5)
     assert found.drives["runs"][0]["plane"] == [0, 1] and len(found.html) < MOST
+
+
+class Turned(type(example("hovercraft"))):
+    """The same vehicle, its states and landmarks in another order."""
+
+    landmarks = type(example("hovercraft")).landmarks[::-1]
+    measurements = tuple(f"bearing_{i} [rad]" for i in reversed(range(4)))
+
+
+def test_every_run_is_drawn_against_its_own_components(runs, data):
+    """Not against the first run's, which may measure the same in another order; and without a known start a heading is
+    on the truth's turn."""
+    other = st.Fit(Turned().float().requires_grad_(False), "hand", known_start=False)
+    found = st.report({"before": runs["before"], "turned": other}, data, simulations=20, draws=5)
+    drawn = content_of(found.html)
+    first, second = drawn["runs"]
+    assert [one["name"] for one in second["measurements"]] == [f"bearing_{i}" for i in reversed(range(4))]
+    np.testing.assert_allclose(unpacked(second["measured"])[:, ::-1], unpacked(first["measured"]), atol=1e-3)
+    error = unpacked(second["measured"]) - unpacked(second["predictions"][0]["middle"])
+    assert np.nanstd(error) < 0.3
+    heading = unpacked(second["truth"])[:, 2] - unpacked(second["posterior"]["middle"])[:, 2]
+    assert np.nanmax(abs(heading)) < np.pi
+    assert "cannot be compared" in found.html
+
+
+def test_the_last_command_of_a_drive_acts_on_nothing(page):
+    controls = unpacked(content(page)["controls"])
+    assert np.isnan(controls[:, :, -1]).all() and not np.isnan(controls[:, :, :-1]).any()
+
+
+def test_what_is_shown_row_by_row_has_an_upper_bound(runs):
+    """A page of three hundred drives is hardly larger than one of thirty."""
+    checks = [st.check(one, simulated(trajectories=6, rows=101), simulations=20) for one in runs.values()]
+    for numbers in (3_000, 30_000):
+        shown = chosen(checks, numbers)
+        rows = -(-101 // shown.every)
+        assert 0.5 * numbers < len(shown.drives) * rows * 100 < 1.5 * numbers
+        assert shown.note and "of 6 drives" in shown.note
+    assert chosen(checks).note is None
+
+
+def test_an_equation_that_is_no_latex_is_said_in_words(runs, data):
+    program = example("hovercraft", torch.float32).with_effect("linear_drag", 0.1)
+    (variant,) = attached(program)
+    broken = replace(variant.effect, equation=r"\frac{")
+    assert _equation(broken) == escape(broken.text)
+    assert "<math" in _equation(variant.effect)
 
 
 def test_the_command_writes_it(work: Path, tmp_path: Path, capsys, refused):

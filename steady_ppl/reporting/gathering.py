@@ -90,7 +90,7 @@ def report(
         seed: of simulations, draws and resampling.
 
     Raises:
-        UsageError: no run, or a program whose noise is not normal.
+        UsageError: no run, or a program that cannot be linearised.
         DataError: nothing to compare, or no known start.
         FilterError: a linearised program broke down.
 

@@ -6,9 +6,10 @@ import inspect
 from typing import Any
 
 from latex2mathml.converter import convert
+from markupsafe import Markup, escape
 
 from steady_ppl.display import parameter_rows
-from steady_ppl.effects import attached, written_class
+from steady_ppl.effects import Effect, attached, written_class
 from steady_ppl.fit import Fit
 
 
@@ -27,7 +28,7 @@ def program_page(label: str, fit: Fit) -> dict[str, Any]:
         "effects": [
             {
                 "name": variant.label,
-                "equation": convert(variant.effect.equation),
+                "equation": _equation(variant.effect),
                 "text": variant.effect.text,
                 "feels": variant.effect.feels,
             }
@@ -41,3 +42,11 @@ def program_page(label: str, fit: Fit) -> dict[str, Any]:
         "known_start": fit.known_start,
         "notes": fit.notes,
     }
+
+
+def _equation(effect: Effect) -> Markup:
+    """As MathML; in words where somebody's own LaTeX is none."""
+    try:
+        return Markup(convert(effect.equation))
+    except Exception:  # the converter raises many kinds
+        return escape(effect.text)

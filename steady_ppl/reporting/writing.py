@@ -77,13 +77,17 @@ def write_page(text: str, path: Path) -> None:
 def _linked(findings: list[dict[str, Any]], found: Report, label: str) -> list[dict[str, Any]]:
     """The strongest findings of a run, each with the address of its place on the page."""
     run = list(found.checks).index(label)
-    by_text = {row["text"]: row["place"] for row in found.drives["runs"][run]["findings"]}
+    places = [row["place"] for row in found.drives["runs"][run]["findings"]]
     rows = []
-    for finding in strongest(findings):
-        place = by_text[finding["text"]]
-        drive = found.shown.drives.index(place[0]) if place and place[0] in found.shown.drives else None
-        link = None if drive is None or place is None else f"#run={run}&drive={drive}&from={place[1]:g}&to={place[2]:g}"
-        rows.append({**finding, "link": link, "drive": found.checks[label].data.labels[place[0]] if place else None})
+    for finding in strongest([{**one, "place": place} for one, place in zip(findings, places, strict=True)]):
+        place = finding["place"]
+        link = drive = None
+        if place is not None:
+            number, start, end = place
+            drive = found.checks[label].data.labels[number]
+            if number in found.shown.drives:
+                link = f"#run={run}&drive={found.shown.drives.index(number)}&from={start:.2f}&to={end:.2f}"
+        rows.append({**finding, "link": link, "drive": drive})
     return rows
 
 
