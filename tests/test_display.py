@@ -28,7 +28,7 @@ def test_a_table_says_what_is_in_its_columns() -> None:
     data = simulated(trajectories=2, rows=4)
     data.observed[1:3, 0, 2] = False
     html = data._repr_html_()
-    assert "2 trajectories of 4 to 4 rows, a row every 0.1 s" in html
+    assert "2 trajectories of 4 rows, a row every 0.1 s" in html
     cells = re.findall(r"<tr><td>y.bearing_2</td><td>([^<]*)</td><td>([^<]*)</td><td>25.0%</td></tr>", html)
     kept = st.to_frame(data)["y.bearing_2"].dropna()
     assert cells == [(f"{kept.min():.4g}", f"{kept.max():.4g}")]
