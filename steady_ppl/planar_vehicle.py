@@ -51,6 +51,15 @@ class PlanarVehicle(Program):
     @property
     def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
         """One bearing a landmark."""
+        return self._bearings
+
+    @property
+    def sees_bearings(self) -> bool:
+        """Whether a bearing to each landmark, and nothing else, is measured; not where a subclass has other sensors."""
+        return len(self.landmarks) > 0 and names(self.measurements) == names(self._bearings)
+
+    @property
+    def _bearings(self) -> tuple[str, ...]:
         return tuple(f"bearing_{i} [rad]" for i in range(len(self.landmarks)))
 
     def integrate(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from typing import Any
 
 from steady_ppl.data import Trajectories
 from steady_ppl.effects.declaration import Effect
-from steady_ppl.effects.planar_forces import not_planar
+from steady_ppl.effects.planar_forces import no_bearings
 from steady_ppl.effects.wheels import needs_commanded_speed
 from steady_ppl.planar_vehicle import PlanarVehicle
 from steady_ppl.program import Program, names
@@ -102,7 +102,7 @@ NOISES = [
         typical=0.1,
         limit=1.0,
         sign=1,
-        lacks=not_planar,
+        lacks=no_bearings,
     ),
     Effect(
         name="process_noise",

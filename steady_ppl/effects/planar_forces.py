@@ -12,11 +12,22 @@ from steady_ppl.data import Trajectories
 from steady_ppl.effects.declaration import Effect
 from steady_ppl.planar_vehicle import PlanarVehicle
 from steady_ppl.program import Program, names
+from steady_ppl.seeding import seeded
+from steady_ppl.sites import broadcast_event, running
+
+STARTS = 500  # drawn, where nothing else says where a vehicle goes
 
 
 def not_planar(program: Program) -> str | None:
     """Why an effect on planar vehicles does not apply."""
     return None if isinstance(program, PlanarVehicle) else "it acts on vehicles in the plane only"
+
+
+def no_bearings(program: Program) -> str | None:
+    """Why an effect on bearings to landmarks does not apply."""
+    if isinstance(program, PlanarVehicle) and not program.sees_bearings:
+        return "it acts on bearings to landmarks, and the program measures something else"
+    return not_planar(program)
 
 
 def _needs_slip(program: Program) -> str | None:
@@ -51,16 +62,24 @@ def _limits(program: Program, data: Trajectories | None) -> Sequence[Mapping[str
 
 
 def _places(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
-    """Patches on a grid over where the vehicle was, as far as its landmarks and its start say."""
-    if data is None or data.states is None:
+    """Patches on a grid over where the vehicle was, as far as its states, its landmarks or its start say."""
+    if (data is None or data.states is None) and len(program.landmarks):
         landmarks = torch.as_tensor(program.landmarks).detach().double()
         low, high = 0.5 * landmarks.amin(0), 0.5 * landmarks.amax(0)
     else:
-        places = data.states[..., :2][torch.isfinite(data.states[..., :2]).all(-1)].double()
+        states = _starts(program) if data is None or data.states is None else data.states
+        places = states[..., :2][torch.isfinite(states[..., :2]).all(-1)].double()
         low, high = places.quantile(0.05, 0), places.quantile(0.95, 0)
     radius = float((high - low).max()) / 5
     steps = [torch.linspace(float(low[i]), float(high[i]), 3).tolist() for i in (0, 1)]
     return [{"x": x, "y": y, "radius": radius} for x, y in itertools.product(*steps)]
+
+
+@torch.no_grad()
+def _starts(program: Program) -> torch.Tensor:
+    """Drawn from where drives begin, `(1, STARTS, D)`."""
+    with seeded("starts"), running(1, STARTS):
+        return broadcast_event(program.initial(), torch.Size((1, STARTS)), 1)
 
 
 def slope(self, state, control, time, step, c):

@@ -7,7 +7,7 @@ from typing import Any
 
 from steady_ppl.data import Trajectories
 from steady_ppl.effects.declaration import Effect, power_of_two_below
-from steady_ppl.effects.planar_forces import not_planar
+from steady_ppl.effects.planar_forces import no_bearings
 from steady_ppl.planar_vehicle import PlanarVehicle
 from steady_ppl.program import Program, names, units
 
@@ -31,11 +31,12 @@ def _spread(data: Trajectories | None, component: int) -> float:
 def _one_landmark(program: Program) -> str | None:
     if isinstance(program, PlanarVehicle) and len(program.measurements) == 1:
         return "there is one landmark: its bias is that of all"
-    return not_planar(program)
+    return no_bearings(program)
 
 
-def _planar(program: Program) -> str | None:
-    return "of a planar vehicle it is bearing_bias or landmark_bias" if isinstance(program, PlanarVehicle) else None
+def _bearings(program: Program) -> str | None:
+    seen = isinstance(program, PlanarVehicle) and program.sees_bearings
+    return "of bearings to landmarks it is bearing_bias or landmark_bias" if seen else None
 
 
 def _units_differ(program: Program) -> str | None:
@@ -79,7 +80,7 @@ SENSORS = [
         function=common_bias,
         typical=0.035,
         limit=0.5,
-        lacks=not_planar,
+        lacks=no_bearings,
     ),
     Effect(
         name="landmark_bias",
@@ -107,7 +108,7 @@ SENSORS = [
         typical=0.05,
         limit=1.0,
         choices=_each_of_its_size,
-        lacks=_planar,
+        lacks=_bearings,
     ),
     Effect(
         name="sensor_scale",
