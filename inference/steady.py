@@ -141,12 +141,12 @@ def fit(
             f"particles blew up, and count for nothing, in {blown_up} of {len(trained.history)} logged E steps"
         )
     if guide == "gaussian" and not trained.interrupted:
-        notes += doubts(program, data, known_start, seed)
+        notes += doubts(program, data, known_start, seed, "guide=lookahead")
     return Fit(program, "steady", settings, seed=seed, known_start=known_start, trained=trained, notes=notes)
 
 
-def doubts(program, data: Trajectories, known_start: bool, seed: int) -> list[str]:
-    """Whether the Gaussian guide can be trusted: a filter weighs what the linearisation neglects."""
+def doubts(program, data: Trajectories, known_start: bool, seed: int, instead: str) -> list[str]:
+    """Whether the linearised program can be trusted: a filter weighs what it neglects."""
     try:
         with seeded(seed, "doubts"):
             nats = float(neglected(program, data, known_start=known_start).abs().mean())
@@ -154,4 +154,4 @@ def doubts(program, data: Trajectories, known_start: bool, seed: int) -> list[st
         return [f"the filter that looks ahead breaks down on the learned program: {error}"]
     if nats < 0.5:
         return []
-    return [f"linearised, the program misses log p(y) by {nats:.1f} nats a drive: try guide=lookahead"]
+    return [f"linearised, the program misses log p(y) by {nats:.1f} nats a drive: try {instead}"]

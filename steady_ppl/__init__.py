@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from steady_ppl.guides import PathGuide, SMCGuide, TruthGuide
     from steady_ppl.inference_network import InferenceNetwork
     from steady_ppl.joint import Joint
+    from steady_ppl.likelihood_fit import fit_by_likelihood
     from steady_ppl.linearization import why_not_linear
     from steady_ppl.linearized_guides import GaussianGuide, LookaheadGuide
     from steady_ppl.particles import particle_filter, roll_out
@@ -71,6 +72,7 @@ _HOMES = {
     "guides": ("PathGuide", "SMCGuide", "TruthGuide"),
     "inference_network": ("InferenceNetwork",),
     "joint": ("Joint",),
+    "likelihood_fit": ("fit_by_likelihood",),
     "linearization": ("why_not_linear",),
     "linearized_guides": ("GaussianGuide", "LookaheadGuide"),
     "particles": ("particle_filter", "roll_out"),

@@ -25,6 +25,12 @@ WHO = {
     "parameters": "its own parameters do not suit these drives",
     "cannot tell": "these drives cannot tell what is at fault",
 }
+BESIDE = {
+    "sensor": "the sensor stands out",
+    "actuator": "the actuators stand out",
+    "dynamics": "the dynamics stand out",
+    "noise": "its noise stands out",
+}
 
 
 def figures(found: Check) -> dict[str, Any]:
@@ -145,23 +151,30 @@ def verdict(found: Check) -> str:
         said += f" ({alone} of {len(found.misfit.cells)} cells would stand out by themselves)" if alone else ""
         said += "; `steady discover` says what could not have been seen"
     else:
-        said = f"The program does not explain these drives: {WHO[blame.kind]}{_most_clearly(found)}; "
-        if blame.parameters_misfit and blame.kind != "parameters":
-            said += f"its own parameters do not suit them either{_parameters(found)}: fit it again first; "
-        said += {
-            "parameters": "fit it again before anything else is believed",
-            "noise": "the effects of kind noise in `steady discover` say in which way",
-        }.get(blame.kind, "`steady discover` tests the physical effects by name")
+        said = "The program does not explain these drives: "
+        discover = "`steady discover` tests the physical effects by name"
+        if blame.parameters_misfit:
+            said += f"{WHO['parameters']}{_parameters(found)}: fit it again before anything else is believed (more "
+            said += f"--steps, or --recipe likelihood){_beside_parameters(found)}; if that changes little, {discover}"
+        else:
+            said += f"{WHO[blame.kind]}{_most_clearly(found)}; "
+            of_noise = "the effects of kind noise in `steady discover` say in which way"
+            said += of_noise if blame.kind == "noise" else discover
     loses = lost_horizons(found)
     if loses:
         said += f"; it predicts worse than a vehicle that just keeps its velocity ({', '.join(loses)} ahead)"
     return said + "."
 
 
+def _beside_parameters(found: Check) -> str:
+    """What stands out as well, which is no verdict while the parameters are wrong."""
+    if found.blame.kind not in BESIDE:
+        return ""
+    return f"; beside them {BESIDE[found.blame.kind]}{_most_clearly(found)}"
+
+
 def _most_clearly(found: Check) -> str:
     blame = found.blame
-    if blame.kind == "parameters":
-        return _parameters(found)
     if blame.kind == "noise":
         name = max(blame.noise, key=lambda name: abs(blame.noise[name]))
         return f", most clearly the {name}, {'more' if blame.noise[name] > 0 else 'less'} than the program says"

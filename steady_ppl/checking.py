@@ -19,6 +19,7 @@ from steady_ppl.blame import SCATTER, Blame, blame, scored
 from steady_ppl.check_report import as_text, figures, verdict
 from steady_ppl.data import Trajectories
 from steady_ppl.directions import directions
+from steady_ppl.doubts import doubts_of_units
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
 from steady_ppl.gaussian_smoother import find_and_smooth
@@ -138,7 +139,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
             scores.dispersion.mean(-1),
         )
     notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
-    notes += run.uneven_steps
+    notes += run.uneven_steps + doubts_of_units(program, run)
     if not scores.parameter_names:
         notes.append("the program's own parameters were not looked at one by one: it has none, or a network's")
     return Check(

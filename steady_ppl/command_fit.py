@@ -12,7 +12,7 @@ import typer
 from steady_ppl.errors import UsageError
 
 WORDS = {"true": True, "false": False, "none": None}
-RECIPES = ("steady", "steady-minus", "svi", "hand", "fit-hand", "fit-tv", "fit-truth")
+RECIPES = ("steady", "likelihood", "steady-minus", "svi", "hand", "fit-hand", "fit-tv", "fit-truth")
 
 
 class Device(StrEnum):
@@ -92,7 +92,8 @@ def fit(
         if judged:
             first, kept = next(iter(judged.values())), judged[result.trained.kept]
             print(
-                f"held-out log p(y) {first:.2f} → {kept:.2f} at step {result.trained.kept}, whose parameters were kept"
+                f"held-out log p(y) of a drive {first:.2f} → {kept:.2f} at step {result.trained.kept}, "
+                "whose parameters were kept"
             )
         if result.trained.interrupted:
             say(f"interrupted; the run so far is usable, `--resume` goes on with {out}")

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 NEXT = (
-    "steady fit models/hovercraft.py train.csv --valid valid.csv --known-start --out runs/first",
+    "steady fit models/hovercraft.py train.csv --valid valid.csv --known-start --recipe likelihood --out runs/first",
     "steady check runs/first test.csv",
     "steady discover runs/first train.csv --valid valid.csv --out runs/found",
     "steady report runs/first runs/found test.csv --out report.html",

@@ -76,7 +76,7 @@ COMMANDS = (
         command_fit.fit,
         "Learn a program's parameters from measurements.",
         (
-            "steady fit models/hovercraft.py train.csv --valid valid.csv --out runs/first",
+            "steady fit mine.py train.csv --valid valid.csv --recipe likelihood --out runs/first",
             "steady fit models/neural_vehicle.py:NeuralHovercraft train.csv --known-start --out runs/net",
             "steady fit mine.py train.csv --recipe svi --set learning_rate=1e-3 --out runs/svi",
         ),

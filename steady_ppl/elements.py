@@ -58,8 +58,9 @@ def elements(program: Program) -> list[Element]:
             found.append(Element(label, parameter, index, max(steps.get(name, 0.01), RELATIVE * abs(value))))
     if len(found) > LARGEST:
         raise UsageError(
-            f"program {type(program).__name__} has {len(found)} learnable numbers: a network cannot be screened "
-            "parameter by parameter; discover the effects missing from a mechanistic program, or from a hybrid of one"
+            f"program {type(program).__name__} has {len(found)} learnable numbers: a network cannot be looked at "
+            "parameter by parameter. Fit it with the recipe steady; discover the effects that are missing from a "
+            "mechanistic program, or from a hybrid of one"
         )
     return found
 

@@ -17,7 +17,8 @@ _LOADS = itertools.count()
 
 
 def load_program(source: str | Path) -> Program:
-    """Load a program by path: `models/hovercraft.py` (the class named after the file) or `mine.py:Boat`.
+    """Load a program by path: `models/hovercraft.py` (the class named after the file, or its only program) or
+    `mine.py:Boat`.
 
     The file is run afresh under a private module name; `from .sibling import …` finds files of its own folder.
 
@@ -28,12 +29,14 @@ def load_program(source: str | Path) -> Program:
     if not class_name.isidentifier() or not path:
         path, class_name = str(source), ""
     file = Path(path)
-    class_name = class_name or "".join(word.capitalize() for word in file.stem.split("_"))
     module = run_file(file)
+    own = [c for c in vars(module).values() if inspect.isclass(c) and c.__module__ == module.__name__]
+    programs = [c.__name__ for c in own if issubclass(c, Program)]
+    if not class_name:
+        class_name = programs[0] if len(programs) == 1 else "".join(word.capitalize() for word in file.stem.split("_"))
     program_class = getattr(module, class_name, None)
     if not (inspect.isclass(program_class) and issubclass(program_class, Program)):
-        own = [c for c in vars(module).values() if inspect.isclass(c) and c.__module__ == module.__name__]
-        have = ", ".join(c.__name__ for c in own if issubclass(c, Program)) or "none"
+        have = ", ".join(programs) or "none"
         if inspect.isclass(program_class):
             have += f"; its class {class_name} derives from no steady_ppl.Program"
         raise ProgramError(f"{file.name} has no program {class_name}; its programs: {have} (choose with {path}:NAME)")

@@ -150,7 +150,7 @@ def prove(
         trajectories=len(data),
         known_start=known_start,
         seed=seed,
-        notes=notes + _blown_up(found) + far_off(found, data),
+        notes=notes + unfinished(rows) + _blown_up(found) + far_off(found, data),
     )
 
 
@@ -158,6 +158,15 @@ def _counted(judged: Iterable[Judged]) -> dict[int, Tensor]:
     """Horizon → the cells that every row predicts, `(T + 1 − horizon, B, K)`."""
     rows = [row.predictions for row in judged]
     return {horizon: torch.stack([row[horizon].observed for row in rows]).all(0) for horizon in rows[0]}
+
+
+def unfinished(rows: Mapping[str, Program | Fit]) -> list[str]:
+    """Which rows are fits that had not converged, so that a difference may be one of training."""
+    return [
+        f"{name} had not converged when its fit ended: part of what it differs by may be training"
+        for name, row in rows.items()
+        if isinstance(row, Fit) and row.trained is not None and row.trained.still_rising is not None
+    ]
 
 
 def _start_of(rows: Mapping[str, Program | Fit], notes: list[str]) -> bool:

@@ -13,6 +13,7 @@ import torch
 
 from steady_ppl.checkpoint import read_tensors
 from steady_ppl.data import Trajectories
+from steady_ppl.doubts import doubts_of_fit, doubts_of_units
 from steady_ppl.errors import RunError, UsageError, require
 from steady_ppl.fit import Fit, program_source, sha256, versions
 from steady_ppl.program import Program, for_program
@@ -104,11 +105,14 @@ def run_recipe(
     if device == "cuda" and not torch.cuda.is_available():
         raise UsageError("--device cuda: this machine has no CUDA device")
     program.to(device)
+    doubts: list[str] = []
     for part in (table, valid):
         if part is not None:
             columns = for_program(program, part)
+            doubts += [said for said in doubts_of_units(program, columns) if said not in doubts]
             if known_start:
                 _ = columns.known_start
+    declared = {key: value.clone() for key, value in program.state_dict().items()}
     begun = {
         "program": program_source(program, folder),
         "recipe": name,
@@ -138,6 +142,7 @@ def run_recipe(
         fitted = recipe(*call.args, **call.kwargs)
         if not isinstance(fitted, Fit):
             raise UsageError(f"recipe {name} returned {type(fitted).__name__}, not a Fit")
+        fitted.notes += doubts + doubts_of_fit(fitted, declared)
         if valid is None and trains and not (fitted.trained and fitted.trained.interrupted):
             fitted.notes.append("no --valid table: trained to the last step, nothing held out decides when to stop")
         fitted.save_into(folder, table, begun)

@@ -24,6 +24,8 @@ from steady_ppl.program import Program
 from steady_ppl.seeding import seeded
 from steady_ppl.validation import Validation, as_good
 
+SETTLED = 1.0  # nats a drive by which held-out log p(y) may rise at the end of a training that has converged
+
 
 class Guide(Protocol):
     """What the loop asks of a guide; parameters, if it is a torch module, are trained with the program's. What it keeps
@@ -103,6 +105,17 @@ class Trained:
     history: list[dict[str, float]]
     kept: int
     interrupted: bool = False
+
+    @property
+    def still_rising(self) -> float | None:
+        """By how many nats a drive held-out log p(y) rose over the last quarter, if that is more than `SETTLED` and its
+        end was kept; None where it had settled, or where fewer than three validations cannot tell."""
+        judged = [(entry["step"], entry["log_likelihood"]) for entry in self.history if "log_likelihood" in entry]
+        if len(judged) < 3 or self.interrupted or judged[-1][0] != self.kept:
+            return None
+        before = max(value for step, value in judged[:-1] if step <= max(0.75 * self.kept, judged[0][0]))
+        risen = judged[-1][1] - before
+        return risen if risen > SETTLED else None
 
 
 def train(

@@ -137,6 +137,7 @@ class HovercraftWithDrag(Hovercraft):
 
     def __init__(self):
         super().__init__()
+        # where its own parameters begin; they are learned as before
         self.mass = tensor(1.47)
         self.linear_drag = PyroParam(tensor(0.1), constraints.real)
 

@@ -103,7 +103,7 @@ def test_a_class_that_is_no_complete_program_is_refused(tmp_path: Path, refused)
     [
         (
             ("--recipe", "magic"),
-            "no recipe 'magic'; there are fit-hand, fit-truth, fit-tv, hand, steady, steady-minus, svi",
+            "no recipe 'magic'; there are fit-hand, fit-truth, fit-tv, hand, likelihood, steady, steady-minus, svi",
         ),
         (("--recipe", "mine.py"), "no recipe file mine.py"),
         (("--recipe", "hand", "--particles", "9"), "recipe hand has no setting particles; it has none"),

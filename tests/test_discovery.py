@@ -20,9 +20,9 @@ from steady_ppl.discovery.discovery import NOT_CONVERGED, _of_one_drive
 from steady_ppl.discovery.finding import _spread
 from steady_ppl.discovery.next_run import next_run
 from steady_ppl.discovery.places import variance_of_places
-from steady_ppl.discovery.refits import _led_back
 from steady_ppl.effects import Effect, chosen_variant, parsed
 from steady_ppl.effects.registry import _EFFECTS, register
+from steady_ppl.likelihood_fit import led_back
 from steady_ppl.maximum_likelihood import maximise
 from steady_ppl.pictures import unknown_effect
 
@@ -196,17 +196,17 @@ def test_not_knowing_a_knee_is_in_the_coefficients_interval():
     assert places > 0.1 * alone**2 and finding.sd[0] ** 2 == pytest.approx(alone**2 + places, rel=1e-3)
 
 
-def test_a_drive_that_strayed_is_led_back():
+def test_a_drive_that_strayed_isled_back():
     program = owner()
     data = st.for_program(program, tables(program, drives=6, rows=41)[0]).without_truth(keep_start=True)
     right = maximise(program, data, known_start=True)
     lost, states = right.log_likelihood.clone(), right.path.states.clone()
     lost[2], states[1:, 2] = -500.0, 0.0
-    found = _led_back(
+    found = led_back(
         program, data, replace(right, log_likelihood=lost, path=replace(right.path, states=states)), known_start=True
     )
     assert torch.allclose(found.log_likelihood, right.log_likelihood, atol=0.3)
-    assert _led_back(program, data, right, known_start=True) is right
+    assert led_back(program, data, right, known_start=True) is right
 
 
 def test_the_next_run_tells_what_these_drives_do_not():

@@ -73,14 +73,14 @@ def test_the_examples_of_a_page_run(name: str, tmp_path: Path, monkeypatch: pyte
 
 
 def test_a_recipe_of_the_page_fits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ((_, text),) = [one for one in blocks(DOCS / "own-recipe.md", "python") if "maximum.py" in one[0]]
-    (tmp_path / "maximum.py").write_text(text)
+    ((_, text),) = [one for one in blocks(DOCS / "own-recipe.md", "python") if "several_starts.py" in one[0]]
+    (tmp_path / "several_starts.py").write_text(text)
     (tmp_path / "models").symlink_to(ROOT / "models")
     st.write_table(simulated(rows=21), tmp_path / "train.csv")
     monkeypatch.chdir(tmp_path)
     (words,) = commands(DOCS / "own-recipe.md")
     assert main(words) == 0
-    assert st.Fit.load("runs/maximum").recipe == "maximum"
+    assert st.Fit.load("runs/several").recipe == "several-starts"
 
 
 def test_the_gallery_is_that_of_the_catalogue() -> None:

@@ -10,10 +10,11 @@ import torch
 from examples import drives, example
 
 from steady_ppl.discovery.candidates import gain_of_fits
-from steady_ppl.discovery.refits import first_refit, refit_elsewhere, refit_with, roomy_path
+from steady_ppl.discovery.refits import first_refit, refit_near, refit_with
 from steady_ppl.effects import chosen_variant
 from steady_ppl.elements import elements
 from steady_ppl.gaussian_smoother import smooth
+from steady_ppl.likelihood_fit import roomy_path
 from steady_ppl.maximum_likelihood import maximise
 
 
@@ -126,6 +127,6 @@ def test_a_fit_at_another_knee_is_the_one_from_nothing():
     assert base.rough is None
     knees = [chosen_variant(program, "thrust_saturation", knee=knee) for knee in (0.5, 0.65)]
     direct = [refit_with(base, knee, 0.5, known_start=True) for knee in knees]
-    near = refit_elsewhere(base, direct[0], knees[1], known_start=True)
+    near = refit_near(base, direct[0], [knees[1]], known_start=True)
     assert gain_of_fits(base, near) == pytest.approx(gain_of_fits(base, direct[1]), abs=0.2)
     assert float((near.held_out - direct[1].held_out).sum()) == pytest.approx(0.0, abs=0.5)

@@ -25,7 +25,7 @@ from steady_ppl.program import Program
 from steady_ppl.scores import measured, smoothed, typical_spreads
 from steady_ppl.seeding import seeded
 
-LEADERS, ALIKE = 6, 0.85  # how many are refitted, and those as well whose columns correlate so much with the first
+LEADERS, ALIKE = 6, 0.85  # how many are refitted at least, and whose columns correlate so much with the first
 NATS = 2.0  # of held-out log p(y) within which two candidates cannot be told apart
 NO_DOUBT = 10.0  # nats of held-out log p(y) for which a test need only be near the family's level
 NEARLY = LEVEL / 5  # p-value of a single test that is near it
@@ -175,14 +175,20 @@ def _starts(ahead: Lookahead, path: Tensor, known_start: bool, sets: int, seed: 
 
 
 def leaders(screened: Screened, first: bool) -> list[Tested]:
-    """Those to fit: the best tests and the aliases of the first; in later rounds those that are nearly significant
-    themselves, the best in any case."""
+    """Those to fit: all that are nearly significant, the aliases of the best, and in the first round the best tests.
+
+    How far the others are behind says little where much is missing: scores look one step ahead, and a drag of which
+    they see a trace may be what holds everything else in its wrong place.
+    """
     alive = [(i, t) for i, t in enumerate(screened.tested) if not (t.untestable or t.departure or t.is_curve)]
     if not alive:
         return []
-    top = alive[0][0]
-    few = [one for k, one in enumerate(alive[:LEADERS]) if first or k == 0 or one[1].p_value < NEARLY]
-    return [tested for i, tested in alive if (i, tested) in few or float(screened.alike[top, i]) > ALIKE]
+    top, sure = alive[0][0], LEADERS if first else 1
+    return [
+        tested
+        for rank, (i, tested) in enumerate(alive)
+        if rank < sure or tested.p_value < NEARLY or float(screened.alike[top, i]) > ALIKE
+    ]
 
 
 def fitted(now: Refit, tested: Tested, screening: Screening, settings: Settings, worth: Worth = ALWAYS) -> Candidate:

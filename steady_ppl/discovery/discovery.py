@@ -17,6 +17,7 @@ from steady_ppl.discovery.fitting import ByDraws
 from steady_ppl.discovery.next_run import NextRun, next_run
 from steady_ppl.discovery.requirements import FEWEST_DRIVES, require, unexcited
 from steady_ppl.discovery.search import Found, Search, search
+from steady_ppl.doubts import doubts_of_units
 from steady_ppl.effects import of_name, record, restore, written_class
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
@@ -189,8 +190,8 @@ def discover(
         proof=proof,
         before=fits[0],
         after=fits[1],
-        doubts=_doubts(found),
-        notes=notes + _notes(found, is_fitted) + far_off(proof.rows, drives[1]),
+        doubts=_doubts(found, is_fitted),
+        notes=notes + doubts_of_units(program, drives[0]) + _notes(found) + far_off(proof.rows, drives[1]),
     )
 
 
@@ -200,8 +201,14 @@ def _unclear(found: Search, effects: Sequence[Finding]) -> Found | None:
     return next((one for name in names for one in found.found if one.candidate.variant.name == name), None)
 
 
-def _doubts(found: Search) -> list[str]:
+def _doubts(found: Search, is_fitted: bool) -> list[str]:
     doubts = [] if found.base.converged else [NOT_CONVERGED]
+    gained = found.base.maxima[0].gained
+    if is_fitted and gained > FITTED_FURTHER:
+        doubts.append(
+            f"the run had not converged: fitting it further gained {gained:.0f} nats on these drives, before anything "
+            "was added. What follows begins from there; `steady prove` against the run would count them as gains"
+        )
     statistic, count = found.rounds[0].screening.tests.fitted
     if count and statistic > 5 * count + 10:
         doubts.append(
@@ -223,11 +230,8 @@ def _proof(found: Search, is_curve: bool, valid: Trajectories, known_start: bool
     return prove(rows, valid, known_start=known_start, with_constant_velocity=False, seed=seed)
 
 
-def _notes(found: Search, is_fitted: bool) -> list[str]:
+def _notes(found: Search) -> list[str]:
     notes = []
-    gained = found.base.maxima[0].gained
-    if is_fitted and gained > FITTED_FURTHER:
-        notes.append(f"the run had not converged on these drives: {gained:.0f} nats were gained by fitting it further")
     if isinstance(found.base.fitting, ByDraws):
         notes.append(
             "the linearised program's log p(y) is off by more than half a nat a drive, or cannot be judged: fits are "
@@ -243,8 +247,7 @@ def _notes(found: Search, is_fitted: bool) -> list[str]:
         )
     if not found.final.converged and found.found:
         notes.append("the fit with what was found has not converged")
-    tests = found.rounds[-1].screening.tests
-    if any(tested.p_value <= tests.critical for tested in tests.tested if not tested.departure):
+    if not found.is_complete:
         notes.append("something is left that no effect of the catalogue brings: the tests were not quiet at the end")
     notes += [f"{one.candidate.variant.label}: {said}" for one in found.found if (said := _of_one_drive(one))]
     for candidate in found.rounds[0].candidates:

@@ -40,6 +40,7 @@ def figures(found: Discovery) -> dict[str, Any]:
         "effect": first.variant.name if first else None,
         "class": first.alike if first else [],
         "confidence": first.confidence if first else None,
+        "complete": found.search.is_complete,
         "effects": [_finding(finding) for finding in found.findings],
         "candidates": [_candidate(found, tested) for tested in ranked(found)],
         "shape": vars(found.shape) if found.shape else None,
@@ -170,9 +171,11 @@ def sentence(found: Discovery) -> str:
         )
     clauses: list[str] = []
     for kind in dict.fromkeys(finding.kind for finding in found.findings):
-        said = [_said(finding) for finding in found.findings if finding.kind == kind]
+        said = [_said(finding, found.search.is_complete) for finding in found.findings if finding.kind == kind]
         words = IN_WORDS[kind] if not clauses else IN_WORDS[kind][0].lower() + IN_WORDS[kind][1:]
         clauses.append(f"{words} {' and '.join(said)}")
+    if not found.search.is_complete:
+        clauses.append("they do not explain all, so that an effect nobody has named may stand behind these names")
     return f"{'; '.join(clauses)} (p = {found.p_value:.2g})."
 
 
@@ -180,12 +183,15 @@ def _times(found: Discovery) -> str:
     return f" times {found.shape.times}" if found.shape and found.shape.times else ""
 
 
-def _said(finding: Finding) -> str:
+def _said(finding: Finding, is_complete: bool) -> str:
+    """A finding with how sure it is, or what it brings where the probabilities leave out what else there may be."""
     said = f"{finding.variant.label} = {with_interval(finding)}"
     if len(finding.alike) > 1:
         said += f", which these drives cannot tell from {' or '.join(finding.alike[1:])}"
     if finding.confidence is None:
         return said
+    if not is_complete:
+        return f"{said} ({finding.gain:+.0f} nats held out)"
     sure = ">99 %" if finding.confidence > 0.99 else f"{100 * finding.confidence:.0f} %"
     return f"{said} (confidence {sure})"
 

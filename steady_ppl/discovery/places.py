@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.discovery.candidates import Candidate, Settings, gain_of_fits, judged
-from steady_ppl.discovery.refits import Refit, refit_elsewhere, refit_with
+from steady_ppl.discovery.refits import Refit, refit_near, refit_with
 from steady_ppl.effects import Variant
 
 BETTER = 0.3  # nats by which another knee or place has to be likelier
@@ -33,7 +33,7 @@ def at_its_best_place(now: Refit, candidate: Candidate, settings: Settings) -> C
         nonlocal at, fit
         for variant in variants:
             assert isinstance(fit, Refit)
-            other = refit_elsewhere(now, fit, variant, known_start=settings.known_start)
+            other = refit_near(now, fit, [variant], known_start=settings.known_start)
             if isinstance(other, Refit) and gain_of_fits(now, other) > gain_of_fits(now, fit) + BETTER:
                 at, fit = variant, other
 
@@ -66,7 +66,7 @@ def variance_of_places(now: Refit, candidate: Candidate, known_start: bool) -> T
 
     def fitted(variant: Variant) -> tuple[Tensor, float] | None:
         """How the coefficient changes, and by how much the likelihood falls."""
-        refit = refit_elsewhere(now, near, variant, known_start=known_start)
+        refit = refit_near(now, near, [variant], known_start=known_start)
         if isinstance(refit, str):
             return None
         return refit.coefficient(variant).flatten().double() - here, best - gain_of_fits(now, refit)

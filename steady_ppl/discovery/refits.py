@@ -13,19 +13,16 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, Fitting, is_doubtful
 from steady_ppl.effects import Variant, attach, attached, coefficient
-from steady_ppl.elements import Element, elements, moved
+from steady_ppl.elements import elements
 from steady_ppl.errors import FilterError, SteadyError
-from steady_ppl.gaussian_smoother import find_path, means_as_path, smooth
+from steady_ppl.gaussian_smoother import find_path
+from steady_ppl.likelihood_fit import fit_by_likelihood, led_back, widens
 from steady_ppl.linearization import Path
-from steady_ppl.lookahead import Lookahead
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.program import Program
-from steady_ppl.scores import channel_moments, smoothed
 from steady_ppl.seeding import seeded
 
-ROUGH = 1.5  # mean square deviation, in the program's own, from which its noise is widened before anything is fitted
 WIDER = math.log(20.0)  # log ratio of a channel's noise after a fit and before, from which it explains next to nothing
-FAR, SEARCHES = 6.0, 3  # standard deviations by which a drive strays from the others, and searches for its path
 NOTHING = 2.0  # nats below the program without, after which a fit is given up: a candidate at zero is that program
 
 
@@ -113,11 +110,10 @@ def first_refit(program: Program, train: Trajectories, valid: Trajectories, *, k
     """
     own = copy.deepcopy(program)
     with seeded(seed, "paths"):
-        first = roomy_path(own, train, known_start)
-        one = _led_back(own, train, maximise(own, train, first, known_start=known_start), known_start)
+        one = fit_by_likelihood(own, train, known_start=known_start)
         other = copy.deepcopy(own)
         second = maximise(other, valid, find_path(other, valid, known_start=known_start), known_start=known_start)
-        second = _led_back(other, valid, second, known_start)
+        second = led_back(other, valid, second, known_start)
     folds = [Fold(train, one.path, valid, second.path), Fold(valid, second.path, train, one.path)]
     refit = _refit([own, other], folds, known_start, [one, second])
     if _far_wider(own, program, train):
@@ -128,80 +124,13 @@ def first_refit(program: Program, train: Trajectories, valid: Trajectories, *, k
     return refit
 
 
-def _led_back(program: Program, data: Trajectories, maximum: Maximum, known_start: bool) -> Maximum:
-    """A fit whose strays have found another path: drives far less likely than the others, whose paths were found before
-    the program was fitted."""
-    for _ in range(SEARCHES):
-        cells = data.observed.sum((0, 2)).clamp(min=1)
-        each = maximum.log_likelihood / cells
-        middle = each.median()
-        usual = 1.5 * (each - middle).abs().median()
-        strays = (~(each >= middle - FAR * usual)).nonzero().flatten()
-        if not len(strays):
-            break
-        part = data.subset(strays)
-        found = find_path(program, part, known_start=known_start)
-        there = smooth(program, part, found, known_start=known_start, kernels=False)
-        better = there.log_likelihood > maximum.log_likelihood[strays] + 1
-        if not bool(better.any()):
-            break
-        states, noise = maximum.path.states.clone(), maximum.path.noise.clone()
-        found = means_as_path(there, part)
-        states[:, strays[better]], noise[:, strays[better]] = found.states[:, better], found.noise[:, better]
-        before = maximum.gained - maximum.objective
-        maximum = maximise(program, data, Path(states, noise), known_start=known_start)
-        maximum = replace(maximum, gained=maximum.objective + before)
-    return maximum
-
-
 def _far_wider(fitted: Program, program: Program, data: Trajectories) -> bool:
     """Whether a fit has made some channel's noise several times what it was."""
     return any(
         float(now.parameter.detach().flatten()[now.index] - then.parameter.detach().flatten()[then.index]) > WIDER
         for now, then in zip(elements(fitted), elements(program), strict=True)
-        if _widens(fitted, now, data)
+        if widens(fitted, now, data)
     )
-
-
-def roomy_path(program: Program, data: Trajectories, known_start: bool) -> Path:
-    """Find paths; where the drives are much rougher than the program says, widen its noise first, in place.
-
-    A program that lacks a strong effect explains nothing at its declared noise: scores there lead nowhere.
-    """
-    path = find_path(program, data, known_start=known_start)
-    ahead = smooth(program, data, path, known_start=known_start, kernels=False)
-    parts = [part for part in elements(program) if _widens(program, part, data)]
-    while parts and _roughness(ahead, data) > ROUGH:
-        before = [part.parameter.data.clone() for part in parts]
-        for part in parts:
-            part.move(math.log(3.0))
-        wider = find_path(program, data, known_start=known_start)
-        there = smooth(program, data, wider, known_start=known_start, kernels=False)
-        if not float(there.log_likelihood.sum()) > float(ahead.log_likelihood.sum()):
-            for part, value in zip(parts, before, strict=True):
-                part.parameter.data.copy_(value)
-            break
-        path, ahead = wider, there
-    return path
-
-
-def _widens(program: Program, part: Element, data: Trajectories) -> bool:
-    """Whether a learnable number is the logarithm of the standard deviation of some channel."""
-    states = data.controls.new_ones((1, *data.steps.shape, len(program.states)))
-    here = channel_moments(program, data, states)[1]
-    with moved(part, 0.1):
-        there = channel_moments(program, data, states)[1]
-    change = (there / here).log()[:, data.transitions]
-    return bool(((change.abs() < 1e-6) | ((change - 0.1).abs() < 1e-3)).all()) and bool((change > 0.05).any())
-
-
-def _roughness(ahead: Lookahead, data: Trajectories) -> float:
-    """Posterior mean square of the channels' or the measurements' standardised deviations, whichever is larger; 1 where
-    the program is right."""
-    at = smoothed(ahead, data)
-    parts = (at.channels, at.measurements)
-    means = [(p.mean.square() + p.variance)[p.present].mean() for p in parts if bool(p.present.any())]
-    return max(float(mean.nan_to_num(torch.inf)) for mean in means)
 
 
 def refit_with(
@@ -233,19 +162,24 @@ def refit_with(
     return replace(fit, rough=base.rough, fitting=base.fitting)
 
 
-def refit_elsewhere(base: Refit, near: Refit, variant: Variant, *, known_start: bool) -> Refit | str:
-    """The program with an effect at another knee, width or place, or why it cannot be fitted.
+def refit_near(base: Refit, near: Refit, variants: Sequence[Variant], *, known_start: bool) -> Refit | str:
+    """The program with effects, fitted from where another that shares parameters with it ended, or why it cannot be.
 
     Args:
-        base: the program without.
-        near: with the effect at some place near, where the fit begins.
-        variant: the effect.
+        base: the program without these effects.
+        near: where the fit begins; its paths are taken as well.
+        variants: the effects; one at another knee, width or place than `near` has it, or fewer of them.
         known_start: the first state is certain.
     """
     try:
-        programs = [attach(copy.deepcopy(program), variant) for program in base.programs]
+        programs = [copy.deepcopy(program) for program in base.programs]
+        for variant in variants:
+            programs = [attach(program, variant) for program in programs]
+        if programs[0].states != near.program.states:
+            return "paths of other states are no start"
         for program, fitted in zip(programs, near.programs, strict=True):
-            program.load_state_dict(fitted.state_dict())
+            own = program.state_dict()
+            program.load_state_dict(own | {name: value for name, value in fitted.state_dict().items() if name in own})
         return _refit(programs, near.folds, known_start, [None] * len(programs), fitting=near.fitting)
     except SteadyError as error:
         return str(error)

@@ -25,7 +25,7 @@ from steady_ppl.discovery.candidates import (
     screen_program,
 )
 from steady_ppl.discovery.places import at_its_best_place
-from steady_ppl.discovery.refits import Refit, Worth, first_refit, refit_with
+from steady_ppl.discovery.refits import Refit, Worth, first_refit, refit_near, refit_with
 from steady_ppl.discovery.screening import LEVEL, Tested
 from steady_ppl.effects import attached
 from steady_ppl.program import Program
@@ -98,6 +98,12 @@ class Search:
     rounds: list[Round] = field(default_factory=list)
     found: list[Found] = field(default_factory=list)
     curves: list[Candidate] = field(default_factory=list)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the tests of the last round found nothing more that an effect or a curve could bring."""
+        tests = self.rounds[-1].screening.tests
+        return not any(tested.p_value <= tests.critical for tested in tests.tested if not tested.departure)
 
     @property
     def departed(self) -> list[Tested]:
@@ -244,8 +250,7 @@ def _curves(base: Refit, screening: Screening, settings: Settings) -> list[Candi
 def _look_again(search: Search, settings: Settings) -> None:
     """Drop effects that are not needed beside the others, and let the rivals of each have its place."""
     for found in list(search.found):
-        others = [other for other in search.found if other is not found]
-        without = _with_all(search.base, others, settings)
+        without = _without(search, found, settings)
         if isinstance(without, str):
             continue
         rivals = [found.candidate] + [
@@ -258,6 +263,9 @@ def _look_again(search: Search, settings: Settings) -> None:
                 start = rival.refit.coefficient(rival.variant)
                 refit = refit_with(without, rival.variant, start, known_start=settings.known_start)
                 again.append(at_its_best_place(without, judged(without, rival.tested, refit), settings))
+        as_it_stands = judged(without, found.candidate.tested, search.final)
+        if all(c.total < as_it_stands.total for c in again if c.variant.name == found.candidate.variant.name):
+            again = [as_it_stands, *(c for c in again if c.variant.name != found.candidate.variant.name)]
         again.sort(key=lambda candidate: -candidate.total)
         best = next((c for c in again if not c.against_its_sign), None)
         place = search.found.index(found)
@@ -267,6 +275,18 @@ def _look_again(search: Search, settings: Settings) -> None:
         else:
             search.found[place] = Found(best, again, without)
             search.final = best.refit
+
+
+def _without(search: Search, found: Found, settings: Settings) -> Refit | str:
+    """The program with the other effects, fitted one after the other and from where the fit of all ended: the better,
+    lest a fit that has stuck make an effect look needed."""
+    others = [other for other in search.found if other is not found]
+    variants = [other.candidate.variant for other in others]
+    afresh = _with_all(search.base, others, settings)
+    near = refit_near(search.base, search.final, variants, known_start=settings.known_start)
+    if isinstance(afresh, str) or isinstance(near, str):
+        return afresh if isinstance(near, str) else near
+    return max(afresh, near, key=lambda refit: sum(maximum.objective for maximum in refit.maxima))
 
 
 def _with_all(base: Refit, effects: Sequence[Found], settings: Settings) -> Refit | str:

@@ -142,8 +142,7 @@ PLANAR_FORCES = [
         text="world-frame acceleration (c₁, c₂)",
         unit="m/s²",
         feels="drifts the same way over ground, wherever it points",
-        occurs="ramps and floors that are not level; a current that carries a hovering vehicle at constant "
-        "acceleration for a while",
+        occurs="ramps and floors that are not level; what a current does to a boat that is slow to drift with it",
         function=slope,
         typical=(0.05, -0.03),
         limit=0.5,
@@ -157,7 +156,8 @@ PLANAR_FORCES = [
         text="a = -k (v-w)|v-w| + k v|v| per axis, w the world-frame wind (c₁, c₂) in the body frame",
         unit="m/s",
         feels="slower one way than the other, and more so when fast",
-        occurs="boats in a current, multirotors and airships in wind, air tables with a draught",
+        occurs="boats in a current (w is the current, its drag found with it), multirotors and airships in wind, air "
+        "tables with a draught",
         function=wind,
         profiled=("drag",),
         typical=(1.0, 0.5),

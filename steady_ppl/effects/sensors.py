@@ -129,7 +129,7 @@ SENSORS = [
         equation=r"y(t) \to y(t - c)",
         text="y(t) → y(t - c)",
         unit="s",
-        feels="measurements show where it was a moment ago",
+        feels="measurements show where it was a moment ago; below zero, commands are logged later than they act",
         occurs="cameras with a long exposure, sensors that are stamped when their message arrives, computers "
         "without a common clock",
         function=clock_offset,

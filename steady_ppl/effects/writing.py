@@ -54,6 +54,8 @@ def _carried_over(program: Program, fresh: Program) -> tuple[list[str], list[str
         if name in coefficients or (hasattr(fresh, name) and torch.equal(value, getattr(fresh, name).to(value))):
             continue
         lines += broken(f"self.{name} = ", [tensor_text(value)], 8)
+    if lines:
+        lines.insert(0, "# where its own parameters begin; they are learned as before")
     before = fresh.state_dict()
     own = {f"{name}_unconstrained" for name in program._pyro_params}
     weights = [

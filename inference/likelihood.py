@@ -1,0 +1,78 @@
+"""Likelihood: the parameters under which the linearised program makes the measurements most likely.
+
+Scoring steps (Gauss–Newton with a learned curvature), what system identification calls the prediction-error method. For
+programs of some dozens of learnable numbers with normal noise: seconds where gradient steps take minutes. A network
+has too many numbers for it, and nothing but the numbers' fewness keeps it from explaining noise.
+"""
+
+from steady_ppl import (
+    FilterError,
+    Fit,
+    Trained,
+    Trajectories,
+    UsageError,
+    Validation,
+    fit_by_likelihood,
+    for_program,
+    seeded,
+    why_not_linear,
+)
+
+from .steady import doubts
+
+
+def fit(
+    program,
+    table: Trajectories,
+    valid: Trajectories | None = None,
+    *,
+    known_start: bool = False,
+    validation_particles: int | None = None,
+    seed: int = 0,
+) -> Fit:
+    """Fit `program` to the measurements of `table`; `valid` is judged before and after, and decides nothing.
+
+    Args:
+        program: the state-space model, changed in place.
+        table: the training drives; true states, where there are any, are used for a known start only.
+        valid: held-out drives.
+        known_start: the first row's true state is given.
+        validation_particles: N of the filter that judges the held-out drives, see `Validation.suited`.
+        seed: of the search for paths.
+
+    Raises:
+        UsageError: a program that cannot be linearised, or a network.
+        FilterError: the drives cannot be smoothed.
+    """
+    settings = {"known_start": known_start, "validation_particles": validation_particles, "seed": seed}
+    data = for_program(program, table).without_truth(keep_start=known_start)
+    reason = why_not_linear(program, data, known_start=known_start)
+    if reason:
+        raise UsageError(f"recipe likelihood needs a program that can be linearised: {reason.split(': looking')[0]}")
+    if data.time.is_cuda:
+        raise UsageError("recipe likelihood computes on the CPU: leave --device out")
+    notes, history = [], []
+    validation = Validation.suited(program, valid, known_start=known_start, particles=validation_particles)
+    with seeded(seed, "prepare"):
+        program.prepare(data, known_start)
+
+    def judge(step: int) -> None:
+        if validation.data is not None:
+            held_out = validation(program, seed)
+            history.append({"step": float(step), "log_likelihood": sum(held_out) / len(held_out)})
+
+    try:
+        judge(0)
+    except FilterError as error:
+        notes.append(f"as declared, the program cannot follow the held-out drives: {error}")
+    with seeded(seed, "paths"):
+        maximum = fit_by_likelihood(program, data, known_start=known_start)
+    judge(maximum.steps)
+    if not maximum.converged:
+        notes.append(
+            f"not converged after {maximum.steps} steps, another would gain {maximum.decrement:.2g} nats: some "
+            "parameter may be at its bound, or told by nothing"
+        )
+    notes += validation.notes + doubts(program, data, known_start, seed, "recipe steady with guide=lookahead")
+    trained = Trained(history, kept=maximum.steps)
+    return Fit(program, "likelihood", settings, seed=seed, known_start=known_start, trained=trained, notes=notes)

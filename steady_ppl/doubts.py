@@ -1,0 +1,74 @@
+"""What a fit and its drives give reason to doubt, in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from pyro.distributions import constraints
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.program import Program, names, units
+
+if TYPE_CHECKING:
+    from steady_ppl.fit import Fit
+
+VANISHED = math.log(20.0)  # log ratio by which a positive number falls to next to nothing
+TURNS = 5 * math.pi  # rad; beyond it a reading on a circle looks like degrees
+
+
+def doubts_of_fit(fit: Fit, declared: Mapping[str, Tensor]) -> list[str]:
+    """That it had not converged, or that it has all but taken away what the program declares.
+
+    Args:
+        fit: as its recipe returned it.
+        declared: `state_dict()` of the program before, copied.
+    """
+    found, trained = [], fit.trained
+    if trained is not None and trained.still_rising is not None:
+        steps = fit.settings.get("steps")
+        more = f"more steps (--steps {4 * steps})" if isinstance(steps, int) else "more steps"
+        found.append(
+            f"not converged: held-out log p(y) rose by {trained.still_rising:.1f} nats a drive over the last quarter. "
+            f"Fit again with {more}, or a mechanistic program by --recipe likelihood, which takes seconds"
+        )
+    for name, before in declared.items():
+        short = name.removesuffix("_unconstrained")
+        if short.startswith(tuple(fit.program.guesses)) or not _is_positive(fit.program, short):
+            continue
+        now = dict(fit.program.state_dict())[name]
+        for index, (then, value) in enumerate(zip(before.flatten().tolist(), now.flatten().tolist(), strict=True)):
+            if then - value > VANISHED:
+                label = f"{short}[{index}]" if before.numel() > 1 else short
+                found.append(
+                    f"{label} fell from {math.exp(then):.3g} to {math.exp(value):.2g}: as the program stands, these "
+                    "drives see next to nothing of it; an effect that is missing may hide it (`steady discover`)"
+                )
+    return found
+
+
+def doubts_of_units(program: Program, data: Trajectories) -> list[str]:
+    """Measurements in radians that look like degrees: beyond several turns, and all within a circle's degrees.
+
+    Args:
+        data: as returned by `for_program`.
+    """
+    found = []
+    for index, (name, unit) in enumerate(zip(names(program.measurements), units(program.measurements), strict=True)):
+        seen = data.measurements[..., index][data.observed[..., index]]
+        if unit == "rad" and len(seen) and TURNS < float(seen.abs().max()) <= 360:
+            between = f"{float(seen.min()):.4g} and {float(seen.max()):.4g}"
+            found.append(f"y.{name} is between {between} and the program reads radians: are these degrees?")
+    return found
+
+
+def _is_positive(program: Program, name: str) -> bool:
+    """Whether a parameter is learned as its logarithm."""
+    owner: Any = program
+    *owners, name = name.split(".")
+    for word in owners:
+        owner = getattr(owner, word)
+    constraint = getattr(owner, "_pyro_params", {}).get(name, (None,))[0]  # a copy's is not the same object
+    return isinstance(constraint, type(constraints.positive)) and constraint.lower_bound == 0
