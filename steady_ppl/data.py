@@ -223,18 +223,16 @@ class Trajectories:
             DataError: naming the missing column and those that the table has.
         """
 
-        def pick(prefix: str, wanted: Sequence[str], have: tuple[str, ...]) -> list[int]:
-            for name in wanted:
-                if name not in have:
-                    raise DataError(
-                        f"the table has no column {prefix}.{name}; it has "
-                        f"{', '.join(f'{prefix}.{n}' for n in have) or f'no {prefix}. column'}",
-                        column=f"{prefix}.{name}",
-                    )
-            return [have.index(name) for name in wanted]
-
-        chosen_controls = pick("u", controls, self.control_names)
-        chosen = pick("y", measurements, self.measurement_names)
+        columns = (("u", controls, self.control_names), ("y", measurements, self.measurement_names))
+        said, missing = [], list[str]()
+        for prefix, wanted, have in columns:
+            lacking = [f"{prefix}.{name}" for name in wanted if name not in have]
+            there = ", ".join(f"{prefix}.{name}" for name in have) or f"no {prefix}. column"
+            said += [f"the table has no column {', '.join(lacking)}; it has {there}"] if lacking else []
+            missing += lacking
+        if missing:
+            raise DataError("; ".join(said).replace("; the table has no", ", and no"), column=missing[0])
+        chosen_controls, chosen = ([have.index(name) for name in wanted] for _, wanted, have in columns)
         truth = None
         if self.states is not None and any(name in self.state_names for name in states):
             truth = self.states.new_full((*self.time.shape, len(states)), torch.nan)

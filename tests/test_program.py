@@ -279,7 +279,7 @@ def test_a_missing_column_is_named_with_those_that_exist() -> None:
     with pytest.raises(DataError, match=r"no column u\.torque; it has u\.left, u\.right") as caught:
         for_program(example("pendulum"), data)
     assert caught.value.column == "u.torque"
-    with pytest.raises(DataError, match=r"no column u\.left; it has no u\. column"):
+    with pytest.raises(DataError, match=r"no column u\.left, u\.right; it has no u\. column"):
         for_program(example("hovercraft"), replace(data, controls=data.controls[..., :0], control_names=()))
 
 
