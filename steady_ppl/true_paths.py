@@ -57,7 +57,7 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
     difference = after - base
     for index in (names(program.states).index(angle) for angle in program.angles):
         difference[..., index] = wrap(difference[..., index])
-    solution = torch.linalg.lstsq(effect, difference.double().unsqueeze(-1)).solution.squeeze(-1).to(states.dtype)
+    solution = (torch.linalg.pinv(effect) @ difference.double().unsqueeze(-1)).squeeze(-1).to(states.dtype)
     noise = {site: value.clone() for site, value in zero.items()}
     for index, (site, channel) in enumerate(places):
         noise[site].reshape(*noise[site].shape[:2], -1)[..., channel] = solution[..., index]

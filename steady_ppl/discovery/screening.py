@@ -111,7 +111,8 @@ def screen(
     information = simulated.information
     scores = torch.cat([(observed.sum(0) - bias).unsqueeze(0), sums - bias])
     own, rest = slice(0, fitted), slice(fitted, None)
-    solved = torch.linalg.lstsq(information[own, own], information[own, rest]).solution
+    inverse = torch.linalg.pinv(information[own, own], hermitian=True)  # `lstsq` rounds differently from run to run
+    solved = inverse @ information[own, rest]
     left = information[rest, rest] - information[rest, own] @ solved
     left = (left + left.T) / 2
     projected = scores[:, rest] - scores[:, own] @ solved
@@ -135,7 +136,7 @@ def screen(
     family = np.stack([p_values for _, p_values in found]).min(0)
     critical = _critical(family[1:])
     tested = [replace(t, detection_limit=_limit(t, critical)) for t, _ in found]
-    own_step = torch.linalg.lstsq(information[own, own], scores[0, own]).solution if fitted else scores[0, own]
+    own_step = inverse @ scores[0, own]
     order = sorted(range(len(tested)), key=lambda i: (tested[i].p_value, -tested[i].statistic))
     return Screened(
         tested=[tested[i] for i in order],
