@@ -65,8 +65,10 @@ def one(seed: int) -> Record:
 
 def table(records: list[Record]) -> str:
     """What was named, how large, and what it brings."""
+    broken = [record for record in records if "failed" in record]
+    records = [record for record in records if "failed" not in record]
     lines = [
-        f"{len(records)} sets; test drives, log p(y) in nats a drive above that of the owner's program.",
+        f"{len(records)} sets, {len(broken)} failed; test drives, log p(y) in nats a drive above that of the owner's program.",
         "",
         "| set | planted: yaw drag, side slip, quadratic drag | named | all | false | gain | of the truth's | s |",
         "|---|---|---|---|---|---|---|---|",

@@ -175,20 +175,23 @@ def _starts(ahead: Lookahead, path: Tensor, known_start: bool, sets: int, seed: 
 
 
 def leaders(screened: Screened, first: bool) -> list[Tested]:
-    """Those to fit: all that are nearly significant, the aliases of the best, and in the first round the best tests.
+    """Those to fit: all that are nearly significant in the first round, of the best few in later ones, and the aliases
+    of the first.
 
-    How far the others are behind says little where much is missing: scores look one step ahead, and a drag of which
-    they see a trace may be what holds everything else in its wrong place.
+    How far behind a test is says little where much is missing: scores look one step ahead, and a drag of which they see
+    a trace may be what holds everything else in its wrong place.
     """
     alive = [(i, t) for i, t in enumerate(screened.tested) if not (t.untestable or t.departure or t.is_curve)]
     if not alive:
         return []
-    top, sure = alive[0][0], LEADERS if first else 1
-    return [
-        tested
-        for rank, (i, tested) in enumerate(alive)
-        if rank < sure or tested.p_value < NEARLY or float(screened.alike[top, i]) > ALIKE
-    ]
+    top = alive[0][0]
+    few = alive[:LEADERS] if first else [one for k, one in enumerate(alive[:LEADERS]) if k == 0 or _nearly(one[1])]
+    few += [one for one in alive[LEADERS:] if first and _nearly(one[1])]
+    return [tested for i, tested in alive if (i, tested) in few or float(screened.alike[top, i]) > ALIKE]
+
+
+def _nearly(tested: Tested) -> bool:
+    return tested.p_value < NEARLY
 
 
 def fitted(now: Refit, tested: Tested, screening: Screening, settings: Settings, worth: Worth = ALWAYS) -> Candidate:

@@ -278,7 +278,7 @@ def _look_again(search: Search, settings: Settings) -> None:
 
 
 def _without(search: Search, found: Found, settings: Settings) -> Refit | str:
-    """The program with the other effects, fitted one after the other and from where the fit of all ended: the better,
+    """The program with the other effects, fitted one after the other and from where the fit of all ended: the likelier,
     lest a fit that has stuck make an effect look needed."""
     others = [other for other in search.found if other is not found]
     variants = [other.candidate.variant for other in others]
