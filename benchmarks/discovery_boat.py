@@ -68,7 +68,7 @@ def table(records: list[Record]) -> str:
     broken = [record for record in records if "failed" in record]
     records = [record for record in records if "failed" not in record]
     lines = [
-        f"{len(records)} sets, {len(broken)} failed; log p(y) of test drives, nats a drive above the owner's program's.",
+        f"{len(records)} sets, {len(broken)} failed; log p(y) of test drives, nats above the owner's program.",
         "",
         "| set | planted: yaw drag, side slip, quadratic drag | named | all | false | gain | of the truth's | s |",
         "|---|---|---|---|---|---|---|---|",
