@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
+
 from steady_ppl.checkpoint import read_tensors
 from steady_ppl.errors import RunError
 from steady_ppl.whole_file import whole_file
@@ -21,7 +23,7 @@ PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY = (
     "discovery.json",
 )
 FILES = (PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY)
-ASIDE = "previous"
+ASIDE, LOCK = "previous", ".lock"
 SAID = {"sentence", "candidates", "effects", "shape", "doubts", "notes", "next_run"}  # of a discovery, what is shown
 
 
@@ -34,7 +36,8 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
     worth resuming.
 
     Raises:
-        RunError: it exists and neither `force` nor `resume` is given, it cannot be made, or has nothing to resume.
+        RunError: it exists and neither `force` nor `resume` is given, it cannot be made, has nothing to resume, or
+            another process writes to it.
     """
     folder = Path(folder)
     if folder.exists() and not (force or resume):
@@ -43,19 +46,37 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
         raise RunError(f"{folder} has no {CHECKPOINT} to resume from")
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
+        with _only_writer(folder):
+            if not resume:
+                _put_aside(folder)
+            try:
+                yield folder
+            except BaseException:
+                if not resume:
+                    _clean_up(folder)
+                raise
+            _remove_aside(folder)
+    finally:
+        _remove_empty(made)
+
+
+@contextmanager
+def _only_writer(folder: Path) -> Iterator[None]:
+    """Make a folder and keep other processes from writing to it. The lock is the process's own: it ends with it,
+    however it ends."""
+    lock = FileLock(folder / LOCK)
+    try:
         folder.mkdir(parents=True, exist_ok=True)
-        if not resume:
-            _put_aside(folder)
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        raise RunError(f"{folder}: another process writes to it: wait for its end, or choose another folder") from error
     except OSError as error:
         raise RunError(f"{folder} cannot be written: {error.strerror}") from error
     try:
-        yield folder
-    except BaseException:
-        if not resume:
-            _clean_up(folder)
-            _remove_empty(made)
-        raise
-    _remove_aside(folder)
+        yield
+    finally:
+        (folder / LOCK).unlink(missing_ok=True)
+        lock.release()
 
 
 def _put_aside(folder: Path) -> None:
@@ -64,10 +85,13 @@ def _put_aside(folder: Path) -> None:
         _remove(folder)
         return
     present = [name for name in FILES if (folder / name).exists()]
-    if present:
-        aside.mkdir()
-    for name in present:
-        os.replace(folder / name, aside / name)
+    try:
+        if present:
+            aside.mkdir()
+        for name in present:
+            os.replace(folder / name, aside / name)
+    except OSError as error:
+        raise RunError(f"{folder} cannot be written: {error.strerror}") from error
 
 
 def _clean_up(folder: Path) -> None:
@@ -84,8 +108,6 @@ def _clean_up(folder: Path) -> None:
     if checkpoint.is_file() and json.loads(read_tensors(checkpoint)[1]["step"]) > 0:
         return
     _remove(folder)
-    if not any(folder.iterdir()):
-        folder.rmdir()
 
 
 def _remove_empty(folders: list[Path]) -> None:
