@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,14 +31,16 @@ def discover(
     simulations: Annotated[int, typer.Option(help="Simulated sets for the calibration.", min=50)] = 200,
     program: Annotated[str | None, typer.Option(help="The run's program, if its file moved or changed.")] = None,
     seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a search that was stopped.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing run.")] = False,
 ) -> None:
     """Learn which physical effect a program lacks: none, one by name, several, or a curve that has no name."""
     from steady_ppl.command_parts import present, program_from, say, write_json
     from steady_ppl.discovery import discover as search
+    from steady_ppl.discovery.kept_search import kept_search
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
-    from steady_ppl.run_folder import DISCOVERY, run_folder
+    from steady_ppl.run_folder import DISCOVERY
     from steady_ppl.run_recipe import fingerprint
     from steady_ppl.table import read_table
     from steady_ppl.whole_file import require_place
@@ -47,22 +48,17 @@ def discover(
     is_run = Path(source).is_dir()
     if program and not is_run:
         raise UsageError("--program names the program of a RUN: leave it out")
-    if out is not None and out.exists() and not force:
-        raise RunError(f"{out} exists: choose another folder, or --force to overwrite")
+    if out is None and resume:
+        raise UsageError("--resume goes on with a search in its run folder: name it (--out)")
+    if out is not None and out.exists() and not (force or resume):
+        raise RunError(f"{out} exists: choose another folder, or --force to overwrite, or --resume to go on")
     require_picture(picture)
     require_place(json_file)
     given: Any = Fit.load(source, program) if is_run else program_from(source, seed)
     drives, judges = read_table(table), read_table(valid) if valid else None
-    with run_folder(out, force=force) if out else nullcontext():
-        found = search(
-            given,
-            drives,
-            judges,
-            known_start=known_start,
-            mix=mix,
-            simulations=simulations,
-            seed=seed,
-        )
+    options: dict[str, Any] = {"known_start": known_start, "mix": mix, "simulations": simulations, "seed": seed}
+    with kept_search(out, given, drives, judges, options, force=force, resume=resume):
+        found = search(given, drives, judges, **options)
         figures = {"source": source, **found.figures}
         present(str(found), figures, json_file)
         if out is not None:

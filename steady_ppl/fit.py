@@ -161,7 +161,8 @@ class Fit:
         folder = Path(folder)
         record = read_record(folder)
         if record.get("status") not in ("finished", "interrupted"):
-            raise RunError(f"{folder}: its fit has not finished: go on with it by `steady fit … --resume`")
+            command = "discover" if record["recipe"] == "discover" else "fit"
+            raise RunError(f"{folder}: its {command} has not finished: go on with it by `steady {command} … --resume`")
         if not isinstance(program, Program):
             program = _load_recorded(folder, record["program"], program)
         effects.restore(program, record.get("effects", []))

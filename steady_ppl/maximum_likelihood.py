@@ -7,6 +7,7 @@ Hall, Hall and Hausman 1974) unless it is known, and learns on the way (Broyden,
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +17,7 @@ from steady_ppl.data import Trajectories
 from steady_ppl.elements import Element, elements, moved
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import find_path, means_as_path, require_found, smooth
+from steady_ppl.journal import Piece, piece
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.program import Program
@@ -83,6 +85,38 @@ def maximise(
     Raises:
         FilterError: the program cannot be smoothed at its initial parameters.
     """
+    return kept_maximum(
+        program, lambda: _climb(program, data, path, known_start, information, steps, precision, hopeless)
+    )
+
+
+def kept_maximum(program: Program, climb: Callable[[], Maximum]) -> Maximum:
+    """A maximum as a piece of a journal: what `climb` returns, with the program moved there."""
+
+    def compute() -> Piece:
+        found = climb()
+        tensors = {name: getattr(found, name) for name in ("log_likelihood", "information")}
+        tensors |= {"states": found.path.states, "noise": found.path.noise}
+        tensors |= {f"program/{name}": value for name, value in program.state_dict().items()}
+        return tensors, {name: getattr(found, name) for name in ("objective", "names", "steps", "decrement", "gained")}
+
+    tensors, values = piece(compute)
+    program.load_state_dict({name: tensors[f"program/{name}"] for name in program.state_dict()})
+    path = Path(tensors["states"], tensors["noise"])
+    values = {**values, "names": tuple(values["names"])}
+    return Maximum(log_likelihood=tensors["log_likelihood"], information=tensors["information"], path=path, **values)
+
+
+def _climb(
+    program: Program,
+    data: Trajectories,
+    path: Path | None,
+    known_start: bool,
+    information: Tensor | None,
+    steps: int,
+    precision: float,
+    hopeless: float,
+) -> Maximum:
     parts = elements(program)
     here = _look(program, data, path or find_path(program, data, known_start=known_start), known_start, parts)
     require_found(here.ahead, data)

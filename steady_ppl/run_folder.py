@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY = (
     "discovery.json",
 )
 FILES = (PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY)
-ASIDE, LOCK = "previous", ".lock"
+ASIDE, LOCK, JOURNAL = "previous", ".lock", "journal"
 SAID = {"sentence", "candidates", "effects", "shape", "doubts", "notes", "next_run"}  # of a discovery, what is shown
 
 
@@ -32,8 +33,8 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
     """Make a run folder for the block that fills it.
 
     With `force` the files of the old run are put aside in the folder `previous` of the run; a block that fails gets
-    them back, one that succeeds removes them. Without an old run a failure leaves nothing but a checkpoint that is
-    worth resuming.
+    them back, one that succeeds removes them. Without an old run a failure leaves nothing but a checkpoint, or the
+    journal of a search, that is worth resuming.
 
     Raises:
         RunError: it exists and neither `force` nor `resume` is given, it cannot be made, has nothing to resume, or
@@ -42,8 +43,8 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
     folder = Path(folder)
     if folder.exists() and not (force or resume):
         raise RunError(f"{folder} exists: choose another folder, or --force to overwrite, or --resume to go on")
-    if resume and not (folder / CHECKPOINT).is_file():
-        raise RunError(f"{folder} has no {CHECKPOINT} to resume from")
+    if resume and not ((folder / CHECKPOINT).is_file() or (folder / JOURNAL).is_dir()):
+        raise RunError(f"{folder} has no {CHECKPOINT} to resume from, nor the {JOURNAL} of a search")
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         with _only_writer(folder):
@@ -86,6 +87,7 @@ def _put_aside(folder: Path) -> None:
         return
     present = [name for name in FILES if (folder / name).exists()]
     try:
+        _remove_journal(folder)
         if present:
             aside.mkdir()
         for name in present:
@@ -106,6 +108,8 @@ def _clean_up(folder: Path) -> None:
         return
     checkpoint = folder / CHECKPOINT
     if checkpoint.is_file() and json.loads(read_tensors(checkpoint)[1]["step"]) > 0:
+        return
+    if any((folder / JOURNAL).glob("*")):
         return
     _remove(folder)
 
@@ -129,12 +133,38 @@ def _remove_aside(folder: Path) -> None:
 def _remove(folder: Path) -> None:
     for name in FILES:
         (folder / name).unlink(missing_ok=True)
+    _remove_journal(folder)
+
+
+def _remove_journal(folder: Path) -> None:
+    if (folder / JOURNAL).is_dir():
+        shutil.rmtree(folder / JOURNAL)
 
 
 def write_record(folder: Path, record: dict[str, Any]) -> None:
     """Write `run.json`, whole or not at all."""
     with whole_file(folder / RECORD, RunError) as beside:
         beside.write_text(json.dumps(record, indent=1) + "\n")
+
+
+def require_same(folder: Path, begun: Mapping[str, Any]) -> None:
+    """Refuse to go on with a run whose inputs were others.
+
+    Raises:
+        RunError: naming the first that was.
+    """
+    before = read_record(folder)
+    for key in ("program", "table_sha256", "valid_sha256"):
+        if before.get(key) != begun[key]:
+            what = {"program": "program", "table_sha256": "training table", "valid_sha256": "--valid table"}[key]
+            raise RunError(f"{folder}: --resume goes on with the same {what}, but it is another or has changed since")
+    if before.get("option_files", {}) != begun["option_files"]:
+        raise RunError(
+            f"{folder}: --resume goes on with the same {' and '.join(begun['option_files'])}; a file has changed"
+        )
+    for key in ("recipe", "known_start", "seed", "options"):
+        if before.get(key) != begun[key]:
+            raise RunError(f"{folder}: --resume needs the same {key}: {before.get(key)} then, {begun[key]} now")
 
 
 def read_record(folder: Path) -> dict[str, Any]:

@@ -14,12 +14,12 @@ import torch
 from steady_ppl.checkpoint import read_tensors
 from steady_ppl.data import Trajectories
 from steady_ppl.doubts import doubts_of_fit, doubts_of_units
-from steady_ppl.errors import RunError, UsageError, require
+from steady_ppl.errors import UsageError, require
 from steady_ppl.fit import Fit, program_source, sha256, versions
 from steady_ppl.program import Program, for_program
 from steady_ppl.program_file import run_file
 from steady_ppl.rooms import workbench
-from steady_ppl.run_folder import CHECKPOINT, read_record, run_folder, write_record
+from steady_ppl.run_folder import CHECKPOINT, require_same, run_folder, write_record
 
 Recipe = Callable[..., Fit]
 
@@ -134,7 +134,7 @@ def run_recipe(
     except TypeError as error:
         raise UsageError(f"recipe {name}: its fit does not take what a recipe is called with: {error}") from error
     if resume:
-        _require_same(folder, begun)
+        require_same(folder, begun)
         read_tensors(folder / CHECKPOINT)
     with run_folder(folder, force=force, resume=resume):
         if not resume:
@@ -161,18 +161,3 @@ def _files(options: Mapping[str, Any]) -> dict[str, str]:
     """Hashes of the programs that options name."""
     named = {name: Path(value.partition(".py")[0] + ".py") for name, value in options.items() if ".py" in str(value)}
     return {name: sha256(file) for name, file in named.items() if file.is_file()}
-
-
-def _require_same(folder: Path, begun: Mapping[str, Any]) -> None:
-    before = read_record(folder)
-    for key in ("program", "table_sha256", "valid_sha256"):
-        if before.get(key) != begun[key]:
-            what = {"program": "program", "table_sha256": "training table", "valid_sha256": "--valid table"}[key]
-            raise RunError(f"{folder}: --resume goes on with the same {what}, but it is another or has changed since")
-    if before.get("option_files", {}) != begun["option_files"]:
-        raise RunError(
-            f"{folder}: --resume goes on with the same {' and '.join(begun['option_files'])}; a file has changed"
-        )
-    for key in ("recipe", "known_start", "seed", "options"):
-        if before.get(key) != begun[key]:
-            raise RunError(f"{folder}: --resume needs the same {key}: {before.get(key)} then, {begun[key]} now")

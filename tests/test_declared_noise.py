@@ -10,7 +10,7 @@ from examples import drives, example
 
 from steady_ppl.discovery.declared_noise import departures
 from steady_ppl.discovery.refits import Fold, Refit
-from steady_ppl.discovery.search import Found
+from steady_ppl.discovery.rounds import Found
 from steady_ppl.elements import elements
 from steady_ppl.linearization import Path
 

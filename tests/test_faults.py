@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+from examples import example
 from small import HOVERCRAFT, steady, written
 
 import steady_ppl as st
@@ -70,3 +75,119 @@ def test_nothing_is_left_of_a_new_folder_whose_block_fails(tmp_path: Path) -> No
     with pytest.raises(RuntimeError), run_folder(tmp_path / "a" / "b"):
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
+
+
+# --- killed, and gone on with -----------------------------------------------------------------------------------------
+
+COMMANDS = {
+    "discover": ("discover", HOVERCRAFT, "train.csv", "--valid", "valid.csv", "--known-start", "--simulations", "50"),
+    "fit": ("fit", HOVERCRAFT, "train.csv", "--known-start", "--steps", "40", "--set", "validate_every=5"),
+}
+KEPT = {"discover": ("discovery.json", "parameters.safetensors"), "fit": ("parameters.safetensors", "run.json")}
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory) -> Path:
+    """Two tables of drives with a yaw bias, and what each command makes of them when nothing happens to it."""
+    desk = tmp_path_factory.mktemp("desk")
+    truth = example("hovercraft", torch.float32).with_effect("yaw_bias", 0.15)
+    truth.duration = 3.0
+    for seed, name in enumerate(("train", "valid")):
+        st.write_table(st.simulate(truth, 6, seed=seed), desk / f"{name}.csv")
+    for name, command in COMMANDS.items():
+        began = time.monotonic()
+        assert started(desk, *command, "--out", name).wait() == 0
+        (desk / f"{name}.seconds").write_text(str(time.monotonic() - began))
+    return desk
+
+
+def started(desk: Path, *words: object) -> subprocess.Popen:
+    program = "import sys; from steady_ppl.command_line import main; sys.exit(main(sys.argv[1:]))"
+    return subprocess.Popen(
+        [sys.executable, "-c", program, *map(str, words)],
+        cwd=desk,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+
+
+def killed_and_resumed(desk: Path, name: str, out: str, moments: list[float]) -> int:
+    """Kill a command after so many seconds each time it runs, and let it end; how often it was caught."""
+    caught = 0
+    for moment in moments:
+        resume = ["--resume"] if (desk / out).exists() else []
+        process = started(desk, *COMMANDS[name], "--out", out, *resume)
+        try:
+            assert process.wait(moment) == 0
+            return caught
+        except subprocess.TimeoutExpired:
+            os.kill(process.pid, signal.SIGKILL)
+            process.wait()
+            caught += 1
+        if (desk / out).exists() and not resumable(desk / out):
+            shutil.rmtree(desk / out)  # it was caught before there was anything to go on with
+    resume = ["--resume"] if (desk / out).exists() else []
+    assert started(desk, *COMMANDS[name], "--out", out, *resume).wait() == 0
+    return caught
+
+
+def resumable(run: Path) -> bool:
+    return (run / "run.json").exists() and any(
+        (run / place).exists() for place in ("journal", "checkpoint.safetensors")
+    )
+
+
+def same_results(desk: Path, name: str, out: str) -> None:
+    for kept in KEPT[name]:
+        ours, theirs = ((desk / run / kept).read_bytes() for run in (out, name))
+        assert ours == theirs, kept
+    assert not any((desk / out / left).exists() for left in ("journal", LOCK, "previous"))
+
+
+@pytest.mark.parametrize(
+    ("name", "begun"), [("discover", "journal/000004.safetensors"), ("fit", "checkpoint.safetensors")]
+)
+def test_a_command_that_is_killed_goes_on_to_the_same_result(desk: Path, name: str, begun: str) -> None:
+    out = f"{name}_killed"
+    process = started(desk, *COMMANDS[name], "--out", out)
+    while not (desk / out / begun).exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert started(desk, *COMMANDS[name], "--out", out, "--resume").wait() == 0
+    same_results(desk, name, out)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(COMMANDS))
+def test_twenty_random_kills_change_nothing(desk: Path, name: str) -> None:
+    whole, random = float((desk / f"{name}.seconds").read_text()), np.random.default_rng(20)
+    caught = 0
+    for trial in range(20):
+        caught += killed_and_resumed(desk, name, f"{name}_{trial}", [float(random.uniform(0.3, 1.0)) * whole])
+        same_results(desk, name, f"{name}_{trial}")
+    assert caught >= 10
+
+
+def test_a_search_goes_on_with_what_it_was_begun_with_only(desk: Path, refused, monkeypatch) -> None:
+    monkeypatch.chdir(desk)
+    process = started(desk, *COMMANDS["discover"], "--out", "begun")
+    while not any((desk / "begun" / "journal").glob("*.safetensors")):
+        assert process.poll() is None
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    command = (*COMMANDS["discover"], "--out", "begun")
+    refused(2, "--resume to go on", *command)
+    refused(2, "the same options", *command[:-3], "60", "--out", "begun", "--resume")
+    other = [word if word != "train.csv" else "valid.csv" for word in command]
+    refused(2, "the same training table", *other, "--resume")
+    refused(2, "discover has not finished", "check", "begun", "valid.csv")
+    refused(2, "name it (--out)", *COMMANDS["discover"], "--resume")
+    first = next((desk / "begun" / "journal").glob("*.safetensors"))
+    first.write_bytes(first.read_bytes()[:100])
+    refused(2, "is damaged", *command, "--resume")
+    assert steady(*command, "--force") == 0
+    same_results(desk, "discover", "begun")

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from steady_ppl.discovery.bootstrap import scores_along, simulate_scores
+from steady_ppl.discovery.bootstrap import Simulated, scores_along, simulate_scores
 from steady_ppl.discovery.columns import Column, columns_of
 from steady_ppl.discovery.curves import curves
 from steady_ppl.discovery.declared_noise import departures
@@ -20,6 +20,7 @@ from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.elements import Element, elements
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import smooth
+from steady_ppl.journal import Piece, piece
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.program import Program
 from steady_ppl.scores import measured, smoothed, typical_spreads
@@ -148,15 +149,15 @@ def screen_program(now: Refit, declared: Program, settings: Settings, *, sets: i
     broken = (~torch.isfinite(observed).all(-1)).nonzero().flatten().tolist()
     if broken:
         raise FilterError(f"trajectory {fold.drives.labels[broken[0]]}: the fitted program blows up on it")
-    simulated = simulate_scores(
-        program,
-        fold.drives,
-        _starts(ahead, fold.path.states[0], settings.known_start, sets, seed),
-        parts,
-        columns,
-        known_start=settings.known_start,
-        seed=seed,
-    )
+    starts = _starts(ahead, fold.path.states[0], settings.known_start, sets, seed)
+
+    def simulate() -> Piece:
+        made = simulate_scores(
+            program, fold.drives, starts, parts, columns, known_start=settings.known_start, seed=seed
+        )
+        return {"scores": made.scores, "log_likelihood": made.log_likelihood}, {}
+
+    simulated = Simulated(**piece(simulate)[0])
     information, first = {"": simulated.information[: len(parts), : len(parts)]}, len(parts)
     for column in columns:
         index = [*range(len(parts)), *range(first, first + column.size)]

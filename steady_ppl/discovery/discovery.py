@@ -16,7 +16,8 @@ from steady_ppl.discovery.finding import Finding, Shape, findings, shape_of
 from steady_ppl.discovery.fitting import ByDraws
 from steady_ppl.discovery.next_run import NextRun, next_run
 from steady_ppl.discovery.requirements import FEWEST_DRIVES, require, unexcited
-from steady_ppl.discovery.search import Found, Search, search
+from steady_ppl.discovery.rounds import Found, Search
+from steady_ppl.discovery.search import search
 from steady_ppl.doubts import doubts_of_units
 from steady_ppl.effects import of_name, record, restore, written_class
 from steady_ppl.errors import DataError, UsageError
@@ -25,6 +26,7 @@ from steady_ppl.joining import joined
 from steady_ppl.program import Program, for_program
 from steady_ppl.progress import stages
 from steady_ppl.proving import Proof, far_off, prove
+from steady_ppl.seeding import seeded
 
 FITTED_FURTHER = 10.0  # nats that fitting a run further may gain before it is said
 
@@ -159,16 +161,17 @@ def discover(
     require(program, drives[0], drives[1], known_start, simulations)
     with stages(("", 8), ("comparing before and after", 1), ("looking for a better next drive", 1)) as begin:
         begin()
-        found = search(
-            program,
-            drives[0],
-            drives[1],
-            known_start=known_start,
-            declared=declared,
-            sets=simulations,
-            seed=seed,
-            withheld=withheld,
-        )
+        with seeded(seed, "search"):
+            found = search(
+                program,
+                drives[0],
+                drives[1],
+                known_start=known_start,
+                declared=declared,
+                sets=simulations,
+                seed=seed,
+                withheld=withheld,
+            )
         begin()
         shape = shape_of(found, program)
         effects = [] if shape else findings(found)
@@ -247,6 +250,9 @@ def _notes(found: Search) -> list[str]:
         )
     if not found.final.converged and found.found:
         notes.append("the fit with what was found has not converged")
+    if found.broke:
+        effects = " and ".join(found.broke)
+        notes.append(f"{effects}: taken back, with it the program blows up on drives of its own")
     if not found.is_complete:
         notes.append("something is left that no effect of the catalogue brings: the tests were not quiet at the end")
     notes += [f"{one.candidate.variant.label}: {said}" for one in found.found if (said := _of_one_drive(one))]

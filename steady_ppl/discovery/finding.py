@@ -14,8 +14,8 @@ from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.curves import unit_of
 from steady_ppl.discovery.places import variance_of_places
 from steady_ppl.discovery.refits import Refit
+from steady_ppl.discovery.rounds import MARGIN, Found, Search
 from steady_ppl.discovery.screening import Tested
-from steady_ppl.discovery.search import MARGIN, Found, Search
 from steady_ppl.effects import Variant, attached
 from steady_ppl.program import Program, names
 

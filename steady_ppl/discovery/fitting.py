@@ -23,7 +23,7 @@ from steady_ppl.gaussian_smoother import find_path, means_as_path, require_found
 from steady_ppl.linearization import Path
 from steady_ppl.linearized_guides import LookaheadGuide
 from steady_ppl.lookahead import Lookahead
-from steady_ppl.maximum_likelihood import Maximum, maximise
+from steady_ppl.maximum_likelihood import Maximum, kept_maximum, maximise
 from steady_ppl.program import Program
 from steady_ppl.seeding import seeded
 from steady_ppl.tempering import Constant
@@ -118,6 +118,9 @@ class ByDraws:
         information: Tensor | None = None,
         hopeless: float = -math.inf,
     ) -> Maximum:
+        return kept_maximum(program, lambda: self._climb(program, drives, path, known_start))
+
+    def _climb(self, program: Program, drives: Trajectories, path: Path | None, known_start: bool) -> Maximum:
         path = path or find_path(program, drives, known_start=known_start)
         before = self.judge(program, drives, path, known_start=known_start)
         guide = LookaheadGuide(

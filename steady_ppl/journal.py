@@ -1,0 +1,87 @@
+"""What a long computation has come to, kept piece by piece, so that one that was killed goes on where it was.
+
+The computation must be deterministic: a piece is known by its number alone. The caller sees to it that the one that
+goes on has the inputs of the one that was killed.
+
+    with journal(folder):
+        tensors, numbers = piece(compute)     # read from the folder if it is there, else computed and written
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from steady_ppl.checkpoint import read_tensors, write_tensors
+from steady_ppl.errors import FilterError, RunError
+
+Piece = tuple[Mapping[str, Tensor], Mapping[str, Any]]
+RANDOM = "random state"  # of torch, after the piece
+
+
+@dataclass
+class _Journal:
+    folder: Path
+    pieces: int = 0
+
+
+_open: ContextVar[_Journal | None] = ContextVar("journal", default=None)
+
+
+@contextmanager
+def journal(folder: Path) -> Iterator[None]:
+    """Keep the pieces of the block in a folder, and read those that are there; it is removed when the block has ended
+    well.
+
+    Raises:
+        RunError: the folder cannot be written, or a piece in it is damaged.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"{folder} cannot be written: {error.strerror}") from error
+    token = _open.set(_Journal(folder))
+    try:
+        yield
+    finally:
+        _open.reset(token)
+    shutil.rmtree(folder)
+
+
+def piece(compute: Callable[[], Piece]) -> Piece:
+    """The next piece: tensors, and what JSON can hold.
+
+    A `FilterError` is a result like any other. Outside of a journal nothing is kept.
+    """
+    now = _open.get()
+    if now is None:
+        return compute()
+    now.pieces += 1
+    file = now.folder / f"{now.pieces:06d}.safetensors"
+    if not file.is_file():
+        _write(file, compute)
+    tensors, text = read_tensors(file)
+    torch.set_rng_state(tensors.pop(RANDOM))
+    said = json.loads(text["said"])
+    if "failed" in said:
+        raise FilterError(said["failed"])
+    return tensors, said["values"]
+
+
+def _write(file: Path, compute: Callable[[], Piece]) -> None:
+    tensors: Mapping[str, Tensor] = {}
+    try:
+        tensors, values = compute()
+        said: dict[str, Any] = {"values": dict(values)}
+    except FilterError as error:
+        said = {"failed": str(error)}
+    write_tensors(file, {**tensors, RANDOM: torch.get_rng_state()}, {"said": json.dumps(said)})
