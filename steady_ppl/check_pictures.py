@@ -59,12 +59,21 @@ def predictions(found: Check, drive: int, component: int, axes: Axes) -> None:
     for name, color in {"one step": NEAR, last: FAR}.items():
         if name == last and len(found.horizons) == 1:
             continue
-        middle, half = (values[:, drive, component] for values in band(found, name))
-        axes.fill_between(time, middle - half, middle + half, color=color, alpha=0.18, lw=0)
-        axes.plot(time, middle, color=color, lw=1, label=f"{name} ahead, 90 % band")
+        at, middle, half = _joined(time, *(values[:, drive, component] for values in band(found, name)))
+        axes.fill_between(at, middle - half, middle + half, color=color, alpha=0.18, lw=0)
+        axes.plot(at, middle, color=color, lw=1, label=f"{name} ahead, 90 % band")
     axes.plot(time, measured(found)[:, drive, component], ".", color=MEASURED, ms=3, label="measured")
     name, unit = names(found.program.measurements)[component], units(found.program.measurements)[component]
     axes.set_ylabel(f"{name} [{unit}]" if unit else name, fontsize=8)
+
+
+def _joined(time: np.ndarray, middle: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The rows that were measured, with a break wherever three of them, as they usually come, are missing."""
+    seen = np.isfinite(half)
+    time, middle, half = time[seen], middle[seen], half[seen]
+    apart = np.diff(time)
+    breaks = np.flatnonzero(apart > 3.5 * np.median(apart)) + 1 if len(apart) else np.zeros(0, int)
+    return np.insert(time, breaks, np.nan), np.insert(middle, breaks, np.nan), np.insert(half, breaks, np.nan)
 
 
 def measured(found: Check) -> np.ndarray:

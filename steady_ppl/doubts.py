@@ -16,6 +16,15 @@ if TYPE_CHECKING:
     from steady_ppl.fit import Fit
 
 VANISHED = math.log(20.0)  # log ratio by which a positive number falls to next to nothing
+GONE = math.log(1e3)  # the same of a guess, such as noise
+HIDDEN = (
+    "as the program stands, these drives see next to nothing of it; an effect that is missing may hide it (`steady "
+    "discover`), or commands are swapped, or a heading counts the other way"
+)
+COLLAPSED = (
+    "something else in the program explains too much; set it back in the program's file and fit again before anything "
+    "is tested"
+)
 TURNS = 5 * math.pi  # rad; beyond it a reading on a circle looks like degrees
 
 
@@ -36,16 +45,15 @@ def doubts_of_fit(fit: Fit, declared: Mapping[str, Tensor]) -> list[str]:
         )
     for name, before in declared.items():
         short = name.removesuffix("_unconstrained")
-        if short.startswith(tuple(fit.program.guesses)) or not _is_positive(fit.program, short):
+        if not _is_positive(fit.program, short):
             continue
+        guessed = short.startswith(tuple(fit.program.guesses))
+        why = COLLAPSED if guessed else HIDDEN
         now = dict(fit.program.state_dict())[name]
         for index, (then, value) in enumerate(zip(before.flatten().tolist(), now.flatten().tolist(), strict=True)):
-            if then - value > VANISHED:
+            if then - value > (GONE if guessed else VANISHED):
                 label = f"{short}[{index}]" if before.numel() > 1 else short
-                found.append(
-                    f"{label} fell from {math.exp(then):.3g} to {math.exp(value):.2g}: as the program stands, these "
-                    "drives see next to nothing of it; an effect that is missing may hide it (`steady discover`)"
-                )
+                found.append(f"{label} fell from {math.exp(then):.3g} to {math.exp(value):.2g}: {why}")
     return found
 
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 WIDTH, NAME = 100, 20
 FLOOR = "noise floor"
+POSSIBLE = (FLOOR, "constant velocity", "oracle", "truth")
 JUDGED = {  # the signs of what log p(y) and the error gained
     (0, 0): ("is not shown to help", "is not shown to be better than"),
     (1, 1): ("helps", "is better than"),
@@ -100,9 +101,15 @@ def changes(found: Proof, name: str) -> dict[Key, Change | None]:
     }
 
 
+def judged_row(found: Proof) -> str:
+    """The row that the sentence is about: the last but those that only show what is possible."""
+    others = [name for name in found.rows if name != found.reference and name not in POSSIBLE]
+    return others[-1] if others else next(name for name in found.rows if name != found.reference)
+
+
 def verdict(found: Proof) -> str:
-    """One sentence on the first row that is not the reference."""
-    name = next(name for name in found.rows if name != found.reference)
+    """One sentence on the last run that is not the reference."""
+    name = judged_row(found)
     changed = changes(found, name)
     likely = changed[Key("log_likelihood", "", 0)]
     horizon = next(h for h in ("3 s", "1 s", "10 s", "one step") if h in found.horizons)

@@ -26,16 +26,28 @@ function stacked(id, components, tracesOf, said) {
   return plot(id, traces, shape, `${said}: ${where()}`);
 }
 
+// The rows that were measured, with a break wherever three of them, as they usually come, are missing.
+function joined(time, middle, half) {
+  const rows = time.map((_, i) => i).filter((i) => half[i] !== null), found = [[], [], []];
+  const apart = rows.slice(1).map((row, i) => time[row] - time[rows[i]]).sort((a, b) => a - b);
+  const usual = apart[Math.floor(apart.length / 2)];
+  rows.forEach((row, i) => {
+    if (i && time[row] - time[rows[i - 1]] > 3.5 * usual) found.forEach((values, k) => values.push(k ? null : time[row]));
+    [time, middle, half].forEach((values, k) => found[k].push(values[row]));
+  });
+  return found;
+}
+
 function drawPredictions() {
   const run = page.runs[view.run], time = series(page.time, view.drive, 0), apart = element("apart").checked;
   return stacked("predictions", run.measurements, (k) => {
     const measured = series(run.measured, view.drive, k), near = series(run.predictions[0].middle, view.drive, k);
     const less = (values) => values.map((value, i) => (!apart ? value : value === null || near[i] === null ? null : value - near[i]));
     const traces = run.predictions.flatMap((one, index) => {
-      const middle = less(series(one.middle, view.drive, k)), half = series(one.half, view.drive, k);
+      const [at, middle, half] = joined(time, less(series(one.middle, view.drive, k)), series(one.half, view.drive, k));
       const edge = (sign) => middle.map((value, i) => (value === null ? null : value + sign * half[i]));
       const name = `${one.ahead} ahead`;
-      return [band(time, edge(-1), edge(1), COLORS[index], name), line(time, middle, COLORS[index], name, DASHES[index])];
+      return [band(at, edge(-1), edge(1), COLORS[index], name), line(at, middle, COLORS[index], name, DASHES[index])];
     });
     const marker = { color: "black", size: view.from === null ? 3 : 5, opacity: 0.7 };
     return [...traces, { x: time, y: less(measured), mode: "markers", marker, name: "measured" }];
