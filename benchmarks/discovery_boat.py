@@ -1,6 +1,6 @@
 """Several large effects at once, unknown starts, GPS and compass: what `discover` names on a newcomer's boat.
 
-    python benchmarks/discovery_boat.py [--sets 8] [--results FILE] [--workers 2]
+    python benchmarks/discovery_boat.py [--sets 16] [--results FILE] [--workers 2]
 
 Each set is `models/gps_boat.py` with a yaw drag, a side slip and a quadratic drag, every size drawn anew between a
 third and one and a half of what `GpsBoatTruth` has. The owner's program, which has none, is fitted by the recipe
@@ -74,7 +74,7 @@ def table(records: list[Record]) -> str:
         "|---|---|---|---|---|---|---|---|",
     ]
     gains, shares = [], []
-    for record in sorted(records, key=lambda record: record["set"]):
+    for record in sorted(records, key=lambda record: int(record["set"].split()[1])):
         levels, named = record["log_likelihood"], record["found"]
         gain, possible = levels["after"] - levels["before"], levels["truth"] - levels["before"]
         gains.append(gain)
@@ -96,7 +96,7 @@ def table(records: list[Record]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sets", type=int, default=8)
+    parser.add_argument("--sets", type=int, default=16)
     parser.add_argument("--results", type=Path, default=FOLDER / "results" / "discovery_boat.jsonl")
     parser.add_argument("--workers", type=int, default=2)
     chosen = parser.parse_args()

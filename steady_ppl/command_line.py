@@ -28,6 +28,7 @@ from steady_ppl import (
     command_states,
 )
 from steady_ppl.command_parts import hushed, say
+from steady_ppl.commanded import commanded
 from steady_ppl.errors import SteadyError
 from steady_ppl.progress import listening
 from steady_ppl.progress_line import progress_line
@@ -168,7 +169,8 @@ def main(arguments: list[str] | None = None) -> int:
     for option in command.params:
         if isinstance(option, typer.core.TyperOption) and option.name in COMPLETION:
             option.hidden = True
-    with hushed("quiet" in asked), progress_line() as line, listening(line):
+    words = ["steady", *(word for word in arguments if word not in ("--resume", "--force"))]
+    with hushed("quiet" in asked), commanded(words), progress_line() as line, listening(line):
         try:
             code = command.main(arguments, prog_name="steady", standalone_mode=False) or 0
             if code == INTERRUPTED:

@@ -76,7 +76,7 @@ def _how(
     simulations: int,
     seed: int,
 ) -> list[str]:
-    """The command as it was given, and how each of its runs was fitted."""
+    """How each of the runs was fitted, by which command if one did, and the command as it was given."""
     from steady_ppl.run_folder import read_record
 
     given: list[tuple[str, Any]] = [
@@ -93,4 +93,6 @@ def _how(
         start = "with" if record["known_start"] else "without"
         name = f"{source['file']}:{source['class']}" if source else "a program of no file"
         fitted.append(f"# {run}: {name}, recipe {record['recipe']}, seed {record['seed']}, {start} a known start")
+        if command := record.get("command"):
+            fitted.append(command)
     return ["\n".join([*fitted, shlex.join(["steady", "report", *map(str, arguments), *options, "--out", str(out)])])]

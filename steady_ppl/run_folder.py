@@ -13,6 +13,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from steady_ppl.checkpoint import read_tensors
+from steady_ppl.commanded import command_line
 from steady_ppl.errors import RunError
 from steady_ppl.whole_file import whole_file
 
@@ -144,7 +145,7 @@ def _remove_journal(folder: Path) -> None:
 def write_record(folder: Path, record: dict[str, Any]) -> None:
     """Write `run.json`, whole or not at all."""
     with whole_file(folder / RECORD, RunError) as beside:
-        beside.write_text(json.dumps(record, indent=1) + "\n")
+        beside.write_text(json.dumps({"command": command_line(), **record}, indent=1) + "\n")
 
 
 def require_same(folder: Path, begun: Mapping[str, Any]) -> None:

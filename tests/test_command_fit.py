@@ -157,6 +157,7 @@ def figures(run: Path) -> dict[str, object]:
     """What two equal runs have in common: their parameters bit for bit and the record, places apart."""
     record = json.loads((run / "run.json").read_text())
     record["program"].pop("file")
+    record["command"] = record["command"].replace(str(run), "RUN")
     return {"parameters": (run / "parameters.safetensors").read_bytes(), "record": record}
 
 

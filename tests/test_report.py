@@ -324,7 +324,7 @@ def test_the_command_that_is_shown_is_the_one_that_was_given(work: Path, tmp_pat
     text = page.read_text()
     given = f"steady report {work / 'hand'} {table} --title &#39;my page&#39; --simulations 20 --seed 3 --out {page}"
     assert given in text
-    assert "Hovercraft, recipe hand, seed 0, without a known start" in text
+    assert "Hovercraft, recipe hand, seed 0, without a known start\nsteady fit " in text  # and by what it was fitted
 
 
 class Motor(st.Program):
