@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 
 from steady_ppl.errors import UsageError
 from steady_ppl.program import units
@@ -45,6 +46,10 @@ def open_loop_picture(found: Proof, *, of: str | None = None, axes: Axes | None 
         axes.plot(*zip(*curve, strict=True), f"{mark}-", color=color, ms=4, lw=1.4, label=name)
     axes.set_xscale("log")
     axes.set_yscale("log")
+    for axis in (axes.xaxis, axes.yaxis):  # 0.1 and 20 rather than powers of ten
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(FuncFormatter(_sparse))
+    axes.tick_params(which="minor", labelsize=7)
     if floor:
         seconds, errors = zip(*floor, strict=True)
         lowest = 0.8 * min(error for curve in (floor, *curves.values()) for _, error in curve)
@@ -62,6 +67,11 @@ def proof_picture(found: Proof) -> Figure:
     figure = Figure(figsize=(6, 4), layout="constrained")
     open_loop_picture(found, axes=figure.subplots())
     return figure
+
+
+def _sparse(value: float, place: int | None = None) -> str:
+    """A label between powers of ten, of twos and fives only."""
+    return f"{value:g}" if f"{value:e}"[0] in "25" else ""
 
 
 def _curve(found: Proof, name: str, of: str) -> list[tuple[float, float]]:

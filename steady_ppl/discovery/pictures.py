@@ -112,16 +112,17 @@ def coefficients(found: Discovery, axes: Axes, rest: int = REST) -> Axes:
             va="center",
             annotation_clip=False,
         )
-    axes.axvspan(-1, 1, color=LIMIT, alpha=0.15, lw=0, label="can be missed")
+    axes.axvspan(-1, 1, color=LIMIT, alpha=0.15, lw=0)
     axes.axvline(0, color="black", lw=0.6)
     axes.set_yticks(range(len(rows)), [row.label for row in rows], fontsize=SMALL)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     if max((abs(row.value) for row in rows), default=0.0) > 8:
         axes.set_xscale("symlog", linthresh=1)
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.margins(x=0.06)
     axes.annotate("limit", (1.01, 1.01), xycoords="axes fraction", fontsize=7, va="bottom", annotation_clip=False)
-    axes.legend(fontsize=7, loc="best")
     what = "what was found and what is left" if found.findings else "what could have been seen"
-    return titled(axes, what, "coefficient / detection limit, 90 % interval")
+    return titled(axes, what, "coefficient / detection limit, 90 % interval (green: can be missed)")
 
 
 def tests(found: Discovery, axes: Axes) -> Axes:
@@ -152,11 +153,16 @@ def _groups(found: Discovery) -> list[Group]:
     alike = [[_label(candidate.variant) for candidate in one.alike] for one in ordered]
     if len(ordered) == 1:
         return [Group("", _fitted(ordered[0].candidates), chosen, alike[0])]
-    groups = [Group("each alone", _fitted(search.rounds[0].candidates), chosen, [])]
+    alone = Group("each alone", _fitted(search.rounds[0].candidates), chosen, [])
+    if all(len(one.candidates) == 1 for one in ordered):
+        together = [candidate for one in ordered for candidate in _fitted(one.candidates)]
+        return [alone, Group("each beside the others", together, chosen, [])]
+    groups = []
     for own, one, like in zip(chosen, ordered, alike, strict=True):
-        beside = ", ".join(label for label in chosen if label != own)
+        others = [label for label in chosen if label != own]
+        beside = others[0] if len(others) == 1 else f"the other {len(others)}"
         groups.append(Group(f"beside {beside}", _fitted(one.candidates), [own], like))
-    return groups
+    return [alone, *groups]
 
 
 def _of_group(group: Group, seed: int) -> list[Row]:
