@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 import traceback
 from collections.abc import Callable
+from importlib.metadata import version as installed_version
 from typing import Annotated, NamedTuple
 
 import typer
@@ -34,7 +35,8 @@ from steady_ppl.progress import listening
 from steady_ppl.progress_line import progress_line
 
 INTERRUPTED = 130  # what typer returns for Ctrl-C
-COMPLETION = ("install_completion", "show_completion")  # left out of the help, which then fits one screen
+COMPLETION = ("install_completion", "show_completion")  # left out of the help, which then fits one screen; as --debug,
+# which the line of an error names
 EVERYWHERE = {"--debug": "debug", "--quiet": "quiet", "-q": "quiet"}  # before or after the command
 
 
@@ -152,10 +154,20 @@ for command in COMMANDS:
 app.add_typer(command_data.app, name="data", short_help="Published logs to tables.")
 
 
+def say_version(asked: bool) -> None:
+    """Print the version of the installed package, for a report of a fault."""
+    if asked:
+        print(f"steady-ppl {installed_version('steady-ppl')}")
+        raise typer.Exit
+
+
 @app.callback()
 def options(
-    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", hidden=True, help="Show the traceback of an error.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no notes, only results.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=say_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
 ) -> None:
     """Learn how a vehicle moves from noisy measurements. To see it: steady demo"""
 

@@ -6,6 +6,7 @@ import io
 import json
 import shlex
 import time
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,12 @@ def test_every_command_has_examples_that_parse(command, capsys: pytest.CaptureFi
 def test_the_example_of_a_log_parses(capsys: pytest.CaptureFixture[str]) -> None:
     assert steady("data", "alpha-truck", "--help") == 0
     assert "steady data alpha-truck alpha_truck/train --out train.csv" in capsys.readouterr().out
+
+
+def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    assert steady("--version") == 0
+    said = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())["project"]["version"]
+    assert capsys.readouterr().out == f"steady-ppl {said}\n"
 
 
 def test_nothing_is_coloured(capsys: pytest.CaptureFixture[str]) -> None:
