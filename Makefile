@@ -7,7 +7,7 @@ OUT ?= out
 DRAWS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test found learn learn-truck truck paper lint types check docs clean
+.PHONY: demo test found learn learn-truck truck paper lint types check wheel docs clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "steady-ppl needs Python 3.11 or newer; name one with make PYTHON=...")'
@@ -47,6 +47,10 @@ types: $(INSTALLED)
 	$(BIN)/mypy
 
 check: lint types test
+
+wheel: $(INSTALLED)
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir $(OUT) .
+	@ls $(OUT)/*.whl
 
 docs: $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'

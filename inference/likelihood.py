@@ -17,6 +17,7 @@ from steady_ppl import (
     seeded,
     why_not_linear,
 )
+from steady_ppl.progress import stages
 
 from .steady import doubts
 
@@ -61,18 +62,24 @@ def fit(
             held_out = validation(program, seed)
             history.append({"step": float(step), "log_likelihood": sum(held_out) / len(held_out)})
 
-    try:
-        judge(0)
-    except FilterError as error:
-        notes.append(f"as declared, the program cannot follow the held-out drives: {error}")
-    with seeded(seed, "paths"):
-        maximum = fit_by_likelihood(program, data, known_start=known_start)
-    judge(maximum.steps)
+    with stages(("judging", 1), ("", 6), ("judging", 1), ("looking for doubts", 1)) as begin:
+        begin()
+        try:
+            judge(0)
+        except FilterError as error:
+            notes.append(f"as declared, the program cannot follow the held-out drives: {error}")
+        begin()
+        with seeded(seed, "paths"):
+            maximum = fit_by_likelihood(program, data, known_start=known_start)
+        begin()
+        judge(maximum.steps)
+        begin()
+        doubtful = doubts(program, data, known_start, seed, "recipe steady with guide=lookahead")
     if not maximum.converged:
         notes.append(
             f"not converged after {maximum.steps} steps, another would gain {maximum.decrement:.2g} nats: some "
             "parameter may be at its bound, or told by nothing"
         )
-    notes += validation.notes + doubts(program, data, known_start, seed, "recipe steady with guide=lookahead")
+    notes += validation.notes + doubtful
     trained = Trained(history, kept=maximum.steps)
     return Fit(program, "likelihood", settings, seed=seed, known_start=known_start, trained=trained, notes=notes)

@@ -1,12 +1,13 @@
-"""What is in a bag: topics, rates and fields, and a mapping to start from.
+"""What is in bags: topics, rates and fields, and a mapping to start from.
 
-Every line is a comment of TOML, so that the whole is a file to edit.
+All but the step is a comment of TOML, so that the whole is a file to edit.
 """
 
 from __future__ import annotations
 
+import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,15 +18,28 @@ from steady_ppl.bag_files import Bag
 _WIDTH = 116
 
 
-def listing(bag: Bag) -> str:
-    """Topics with type, number of messages, median rate and numeric fields, then sections for a mapping."""
+def listing(bags: Sequence[Bag]) -> str:
+    """Of each bag its topics with type, number of messages, median rate and numeric fields; then a mapping to start
+    from, whose sections are comments."""
+    lines: list[str] = []
+    sections: dict[str, list[str]] = {}
+    for bag in bags:
+        said, found = _of_bag(bag)
+        lines += said
+        sections |= found
+    return "\n".join(lines + _skeleton(sections))
+
+
+def _of_bag(bag: Bag) -> tuple[list[str], dict[str, list[str]]]:
+    """Its lines, and sections by their columns' names."""
     arrivals: dict[str, list[int]] = {topic: [] for topic in bag.topics}
     first: dict[str, Any] = {}
     for connection, received, raw in bag.raw_messages(bag.topics):
         arrivals[connection.topic].append(received)
         if connection.topic not in first and not bag.undefined(connection.msgtype):
             first[connection.topic] = bag.content(connection, raw)
-    lines, sections = [f"# {bag.name}"], []
+    lines: list[str] = [f"# {bag.name}"]
+    sections: dict[str, list[str]] = {}
     for topic in bag.topics:
         types, count = bag.types(topic), len(arrivals[topic])
         rate = _median_rate(arrivals[topic])
@@ -36,8 +50,8 @@ def listing(bag: Bag) -> str:
         elif len(types) == 1:
             fields = list(numeric_fields(bag.store, types[0], first.get(topic)))
             lines += _wrapped(fields)
-            sections += _section(topic, fields, has_stamp(bag.store, types[0]))
-    return "\n".join(lines + _skeleton(sections))
+            sections |= _section(topic, fields, has_stamp(bag.store, types[0]))
+    return lines, sections
 
 
 def _median_rate(arrivals: list[int]) -> str:
@@ -52,26 +66,27 @@ def _wrapped(fields: list[str]) -> Iterator[str]:
         yield f"#     {line}".replace("\0", " ")
 
 
-def _section(topic: str, fields: list[str], stamped: bool) -> list[str]:
-    """The section of a topic's first field that is not its time stamp."""
+def _section(topic: str, fields: list[str], stamped: bool) -> dict[str, list[str]]:
+    """The section of a topic's first field that is not its time stamp, by the name of the column; none without one."""
     said = [field for field in fields if "stamp." not in field and "[]" not in field and not field.startswith("header")]
     if not said:
-        return []
+        return {}
     field, _, reading = said[0].partition(" ")
-    lines = ["#", '# [columns."y.NAME"]', f'# topic = "{topic}"', f'# field = "{field.partition("…")[0]}'.rstrip(".")]
-    lines[-1] += ']"' if "…" in field else '"'
+    field = field.partition("…")[0].rstrip(".") + ("]" if "…" in field else "")
+    name = "y." + re.sub(r"\W+", "_", f"{topic}_{field}").strip("_")
+    lines = ["#", f'# [columns."{name}"]', f'# topic = "{topic}"', f'# field = "{field}"']
     if reading:
         lines.append('# as = "yaw"')
     if stamped:
         lines.append('# clock = "aligned"  # its header says when it was made; leave out for the time of arrival')
-    return lines
+    return {name: lines}
 
 
-def _skeleton(sections: list[str]) -> list[str]:
+def _skeleton(sections: dict[str, list[str]]) -> list[str]:
     return [
         "",
         "# A mapping to start from: take the sections that you need out of the comments and name their columns u.NAME",
         "# (a control), y.NAME (a measurement) or x.NAME (a state that is known).",
         "step = 0.1  # s between two rows",
-        *sections,
+        *(line for lines in sections.values() for line in lines),
     ]

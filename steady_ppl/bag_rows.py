@@ -5,7 +5,7 @@ Times are whole nanoseconds throughout, so that a command at the very time of a 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from steady_ppl.bag_mapping import BagColumn
 from steady_ppl.errors import DataError
 
 MOST_ROWS = 10_000_000
+UNUSUAL = 20  # times the usual time between commands, or the step if that is longer, from which holding one is said
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,24 @@ def _stretches(control: Series, last: int) -> list[tuple[int, int]]:
     if last - end[-1] <= longest * 1e9:
         end[-1] = max(end[-1], last)
     return list(zip(first.tolist(), end.tolist(), strict=True))
+
+
+def held_pauses(series: Sequence[Series], step: float) -> Iterator[str]:
+    """What is to be said of controls whose last command is held far longer than commands usually last."""
+    measured = [one.times[-1] for one in series if one.column.kind == "y" and len(one.times)]
+    for control in series:
+        if control.column.kind != "u" or control.column.longest is not None or not measured:
+            continue
+        gaps = np.diff(np.append(control.times, max(control.times[-1], *measured)))
+        usual = max(float(np.median(gaps)), step * 1e9)
+        longest = int(gaps.argmax())
+        if gaps[longest] > UNUSUAL * usual:
+            after = (control.times[longest] - control.times[0]) / 1e9
+            yield (
+                f"no {control.column.topic} for {gaps[longest] / 1e9:.3g} s, {after:.3g} s after its first: its last "
+                f"{control.column.name} is held as if it still acted; `longest = {10 * usual / 1e9:.2g}` would end "
+                "the trajectory there"
+            )
 
 
 def _intersection(a: list[tuple[int, int]], b: list[tuple[int, int]]) -> list[tuple[int, int]]:

@@ -34,7 +34,7 @@ from steady_ppl.bag_clocks import align
 from steady_ppl.bag_fields import check_field, has_stamp, number_at, stamp_of, yaw_at
 from steady_ppl.bag_files import Bag, Say, bag_label, open_bag
 from steady_ppl.bag_mapping import BagColumn, BagMapping
-from steady_ppl.bag_rows import Piece, Series, in_rows
+from steady_ppl.bag_rows import Piece, Series, held_pauses, in_rows
 from steady_ppl.command_parts import say as say_aside
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError, UsageError
@@ -186,6 +186,8 @@ def _series(bag: Bag, column: BagColumn, time: np.ndarray, values: np.ndarray) -
 def _pieces(series: list[Series], mapping: BagMapping, label: str, say: Say) -> dict[str, Piece]:
     """The trajectories of a bag by name, without those that say nothing; what is left out is said."""
     found = in_rows(series, mapping.step, label)
+    for held in held_pauses(series, mapping.step):
+        say(f"{label}: {held}")
     first = min((int(one.times[0]) for one in series if len(one.times)), default=0)
     kept = {}
     for i, piece in enumerate(found):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,9 +35,8 @@ def import_bag(
     if not files and not column:
         if out is not None or step is not None:
             raise UsageError("name what to take from the bag, by MAPPING.toml or --map; without --out it is listed")
-        for path in bags:
-            with open_bag(path) as bag:
-                print(listing(bag))
+        with ExitStack() as opened:
+            print(listing([opened.enter_context(open_bag(path)) for path in bags]))
         return
     if out is None:
         raise UsageError("name the table to write: --out TABLE")

@@ -59,7 +59,7 @@ def report(
         drives,
         discovery=given if discovery is not None else found[-1] if found else None,
         title=title or f"{', '.join(labels)} on {table.name}",
-        how=_how(arguments, out, discovery, title, program, simulations, seed),
+        how=_how(arguments, fingerprint(drives), out, discovery, title, program, simulations, seed),
         notes=used_before(labels, fingerprint(drives)),
         simulations=simulations,
         seed=seed,
@@ -69,6 +69,7 @@ def report(
 
 def _how(
     arguments: list[Path],
+    digest: str,
     out: Path,
     discovery: Path | None,
     title: str | None,
@@ -76,8 +77,11 @@ def _how(
     simulations: int,
     seed: int,
 ) -> list[str]:
-    """How each of the runs was fitted, by which command if one did, and the command as it was given."""
-    from steady_ppl.run_folder import read_record
+    """How each of the runs, and what was discovered, were made, by which command if one did; the table; the command as
+    it was given."""
+    import os
+
+    from steady_ppl.run_folder import RECORD, read_record
 
     given: list[tuple[str, Any]] = [
         ("--discovery", discovery),
@@ -86,13 +90,17 @@ def _how(
     ]
     given += [("--simulations", simulations if simulations != SIMULATIONS else None), ("--seed", seed or None)]
     options = [word for name, value in given if value is not None for word in (name, str(value))]
+    *runs, table = arguments
+    if discovery is not None and (discovery / RECORD).is_file() and discovery not in runs:
+        runs.insert(1, discovery)
     fitted = []
-    for run in arguments[:-1]:
+    for run in runs:
         record = read_record(run)
         source = record["program"]
         start = "with" if record["known_start"] else "without"
-        name = f"{source['file']}:{source['class']}" if source else "a program of no file"
+        name = f"{os.path.relpath(run / source['file'])}:{source['class']}" if source else "a program of no file"
         fitted.append(f"# {run}: {name}, recipe {record['recipe']}, seed {record['seed']}, {start} a known start")
         if command := record.get("command"):
             fitted.append(command)
+    fitted.append(f"# {table}: sha256 of its drives {digest[:16]}…")
     return ["\n".join([*fitted, shlex.join(["steady", "report", *map(str, arguments), *options, "--out", str(out)])])]

@@ -24,6 +24,7 @@ def simulate(
     """Simulate drives of a program, with measurements and true states."""
     from steady_ppl.command_effects import with_effects
     from steady_ppl.command_parts import program_from, say
+    from steady_ppl.progress import stages
     from steady_ppl.simulation import simulate as run
     from steady_ppl.table import read_table, write_table
 
@@ -31,4 +32,7 @@ def simulate(
         raise UsageError("--controls has as many drives as its table: leave --trajectories out")
     program = with_effects(program_from(model, seed), effect or [], say)
     like = read_table(controls) if controls else None
-    write_table(run(program, trajectories or 16, seed=seed, like=like), out)
+    with stages(("simulating", 1)) as begin:
+        begin()
+        drives = run(program, trajectories or 16, seed=seed, like=like)
+    write_table(drives, out)

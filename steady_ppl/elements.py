@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from steady_ppl.effects import attached
@@ -74,3 +75,14 @@ def moved(part: Element, by: float) -> Iterator[None]:
         yield
     finally:
         part.parameter.data.view(-1)[part.index] = before
+
+
+def values_of(parts: Sequence[Element]) -> Tensor:
+    """All of them, `(P,)`, in the space in which they are learned."""
+    return torch.tensor([float(part.parameter.data.view(-1)[part.index]) for part in parts], dtype=torch.float64)
+
+
+def set_values(parts: Sequence[Element], values: Tensor) -> None:
+    """Make them others, `(P,)`."""
+    for part, value in zip(parts, values.tolist(), strict=True):
+        part.parameter.data.view(-1)[part.index] = value

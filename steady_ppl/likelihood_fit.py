@@ -18,6 +18,7 @@ from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.program import Program
+from steady_ppl.progress import stages
 from steady_ppl.scores import channel_moments, smoothed
 
 ROUGH = 1.5  # mean square deviation, in the program's own, from which its noise is widened before anything is fitted
@@ -38,8 +39,13 @@ def fit_by_likelihood(program: Program, data: Trajectories, *, known_start: bool
         UsageError: more learnable numbers than can be looked at one by one.
         FilterError: the drives cannot be smoothed.
     """
-    first = roomy_path(program, data, known_start)
-    return led_back(program, data, maximise(program, data, first, known_start=known_start), known_start)
+    with stages(("finding paths", 1), ("scoring steps", 3), ("drives that strayed", 1)) as begin:
+        begin()
+        first = roomy_path(program, data, known_start)
+        begin()
+        found = maximise(program, data, first, known_start=known_start)
+        begin()
+        return led_back(program, data, found, known_start)
 
 
 def led_back(program: Program, data: Trajectories, maximum: Maximum, known_start: bool) -> Maximum:

@@ -14,17 +14,20 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
-from steady_ppl.elements import Element, elements, moved
+from steady_ppl.elements import Element, elements, moved, set_values, values_of
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import find_path, means_as_path, require_found, smooth
 from steady_ppl.journal import Piece, piece
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.program import Program
+from steady_ppl.progress import stages
 from steady_ppl.scores import parameter_scores, smoothed
 
 PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
 PATIENT = 30  # linearisations a step once no share of a step was accepted: some path swings about its mode
+REACH = 150  # steps of differences, 1.5 of a logarithm: the most that a number moves at once
+FEWER = 0.8  # share of fits that take one step more, by which the time left is told
 GIVES_WAY = 0.3  # nats by which an objective may fall: paths are at rest but for the tolerance
 
 
@@ -120,26 +123,28 @@ def _climb(
     parts = elements(program)
     here = _look(program, data, path or find_path(program, data, known_start=known_start), known_start, parts)
     require_found(here.ahead, data)
-    began, reach = here.objective, torch.tensor([150 * part.step for part in parts], dtype=torch.float64)
+    began, reach = here.objective, torch.tensor([REACH * part.step for part in parts], dtype=torch.float64)
     information = _firm(_of_drives(here) if information is None else information)
     taken, decrement, passes = 0, 0.0, PASSES
-    for taken in range(steps + 1):
-        move = torch.linalg.solve(information, here.gradient)
-        decrement = 0.5 * float(here.gradient @ move)
-        behind = taken >= 6 and float(here.ahead.log_likelihood.sum()) < hopeless
-        if decrement < precision or taken == steps or behind:
-            break
-        move = move * min(1.0, 1 / max(1e-9, float((move.abs() / reach).max())))
-        share, there = _searched(program, data, here, move, known_start, parts, passes)
-        if there is not None:
-            information = _updated(information, share * move, here.gradient - there.gradient)
-            here = there
-        elif passes == PATIENT:
-            break
-        else:
-            passes = PATIENT
-            here = _look(program, data, here.path, known_start, parts, passes)
-            information = _firm(_of_drives(here))
+    with stages(*(("", FEWER**step) for step in range(steps + 1))) as begin:
+        for taken in range(steps + 1):
+            begin()
+            move = torch.linalg.solve(information, here.gradient)
+            decrement = 0.5 * float(here.gradient @ move)
+            behind = taken >= 6 and float(here.ahead.log_likelihood.sum()) < hopeless
+            if decrement < precision or taken == steps or behind:
+                break
+            move = move * min(1.0, 1 / max(1e-9, float((move.abs() / reach).max())))
+            share, there = _searched(program, data, here, move, known_start, parts, passes)
+            if there is not None:
+                information = _updated(information, share * move, here.gradient - there.gradient)
+                here = there
+            elif passes == PATIENT:
+                break
+            else:
+                passes = PATIENT
+                here = _look(program, data, here.path, known_start, parts, passes)
+                information = _firm(_of_drives(here))
     return _maximum(here, parts, information, taken, decrement, began)
 
 
@@ -153,14 +158,14 @@ def _searched(
     passes: int,
 ) -> tuple[float, _Here | None]:
     """The share of a move that does not fall, and where it leads; None where none does and nothing is moved."""
-    share, before = 1.0 if bool(torch.isfinite(move).all()) else 0.0, _values(parts)
+    share, before = 1.0 if bool(torch.isfinite(move).all()) else 0.0, values_of(parts)
     while share > 0.01:
-        _set(parts, before + share * move)
+        set_values(parts, before + share * move)
         there = _try(program, data, here.path, known_start, parts, passes)
         if there is not None and there.objective >= here.objective - GIVES_WAY:
             return share, there
         share /= 3
-    _set(parts, before)
+    set_values(parts, before)
     return 0.0, None
 
 
@@ -198,6 +203,15 @@ def _look(
     )
 
 
+def posterior_score(program: Program, data: Trajectories, path: Path, known_start: bool) -> Tensor:
+    """The slope of log p(y) and the log prior where the program is, `(P,)`, along the best path near `path`.
+
+    Raises:
+        FilterError: the program blows up there.
+    """
+    return _look(program, data, path, known_start, elements(program), PATIENT).gradient
+
+
 def _try(
     program: Program, data: Trajectories, path: Path, known_start: bool, parts: list[Element], passes: int
 ) -> _Here | None:
@@ -213,28 +227,21 @@ def _try(
 def _prior(program: Program, parts: list[Element]) -> tuple[float, Tensor]:
     """The log prior and its slope in the unconstrained space, without the Jacobian: for the parameter's own mode."""
 
-    def log_prior() -> float:
-        return sum(float(prior.log_prob(getattr(program, name)).sum()) for name, prior in program.priors.items())
-
     slope = torch.zeros(len(parts), dtype=torch.float64)
     if not program.priors:
         return 0.0, slope
     for index, part in enumerate(parts):
         if part.name.split("[")[0] in program.priors:
             with moved(part, part.step):
-                up = log_prior()
+                up = log_prior(program)
             with moved(part, -part.step):
-                slope[index] = (up - log_prior()) / (2 * part.step)
-    return log_prior(), slope
+                slope[index] = (up - log_prior(program)) / (2 * part.step)
+    return log_prior(program), slope
 
 
-def _values(parts: list[Element]) -> Tensor:
-    return torch.tensor([float(part.parameter.data.view(-1)[part.index]) for part in parts], dtype=torch.float64)
-
-
-def _set(parts: list[Element], values: Tensor) -> None:
-    for part, value in zip(parts, values.tolist(), strict=True):
-        part.parameter.data.view(-1)[part.index] = value
+def log_prior(program: Program) -> float:
+    """Of the parameters that have one, of their own values."""
+    return sum(float(prior.log_prob(getattr(program, name)).sum()) for name, prior in program.priors.items())
 
 
 def _updated(information: Tensor, step: Tensor, fall: Tensor) -> Tensor:

@@ -42,6 +42,7 @@ def furnish(folder: Path) -> list[Path]:
         UsageError: the folder has something in it, or cannot be written.
     """
     from steady_ppl.program_file import load_program
+    from steady_ppl.progress import stages
     from steady_ppl.simulation import simulate
     from steady_ppl.table import write_table
 
@@ -56,8 +57,10 @@ def furnish(folder: Path) -> list[Path]:
         raise UsageError(f"{folder} cannot be written: {error.strerror} ({error.filename})") from error
     program = load_program(str(folder / TRUTH))
     tables = []
-    for seed, (name, count) in enumerate(DRIVES.items(), 1):
-        drives = simulate(program, count, seed=seed)
-        tables.append(folder / f"{name}.csv")
-        write_table(drives if name == "test" else drives.without_truth(keep_start=True), tables[-1])
+    with stages(*((f"simulating {name}", count) for name, count in DRIVES.items())) as begin:
+        for seed, (name, count) in enumerate(DRIVES.items(), 1):
+            begin()
+            drives = simulate(program, count, seed=seed)
+            tables.append(folder / f"{name}.csv")
+            write_table(drives if name == "test" else drives.without_truth(keep_start=True), tables[-1])
     return tables

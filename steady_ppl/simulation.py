@@ -9,6 +9,7 @@ from steady_ppl.data import Trajectories
 from steady_ppl.errors import ProgramError
 from steady_ppl.particles import roll_out
 from steady_ppl.program import Program, acting_controls, for_program, names
+from steady_ppl.progress import stages
 from steady_ppl.seeding import seeded
 from steady_ppl.sites import Recording, as_vector, broadcast_event, running
 
@@ -52,10 +53,12 @@ def simulate(
             start = broadcast_event(program.initial(), torch.Size((1, drives)), 1)
         states = [start]
         controls_over_time = acting_controls(program, run)[:-1].unsqueeze(1)
-        for state in roll_out(
-            program, start, controls_over_time, run.elapsed[:-1].unsqueeze(1), run.steps.unsqueeze(1)
-        ):
-            states.append(state)
+        with stages(*[("", 1)] * (rows - 1)) as begin:
+            for state in roll_out(
+                program, start, controls_over_time, run.elapsed[:-1].unsqueeze(1), run.steps.unsqueeze(1)
+            ):
+                begin()
+                states.append(state)
         path = torch.cat(states)
         _require_finite(program, path, run)
         measurements = measure(program, path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from pathlib import Path
 
@@ -225,7 +226,7 @@ def test_without_a_mapping_the_bag_is_listed_and_the_list_is_a_mapping_to_start_
         "pose.covariance[0…35]",
         "ranges[0…1], intensities[] (empty in the first message)",
         "left, right, cells[0…1].volt\n",
-        '# [columns."y.NAME"]\n# topic = "/cmd_vel"\n# field = "linear.x"\n',
+        '# [columns."y.cmd_vel_linear_x"]\n# topic = "/cmd_vel"\n# field = "linear.x"\n',
     ):
         assert says in out
     assert "gear" not in out  # which is text
@@ -233,11 +234,32 @@ def test_without_a_mapping_the_bag_is_listed_and_the_list_is_a_mapping_to_start_
     start.write_text(out)
     with pytest.raises(Exception, match="there is no measurement"):
         BagMapping.read(start)
-    head, _, sections = out.partition("step = 0.1")
-    start.write_text(head + "step = 0.1" + sections.split('# [columns."y.NAME"]')[0])
-    first = sections.split('# [columns."y.NAME"]')[1].replace("\n# ", "\n").rstrip("#\n ")
-    start.write_text(f'step = 0.1\n[columns."y.NAME"]{first}\n')
-    assert BagMapping.read(start).columns == (BagColumn("y.NAME", "/cmd_vel", "linear.x"),)
+    head, step, sections = out.partition("step = 0.1  # s between two rows\n")
+    start.write_text(head + step + re.sub("^# ?", "", sections, flags=re.MULTILINE))
+    columns = {column.topic: column for column in BagMapping.read(start).columns}
+    assert columns["/cmd_vel"] == BagColumn("y.cmd_vel_linear_x", "/cmd_vel", "linear.x")
+    assert columns["/scan"].field == "angle_min" and columns["/scan"].clock == "aligned"
+    assert len(columns) == 4
+
+
+def test_the_list_of_several_bags_is_one_mapping(tmp_path: Path, capsys) -> None:
+    for name in ("one", "two"):
+        write_bag(tmp_path / name, "mcap", drive())
+    assert steady("import-bag", tmp_path / "one", tmp_path / "two") == 0
+    out = capsys.readouterr().out
+    assert "# one\n" in out and "# two\n" in out
+    assert tomllib.loads(out) == {"step": 0.1} and out.count('"y.cmd_vel_linear_x"') == 1
+
+
+def test_a_pause_over_which_a_command_is_held_is_said(tmp_path: Path, capsys) -> None:
+    controls = [(at / 10, 1.0) for at in (*range(20), *range(600, 620))]
+    bag = write_bag(tmp_path / "drive", "mcap", values(controls, "/u") + values([(at / 10, 0.0) for at in range(625)]))
+    options = ("--map", "u.b=/u:data", "--map", "y.a=/y:data", "--step", 0.1, "--out", tmp_path / "drive.csv")
+    assert steady("import-bag", bag, *options) == 0
+    assert "no /u for 58.1 s, 1.9 s after its first: its last u.b is held as if" in capsys.readouterr().err
+    said: list[str] = []
+    data = taken(bag, BagColumn("u.b", "/u", "data", longest=1.0), Y, say=said.append)
+    assert len(data) == 2 and not any("is held" in line for line in said)
 
 
 def test_the_mapping_that_the_how_to_shows_is_one() -> None:

@@ -221,7 +221,7 @@ def test_damage_is_never_a_traceback(tmp_path: Path, kind: str) -> None:
 
 def _listed(bag: Path) -> str:
     with open_bag(bag) as opened:
-        return listing(opened)
+        return listing([opened])
 
 
 def test_a_mapping_built_in_python_is_judged_like_a_file() -> None:

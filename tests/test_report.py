@@ -325,6 +325,20 @@ def test_the_command_that_is_shown_is_the_one_that_was_given(work: Path, tmp_pat
     given = f"steady report {work / 'hand'} {table} --title &#39;my page&#39; --simulations 20 --seed 3 --out {page}"
     assert given in text
     assert "Hovercraft, recipe hand, seed 0, without a known start\nsteady fit " in text  # and by what it was fitted
+    assert f"# {table}: sha256 of its drives " in text
+
+
+def test_what_was_discovered_is_among_what_is_to_be_repeated(work: Path, tmp_path: Path):
+    shutil.copytree(work / "hand", tmp_path / "found")
+    (tmp_path / "found" / "discovery.json").write_text(json.dumps(FOUND))
+    record = json.loads((tmp_path / "found" / "run.json").read_text())
+    record["command"] = "steady discover runs/hand train.csv --out found"
+    (tmp_path / "found" / "run.json").write_text(json.dumps(record))
+    page, table = tmp_path / "report.html", work / "valid.parquet"
+    asked = ("--simulations", 20, "--discovery", tmp_path / "found", "--out", page)
+    assert steady("report", work / "hand", table, *asked) == 0
+    text = page.read_text()
+    assert text.index("steady fit ") < text.index(record["command"]) < text.index(f"steady report {work / 'hand'}")
 
 
 class Motor(st.Program):
@@ -420,6 +434,24 @@ def lines_of(page: Path, script: str, name: str, *options: str, anchor: str = ""
     dom, log = opened(with_script(page, script, name), "--dump-dom", *options, anchor=anchor)
     assert "CONSOLE" not in log, log
     return unescape(re.findall("<title>(.*?)</title>", dom)[0]).split(" | ")
+
+
+@in_a_browser
+def test_in_a_notebooks_frame_it_answers_as_well(page):
+    script = """
+    setTimeout(() => {
+      const select = document.getElementById("drive");
+      select.value = "1";
+      select.dispatchEvent(new Event("change"));
+      setTimeout(() => { parent.document.title = document.getElementById("place").textContent; }, 500);
+    }, 1000);
+    """
+    inside = with_script(page, script, "inside.html").read_text()
+    notebook = page.with_name("notebook.html")
+    notebook.write_text(f'<title>nothing</title><iframe srcdoc="{escape(inside)}"></iframe>')
+    dom, log = opened(notebook, "--dump-dom")
+    assert "CONSOLE" not in log, log
+    assert "<title>after, drive 2, all seconds</title>" in dom
 
 
 @in_a_browser

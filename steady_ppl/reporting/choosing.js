@@ -43,7 +43,7 @@ function show() {
 // The address always says what is shown.
 function choose(change) {
   Object.assign(view, change);
-  history.replaceState(null, "", address(view));
+  history.replaceState(null, "", location.href.split("#")[0] + address(view)); // whole: in a notebook's frame a part is the notebook's
   redraw("run" in change ? OF_RUN : [...OF_DRIVE, "map"]);
 }
 

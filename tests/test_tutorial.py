@@ -1,0 +1,65 @@
+"""The tutorial, typed from its first line to its last on somebody's log of a boat."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from examples import MODELS, example
+
+import steady_ppl as st
+
+TUTORIAL = MODELS.parent / "docs" / "tutorial.md"
+COLUMNS = {"trajectory": "drive", "time": "t", "u.left": "left", "u.right": "right"}
+COLUMNS |= {"y.gps_x": "gps_x", "y.gps_y": "gps_y", "y.compass": "compass"}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A log with a column that nobody asked for, and the owner's program: the second class is deleted, as is said."""
+    log = st.to_frame(st.simulate(example("gps_boat.py:GpsBoatTruth"), 18, seed=1))
+    log[list(COLUMNS)].rename(columns=COLUMNS).assign(note="windy").to_csv(tmp_path / "log.csv", index=False)
+    source = (MODELS / "gps_boat.py").read_text()
+    (tmp_path / "mine.py").write_text(source[: source.index("class GpsBoatTruth")])
+    return tmp_path
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", TUTORIAL.read_text(), re.MULTILINE | re.DOTALL)
+
+
+def typed(folder: Path, command: list[str]) -> str:
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_a_log_becomes_three_tables(folder: Path) -> None:
+    (script,) = blocks("python")
+    typed(folder, [sys.executable, "-c", script])
+    tables = {name: st.read_table(folder / f"{name}.csv") for name in ("train", "valid", "test")}
+    assert [len(table) for table in tables.values()] == [6, 5, 7]
+    assert all(table.measurement_names == ("gps_x", "gps_y", "compass") for table in tables.values())
+
+
+@pytest.mark.slow
+def test_it_ends_with_a_program_that_predicts_better_and_a_page(folder: Path) -> None:
+    typed(folder, [sys.executable, "-c", blocks("python")[0]])
+    steady = shutil.which("steady", path=str(Path(sys.executable).parent))
+    assert steady is not None
+    said = {}
+    for line in "".join(blocks("sh")).splitlines():
+        words = line.split()
+        said[" ".join(words[1:3])] = typed(folder, [steady, *words[1:]])
+    assert "does not explain these drives" in said["check runs/before"]
+    assert "lack yaw_linear_drag" in said["discover runs/before"]
+    assert "class " in (folder / "mine_after.py").read_text()
+    before, after = (
+        float(re.search(rf"^{name} +.*", said["prove runs/before"], re.MULTILINE)[0].split()[1])
+        for name in ("before", "after")
+    )
+    assert after != before and (folder / "report.html").stat().st_size < 6_000_000
