@@ -6,6 +6,7 @@ import ast
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -182,3 +183,28 @@ def test_text_in_a_bags_definition_stays_text(kind: str, text: str) -> None:
     store.register(get_types_from_msg(f"{kind} X={text}\nfloat64 x\n", "a/msg/B"))
     constants, fields = store.fielddefs["a/msg/B"]
     assert [field for field, _ in fields] == ["x"] and type(constants[0][2]) is str
+
+
+# --- what is installed ------------------------------------------------------------------------------------------------
+def locked(name: str) -> dict[str, list[str]]:
+    """Packages of a lock, and the hashes of each, in all its versions."""
+    found: dict[str, list[str]] = {}
+    for line in (ROOT / "requirements" / name).read_text().splitlines():
+        if package := re.match(r"([a-z0-9-]+)==[0-9]", line):
+            last = found.setdefault(package[1], [])
+        elif said := re.fullmatch(r"    --hash=sha256:([0-9a-f]{64})( \\)?", line):
+            last.append(said[1])
+        else:
+            assert not line or line.lstrip().startswith("#"), line
+    return found
+
+
+def test_every_dependency_is_locked_with_hashes() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = [*project["dependencies"], *(one for extra in project["optional-dependencies"].values() for one in extra)]
+    names = {re.split(r"[^A-Za-z0-9-]", one)[0].lower() for one in wanted}
+    everything, torch = locked("locked.txt"), locked("torch.txt")
+    assert names <= everything.keys() | {"torch"} and torch.keys() == {"torch"} and "torch" not in everything
+    assert all(everything.values()) and len(torch["torch"]) > 20
+    assert not [name for name in everything if "nvidia" in name or "cuda" in name]
+    assert "://" not in (ROOT / "requirements/locked.txt").read_text() + (ROOT / "requirements/torch.txt").read_text()
