@@ -7,13 +7,23 @@ OUT ?= out
 DRAWS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test found learn learn-truck truck paper lint types check wheel docs clean
+TORCH := $(shell sed -n 's/^\(torch==[^ ]*\).*/\1/p' requirements/torch.txt)
+PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 
-$(INSTALLED): pyproject.toml constraints.txt
+.PHONY: demo test found learn learn-truck truck paper lint types check wheel docs lock audit clean
+
+# Every package is checked by its hash, and none is built but this one. torch is fetched first, for pip would pass over a
+# CPU build that an index offers without saying its hash, and not at all where a build of its version is installed. The
+# last line adds the CUDA packages that torch's build names, if it is one that needs them.
+$(INSTALLED): pyproject.toml requirements/torch.txt requirements/locked.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "steady-ppl needs Python 3.11 or newer; name one with make PYTHON=...")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(PIP) freeze | grep -q "^$(TORCH)" || { \
+		$(PIP) download --no-deps --only-binary :all: --dest $(VENV)/torch $(TORCH) && \
+		$(PIP) install --no-deps --require-hashes --no-index --find-links $(VENV)/torch -r requirements/torch.txt && \
+		rm -r $(VENV)/torch; }
+	$(PIP) install --no-deps --require-hashes --only-binary :all: -r requirements/locked.txt
+	$(PIP) install --no-build-isolation --editable .
 	touch $@
 
 demo: $(INSTALLED)
@@ -53,9 +63,23 @@ wheel: $(INSTALLED)
 	@ls $(OUT)/*.whl
 
 docs: $(INSTALLED)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir $(abspath $(OUT))/site
 	@echo "$(OUT)/site/index.html"
+
+# Asks the registry for hashes; versions stay as they are, except those named: make lock UPGRADE="numpy ruff".
+lock: $(INSTALLED)
+	$(PIP) install uv
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+		--custom-compile-command "make lock" $(addprefix --upgrade-package ,$(UPGRADE)) --all-extras \
+		--override requirements/no-torch.in --output-file requirements/locked.txt pyproject.toml requirements/torch-needs.in
+
+# Known faults of what is locked. Fails where one is known, and where the service that knows them cannot be asked.
+audit:
+	$(PYTHON) -m venv $(OUT)/audit
+	$(OUT)/audit/bin/python -m pip install --quiet --disable-pip-version-check pip-audit
+	$(OUT)/audit/bin/pip-audit --strict --progress-spinner off --disable-pip --no-deps \
+		-r requirements/torch.txt -r requirements/locked.txt || \
+		{ echo "make audit: not clean: the lines above name a known fault, or say that the service could not be asked" >&2; exit 1; }
 
 clean:
 	rm -rf $(VENV) $(OUT)

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from steady_ppl.harmless import tell
+
 
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Folder to write.")] = Path("out/demo"),
@@ -18,4 +20,4 @@ def demo(
     """
     from steady_ppl.demonstration import demonstrate
 
-    demonstrate(out, force=force, say=lambda line: print(line, flush=True))
+    demonstrate(out, force=force, say=tell)

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from steady_ppl.errors import UsageError
+from steady_ppl.harmless import tell
 
 Effects = Annotated[
     list[str] | None,
@@ -41,10 +42,10 @@ def add(
     notes = write_program(grown, out, force=force)
     for note in notes if is_run else []:
         say(note)
-    print(f"{out}: {grown}")
+    tell(f"{out}: {grown}")
     for variant in added(grown):
-        print(f"{variant.label}: {variant.effect.text}")
-        print(f"{variant.label}: ${variant.effect.equation}$")
+        tell(f"{variant.label}: {variant.effect.text}")
+        tell(f"{variant.label}: ${variant.effect.equation}$")
 
 
 def effects(
@@ -54,7 +55,7 @@ def effects(
     from steady_ppl.command_parts import program_from
     from steady_ppl.effects.page import page
 
-    print(page(program_from(model, 0) if model else None), end="")
+    tell(page(program_from(model, 0) if model else None), end="")
 
 
 def with_effects(program: Any, effects: list[str], say: Any) -> Any:

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from steady_ppl.errors import UsageError
+from steady_ppl.harmless import tell
 
 WORDS = {"true": True, "false": False, "none": None}
 RECIPES = ("steady", "likelihood", "steady-minus", "svi", "hand", "fit-hand", "fit-tv", "fit-truth")
@@ -86,12 +87,12 @@ def fit(
     )
     for note in result.notes:
         say(note)
-    print(f"{out}: {result.program}")
+    tell(f"{out}: {result.program}")
     if result.trained is not None:
         judged = {e["step"]: e["log_likelihood"] for e in result.trained.history if "log_likelihood" in e}
         if judged:
             first, kept = next(iter(judged.values())), judged[result.trained.kept]
-            print(
+            tell(
                 f"held-out log p(y) of a drive {first:.2f} → {kept:.2f} at step {result.trained.kept}, "
                 "whose parameters were kept"
             )

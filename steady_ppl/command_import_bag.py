@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from steady_ppl.errors import UsageError
+from steady_ppl.harmless import tell
 
 
 def import_bag(
@@ -36,7 +37,7 @@ def import_bag(
         if out is not None or step is not None:
             raise UsageError("name what to take from the bag, by MAPPING.toml or --map; without --out it is listed")
         with ExitStack() as opened:
-            print(listing([opened.enter_context(open_bag(path)) for path in bags]))
+            tell(listing([opened.enter_context(open_bag(path)) for path in bags]))
         return
     if out is None:
         raise UsageError("name the table to write: --out TABLE")
@@ -45,7 +46,7 @@ def import_bag(
     data = read_bags(bags, mapping)
     write_table(data, out)
     rows, many = int(data.lengths.sum()), len(data)
-    print(f"{out}: {many} trajector{'y' if many == 1 else 'ies'}, {rows} rows, {_share(data)}")
+    tell(f"{out}: {many} trajector{'y' if many == 1 else 'ies'}, {rows} rows, {_share(data)}")
 
 
 def _mapping(file: Path | None, maps: list[str], step: float | None) -> Any:

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from steady_ppl.harmless import tell
+
 NEXT = (
     "steady fit models/hovercraft.py train.csv --valid valid.csv --known-start --recipe likelihood --out runs/first",
     "steady check runs/first test.csv",
@@ -21,5 +23,5 @@ def init(folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder 
     from steady_ppl.rooms import ROOMS, furnish
 
     tables = furnish(folder)
-    print(f"{folder}: {', '.join(f'{room}/' for room in ROOMS)}, {', '.join(table.name for table in tables)}")
-    print("\n".join(["", "next:", f"  cd {shlex.quote(str(folder))}", *(f"  {line}" for line in NEXT)]))
+    tell(f"{folder}: {', '.join(f'{room}/' for room in ROOMS)}, {', '.join(table.name for table in tables)}")
+    tell("\n".join(["", "next:", f"  cd {shlex.quote(str(folder))}", *(f"  {line}" for line in NEXT)]))

@@ -31,6 +31,7 @@ from steady_ppl import (
 from steady_ppl.command_parts import hushed, say
 from steady_ppl.commanded import commanded
 from steady_ppl.errors import SteadyError
+from steady_ppl.harmless import tell
 from steady_ppl.progress import listening
 from steady_ppl.progress_line import progress_line
 
@@ -157,7 +158,7 @@ app.add_typer(command_data.app, name="data", short_help="Published logs to table
 def say_version(asked: bool) -> None:
     """Print the version of the installed package, for a report of a fault."""
     if asked:
-        print(f"steady-ppl {installed_version('steady-ppl')}")
+        tell(f"steady-ppl {installed_version('steady-ppl')}")
         raise typer.Exit
 
 
@@ -191,7 +192,7 @@ def main(arguments: list[str] | None = None) -> int:
             return code
         except SteadyError as error:
             if "debug" in asked:
-                traceback.print_exc()
+                tell(traceback.format_exc(), aside=True)
             say(str(error), always=True)
             return error.exit_code
         except KeyboardInterrupt:
@@ -199,14 +200,14 @@ def main(arguments: list[str] | None = None) -> int:
             return 1
         except Exception as error:
             if type(error).__name__ == "NoArgsIsHelpError":  # of click, which typer may bring along itself
-                print(error)
+                tell(error)
                 return 2
             if hasattr(error, "format_message"):
                 if error.format_message():
                     say(f"{error.format_message()} (steady --help shows the usage)", always=True)
                 return 2
             if "debug" in asked:
-                traceback.print_exc()
+                tell(traceback.format_exc(), aside=True)
             lines = str(error).strip().splitlines() or [""]
             say(f"{type(error).__name__}: {lines[0]} (--debug shows where)", always=True)
             return 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from steady_ppl.errors import ComputationError, UsageError
+from steady_ppl.harmless import tell
 from steady_ppl.whole_file import whole_file
 
 
@@ -62,15 +62,15 @@ def is_quiet() -> bool:
 def say(line: str, *, always: bool = False) -> None:
     """A word to the person, beside what a script reads; errors are said `always`."""
     if always or not is_quiet():
-        print(f"steady: {line}", file=sys.stderr)
+        tell(f"steady: {line}", aside=True)
 
 
 def present(text: str, content: Any, json_file: Path | None) -> None:
     """Print the text and write the figures beside it, or print the figures alone if the file is `-`."""
     if json_file is not None and str(json_file) == "-":
-        print(as_json(content, "the output"))
+        tell(as_json(content, "the output"))
         return
-    print(text)
+    tell(text)
     if json_file is not None:
         write_json(json_file, content)
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from steady_ppl.errors import UsageError
+from steady_ppl.harmless import tell
 
 SIMULATIONS = 100
 
@@ -64,7 +65,7 @@ def report(
         simulations=simulations,
         seed=seed,
     ).write(out)
-    print(f"{out}: {', '.join(labels)} on {len(drives)} drives")
+    tell(f"{out}: {', '.join(labels)} on {len(drives)} drives")
 
 
 def _how(

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from steady_ppl.harmless import tell
+
 
 def states(
     run: Annotated[Path, typer.Argument(help="Run folder.")],
@@ -35,4 +37,4 @@ def states(
     require_place(out)
     fit, drives = Fit.load(run, program), read_table(table)
     write_states(fit.posterior(drives, draws=draws, particles=particles, seed=seed), out)
-    print(f"{out}: {len(drives)} drives, {draws} draws of each")
+    tell(f"{out}: {len(drives)} drives, {draws} draws of each")

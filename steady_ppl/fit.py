@@ -21,7 +21,7 @@ from steady_ppl.data import Trajectories
 from steady_ppl.errors import RunError
 from steady_ppl.program import Program
 from steady_ppl.program_file import load_program
-from steady_ppl.run_folder import PARAMETERS, POSTERIOR, read_record, run_folder, write_record
+from steady_ppl.run_folder import PARAMETERS, POSTERIOR, RECORD, read_record, run_folder, write_record
 from steady_ppl.training import Trained
 from steady_ppl.whole_file import whole_file
 
@@ -155,7 +155,8 @@ class Fit:
             program: the program, or where its file is now; the recorded place when not given.
 
         Raises:
-            RunError: the folder is no finished run, its program moved, changed, or has other parameters.
+            RunError: the folder is no finished run, its program moved, changed, came with a run, or has other
+                parameters.
             UsageError: an effect that was added to the program is not registered here.
         """
         folder = Path(folder)
@@ -214,18 +215,31 @@ def sha256(file: Path) -> str:
 
 
 def _load_recorded(folder: Path, source: dict[str, str] | None, moved: str | Path | None) -> Program:
+    """The program that the caller names, or the one that the record does: a file that is as it was at the fit, and
+    outside of every run folder, for a run of somebody else must not bring code along."""
     if moved is not None:
         return load_program(moved)
     if source is None:
         raise RunError(f"{folder}: its program came from no file: name it with --program PATH (or pass `program=`)")
-    file = folder.resolve() / source["file"]
+    try:
+        name, recorded, class_name = source["file"], source["sha256"], source["class"]
+        file = (folder / name).resolve()
+        if not class_name.isidentifier():
+            raise ValueError(class_name)
+    except (TypeError, KeyError, ValueError, AttributeError, OSError) as error:
+        raise RunError(f"{folder / RECORD} is damaged: it does not say which program it is of") from error
     if not file.is_file():
-        raise RunError(f"{folder}: its program {source['file']} is gone: name it with --program PATH")
-    if sha256(file) != source["sha256"]:
+        raise RunError(f"{folder}: its program {name} is gone: name it with --program PATH")
+    if any((place / RECORD).exists() for place in file.parents):
         raise RunError(
-            f"{folder}: its program {source['file']} changed since the fit: fit again, or accept it with --program PATH"
+            f"{folder}: its program {name} came with a run, and nothing that comes with one is executed: read it, and "
+            "name it with --program PATH"
         )
-    return load_program(f"{file}:{source['class']}")
+    if sha256(file) != recorded:
+        raise RunError(
+            f"{folder}: its program {name} changed since the fit: fit again, or accept it with --program PATH"
+        )
+    return load_program(f"{file}:{class_name}")
 
 
 def versions() -> dict[str, str]:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from steady_ppl.command_parts import is_quiet
+from steady_ppl.harmless import harmless
 
 PATIENCE = 2.0  # s, before anything is said
 CLEAR = "\r\x1b[K"
@@ -40,7 +41,7 @@ class _Line:
                 now = time.monotonic()
                 if self.doing and now - self.begun > PATIENCE:
                     said = in_words(self.doing, self.share, self.since - self.begun, now - self.begun)
-                    print(f"{CLEAR}{said}", end="", file=sys.stderr, flush=True)
+                    print(f"{CLEAR}{harmless(said)}", end="", file=sys.stderr, flush=True)
                     self.drawn = True
 
     def _clear(self) -> None:

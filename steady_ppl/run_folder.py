@@ -49,6 +49,7 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         with _only_writer(folder):
+            _refuse_links(folder)
             if not resume:
                 _put_aside(folder)
             try:
@@ -79,6 +80,13 @@ def _only_writer(folder: Path) -> Iterator[None]:
     finally:
         (folder / LOCK).unlink(missing_ok=True)
         lock.release()
+
+
+def _refuse_links(folder: Path) -> None:
+    """Folders in a run that are links lead out of it, to files that are somebody else's to remove."""
+    for name in (ASIDE, JOURNAL):
+        if (folder / name).is_symlink():
+            raise RunError(f"{folder}: {name} in it is a link: remove the link, or choose another folder")
 
 
 def _put_aside(folder: Path) -> None:

@@ -19,6 +19,7 @@ from tqdm import tqdm
 from steady_ppl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import TrainingError, require
+from steady_ppl.harmless import tell
 from steady_ppl.joint import Joint
 from steady_ppl.program import Program
 from steady_ppl.seeding import seeded
@@ -206,7 +207,7 @@ def train(
                             held_out = validation(program, seed)
                     _judge(state, held_out, {"loss": loss.item(), **figures})
                     if progress and not shows_bar:
-                        print(_in_words(state.history[-1], optimization.steps), file=sys.stderr, flush=True)
+                        tell(_in_words(state.history[-1], optimization.steps), aside=True)
                     if checkpoint is not None:
                         write_checkpoint(checkpoint, state, optimizer)
                 held = {k: v for k, v in (state.history or [{}])[-1].items() if k == "log_likelihood"}

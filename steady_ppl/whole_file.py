@@ -25,6 +25,7 @@ def whole_file(path: Path, refused: type[SteadyError] = UsageError, beside: Path
     """
     beside = beside or path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
+        beside.unlink(missing_ok=True)  # a link in its place would be written through
         yield beside
         os.replace(beside, path)
     except OSError as error:
