@@ -1,0 +1,112 @@
+"""Whether true parameters rank uniformly among the draws of their posterior, and how many an interval holds.
+
+A data set is four drives of the hovercraft with drag, whose mass, inertia, drag and noise are drawn from priors about
+what the program declares. Draws are `parameter_posterior`'s: of the linearised program's likelihood. The same values
+weighed by bootstrap filters of 200 particles show what the paper's filter would make of them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pyro.distributions as dist
+import torch
+from examples import example
+from torch import Tensor
+from uniformity import inside, ranks, together, uniform
+
+from steady_ppl import Program, Trajectories, run_filter, seeded, simulate
+from steady_ppl.maximum_likelihood import maximise
+from steady_ppl.parameter_draws import (
+    RELIABLE,
+    LogLikelihood,
+    about_maximum,
+    adapt,
+    linearised,
+    resampled,
+    weighed,
+)
+from steady_ppl.program import for_program
+
+DRAWS, DRIVES, VALUES = 99, 4, 240
+SPREAD = 0.4  # of the logarithms, a priori
+BLIND = 200  # particles of the bootstrap filter
+
+
+class Hovercraft(type(example("hovercraft:HovercraftTruth"))):
+    """Its declared parameters are the priors' medians."""
+
+    duration = 5.0
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.priors = {
+            name: dist.LogNormal(getattr(self, name).detach().double().log(), SPREAD).to_event(
+                getattr(self, name).dim()
+            )
+            for name in ("mass", "inertia", "drag", "noise")
+        }
+
+
+def drawn(seed: int) -> tuple[Program, Program, Trajectories]:
+    """The program as declared, the truth, and its drives."""
+    program, truth = Hovercraft().double(), Hovercraft().double()
+    with seeded(seed, "truth"), torch.no_grad():
+        for name, prior in truth.priors.items():
+            setattr(truth, name, prior.sample())
+    data = for_program(program, simulate(truth, DRIVES, seed=seed))
+    return program, truth, data.without_truth()
+
+
+def blind(data: Trajectories) -> LogLikelihood:
+    """log p(y) by bootstrap filters."""
+
+    def judge(program: Program) -> Tensor:
+        found = run_filter(program, data, particles=BLIND, known_start=False, keep_history=False)
+        return found.log_likelihood.sum()
+
+    return judge
+
+
+def numbers(program: Program) -> Tensor:
+    """The parameters' own values, in the order of the draws."""
+    return torch.cat(
+        [
+            getattr(program, name.removesuffix("_unconstrained")).detach().reshape(-1)
+            for name, _ in program.named_parameters()
+        ]
+    )
+
+
+@torch.no_grad()
+def ranked(seed: int) -> dict:
+    """Ranks of a data set's true parameters among draws by either likelihood."""
+    torch.set_num_threads(1)
+    program, truth, data = drawn(seed)
+    with seeded(seed, "parameters"):
+        maximum = maximise(program, data)
+        shape = about_maximum(program, data, maximum.path)
+        judges = {"linearised": linearised(data, maximum.path), f"bootstrap {BLIND}": blind(data)}
+        values, log_weights = adapt(program, shape, judges["linearised"], VALUES)
+        density = weighed(program, values, judges["linearised"]) - log_weights
+        record = {"names": list(maximum.names), "truth": numbers(truth).tolist()}
+        for name, judge in judges.items():
+            weights = log_weights if name == "linearised" else weighed(program, values, judge) - density
+            found = resampled(program, values, weights, DRAWS)
+            record[name] = {
+                "ranks": ranks(numbers(truth).numpy(), found.draws.numpy()).tolist(),
+                "tail_index": found.tail_index,
+            }
+    return record
+
+
+def summary(records: list[dict], name: str) -> dict:
+    """How uniform the ranks of a likelihood's draws are, together and each, and how many intervals hold the truth."""
+    found = np.array([record[name]["ranks"] for record in records])
+    p_values = {number: uniform(found[:, i], DRAWS) for i, number in enumerate(records[0]["names"])}
+    return {
+        "p_value": together(np.array(list(p_values.values()))),
+        "p_values": p_values,
+        "inside_50": inside(found, DRAWS, 0.5),
+        "inside_90": inside(found, DRAWS, 0.9),
+        "reliable": sum(record[name]["tail_index"] <= RELIABLE for record in records),
+    }

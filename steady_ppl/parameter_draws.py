@@ -1,0 +1,268 @@
+"""How far drives leave a program's parameters open: draws of them, from the linearised program's likelihood.
+
+The likelihood's maximum and curvature give a Student t, from which values are drawn and weighed by likelihood and
+prior; these shape a second and a third (adaptive importance sampling, Cappé, Guillin, Marin and Robert 2004). Draws are
+resampled from the last by weights with a smoothed tail (Vehtari, Simpson, Gelman, Yao and Gabry 2024, JMLR 25:72),
+whose index says where that distribution is too far from the posterior.
+"""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from torch.distributions import transform_to
+
+from steady_ppl.data import Trajectories
+from steady_ppl.elements import Element, elements, moved, set_values, values_of
+from steady_ppl.errors import FilterError, require
+from steady_ppl.gaussian_smoother import smooth
+from steady_ppl.linearization import Path
+from steady_ppl.maximum_likelihood import PASSES, REACH, TOLERANCE, log_prior, maximise, posterior_score
+from steady_ppl.program import Program, for_program
+from steady_ppl.progress import stages
+from steady_ppl.seeding import seeded
+
+if TYPE_CHECKING:
+    import arviz
+
+FREEDOM = 5.0  # of the Student t: its tails are heavier than those of any posterior that data tell
+ROUNDS = (0.25, 0.25, 0.5)  # shares of the values; each round draws about what the one before found
+ENOUGH = 4  # effective values a number, for which the weights that shape the next round are tempered
+RELIABLE = 0.7  # Pareto tail index above which weights are not to be trusted (Vehtari et al. 2024)
+
+LogLikelihood = Callable[[Program], Tensor]
+
+
+@dataclass(frozen=True)
+class ParameterPosterior:
+    """Draws of the learnable numbers of a program.
+
+    Attributes:
+        names: of the P numbers, as in `Maximum.names`.
+        draws: `(M, P)` in the parameters' own units.
+        tail_index: Pareto's k of the weights; above `RELIABLE` the draws are not to be trusted.
+    """
+
+    names: tuple[str, ...]
+    draws: Tensor
+    tail_index: float
+
+    @property
+    def is_reliable(self) -> bool:
+        """Whether the distribution that was drawn from covers the posterior."""
+        return self.tail_index <= RELIABLE
+
+    def interval(self, share: float = 0.9) -> dict[str, tuple[float, float]]:
+        """The central interval of each number."""
+        ends = torch.tensor([(1 - share) / 2, (1 + share) / 2], dtype=self.draws.dtype)
+        low, high = self.draws.quantile(ends, 0)
+        return dict(zip(self.names, zip(low.tolist(), high.tolist(), strict=True), strict=True))
+
+    def to_arviz(self) -> arviz.InferenceData:
+        """One chain, a variable a number."""
+        import arviz
+
+        columns = zip(self.names, self.draws.T.numpy(), strict=True)
+        return arviz.from_dict(posterior={name: draws[None] for name, draws in columns})
+
+
+@dataclass(frozen=True)
+class Proposals:
+    """Values drawn about the posterior's mode.
+
+    Attributes:
+        parts: the learnable numbers.
+        values: `(K, P)` in the unconstrained space.
+        log_density: `(K,)` at which they were drawn, but for a constant.
+    """
+
+    parts: list[Element]
+    values: Tensor
+    log_density: Tensor
+
+
+@torch.no_grad()
+def parameter_posterior(
+    program: Program,
+    table: Trajectories,
+    *,
+    known_start: bool = False,
+    draws: int = 200,
+    proposals: int = 400,
+    seed: int = 0,
+) -> ParameterPosterior:
+    """Draw the parameters given drives; `program` stays as it is, and need not be at its maximum.
+
+    A parameter without a prior (`Program.priors`) has a flat one on its own value.
+
+    Args:
+        program: with normal noise and at most some dozens of learnable numbers, fitted or near it.
+        table: the drives.
+        known_start: the first row's true state is given.
+        draws: M.
+        proposals: K, of which each needs a run of the smoother.
+        seed: of all draws.
+
+    Raises:
+        FilterError: the drives cannot be smoothed at the program's parameters, or at none of the values.
+        UsageError: more learnable numbers than can be looked at one by one.
+    """
+    require(draws >= 1, "draws", draws, "at least 1")
+    require(proposals >= 20, "proposals", proposals, "at least 20: a tail is told from the largest weights")
+    program = copy.deepcopy(program).double()
+    data = for_program(program, table).without_truth(keep_start=known_start)
+    with seeded(seed, "parameters"), stages(("finding the maximum", 1), ("weighing", 4)) as begin:
+        begin()
+        maximum = maximise(program, data, known_start=known_start)
+        begin()
+        first = about_maximum(program, data, maximum.path, known_start)
+        proposed, log_weights = adapt(program, first, linearised(data, maximum.path, known_start), proposals)
+        return resampled(program, proposed, log_weights, draws)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A Student t in the space in which parameters are learned.
+
+    Attributes:
+        centre: `(P,)`.
+        root: `(P, P)`, times its transpose the covariance of the normal that it is in the middle.
+    """
+
+    centre: Tensor
+    root: Tensor
+
+    def draws(self, count: int) -> tuple[Tensor, Tensor]:
+        """Values `(K, P)` and the log-density `(K,)`, but for a constant."""
+        size = len(self.centre)
+        student = torch.distributions.Chi2(torch.tensor(FREEDOM, dtype=torch.float64)).sample((count, 1))
+        white = torch.randn(count, size, dtype=torch.float64) * (FREEDOM / student).sqrt()
+        density = -0.5 * (FREEDOM + size) * torch.log1p(white.square().sum(-1) / FREEDOM)
+        return self.centre + white @ self.root.T, density
+
+
+def about_maximum(program: Program, data: Trajectories, path: Path, known_start: bool = False) -> Shape:
+    """By the curvature where the program is; what the data do not tell is open by as much as a fit moves it at once."""
+    parts = elements(program)
+    reach = torch.tensor([REACH * part.step for part in parts], dtype=torch.float64)
+    information = observed_information(program, data, path, parts, known_start)
+    curvature, directions = torch.linalg.eigh(reach * information * reach[:, None])
+    return Shape(values_of(parts), reach[:, None] * directions * curvature.clamp(min=1.0).rsqrt())
+
+
+def adapt(program: Program, shape: Shape, judge: LogLikelihood, count: int) -> tuple[Tensor, Tensor]:
+    """Values of the last round, `(K, P)`, and their log weights, `(K,)`."""
+    with stages(*(("", share) for share in ROUNDS)) as begin:
+        for share in ROUNDS:
+            begin()
+            values, density = shape.draws(round(share * count))
+            log_weights = weighed(program, values, judge) - density
+            shape = _shaped(shape, values, log_weights)
+    return values, log_weights
+
+
+def _shaped(shape: Shape, values: Tensor, log_weights: Tensor) -> Shape:
+    """The moments of weighed values; weights are tempered until enough of the values count."""
+    enough = min(ENOUGH * values.shape[1], int(torch.isfinite(log_weights).sum()) / 2)
+    power = 1.0
+    while (weights := _normalised(power * log_weights)).square().sum().reciprocal() < enough:
+        power *= 0.8
+    centre = weights @ values
+    apart = values - centre
+    covariance = apart.T @ (weights[:, None] * apart)
+    spread = covariance.diagonal().sqrt()
+    root, failed = torch.linalg.cholesky_ex(covariance + torch.diag(1e-6 * spread.square()))
+    return Shape(centre, root) if not failed else shape
+
+
+def observed_information(
+    program: Program, data: Trajectories, path: Path, parts: list[Element], known_start: bool
+) -> Tensor:
+    """Minus the second derivatives of log p(y) and the log prior, `(P, P)`, by differences of exact scores."""
+    columns = []
+    for part in parts:
+        with moved(part, part.step):
+            up = posterior_score(program, data, path, known_start)
+        with moved(part, -part.step):
+            down = posterior_score(program, data, path, known_start)
+        columns.append((down - up) / (2 * part.step))
+    found = torch.stack(columns)
+    return (found + found.T) / 2
+
+
+def linearised(data: Trajectories, path: Path, known_start: bool = False) -> LogLikelihood:
+    """log p(y) of the linearised program as it stands, summed over drives."""
+
+    def judge(program: Program) -> Tensor:
+        ahead = smooth(program, data, path, known_start=known_start, passes=PASSES, tolerance=TOLERANCE, kernels=False)
+        return ahead.log_likelihood.sum()
+
+    return judge
+
+
+def _normalised(log_weights: Tensor) -> Tensor:
+    return torch.nan_to_num(log_weights, nan=-torch.inf).softmax(0)
+
+
+def weighed(program: Program, values: Tensor, judge: LogLikelihood) -> Tensor:
+    """log p(y) and log prior of values `(K, P)`, `(K,)`: minus infinity where the program blows up.
+
+    Raises:
+        FilterError: it does at all of them.
+    """
+    parts = elements(program)
+    before = values_of(parts)
+    found = torch.full((len(values),), -torch.inf, dtype=torch.float64)
+    with stages(*[("", 1)] * len(values)) as begin:
+        for index, each in enumerate(values):
+            begin()
+            set_values(parts, each)
+            try:
+                found[index] = judge(program).double() + _log_prior(program)
+            except FilterError:
+                continue
+    set_values(parts, before)
+    found = torch.where(torch.isnan(found), -torch.inf, found)
+    if not bool(torch.isfinite(found).any()):
+        raise FilterError("at none of the parameters' values can these drives be smoothed")
+    return found
+
+
+def resampled(program: Program, values: Tensor, log_weights: Tensor, draws: int) -> ParameterPosterior:
+    """Draws of values `(K, P)` by their smoothed weights."""
+    import arviz
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # that the index is large, which the result says itself
+        smoothed, tail = arviz.psislw(log_weights.numpy().copy())
+    chosen = values[torch.multinomial(torch.from_numpy(smoothed).exp(), draws, replacement=True)]
+    parts = elements(program)
+    before, rows = values_of(parts), []
+    for each in chosen:
+        set_values(parts, each)
+        rows.append(torch.stack([_own_value(program, part) for part in parts]))
+    set_values(parts, before)
+    return ParameterPosterior(tuple(part.name for part in parts), torch.stack(rows), float(tail))
+
+
+def _own_value(program: Program, part: Element) -> Tensor:
+    """A learnable number in its own units."""
+    return attrgetter(part.name.split("[")[0])(program).detach().view(-1)[part.index].double()
+
+
+def _log_prior(program: Program) -> float:
+    """Of the parameters' own values, with what makes it a density in the space in which they are learned."""
+    total = log_prior(program)
+    for name, (constraint, _) in program._pyro_params.items():
+        free = getattr(program, f"{name}_unconstrained")
+        if free.requires_grad:
+            transform = transform_to(constraint)
+            total += float(transform.log_abs_det_jacobian(free, transform(free)).sum())
+    return total
