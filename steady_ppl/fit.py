@@ -124,9 +124,11 @@ class Fit:
         """Write into an open run folder; `begun` is what its record already says."""
         write_tensors(folder / PARAMETERS, self.program.state_dict())
         if train is not None:
+            from steady_ppl.posterior_files import netcdf
+
             drawn = self.posterior(train, draws=50, seed=self.seed)
             with whole_file(folder / POSTERIOR, RunError) as beside:
-                drawn.to_netcdf(str(beside), engine="h5netcdf")
+                beside.write_bytes(netcdf(drawn))
         write_record(folder, {**(begun or {}), **self.record(folder)})
 
     def record(self, folder: Path) -> dict[str, Any]:

@@ -59,8 +59,13 @@ def write_states(posterior: arviz.InferenceData, path: Path) -> None:
     suffix = path.suffix.lower()
     with whole_file(path) as beside:
         if suffix == ".nc":
-            posterior.to_netcdf(str(beside), engine="h5netcdf")
+            beside.write_bytes(netcdf(posterior))
         elif suffix == ".csv":
             states_frame(posterior).to_csv(beside, index=False)
         else:
             states_frame(posterior).to_parquet(beside, index=False)
+
+
+def netcdf(draws: arviz.InferenceData) -> memoryview:
+    """The bytes of a netCDF file. HDF5 is kept away from disks: on one that is full it prints pages and may crash."""
+    return draws.to_datatree().to_netcdf(None, engine="h5netcdf")
