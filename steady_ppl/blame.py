@@ -109,24 +109,60 @@ def scored(real: Sequence[Direction], simulated: Sequence[Direction], sets: int)
     each = np.concatenate([np.stack([d.scores.double().numpy() for d in real], -1)[None], each])
     each = _held(each)
     covariance = np.einsum("mbi,mbj->ij", each[1:], each[1:]) / (sets - 1)
-    scale = np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
-    each, correlation = each / scale, covariance / np.outer(scale, scale)
-    by_own = correlation[:, own] @ np.linalg.pinv(correlation[np.ix_(own, own)], rcond=1e-6, hermitian=True)
-    rest, left = each - each[..., own] @ by_own.T, correlation - by_own @ correlation[own]
-    free = ~own & (left.diagonal() > 0.02) & (covariance.diagonal() > 1e-20)
-    sd = np.sqrt(left.diagonal()[free])
-    rest, left = rest[..., free] / sd, left[np.ix_(free, free)] / np.outer(sd, sd)
+    fit = _fitted(covariance, own)
+    free = ~own & (fit.left.diagonal() > 0.02) & (covariance.diagonal() > 1e-20)
+    parts = [fit.split(each[0], free)]
+    for values in each[1:]:  # compared with the others, as the real set is: what fits itself looks small
+        away = values * sets / (sets - 1)
+        others = _fitted((covariance * (sets - 1) - values.T @ away) / (sets - 2), own)
+        parts.append(others.split(away, free))
+    parameters, rest = (np.stack(part) for part in zip(*parts, strict=True))
+    sd = np.sqrt(fit.left.diagonal()[free])
+    left = fit.left[np.ix_(free, free)] / np.outer(sd, sd)
     return Scored(
-        kinds=[d.kind for d, kept in zip(real, free, strict=True) if kept],
-        names=[d.name for d, kept in zip(real, free, strict=True) if kept],
+        kinds=[d.kind for d, is_free in zip(real, free, strict=True) if is_free],
+        names=[d.name for d, is_free in zip(real, free, strict=True) if is_free],
         z=rest.sum(1),
         correlation=left,
         dispersion=_dispersion(rest, left),
-        parameters=each[..., own].sum(1),
-        parameters_dispersion=_dispersion(each, correlation)[:, own],
-        parameters_correlation=correlation[np.ix_(own, own)],
+        parameters=parameters.sum(1),
+        parameters_dispersion=_dispersion(each / fit.scale, fit.correlation)[:, own],
+        parameters_correlation=fit.correlation[np.ix_(own, own)],
         parameter_names=[d.name for d in real if d.kind == "parameter"],
     )
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """A covariance of scores, and what of every score the parameters' explain.
+
+    Attributes:
+        own: `(J,)` which scores are the parameters'.
+        scale: `(J,)` standard deviations.
+        correlation: `(J, J)`.
+        by_own: `(J, P)` regression on the parameters' scores.
+        left: `(J, J)` correlation that these leave.
+    """
+
+    own: Array
+    scale: Array
+    correlation: Array
+    by_own: Array
+    left: Array
+
+    def split(self, values: Array, free: Array) -> tuple[Array, Array]:
+        """Scores `(B, J)` of the parameters and, less what those explain, of the `free`, in standard deviations."""
+        values = values / self.scale
+        own = values[:, self.own]
+        sd = np.sqrt(np.maximum(self.left.diagonal()[free], 1e-3))
+        return own, (values - own @ self.by_own.T)[:, free] / sd
+
+
+def _fitted(covariance: Array, own: Array) -> _Fitted:
+    scale = np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
+    correlation = covariance / np.outer(scale, scale)
+    by_own = correlation[:, own] @ np.linalg.pinv(correlation[np.ix_(own, own)], rcond=1e-6, hermitian=True)
+    return _Fitted(own, scale, correlation, by_own, correlation - by_own @ correlation[own])
 
 
 def _held(each: Array) -> Array:

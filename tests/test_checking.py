@@ -139,6 +139,16 @@ def test_false_discoveries_on_clean_drives_are_as_rare_as_they_should_be(cart):
     assert most < seeds / 2
 
 
+def test_a_single_drive_beside_few_simulated_ones_accuses_nobody_either():
+    """Twenty drives tell the covariance of some eighty scores: simulated ones, too, are judged by the others' alone."""
+    program, seeds = hovercraft("hovercraft:HovercraftTruth"), 20
+    accused = 0
+    for seed in range(seeds):
+        result = st.check(fitted(program, known_start=False), table(program, 1, 61, seed), simulations=20, seed=seed)
+        accused += result.blame.mean_p_value < 0.05
+    assert accused <= 4  # one in 400
+
+
 def test_the_figures_are_those_of_kalmans_predictions(cart, uneven):
     figures = st.check(fitted(cart, known_start=False), uneven, simulations=200).figures
     row = figures["measurements"]["position"]["horizons"]["one step"]
