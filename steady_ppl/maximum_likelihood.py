@@ -124,7 +124,9 @@ def _climb(
     information = _firm(_of_drives(here) if information is None else information)
     taken, decrement, passes = 0, 0.0, PASSES
     for taken in range(steps + 1):
-        move = torch.linalg.solve(information, here.gradient)
+        move, singular = torch.linalg.solve_ex(information, here.gradient)
+        if singular:
+            raise FilterError("the likeliest parameters cannot be found: the drives do not tell them apart (singular)")
         decrement = 0.5 * float(here.gradient @ move)
         behind = taken >= 6 and float(here.ahead.log_likelihood.sum()) < hopeless
         if decrement < precision or taken == steps or behind:
