@@ -20,6 +20,7 @@ import torch
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError, UsageError
+from steady_ppl.given_files import require_file
 from steady_ppl.planar_vehicle import bearings_to, wrap
 from steady_ppl.seeding import seeded
 
@@ -28,6 +29,9 @@ LANDMARKS = ((-1.230314, -0.606814), (0.797073, 0.889471), (-3.496525, 0.207874)
 
 FRAMES = 100
 """Rows a trajectory, which spans a little more than 10 s."""
+
+LONGEST_HEADER = 1_000_000  # characters; the reader takes minutes for a line of ten million
+LATEST = 2**33  # s since 1970, whose nanoseconds fit into 64 bits
 
 STAMP = ("header.stamp.secs", "header.stamp.nsecs")
 POSE = ("pose.position.x", "pose.position.y", "pose.orientation.z", "pose.orientation.w")
@@ -116,7 +120,11 @@ def read_alpha_truck(
 def _read_log(path: Path, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """The header stamps `(N,)` in ns, in order, and the named columns `(N, ·)`."""
     where = f"{path.parent.name}/{path.name}"
+    require_file(path, DataError)
     try:
+        with path.open("rb") as file:
+            if len(file.readline(LONGEST_HEADER + 1)) > LONGEST_HEADER:
+                raise DataError(f"{where}: the first line has more than {LONGEST_HEADER} characters: is it a log?")
         log = pd.read_csv(path, low_memory=False)
     except FileNotFoundError as error:
         raise DataError(f"{where}: there is no such file") from error
@@ -127,7 +135,10 @@ def _read_log(path: Path, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarra
     for column in (*STAMP, *columns):
         if column not in log.columns:
             raise DataError(f"{where}: column {column} is missing", column=column)
-        numbers = pd.to_numeric(log[column], errors="coerce")
+        cells = log[column]
+        if cells.dtype == object and any(isinstance(cell, int) for cell in cells):  # whole numbers beyond 64 bits
+            cells = cells.astype(str)
+        numbers = pd.to_numeric(cells, errors="coerce")
         bad = ~np.isfinite(numbers.to_numpy(dtype=np.float64))
         if bad.any():
             row = int(bad.argmax())
@@ -138,6 +149,12 @@ def _read_log(path: Path, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarra
         log[column] = numbers
     if len(log) == 0:
         raise DataError(f"{where}: the log has no rows")
+    for column, most in zip(STAMP, (LATEST, 10**9), strict=True):
+        outside = ((log[column] < 0) | (log[column] >= most)).to_numpy()
+        if outside.any():
+            row = int(outside.argmax())
+            problem = f"got {log[column].iloc[row]:g}, expected a part of a time stamp, 0 to {most}"
+            raise DataError(f"{where}: column {column}, row {row + 1}: {problem}", column=column, row=row + 1)
     stamps = log[STAMP[0]].to_numpy(np.int64) * 10**9 + log[STAMP[1]].to_numpy(np.int64)
     order = stamps.argsort(kind="stable")
     return stamps[order], log[list(columns)].to_numpy(np.float64)[order]

@@ -7,6 +7,7 @@ before Iron never do), the standard types are those of Humble, and others are re
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from typing import Any
 
 from steady_ppl.bag_fields import undefined_types
 from steady_ppl.errors import DataError, SteadyError, UsageError, one_line
+from steady_ppl.given_files import require_file
 
 Say = Callable[[str], None]
 
@@ -131,6 +133,9 @@ def open_bag(path: Path, messages: Sequence[Path] = ()) -> Iterator[Bag]:
         raise DataError(f"{name}: is no bag: a folder needs metadata.yaml; name the .mcap or .bag file itself")
     if path.is_file() and path.suffix not in (".bag", ".mcap", ".db3"):
         raise DataError(f"{name}: is no bag: expected a .bag, .mcap or .db3 file or a folder with metadata.yaml")
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if not file.is_dir():
+            require_file(file, DataError)
     known = get_typestore(Stores.EMPTY)
     known.register({**get_typestore(Stores.ROS2_HUMBLE).fielddefs, **own})
     with _damage(name):
@@ -176,7 +181,7 @@ def _definitions(paths: Sequence[Path]) -> dict[str, Any]:
     Raises:
         UsageError: naming the file.
     """
-    from rosbags.typesys import get_types_from_msg
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     found: dict[str, Any] = {}
     for path in paths:
@@ -184,11 +189,14 @@ def _definitions(paths: Sequence[Path]) -> dict[str, Any]:
         if not files:
             raise UsageError(f"messages: the folder {path} holds no .msg file")
         for file in files:
-            package, folder, _ = ["", "", *file.resolve().parts][-3:]
+            package, folder, _ = ["", "", *Path(os.path.realpath(file)).parts][-3:]
             if file.suffix != ".msg" or folder != "msg":
                 raise UsageError(f"messages: expected PACKAGE/msg/NAME.msg, got {file}")
+            require_file(file, UsageError)
             try:
-                found.update(get_types_from_msg(file.read_text(encoding="utf-8"), f"{package}/msg/{file.stem}"))
+                own = get_types_from_msg(file.read_text(encoding="utf-8"), f"{package}/msg/{file.stem}")
+                get_typestore(Stores.EMPTY).register(own)  # which refuses what makes no type
+                found.update(own)
             except OSError as error:
                 raise UsageError(f"messages: {file} cannot be read: {error.strerror}") from error
             except Exception as error:

@@ -26,12 +26,15 @@ from typing import Any
 
 from steady_ppl.bag_fields import Steps, parse_field
 from steady_ppl.errors import UsageError
+from steady_ppl.given_files import require_file
 
 _CHOICES = {
     "between": (None, "hold", "interpolate"),
     "reading": (None, "yaw", "angle"),
     "clock": ("bag", "header", "aligned"),
 }
+
+LATEST = 1e9  # s; times are whole nanoseconds in 64 bits
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,8 @@ class BagColumn:
         if self.kind != "u" and (self.between is not None or self.longest is not None):
             key = "between" if self.between is not None else "longest"
             raise UsageError(f"{where}: {key} is for controls (u.); measurements and states are not held: leave it out")
+        if abs(self.late) > LATEST:
+            raise UsageError(f"{where}: late is {self.late:g} s, expected at most {LATEST:g} s, which are thirty years")
         if self.scale == 0:
             raise UsageError(f"{where}: scale is 0, which leaves nothing of what was read")
         try:
@@ -178,12 +183,15 @@ def read_toml(path: Path) -> dict[str, Any]:
     """
     import tomllib
 
+    require_file(path, UsageError)
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise UsageError(f"{path.name}: cannot be read: {error.strerror or error}") from error
     except ValueError as error:
         raise UsageError(f"{path.name}: is not TOML: {str(error).partition(chr(10))[0]}") from error
+    except RecursionError:
+        raise UsageError(f"{path.name}: is not TOML that can be read: it is nested too deeply") from None
     if isinstance(content.get("messages"), list):
         content["messages"] = [path.parent / text if isinstance(text, str) else text for text in content["messages"]]
     return content

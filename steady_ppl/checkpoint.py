@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from steady_ppl.errors import RunError
+from steady_ppl.errors import RunError, shown
+from steady_ppl.given_files import ANYTHING, NUMBER, WHOLE, misfit, require_file
 from steady_ppl.whole_file import whole_file
+
+HASH = "sha256"  # of tensors and text, in the file's own text
+NUMBERS = {"step": WHOLE, "history": [{str: ANYTHING}], "kept_step": WHOLE, "best_held_out": [NUMBER]}
+"""The form of what a checkpoint says in JSON beside its tensors."""
 
 
 @dataclass
@@ -42,28 +49,42 @@ class Checkpoint:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: Mapping[str, str] | None = None) -> None:
-    """Write tensors and text to a safetensors file, whole or not at all."""
+    """Write tensors and text to a safetensors file, whole or not at all, with their hash, by which damage is told."""
     kept = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     with whole_file(path, RunError) as beside:
         try:
-            save_file(kept, beside, dict(text or {}))
+            save_file(kept, beside, {**(text or {}), HASH: _hash(kept, text or {})})
         except SafetensorError as error:  # what the file system refuses comes as its own
             raise RunError(f"{path} cannot be written: {error}") from error
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read a file of `write_tensors`.
+    """Read a file of `write_tensors`, or one from before there was a hash in it.
 
     Raises:
         RunError: the file is missing or damaged.
     """
+    require_file(path, RunError)
     try:
         with safe_open(path, framework="pt") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            text = dict(file.metadata() or {})
     except FileNotFoundError:
         raise RunError(f"no file {path.name} in {path.parent}") from None
     except SafetensorError as error:
         raise RunError(f"{path.name} in {path.parent} is damaged ({error})") from error
+    written = text.pop(HASH, None)
+    if written is not None and written != _hash(tensors, text):
+        raise _damaged(path, "its numbers are not those that were written")
+    return tensors, text
+
+
+def _hash(tensors: Mapping[str, Tensor], text: Mapping[str, str]) -> str:
+    digest = hashlib.sha256(json.dumps(sorted(text.items())).encode())
+    for name, value in sorted(tensors.items()):
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode(errors="surrogatepass"))
+        digest.update(value.contiguous().reshape(-1).view(torch.uint8).numpy(force=True).tobytes())
+    return digest.hexdigest()
 
 
 def write_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimizer) -> None:
@@ -74,7 +95,7 @@ def write_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optim
     tensors |= {f"memory/{name}": value for name, value in state.memory.items()}
     for index, slots in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer/{index}/{slot}": value for slot, value in slots.items()}
-    numbers = {name: getattr(state, name) for name in ("step", "history", "kept_step", "best_held_out")}
+    numbers = {name: getattr(state, name) for name in NUMBERS}
     write_tensors(path, tensors, {name: json.dumps(value) for name, value in numbers.items()})
 
 
@@ -88,9 +109,19 @@ def read_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimi
     groups: dict[str, dict[str, Tensor]] = {"parameters": {}, "averaged": {}, "kept": {}, "memory": {}, "optimizer": {}}
     for key, value in tensors.items():
         group, _, name = key.partition("/")
+        if group not in groups:
+            raise _damaged(path, f"no checkpoint has {shown(key, 100)}")
         groups[group][name] = value
-    if {n: v.shape for n, v in groups["parameters"].items()} != {n: v.shape for n, v in state.parameters.items()}:
+    if _shapes(groups["parameters"]) != _shapes(state.parameters):
         raise RunError(f"{path.name} in {path.parent} was written by a program with other parameters")
+    if _shapes(groups["averaged"]) != _shapes(state.averaged):
+        raise _damaged(path, "the averaged parameters are others than the program's")
+    if groups["kept"] and _shapes(groups["kept"]) != _shapes(state.averaged):
+        raise _damaged(path, "the kept parameters are others than the program's")
+    broken = [name for name, value in groups["parameters"].items() if not value.isfinite().all()]
+    if broken:
+        raise _damaged(path, f"the parameters {', '.join(broken)} are not finite")
+    numbers = _numbers(path, text)
     with torch.no_grad():
         for name, value in groups["parameters"].items():
             state.parameters[name].copy_(value)
@@ -98,10 +129,50 @@ def read_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimi
         state.averaged[name].copy_(value)
     state.kept = {name: value.to(state.averaged[name].device) for name, value in groups["kept"].items()}
     state.memory.update(groups["memory"])
-    for name in ("step", "history", "kept_step", "best_held_out"):
-        setattr(state, name, json.loads(text[name]))
-    slots: dict[int, dict[str, Tensor]] = {}
-    for key, value in groups["optimizer"].items():
-        index, _, slot = key.partition("/")
-        slots.setdefault(int(index), {})[slot] = value
+    for name, said in numbers.items():
+        setattr(state, name, said)
+    slots = _slots(path, groups["optimizer"], optimizer)
     optimizer.load_state_dict({"state": slots, "param_groups": optimizer.state_dict()["param_groups"]})
+
+
+def _damaged(path: Path, why: str) -> RunError:
+    return RunError(f"{path.name} in {path.parent} is damaged ({why})")
+
+
+def _shapes(tensors: Mapping[str, Tensor]) -> dict[str, torch.Size]:
+    return {name: value.shape for name, value in tensors.items()}
+
+
+def _numbers(path: Path, text: Mapping[str, str]) -> dict[str, Any]:
+    """The text beside the tensors, by name of the state.
+
+    Raises:
+        RunError: it is not what `write_checkpoint` writes.
+    """
+    try:
+        found = {name: json.loads(text[name]) for name in NUMBERS if name in text}
+    except (ValueError, RecursionError):
+        raise _damaged(path, "the text beside the tensors is no JSON") from None
+    problem = misfit(found, NUMBERS)
+    if problem is not None:
+        raise _damaged(path, problem)
+    return found
+
+
+def _slots(path: Path, tensors: Mapping[str, Tensor], optimizer: torch.optim.Optimizer) -> dict[int, dict[str, Tensor]]:
+    """What the optimiser remembers of each parameter, by its number.
+
+    Raises:
+        RunError: of a parameter that is not there, or of another shape.
+    """
+    trained = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    slots: dict[int, dict[str, Tensor]] = {}
+    for key, value in tensors.items():
+        index, _, slot = key.partition("/")
+        number = int(index) if index.isdecimal() else len(trained)
+        if number >= len(trained) or (value.dim() and value.shape != trained[number].shape):
+            raise _damaged(path, f"the optimiser has no {shown(key, 100)} of shape {tuple(value.shape)}")
+        slots.setdefault(number, {})[slot] = value
+    if len({frozenset(one) for one in slots.values()}) > 1:
+        raise _damaged(path, "the optimiser's memory is not complete")
+    return slots

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -39,7 +40,7 @@ def check(
     if mask is not None:
         require_table_file(mask)
         require_place(mask)
-        if mask.resolve() in (table.resolve(), json_file and json_file.resolve()):
+        if os.path.realpath(mask) in (os.path.realpath(table), json_file and os.path.realpath(json_file)):
             raise UsageError(f"--mask {mask} is the table itself, or the file of --json: name another file")
     drives = read_table(table)
     found = compare(Fit.load(run, program), drives, simulations=simulations, seed=seed)

@@ -9,9 +9,11 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from steady_ppl.errors import ComputationError, UsageError
+from steady_ppl.errors import ComputationError, UsageError, shown
 from steady_ppl.harmless import tell
 from steady_ppl.whole_file import whole_file
+
+LONGEST = 1000  # characters of a line that is said; a file that somebody gives can put more into it
 
 
 def program_from(model: str, seed: int) -> Any:
@@ -62,7 +64,8 @@ def is_quiet() -> bool:
 def say(line: str, *, always: bool = False) -> None:
     """A word to the person, beside what a script reads; errors are said `always`."""
     if always or not is_quiet():
-        tell(f"steady: {line}", aside=True)
+        lines = [shown(part, LONGEST) for part in line.splitlines()]
+        tell("\n".join([f"steady: {part}" for part in lines[:1]] + lines[1:]), aside=True)
 
 
 def present(text: str, content: Any, json_file: Path | None) -> None:

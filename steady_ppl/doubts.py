@@ -58,18 +58,34 @@ def doubts_of_fit(fit: Fit, declared: Mapping[str, Tensor]) -> list[str]:
 
 
 def doubts_of_units(program: Program, data: Trajectories) -> list[str]:
-    """Measurements in radians that look like degrees: beyond several turns, and all within a circle's degrees.
+    """What is read as radians and looks like degrees: beyond several turns, and all within a circle's degrees.
+
+    Of measurements all are looked at, of known angles those of the first rows alone, since later ones may have counted
+    turns, and of the controls of a program with a heading those that are angles or turn rates.
 
     Args:
         data: as returned by `for_program`.
     """
     found = []
     for index, (name, unit) in enumerate(zip(names(program.measurements), units(program.measurements), strict=True)):
-        seen = data.measurements[..., index][data.observed[..., index]]
-        if unit == "rad" and len(seen) and TURNS < float(seen.abs().max()) <= 360:
-            between = f"{float(seen.min()):.4g} and {float(seen.max()):.4g}"
-            found.append(f"y.{name} is between {between} and the program reads radians: are these degrees?")
+        if unit == "rad":
+            found += _degrees(f"y.{name}", unit, data.measurements[..., index][data.observed[..., index]])
+    for index, (name, unit) in enumerate(zip(names(program.controls), units(program.controls), strict=True)):
+        if unit == "rad" or (unit == "rad/s" and program.angles):
+            found += _degrees(f"u.{name}", unit, data.controls[..., index][data.rows])
+    for index, name in enumerate(names(program.states)):
+        if data.states is not None and name in program.angles:
+            start = data.states[0, :, index]
+            found += _degrees(f"x.{name}", "rad", start[start.isfinite()])
     return found
+
+
+def _degrees(column: str, unit: str, seen: Tensor) -> list[str]:
+    if not len(seen) or not TURNS < float(seen.abs().max()) <= 360:
+        return []
+    between = f"{float(seen.min()):.4g} and {float(seen.max()):.4g}"
+    read = "radians" if unit == "rad" else "radians a second"
+    return [f"{column} is between {between} and the program reads {read}: are these degrees?"]
 
 
 def _is_positive(program: Program, name: str) -> bool:

@@ -5,6 +5,8 @@ Programming errors stay ordinary Python errors.
 
 from __future__ import annotations
 
+from steady_ppl.harmless import harmless
+
 
 class SteadyError(Exception):
     """A problem the user can mend. The message says what was got, what was expected and what to do.
@@ -73,6 +75,16 @@ class FilterError(ComputationError):
 
 class TrainingError(ComputationError):
     """Training failed, for example on a loss that is not finite."""
+
+
+def shown(text: str, most: int | None = None) -> str:
+    """What somebody's file says, fit for one line of a terminal: what is not seen as escapes, cut where it is too long.
+
+    Example:
+        >>> shown("drive\\x1b[2J", most=40)
+        'drive\\\\x1b[2J'
+    """
+    return harmless(text if most is None or len(text) <= most else f"{text[: most - 1]}…", kept="")
 
 
 def one_line(error: BaseException) -> str:

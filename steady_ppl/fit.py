@@ -22,6 +22,7 @@ from steady_ppl.errors import RunError
 from steady_ppl.program import Program
 from steady_ppl.program_file import load_program
 from steady_ppl.run_folder import PARAMETERS, POSTERIOR, RECORD, read_record, run_folder, write_record
+from steady_ppl.run_forms import FINISHED
 from steady_ppl.training import Trained
 from steady_ppl.whole_file import whole_file
 
@@ -163,7 +164,7 @@ class Fit:
         """
         folder = Path(folder)
         record = read_record(folder)
-        if record.get("status") not in ("finished", "interrupted"):
+        if record["status"] not in FINISHED:
             command = "discover" if record["recipe"] == "discover" else "fit"
             raise RunError(f"{folder}: its {command} has not finished: go on with it by `steady {command} … --resume`")
         if not isinstance(program, Program):
@@ -177,6 +178,10 @@ class Fit:
             raise RunError(
                 f"{folder}: the parameters do not fit program {type(program).__name__}: {', '.join(differing)}"
             )
+        learned = {name for name, _ in program.named_parameters()}
+        broken = sorted(name for name, value in tensors.items() if name in learned and not value.isfinite().all())
+        if broken:
+            raise RunError(f"{folder}: the parameters {', '.join(broken)} are not finite: fit again")
         kinds = {value.dtype for value in tensors.values() if value.is_floating_point()}
         if len(kinds) == 1:
             program.to(kinds.pop())

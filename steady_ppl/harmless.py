@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-import re
 import sys
+import unicodedata
 
-# what moves the cursor, colours, renames the window, turns lines round, or cannot be written at all
-OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+# what moves the cursor, colours, renames the window, turns lines round, is not seen, or cannot be written at all
+UNSEEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # categories of Unicode: control, format, half of a pair, line separators
 
 
-def harmless(text: str) -> str:
-    r"""The text with control characters but tabs and ends of lines spelt out.
+def harmless(text: str, kept: str = "\t\n") -> str:
+    r"""The text with what is not seen spelt out, but for the characters that are `kept`.
 
     Example:
         >>> harmless("drive \x1b[2J")
         'drive \\x1b[2J'
     """
-    return OBEYED.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+    if text.isprintable():
+        return text
+    return "".join(
+        char.encode("unicode_escape").decode() if unicodedata.category(char) in UNSEEN and char not in kept else char
+        for char in text
+    )
 
 
 def tell(text: object, *, end: str = "\n", aside: bool = False) -> None:

@@ -23,9 +23,11 @@ from torch import Tensor
 
 from steady_ppl.checkpoint import read_tensors, write_tensors
 from steady_ppl.errors import FilterError, RunError
+from steady_ppl.given_files import ANYTHING, TEXT, Among, misfit
 
 Piece = tuple[Mapping[str, Tensor], Mapping[str, Any]]
 RANDOM = "random state"  # of torch, after the piece
+SAID = Among(({"values": {str: ANYTHING}}, {"failed": TEXT}))
 
 
 @dataclass
@@ -69,12 +71,28 @@ def piece(compute: Callable[[], Piece]) -> Piece:
     file = now.folder / f"{now.pieces:06d}.safetensors"
     if not file.is_file():
         _write(file, compute)
-    tensors, text = read_tensors(file)
+    tensors, said = _read(file)
     torch.set_rng_state(tensors.pop(RANDOM))
-    said = json.loads(text["said"])
     if "failed" in said:
         raise FilterError(said["failed"])
     return tensors, said["values"]
+
+
+def _read(file: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """A piece, the random state among its tensors.
+
+    Raises:
+        RunError: the file is damaged.
+    """
+    tensors, text = read_tensors(file)
+    try:
+        said = json.loads(text.get("said", "null"))
+    except (ValueError, RecursionError):
+        said = None
+    state, now = tensors.get(RANDOM), torch.get_rng_state()
+    if misfit(said, SAID) is not None or state is None or (state.shape, state.dtype) != (now.shape, now.dtype):
+        raise RunError(f"{file} is damaged: it is no piece of a search; --force begins the search anew")
+    return tensors, said
 
 
 def _write(file: Path, compute: Callable[[], Piece]) -> None:

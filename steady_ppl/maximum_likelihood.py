@@ -129,7 +129,11 @@ def _climb(
     with stages(*(("", FEWER**step) for step in range(steps + 1))) as begin:
         for taken in range(steps + 1):
             begin()
-            move = torch.linalg.solve(information, here.gradient)
+            move, singular = torch.linalg.solve_ex(information, here.gradient)
+            if singular:
+                raise FilterError(
+                    "the likeliest parameters cannot be found: the drives do not tell them apart (singular)"
+                )
             decrement = 0.5 * float(here.gradient @ move)
             behind = taken >= 6 and float(here.ahead.log_likelihood.sum()) < hopeless
             if decrement < precision or taken == steps or behind:

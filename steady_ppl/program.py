@@ -16,7 +16,7 @@ from pyro.nn import PyroModule, PyroParam, PyroSample
 from pyro.nn.module import _PyroModuleMeta
 from torch import Tensor
 
-from steady_ppl.errors import ProgramError
+from steady_ppl.errors import DataError, ProgramError
 
 if TYPE_CHECKING:
     from steady_ppl.data import Trajectories
@@ -221,5 +221,39 @@ def for_program(program: Program, data: Trajectories) -> Trajectories:
         chosen.states[0][..., resting] = 0.0
     parameter = next(program.parameters(), None)
     if parameter is None:
-        return chosen.to(torch.get_default_dtype())
-    return chosen.to(parameter.dtype, parameter.device)
+        return _within(chosen.to(torch.get_default_dtype()))
+    return _within(chosen.to(parameter.dtype, parameter.device))
+
+
+SHORTEST, LONGEST = 1e-10, 1e9  # s between two rows; beyond these the time has another unit
+
+
+def _within(data: Trajectories) -> Trajectories:
+    """The same drives, if every number is one in their precision (1e300 is infinite in single) and time is in seconds.
+
+    Raises:
+        DataError: naming column, trajectory and row.
+    """
+    blocks = [("u", data.controls, data.control_names), ("y", data.measurements, data.measurement_names)]
+    if data.states is not None:
+        blocks.append(("x", data.states, data.state_names))
+    for prefix, values, columns in blocks:
+        for row, drive, index in values.isinf().nonzero()[:1].tolist():
+            most = torch.finfo(values.dtype).max
+            raise _beyond(
+                data, f"{prefix}.{columns[index]}", drive, row, f"the number is beyond {most:.2g}, the largest"
+            )
+    odd = data.transitions & ((data.steps < SHORTEST) | (data.steps > LONGEST))
+    for row, drive in odd.nonzero()[:1].tolist():
+        step = float(data.time[row + 1, drive] - data.time[row, drive])
+        said = (
+            f"time goes on by {step:.3g} s, expected {SHORTEST:g} to {LONGEST:g} s from row to row: is it in seconds?"
+        )
+        raise _beyond(data, "time", drive, row + 1, said)
+    return data
+
+
+def _beyond(data: Trajectories, column: str, drive: int, row: int, said: str) -> DataError:
+    label = data.labels[drive]
+    where = f"column {column}, trajectory {label}, its row {row + 1}"
+    return DataError(f"{where}: {said}", column=column, trajectory=label)

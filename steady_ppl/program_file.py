@@ -11,6 +11,7 @@ from pathlib import Path
 from types import CodeType, ModuleType
 
 from steady_ppl.errors import ProgramError, SteadyError, one_line
+from steady_ppl.given_files import require_file
 from steady_ppl.program import Program
 
 _LOADS = itertools.count()
@@ -61,6 +62,7 @@ def run_file(file: Path) -> ModuleType:
     Raises:
         ProgramError: the file does not exist or raises while it is imported.
     """
+    require_file(file, ProgramError)
     if not file.is_file():
         raise ProgramError(f"no file {file}")
     folder = file.resolve().parent

@@ -15,6 +15,8 @@ from filelock import FileLock, Timeout
 from steady_ppl.checkpoint import read_tensors
 from steady_ppl.commanded import command_line
 from steady_ppl.errors import RunError
+from steady_ppl.given_files import misfit, read_json, require_file
+from steady_ppl.run_forms import BEGUN_RECORD, FINISHED, FINISHED_RECORD, FOUND
 from steady_ppl.whole_file import whole_file
 
 PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY = (
@@ -26,7 +28,6 @@ PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY = (
 )
 FILES = (PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY)
 ASIDE, LOCK, JOURNAL = "previous", ".lock", "journal"
-SAID = {"sentence", "candidates", "effects", "shape", "doubts", "notes", "next_run"}  # of a discovery, what is shown
 
 
 @contextmanager
@@ -95,6 +96,8 @@ def _put_aside(folder: Path) -> None:
         _remove(folder)
         return
     present = [name for name in FILES if (folder / name).exists()]
+    for name in present:
+        require_file(folder / name, RunError)
     try:
         _remove_journal(folder)
         if present:
@@ -183,13 +186,14 @@ def read_record(folder: Path) -> dict[str, Any]:
         RunError: there is none, or it is damaged.
     """
     try:
-        record = json.loads((folder / RECORD).read_text())
+        record = read_json(folder / RECORD, RunError)
     except (FileNotFoundError, NotADirectoryError):
         raise RunError(f"{folder} is not a run: it has no {RECORD}") from None
-    except (OSError, ValueError) as error:
-        raise RunError(f"{folder / RECORD} is damaged: {error}") from error
-    if not (isinstance(record, dict) and {"program", "recipe", "status"} <= record.keys()):
-        raise RunError(f"{folder / RECORD} is damaged: it says neither program nor recipe")
+    problem = misfit(record, BEGUN_RECORD)
+    if problem is None and record["status"] in FINISHED:
+        problem = misfit(record, FINISHED_RECORD)
+    if problem is not None:
+        raise RunError(f"{folder / RECORD} is damaged: {problem}")
     return record
 
 
@@ -202,11 +206,8 @@ def read_discovery(source: Path) -> dict[str, Any] | None:
     file = source / DISCOVERY if source.is_dir() else source
     if not file.is_file():
         return None
-    try:
-        found = json.loads(file.read_text())
-    except (OSError, ValueError) as error:
-        raise RunError(f"{file} is damaged: {error}") from error
-    lacking = SAID - found.keys() if isinstance(found, dict) else SAID
-    if lacking:
-        raise RunError(f"{file} is not what `steady discover` writes: it has no {', '.join(sorted(lacking))}")
+    found = read_json(file, RunError)
+    problem = misfit(found, FOUND)
+    if problem is not None:
+        raise RunError(f"{file} is not what `steady discover` writes: {problem}")
     return found

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
-from steady_ppl.errors import ProgramError
+from steady_ppl.errors import ProgramError, SteadyError, one_line
 from steady_ppl.particles import roll_out
 from steady_ppl.program import Program, acting_controls, for_program, names
 from steady_ppl.progress import stages
@@ -33,7 +33,7 @@ def simulate(
         if like is None:
             rows = round(program.duration / program.step) + 1
             time = (torch.arange(rows, dtype=torch.float64) * program.step)[:, None].repeat(1, trajectories or 1)
-            controls = program.example_controls(time)
+            controls = _example_controls(program, time)
             data = Trajectories(
                 time=time,
                 controls=controls,
@@ -94,3 +94,29 @@ def _require_finite(program: Program, path: Tensor, data: Trajectories) -> None:
             "are not finite",
             site="transition",
         )
+
+
+def _example_controls(program: Program, time: torch.Tensor) -> torch.Tensor:
+    """What the program's own method gives: `(rows, trajectories, controls)`.
+
+    Raises:
+        ProgramError: it fails, or what it gives has another shape or is not finite.
+    """
+    name, expected = type(program).__name__, (*time.shape, len(program.controls))
+    try:
+        controls = program.example_controls(time)
+    except SteadyError:
+        raise
+    except Exception as error:  # a user's own code
+        raise ProgramError(
+            f"program {name}: example_controls failed: {one_line(error)}", site="example_controls"
+        ) from error
+    if not isinstance(controls, torch.Tensor) or tuple(controls.shape) != expected:
+        came = f"shape {tuple(controls.shape)}" if isinstance(controls, torch.Tensor) else type(controls).__name__
+        raise ProgramError(
+            f"program {name}: example_controls gave {came}, expected a tensor of shape {expected}",
+            site="example_controls",
+        )
+    if not controls.isfinite().all():
+        raise ProgramError(f"program {name}: example_controls gave a control that is not finite")
+    return controls

@@ -21,8 +21,11 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories, pad, pad_time
-from steady_ppl.errors import DataError
+from steady_ppl.errors import DataError, shown
+from steady_ppl.given_files import require_file
 from steady_ppl.whole_file import whole_file
+
+SEPARATORS = {";": "semicolons", "\t": "tabs"}  # of other programs' CSV
 
 
 def read_table(path: str | Path) -> Trajectories:
@@ -35,6 +38,7 @@ def read_table(path: str | Path) -> Trajectories:
         DataError: naming the file and, where they apply, the column, the trajectory and the row.
     """
     path = Path(path)
+    require_file(path, DataError)
     read = _read_csv if _suffix(path) == ".csv" else _read_parquet
     try:
         frame = read(path)
@@ -212,6 +216,9 @@ def _read_csv(path: Path) -> pd.DataFrame:
     if not lines:
         _fail(path.name, "the table is empty")
     header, *rows = lines
+    for sign, word in SEPARATORS.items():
+        if sign in header[0]:
+            _fail(path.name, f"the columns are separated by {word}, expected commas, and numbers with a decimal point")
     for i, row in enumerate(rows):
         if len(row) != len(header):
             _fail(path.name, f"got {len(row)} cells, expected {len(header)} as in the header", row=i + 1)
@@ -249,6 +256,6 @@ def _fail(
 ) -> NoReturn:
     """Raise a DataError whose one line says where."""
     places = (("column", column), ("trajectory", trajectory), ("row", row))
-    where = ", ".join(f"{kind} {place}" for kind, place in places if place is not None)
+    where = ", ".join(f"{kind} {shown(str(place), 100)}" for kind, place in places if place is not None)
     message = " ".join(f"{name}: {where}{': ' if where else ''}{problem}".split())
     raise DataError(message, column=column, trajectory=trajectory, row=row)

@@ -23,6 +23,7 @@ from steady_ppl.program import Program, acting_controls, names, units
 
 KNOTS = 7
 REACH = 0.4  # of the variable's range over which heights are alike
+LOWEST = 1e-15  # height of a curve whose square is still a number in single precision
 TALL = 1.5  # prior standard deviation of the heights, in the noise's
 NAME = "curve"
 ALONE, COMMANDED = "", "what is commanded"  # what a curve is multiplied with
@@ -51,7 +52,7 @@ def curves(program: Program, data: Trajectories, spread: Tensor, sharpness: Tens
         for index, channel in enumerate(names(program.channels)):
             for times in (ALONE, COMMANDED) if variable == "time" else (ALONE,):
                 size = _size(data, multiplier(mean, channel, times))
-                if size > 0:
+                if size > 0 and float(spread[index]) / size > LOWEST:
                     unit = "1" if times else units(program.channels)[index]
                     height = float(spread[index]) / size
                     effect = _effect("push", variable, knots, height, unit, variable in program.angles)

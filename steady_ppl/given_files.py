@@ -1,0 +1,132 @@
+"""Files that somebody gives: that they can be read to their end, and that JSON in them has the expected form."""
+
+from __future__ import annotations
+
+import json
+import math
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from steady_ppl.errors import SteadyError, shown
+
+KINDS = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISCHR, "a device"), (stat.S_ISSOCK, "a socket"))
+
+
+def require_file(path: Path, refused: type[SteadyError]) -> None:
+    """Refuse a folder in place of a file, and what may never end: a pipe, a device. A missing file is left to be found.
+
+    Raises:
+        SteadyError, of the kind that is `refused`.
+    """
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return
+    if not stat.S_ISREG(mode):
+        what = next((word for test, word in KINDS if test(mode)), "no file")
+        raise refused(f"{path} is {what}: expected a file")
+
+
+def read_json(path: Path, refused: type[SteadyError]) -> Any:
+    """What a JSON file says.
+
+    Raises:
+        FileNotFoundError, NotADirectoryError: there is none.
+        SteadyError, of the kind that is `refused`: it cannot be read, or is no JSON.
+    """
+    require_file(path, refused)
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise
+    except (OSError, ValueError) as error:
+        raise refused(f"{path} is damaged: {error}") from error
+    except RecursionError:
+        raise refused(f"{path} is damaged: it is nested too deeply") from None
+
+
+class Maybe(NamedTuple):
+    """A form that may be null."""
+
+    form: Any
+
+
+class Among(NamedTuple):
+    """One of several forms."""
+
+    forms: tuple[Any, ...]
+
+
+NUMBER, WHOLE, TEXT, TRUTH = "a finite number", "a whole number from 0 to 2^63", "text", "true or false"
+LINES = [TEXT]
+
+
+def misfit(content: Any, form: Any, place: str = "") -> str | None:
+    """Where JSON has another form than expected, in words; None where it has not.
+
+    Args:
+        content: as it was read.
+        form: `NUMBER`, `WHOLE`, `TEXT` or `TRUTH`; `[form]` for a list; `{key: form}` for what has these keys, and
+            perhaps others; `{str: form}` for any keys; `Maybe(form)` for null as well; `Among(forms)` for one of them.
+        place: what error messages call the content.
+
+    Example:
+        >>> misfit({"seed": "one"}, {"seed": WHOLE})
+        "seed is 'one', expected a whole number from 0 to 2^63"
+    """
+    if isinstance(form, Maybe):
+        return None if content is None else misfit(content, form.form, place)
+    if isinstance(form, Among):
+        found = [misfit(content, one, place) for one in form.forms]
+        return None if None in found else found[0]
+    if isinstance(form, list):
+        if not isinstance(content, list):
+            return _wrong(content, place, "a list")
+        return _first(misfit(one, form[0], f"{place}[{i}]") for i, one in enumerate(content))
+    if isinstance(form, Mapping):
+        if not isinstance(content, dict):
+            return _wrong(content, place, "names and values")
+        if str in form:
+            return _first(misfit(one, form[str], _inside(place, key)) for key, one in content.items())
+        lacking = [key for key in form if key not in content and not isinstance(form[key], Absent)]
+        if lacking:
+            return f"{place or 'it'} has no {', '.join(lacking)}"
+        return _first(misfit(content[key], inner, _inside(place, key)) for key, inner in form.items() if key in content)
+    if isinstance(form, Absent):
+        return misfit(content, form.form, place)
+    return None if _is(content, form) else _wrong(content, place, form)
+
+
+class Absent(NamedTuple):
+    """A form of what need not be there."""
+
+    form: Any
+
+
+ANYTHING = "anything"
+
+
+def _is(content: Any, form: str) -> bool:
+    if form == ANYTHING:
+        return True
+    if form in (TEXT, TRUTH):
+        return isinstance(content, str if form == TEXT else bool)
+    if isinstance(content, bool) or not isinstance(content, int | float):
+        return False
+    if form == WHOLE:
+        return isinstance(content, int) and 0 <= content < 2**63
+    return abs(content) <= 1e300 if isinstance(content, int) else math.isfinite(content)
+
+
+def _first(problems: Any) -> str | None:
+    return next((problem for problem in problems if problem is not None), None)
+
+
+def _inside(place: str, key: str) -> str:
+    return f"{place}.{key}" if place else key
+
+
+def _wrong(content: Any, place: str, wanted: str) -> str:
+    return f"{place or 'it'} is {shown(repr(content), 40)}, expected {wanted}"
