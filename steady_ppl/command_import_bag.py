@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from steady_ppl.errors import UsageError
+from steady_ppl.errors import UsageError, shown
 
 
 def import_bag(
@@ -36,7 +36,7 @@ def import_bag(
             raise UsageError("name what to take from the bag, by MAPPING.toml or --map; without --out it is listed")
         for path in bags:
             with open_bag(path) as bag:
-                print(listing(bag))
+                print("\n".join(map(shown, listing(bag).split("\n"))))
         return
     if out is None:
         raise UsageError("name the table to write: --out TABLE")
@@ -45,7 +45,7 @@ def import_bag(
     data = read_bags(bags, mapping)
     write_table(data, out)
     rows, many = int(data.lengths.sum()), len(data)
-    print(f"{out}: {many} trajector{'y' if many == 1 else 'ies'}, {rows} rows, {_share(data)}")
+    print(shown(f"{out}: {many} trajector{'y' if many == 1 else 'ies'}, {rows} rows, {_share(data)}"))
 
 
 def _mapping(file: Path | None, maps: list[str], step: float | None) -> Any:
