@@ -233,7 +233,7 @@ def _load_recorded(folder: Path, source: dict[str, str] | None, moved: str | Pat
         file = (folder / name).resolve()
         if not class_name.isidentifier():
             raise ValueError(class_name)
-    except (TypeError, KeyError, ValueError, AttributeError, OSError) as error:
+    except (ValueError, OSError) as error:
         raise RunError(f"{folder / RECORD} is damaged: it does not say which program it is of") from error
     if not file.is_file():
         raise RunError(f"{folder}: its program {name} is gone: name it with --program PATH")

@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 from scipy import special
 
+from steady_ppl.errors import DataError
+
 STRIPS, BINS, BINS_OF_PAIRS = 10, 5, 4
 FEWEST = 8  # residuals in a cell
 LAGS = (0, 1, 2, 5, 10)  # rows
@@ -119,6 +121,9 @@ def judge(
         pairs: names of variables that make a map together.
         unexplained: dispersion that no effect on the mean explains, of every set, the real one first; no band is
             widened by more.
+
+    Raises:
+        DataError: too few residuals to average anywhere.
     """
     both = Residuals(
         real.names,
@@ -131,6 +136,12 @@ def judge(
     for found, average in _all_cells(both, time, controls, pairs):
         cells.append(found)
         averages.append(average)
+    if not cells:
+        rows, drives = real.values.shape[1:3]
+        raise DataError(
+            f"{drives} drives of at most {rows} intervals hold no place, time or regime with enough residuals to "
+            "average: take more drives, or longer ones"
+        )
     average = np.stack(averages, -1)  # (1 + M, cells)
     squares = (both.values**2).sum((1, 2)) / np.maximum(both.there.sum((1, 2)), 1)
     typical = squares[1:].mean(0)

@@ -119,7 +119,8 @@ def from_frame(frame: pd.DataFrame, name: str = "table") -> Trajectories:
         if bad.any():
             row = int(bad.argmax())
             cell = frame[column].iloc[row]
-            came = "an empty cell" if pd.isna(cell) or not str(cell).strip() else f"{str(cell)[:40]!r}"
+            empty = not str(cell).strip() or (pd.api.types.is_scalar(cell) and pd.isna(cell))
+            came = "an empty cell" if empty else f"{str(cell)[:40]!r}"
             wanted = "a finite number" if required[row] else "a finite number or an empty cell"
             _fail(name, f"got {came}, expected {wanted}", column=column, trajectory=row_labels[row], row=row + 1)
         return values
