@@ -22,6 +22,7 @@ from steady_ppl.parameter_draws import (
     about_maximum,
     adapt,
     linearised,
+    own_values,
     resampled,
     weighed,
 )
@@ -67,16 +68,6 @@ def blind(data: Trajectories) -> LogLikelihood:
     return judge
 
 
-def numbers(program: Program) -> Tensor:
-    """The parameters' own values, in the order of the draws."""
-    return torch.cat(
-        [
-            getattr(program, name.removesuffix("_unconstrained")).detach().reshape(-1)
-            for name, _ in program.named_parameters()
-        ]
-    )
-
-
 @torch.no_grad()
 def ranked(seed: int) -> dict:
     """Ranks of a data set's true parameters among draws by either likelihood."""
@@ -88,12 +79,12 @@ def ranked(seed: int) -> dict:
         judges = {"linearised": linearised(data, maximum.path), f"bootstrap {BLIND}": blind(data)}
         values, log_weights = adapt(program, shape, judges["linearised"], VALUES)
         density = weighed(program, values, judges["linearised"]) - log_weights
-        record = {"names": list(maximum.names), "truth": numbers(truth).tolist()}
+        record = {"names": list(maximum.names), "truth": own_values(truth).tolist()}
         for name, judge in judges.items():
             weights = log_weights if name == "linearised" else weighed(program, values, judge) - density
             found = resampled(program, values, weights, DRAWS)
             record[name] = {
-                "ranks": ranks(numbers(truth).numpy(), found.draws.numpy()).tolist(),
+                "ranks": ranks(own_values(truth).numpy(), found.draws.numpy()).tolist(),
                 "tail_index": found.tail_index,
             }
     return record

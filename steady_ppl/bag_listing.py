@@ -22,7 +22,7 @@ def listing(bags: Sequence[Bag]) -> str:
     """Of each bag its topics with type, number of messages, median rate and numeric fields; then a mapping to start
     from, whose sections are comments."""
     lines: list[str] = []
-    sections: dict[str, list[str]] = {}
+    sections: dict[tuple[str, str], list[str]] = {}
     for bag in bags:
         said, found = _of_bag(bag)
         lines += said
@@ -30,8 +30,8 @@ def listing(bags: Sequence[Bag]) -> str:
     return "\n".join(lines + _skeleton(sections))
 
 
-def _of_bag(bag: Bag) -> tuple[list[str], dict[str, list[str]]]:
-    """Its lines, and sections by their columns' names."""
+def _of_bag(bag: Bag) -> tuple[list[str], dict[tuple[str, str], list[str]]]:
+    """Its lines, and sections by topic and field."""
     arrivals: dict[str, list[int]] = {topic: [] for topic in bag.topics}
     first: dict[str, Any] = {}
     for connection, received, raw in bag.raw_messages(bag.topics):
@@ -39,7 +39,7 @@ def _of_bag(bag: Bag) -> tuple[list[str], dict[str, list[str]]]:
         if connection.topic not in first and not bag.undefined(connection.msgtype):
             first[connection.topic] = bag.content(connection, raw)
     lines: list[str] = [f"# {bag.name}"]
-    sections: dict[str, list[str]] = {}
+    sections: dict[tuple[str, str], list[str]] = {}
     for topic in bag.topics:
         types, count = bag.types(topic), len(arrivals[topic])
         rate = _median_rate(arrivals[topic])
@@ -66,27 +66,32 @@ def _wrapped(fields: list[str]) -> Iterator[str]:
         yield f"#     {line}".replace("\0", " ")
 
 
-def _section(topic: str, fields: list[str], stamped: bool) -> dict[str, list[str]]:
-    """The section of a topic's first field that is not its time stamp, by the name of the column; none without one."""
+def _section(topic: str, fields: list[str], stamped: bool) -> dict[tuple[str, str], list[str]]:
+    """What is said of a topic's first field that is not its time stamp, by topic and field; nothing without one."""
     said = [field for field in fields if "stamp." not in field and "[]" not in field and not field.startswith("header")]
     if not said:
         return {}
     field, _, reading = said[0].partition(" ")
     field = field.partition("…")[0].rstrip(".") + ("]" if "…" in field else "")
-    name = "y." + re.sub(r"\W+", "_", f"{topic}_{field}").strip("_")
-    lines = ["#", f'# [columns."{name}"]', f'# topic = "{topic}"', f'# field = "{field}"']
+    lines = [f'# topic = "{topic}"', f'# field = "{field}"']
     if reading:
         lines.append('# as = "yaw"')
     if stamped:
         lines.append('# clock = "aligned"  # its header says when it was made; leave out for the time of arrival')
-    return {name: lines}
+    return {(topic, field): lines}
 
 
-def _skeleton(sections: dict[str, list[str]]) -> list[str]:
-    return [
+def _skeleton(sections: dict[tuple[str, str], list[str]]) -> list[str]:
+    lines = [
         "",
         "# A mapping to start from: take the sections that you need out of the comments and name their columns u.NAME",
         "# (a control), y.NAME (a measurement) or x.NAME (a state that is known).",
         "step = 0.1  # s between two rows",
-        *(line for lines in sections.values() for line in lines),
     ]
+    taken: list[str] = []
+    for (topic, field), said in sections.items():
+        name = re.sub(r"\W+", "_", f"{topic}_{field}").strip("_")
+        again = taken.count(name)  # /a/b with c, and /a with b.c
+        taken.append(name)
+        lines += ["#", f'# [columns."y.{name}{f"_{again + 1}" if again else ""}"]', *said]
+    return lines

@@ -91,7 +91,7 @@ def _stretches(control: Series, last: int) -> list[tuple[int, int]]:
 
 
 def held_pauses(series: Sequence[Series], step: float) -> Iterator[str]:
-    """What is to be said of controls whose last command is held far longer than commands usually last."""
+    """What is to be said of controls that are held, or interpolated, for far longer than commands usually last."""
     measured = [one.times[-1] for one in series if one.column.kind == "y" and len(one.times)]
     for control in series:
         if control.column.kind != "u" or control.column.longest is not None or not measured:
@@ -101,10 +101,10 @@ def held_pauses(series: Sequence[Series], step: float) -> Iterator[str]:
         longest = int(gaps.argmax())
         if gaps[longest] > UNUSUAL * usual:
             after = (control.times[longest] - control.times[0]) / 1e9
+            what = "interpolated over it" if control.column.between == "interpolate" else "held as if it still acted"
             yield (
-                f"no {control.column.topic} for {gaps[longest] / 1e9:.3g} s, {after:.3g} s after its first: its last "
-                f"{control.column.name} is held as if it still acted; `longest = {10 * usual / 1e9:.2g}` would end "
-                "the trajectory there"
+                f"no {control.column.topic} for {gaps[longest] / 1e9:.3g} s, {after:.3g} s after its first: "
+                f"{control.column.name} is {what}; `longest = {10 * usual / 1e9:.2g}` would end the trajectory there"
             )
 
 

@@ -117,7 +117,7 @@ def scored(real: Sequence[Direction], simulated: Sequence[Direction], sets: int)
         others = _fitted((covariance * (sets - 1) - values.T @ away) / (sets - 2), own)
         parts.append(others.split(away, free))
     parameters, rest = (np.stack(part) for part in zip(*parts, strict=True))
-    sd = np.sqrt(fit.left.diagonal()[free])
+    sd = fit.spread(free)
     left = fit.left[np.ix_(free, free)] / np.outer(sd, sd)
     return Scored(
         kinds=[d.kind for d, is_free in zip(real, free, strict=True) if is_free],
@@ -154,8 +154,11 @@ class _Fitted:
         """Scores `(B, J)` of the parameters and, less what those explain, of the `free`, in standard deviations."""
         values = values / self.scale
         own = values[:, self.own]
-        sd = np.sqrt(np.maximum(self.left.diagonal()[free], 1e-3))
-        return own, (values - own @ self.by_own.T)[:, free] / sd
+        return own, (values - own @ self.by_own.T)[:, free] / self.spread(free)
+
+    def spread(self, free: Array) -> Array:
+        """Standard deviations of what is left of the `free` scores; those of fewer sets may leave hardly any."""
+        return np.sqrt(np.maximum(self.left.diagonal()[free], 1e-3))
 
 
 def _fitted(covariance: Array, own: Array) -> _Fitted:

@@ -36,8 +36,8 @@ from steady_ppl.progress import listening
 from steady_ppl.progress_line import progress_line
 
 INTERRUPTED = 130  # what typer returns for Ctrl-C
-COMPLETION = ("install_completion", "show_completion")  # left out of the help, which then fits one screen; as --debug,
-# which the line of an error names
+# left out of the help, which then fits one screen; as --debug, which the line of an unexpected error names
+COMPLETION = ("install_completion", "show_completion")
 EVERYWHERE = {"--debug": "debug", "--quiet": "quiet", "-q": "quiet"}  # before or after the command
 
 

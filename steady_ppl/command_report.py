@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from pathlib import Path
 from typing import Annotated, Any
@@ -80,8 +81,6 @@ def _how(
 ) -> list[str]:
     """How each of the runs, and what was discovered, were made, by which command if one did; the table; the command as
     it was given."""
-    import os
-
     from steady_ppl.run_folder import RECORD, read_record
 
     given: list[tuple[str, Any]] = [

@@ -73,21 +73,6 @@ class ParameterPosterior:
         return arviz.from_dict(posterior={name: draws[None] for name, draws in columns})
 
 
-@dataclass(frozen=True)
-class Proposals:
-    """Values drawn about the posterior's mode.
-
-    Attributes:
-        parts: the learnable numbers.
-        values: `(K, P)` in the unconstrained space.
-        log_density: `(K,)` at which they were drawn, but for a constant.
-    """
-
-    parts: list[Element]
-    values: Tensor
-    log_density: Tensor
-
-
 @torch.no_grad()
 def parameter_posterior(
     program: Program,
@@ -159,12 +144,13 @@ def about_maximum(program: Program, data: Trajectories, path: Path, known_start:
 
 def adapt(program: Program, shape: Shape, judge: LogLikelihood, count: int) -> tuple[Tensor, Tensor]:
     """Values of the last round, `(K, P)`, and their log weights, `(K,)`."""
+    values, log_weights = torch.empty(0), torch.empty(0)
     with stages(*(("", share) for share in ROUNDS)) as begin:
         for share in ROUNDS:
             begin()
+            shape = _shaped(shape, values, log_weights) if len(values) else shape
             values, density = shape.draws(round(share * count))
             log_weights = weighed(program, values, judge) - density
-            shape = _shaped(shape, values, log_weights)
     return values, log_weights
 
 
@@ -172,7 +158,7 @@ def _shaped(shape: Shape, values: Tensor, log_weights: Tensor) -> Shape:
     """The moments of weighed values; weights are tempered until enough of the values count."""
     enough = min(ENOUGH * values.shape[1], int(torch.isfinite(log_weights).sum()) / 2)
     power = 1.0
-    while (weights := _normalised(power * log_weights)).square().sum().reciprocal() < enough:
+    while (weights := (power * log_weights).softmax(0)).square().sum().reciprocal() < enough:
         power *= 0.8
     centre = weights @ values
     apart = values - centre
@@ -207,10 +193,6 @@ def linearised(data: Trajectories, path: Path, known_start: bool = False) -> Log
     return judge
 
 
-def _normalised(log_weights: Tensor) -> Tensor:
-    return torch.nan_to_num(log_weights, nan=-torch.inf).softmax(0)
-
-
 def weighed(program: Program, values: Tensor, judge: LogLikelihood) -> Tensor:
     """log p(y) and log prior of values `(K, P)`, `(K,)`: minus infinity where the program blows up.
 
@@ -229,7 +211,7 @@ def weighed(program: Program, values: Tensor, judge: LogLikelihood) -> Tensor:
             except FilterError:
                 continue
     set_values(parts, before)
-    found = torch.where(torch.isnan(found), -torch.inf, found)
+    found = torch.where(torch.isfinite(found), found, -torch.inf)
     if not bool(torch.isfinite(found).any()):
         raise FilterError("at none of the parameters' values can these drives be smoothed")
     return found
@@ -247,22 +229,25 @@ def resampled(program: Program, values: Tensor, log_weights: Tensor, draws: int)
     before, rows = values_of(parts), []
     for each in chosen:
         set_values(parts, each)
-        rows.append(torch.stack([_own_value(program, part) for part in parts]))
+        rows.append(own_values(program))
     set_values(parts, before)
     return ParameterPosterior(tuple(part.name for part in parts), torch.stack(rows), float(tail))
 
 
-def _own_value(program: Program, part: Element) -> Tensor:
-    """A learnable number in its own units."""
-    return attrgetter(part.name.split("[")[0])(program).detach().view(-1)[part.index].double()
+def own_values(program: Program) -> Tensor:
+    """All learnable numbers, `(P,)`, in their own units."""
+    parts = elements(program)
+    tensors = [attrgetter(part.name.split("[")[0])(program).detach() for part in parts]
+    return torch.stack([values.view(-1)[part.index].double() for values, part in zip(tensors, parts, strict=True)])
 
 
 def _log_prior(program: Program) -> float:
     """Of the parameters' own values, with what makes it a density in the space in which they are learned."""
     total = log_prior(program)
-    for name, (constraint, _) in program._pyro_params.items():
-        free = getattr(program, f"{name}_unconstrained")
-        if free.requires_grad:
-            transform = transform_to(constraint)
-            total += float(transform.log_abs_det_jacobian(free, transform(free)).sum())
+    for module in program.modules():
+        for name, (constraint, _) in getattr(module, "_pyro_params", {}).items():
+            free = getattr(module, f"{name}_unconstrained")
+            if free.requires_grad:
+                transform = transform_to(constraint)
+                total += float(transform.log_abs_det_jacobian(free, transform(free)).sum())
     return total

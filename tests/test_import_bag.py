@@ -251,15 +251,28 @@ def test_the_list_of_several_bags_is_one_mapping(tmp_path: Path, capsys) -> None
     assert tomllib.loads(out) == {"step": 0.1} and out.count('"y.cmd_vel_linear_x"') == 1
 
 
+def test_topics_that_spell_alike_are_columns_of_their_own(tmp_path: Path, capsys) -> None:
+    bag = write_bag(tmp_path / "drive", "mcap", values([(0.0, 1.0)], "/a/b") + values([(0.0, 1.0)], "/a_b"))
+    assert steady("import-bag", bag) == 0
+    sections = capsys.readouterr().out.partition("step = 0.1")[2]
+    mapping = tomllib.loads("step = 0.1" + re.sub("^# ?", "", sections, flags=re.MULTILINE))
+    assert {name: said["topic"] for name, said in mapping["columns"].items()} == {
+        "y.a_b_data": "/a/b",
+        "y.a_b_data_2": "/a_b",
+    }
+
+
 def test_a_pause_over_which_a_command_is_held_is_said(tmp_path: Path, capsys) -> None:
     controls = [(at / 10, 1.0) for at in (*range(20), *range(600, 620))]
     bag = write_bag(tmp_path / "drive", "mcap", values(controls, "/u") + values([(at / 10, 0.0) for at in range(625)]))
     options = ("--map", "u.b=/u:data", "--map", "y.a=/y:data", "--step", 0.1, "--out", tmp_path / "drive.csv")
     assert steady("import-bag", bag, *options) == 0
-    assert "no /u for 58.1 s, 1.9 s after its first: its last u.b is held as if" in capsys.readouterr().err
+    assert "no /u for 58.1 s, 1.9 s after its first: u.b is held as if" in capsys.readouterr().err
     said: list[str] = []
     data = taken(bag, BagColumn("u.b", "/u", "data", longest=1.0), Y, say=said.append)
     assert len(data) == 2 and not any("is held" in line for line in said)
+    taken(bag, BagColumn("u.b", "/u", "data", between="interpolate"), Y, say=said.append)
+    assert any("u.b is interpolated over it" in line for line in said)
 
 
 def test_the_mapping_that_the_how_to_shows_is_one() -> None:

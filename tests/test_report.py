@@ -1,26 +1,19 @@
-"""The report: what it says, that it is whole and harmless, and what a browser makes of it."""
+"""The report: what it says, and that it is whole and harmless."""
 
 from __future__ import annotations
 
 import base64
 import json
-import re
 import shutil
-import signal
-import subprocess
 from dataclasses import replace
-from html import unescape
-from html.parser import HTMLParser
-from os import environ, killpg
 from pathlib import Path
 
 import numpy as np
-import pyro
-import pyro.distributions as dist
 import pytest
 import torch
 from examples import example
 from markupsafe import escape
+from report_pages import EVIL, FOUND, Elements, content, content_of, six_drives, two_run_report, two_runs
 from small import simulated, steady
 
 import steady_ppl as st
@@ -31,80 +24,22 @@ from steady_ppl.reporting.packing import packed
 from steady_ppl.reporting.program_page import _equation
 from steady_ppl.reporting.writing import said, spread
 
-EVIL = "</script><script>window.broken = 1</script>"
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
-in_a_browser = pytest.mark.skipif(BROWSER is None, reason="there is no chromium: apt-get install chromium")
 MOST = 6_000_000  # bytes
-FOUND = {
-    "sentence": "The dynamics lack yaw_linear_drag = 0.05 1/s.",
-    "doubts": [],
-    "effects": [
-        {
-            "effect": "yaw_linear_drag",
-            "kind": "dynamics",
-            "class": ["yaw_linear_drag", EVIL],
-            "confidence": 0.97,
-            "coefficient": [0.05],
-            "interval_90": [[0.04, 0.06]],
-            "unit": "1/s",
-            "text": "a_yaw = -c w",
-            "heldout_gain": 12.0,
-        }
-    ],
-    "candidates": [
-        {
-            "effect": "yaw_linear_drag",
-            "kind": "dynamics",
-            "p_value": 1e-9,
-            "coefficient": 0.05,
-            "sd": 0.005,
-            "absent": 0.0,
-            "unit": "1/s",
-            "detection_limit": 0.02,
-            "heldout_gain": 12.0,
-            "heldout_gain_ci": [8.0, 16.0],
-            "note": None,
-        }
-    ],
-    "shape": None,
-    "next_run": None,
-    "notes": ["a note"],
-}
 
 
-class Elements(HTMLParser):
-    """Tags and attributes of a page, and its identifiers."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict]] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-
-    def of(self, name: str) -> list[str]:
-        return [attributes[name] for _, attributes in self.tags if attributes.get(name)]
+@pytest.fixture(scope="module", name="runs")
+def _runs() -> dict[str, st.Fit]:
+    return two_runs()
 
 
-def fit(name: str) -> st.Fit:
-    return st.Fit(example(name, torch.float32).requires_grad_(False), "hand", known_start=True)
+@pytest.fixture(scope="module", name="data")
+def _data() -> st.Trajectories:
+    return six_drives()
 
 
 @pytest.fixture(scope="module")
-def runs() -> dict[str, st.Fit]:
-    return {"before": fit("hovercraft"), "after": fit("hovercraft.py:HovercraftTruth")}
-
-
-@pytest.fixture(scope="module")
-def data() -> st.Trajectories:
-    table = simulated(trajectories=6, rows=101)
-    return replace(table, labels=("1", "2", EVIL, "4", "5", "6"))
-
-
-@pytest.fixture(scope="module")
-def found(runs, data) -> st.Report:
-    return st.report(runs, data, discovery=FOUND, simulations=20, draws=5, how=["steady report before after"])
+def found() -> st.Report:
+    return two_run_report()
 
 
 @pytest.fixture(scope="module")
@@ -112,15 +47,6 @@ def page(found, tmp_path_factory) -> Path:
     file = tmp_path_factory.mktemp("report") / "report.html"
     found.write(file)
     return file
-
-
-def content(page: Path) -> dict:
-    return content_of(page.read_text())
-
-
-def content_of(html: str) -> dict:
-    (text,) = re.findall(r'<script id="data" type="application/json">(.*?)</script>', html, re.DOTALL)
-    return json.loads(text, parse_constant=lambda name: pytest.fail(name))
 
 
 def unpacked(part: dict) -> np.ndarray:
@@ -339,229 +265,3 @@ def test_what_was_discovered_is_among_what_is_to_be_repeated(work: Path, tmp_pat
     assert steady("report", work / "hand", table, *asked) == 0
     text = page.read_text()
     assert text.index("steady fit ") < text.index(record["command"]) < text.index(f"steady report {work / 'hand'}")
-
-
-class Motor(st.Program):
-    """One state, one channel."""
-
-    states = ("speed [rad/s]",)
-    controls = ("voltage [V]",)
-    measurements = ("speed [rad/s]",)
-    channels = ("torque [rad/s²]",)
-    motion = {"torque": ("", "speed")}
-
-    def initial(self):
-        return pyro.sample("start", dist.Normal(torch.zeros(1), torch.ones(1)).to_event(1))
-
-    def transition(self, state, control, time, step):
-        return state + step[..., None] * pyro.sample("torque", dist.Normal(control - state, 0.2).to_event(1))
-
-    def observe(self, state):
-        pyro.sample("speed", dist.Normal(state, 0.1).to_event(1))
-
-
-# --- in a browser -----------------------------------------------------------------------------------------------------
-def opened(page: Path, *options: str, anchor: str = "") -> tuple[str, str]:
-    """What a headless browser prints on stdout and stderr; its whole process group is ended with it."""
-    assert BROWSER is not None
-    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--enable-logging=stderr"]
-    command += ["--virtual-time-budget=8000", f"--user-data-dir={page.parent / 'profile'}", *options]
-    process = subprocess.Popen(
-        [*command, f"file://{page}{anchor}"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    try:
-        return process.communicate(timeout=120)
-    finally:
-        if process.poll() is None:
-            killpg(process.pid, signal.SIGKILL)
-            process.wait()
-
-
-def with_script(page: Path, script: str, name: str) -> Path:
-    """The page with another script at its end."""
-    file = page.with_name(name)
-    file.write_text(page.read_text().replace("</body>", f"<script>{script}</script></body>"))
-    return file
-
-
-@in_a_browser
-def test_a_browser_draws_it_without_an_error(page):
-    wide = ("--window-size=1280,9000", "--dump-dom")
-    dom, log = opened(page, *wide)
-    assert "CONSOLE" not in log, log
-    assert dom.count('class="main-svg"') >= 8
-    assert not re.search(r"window\.broken = 1</script>", dom.split('id="data"')[0])
-    assert '<option value="2">' in dom and dom.count("<option") > 8
-
-
-@in_a_browser
-def test_a_link_shows_its_drive_and_seconds(page):
-    dom, log = opened(page, "--dump-dom", "--window-size=1280,2000", anchor="#run=0&drive=3&from=1&to=2.5")
-    assert "CONSOLE" not in log, log
-    assert 'role="status">before, drive 4, 1.0 to 2.5 s<' in dom
-    dom, _ = opened(page, "--dump-dom", anchor="#run=99&drive=-7&from=x&to=y")
-    assert 'role="status">after, drive 1, all seconds<' in dom
-
-
-@in_a_browser
-def test_clicking_a_place_shows_its_seconds(page):
-    click = """
-    const place = (id) => document.getElementById(id), said = [];
-    const click = (id, point) => { place(id).emit("plotly_click", { points: [point] }); said.push(location.hash); };
-    setTimeout(() => window.dispatchEvent(new Event("beforeprint")), 1000);  // draws everything
-    setTimeout(() => {
-      click("strips", { pointIndex: [1, 0], y: "2" });
-      click("map", { customdata: [4, 2.0] });
-      click("regimes", { pointIndex: [0, 0] });
-      document.title = said.join(" | ");
-    }, 4000);
-    """
-    dom, log = opened(with_script(page, click, "click.html"), "--dump-dom", "--window-size=1280,9000")
-    assert "CONSOLE" not in log, log
-    title = re.findall("<title>(.*?)</title>", dom)[0]
-    first, second, third = title.replace("&amp;", "&").split(" | ")
-    assert first.startswith("#run=1&drive=1&from=0.00")
-    assert second == "#run=1&drive=4&from=1.00&to=3.00"
-    assert third.startswith("#run=1&drive=") and third != second
-
-
-def lines_of(page: Path, script: str, name: str, *options: str, anchor: str = "") -> list[str]:
-    """What a script in the page puts into its title, and no word on the console."""
-    dom, log = opened(with_script(page, script, name), "--dump-dom", *options, anchor=anchor)
-    assert "CONSOLE" not in log, log
-    return unescape(re.findall("<title>(.*?)</title>", dom)[0]).split(" | ")
-
-
-@in_a_browser
-def test_in_a_notebooks_frame_it_answers_as_well(page):
-    script = """
-    setTimeout(() => {
-      const select = document.getElementById("drive");
-      select.value = "1";
-      select.dispatchEvent(new Event("change"));
-      setTimeout(() => { parent.document.title = document.getElementById("place").textContent; }, 500);
-    }, 1000);
-    """
-    inside = with_script(page, script, "inside.html").read_text()
-    notebook = page.with_name("notebook.html")
-    notebook.write_text(f'<title>nothing</title><iframe srcdoc="{escape(inside)}"></iframe>')
-    dom, log = opened(notebook, "--dump-dom")
-    assert "CONSOLE" not in log, log
-    assert "<title>after, drive 2, all seconds</title>" in dom
-
-
-@in_a_browser
-def test_every_place_of_the_maps_is_a_link_as_well(page):
-    script = """
-    for (const id of ["strips-list", "regimes-list"]) document.getElementById(id).open = true;
-    setTimeout(() => {
-      const links = (id) => [...document.querySelectorAll(`#${id} a`)];
-      const said = ["strips-list", "regimes-list"].map((id) => links(id).length);
-      links("strips-list")[1].click();
-      setTimeout(() => { document.title = [...said, location.hash, document.activeElement.id].join(" | "); }, 500);
-    }, 1000);
-    """
-    strips, regimes, place, focused = lines_of(page, script, "lists.html")
-    shown = content(page)["runs"][1]
-    assert int(strips) == 6 * (len(shown["strips"]["edges"]) - 1)
-    assert int(regimes) == len(shown["regimes"]["cells"])
-    assert place.startswith("#run=1&drive=0&from=") and focused == "h-drives"
-
-
-@in_a_browser
-def test_a_link_that_was_followed_can_be_followed_again(page):
-    script = """
-    const link = document.createElement("a");
-    link.href = "#run=0&drive=3&from=1.00&to=2.00";
-    document.body.append(link);
-    const place = () => document.getElementById("place").textContent, said = [];
-    const box = document.getElementById("drive");
-    const steps = [() => link.click(), () => { box.value = 1; box.onchange(); }, () => link.click()];
-    steps.forEach((step, i) => setTimeout(() => { step(); setTimeout(() => said.push(place()), 200); }, 500 * i + 500));
-    setTimeout(() => { document.title = said.join(" | "); }, 3000);
-    """
-    first, chosen_by_hand, again = lines_of(page, script, "again.html")
-    assert first == again == "before, drive 4, 1.0 to 2.0 s" and chosen_by_hand == "before, drive 2, all seconds"
-
-
-@in_a_browser
-def test_addresses_that_are_nonsense_show_what_is_nearest(page):
-    for anchor, shown in (
-        ("#run=99&drive=99&from=500&to=600", "after, drive 6, all seconds"),
-        ("#run=0&drive=0&from=5&to=1e9", "before, drive 1, 5.0 to 10.0 s"),
-        ("#run=0&drive=0&from=-50&to=-40", "before, drive 1, all seconds"),
-    ):
-        dom, log = opened(page, "--dump-dom", anchor=anchor)
-        assert "CONSOLE" not in log and f'role="status">{shown}<' in dom, anchor
-
-
-@in_a_browser
-def test_the_keyboard_meets_no_tools_and_every_picture_has_a_name(page):
-    script = """
-    setTimeout(() => window.dispatchEvent(new Event("beforeprint")), 500);
-    setTimeout(() => {
-      const pictures = [...document.querySelectorAll('[role="img"]')];
-      const tools = document.querySelectorAll(".modebar-btn").length;
-      const unnamed = pictures.filter((one) => !one.getAttribute("aria-label")).length;
-      document.title = [tools, pictures.length, unnamed].join(" | ");
-    }, 4000);
-    """
-    tools, pictures, unnamed = lines_of(page, script, "names.html", "--window-size=1280,9000")
-    assert (tools, unnamed) == ("0", "0") and int(pictures) == 9
-
-
-@in_a_browser
-def test_paper_is_as_wide_as_what_is_drawn_on_it(page, tmp_path):
-    script = """
-    window.dispatchEvent(new Event("beforeprint"));
-    const said = [];
-    setTimeout(() => {
-      said.push([...document.querySelectorAll(".js-plotly-plot")].filter((one) => one.layout.width !== 680).length);
-      said.push(document.querySelectorAll("#program details:not([open])").length);
-      window.dispatchEvent(new Event("afterprint"));
-    }, 3000);
-    setTimeout(() => {
-      said.push([...document.querySelectorAll(".js-plotly-plot")].filter((one) => one.layout.width === 680).length);
-      said.push(document.querySelectorAll("#program details[open]").length);
-      document.title = said.join(" | ");
-    }, 5000);
-    """
-    assert lines_of(page, script, "paper.html", "--window-size=1280,3000") == ["0", "0", "0", "0"]
-    opened(page, f"--print-to-pdf={tmp_path / 'report.pdf'}")
-    assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
-
-
-@in_a_browser
-def test_a_phone_need_not_scroll_sideways(page):
-    script = "setTimeout(() => { document.title = document.documentElement.scrollWidth; }, 3000);"
-    frame = page.with_name("frame.html")
-    file = with_script(page, script.replace("document.title", "parent.document.title"), "inner.html")
-    frame.write_text(f'<title></title><iframe src="{file.name}" style="width:390px;height:800px;border:0"></iframe>')
-    dom, _ = opened(frame, "--dump-dom", "--allow-file-access-from-files", "--window-size=1280,900")
-    assert int(re.findall("<title>(.*?)</title>", dom)[0]) == 390
-
-
-@in_a_browser
-def test_a_system_of_one_state_is_drawn(tmp_path):
-    program = Motor()
-    program.duration = 6.0
-    with st.seeded(0):
-        table = st.simulate(program, 6, seed=0)
-    file = tmp_path / "motor.html"
-    st.report({"motor": st.Fit(program, "hand")}, table, simulations=20, draws=5).write(file)
-    dom, log = opened(file, "--dump-dom", "--window-size=1280,9000")
-    assert "CONSOLE" not in log and "could not be drawn" not in dom.split("<script")[0], log
-    assert "One state alone has no plane" in dom.split("<script")[0]
-
-
-@in_a_browser
-def test_a_screenshot_is_kept(page):
-    kept = Path(environ.get("OUT", Path(__file__).parents[1] / "out")) / "report.png"
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    kept.unlink(missing_ok=True)
-    opened(page, "--window-size=1280,6000", f"--screenshot={kept}")
-    assert kept.read_bytes().startswith(b"\x89PNG") and kept.stat().st_size > 100_000

@@ -9,7 +9,7 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
-from test_report import FOUND, Elements, content, in_a_browser, opened, with_script
+from report_pages import FOUND, Elements, content, in_a_browser, opened, with_script
 
 import steady_ppl as st
 
