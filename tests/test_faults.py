@@ -166,7 +166,11 @@ def test_twenty_random_kills_change_nothing(desk: Path, name: str) -> None:
     whole, random = float((desk / f"{name}.seconds").read_text()), np.random.default_rng(20)
     caught = 0
     for trial in range(20):
-        caught += killed_and_resumed(desk, name, f"{name}_{trial}", [float(random.uniform(0.3, 1.0)) * whole])
+        began = time.perf_counter()
+        was_caught = killed_and_resumed(desk, name, f"{name}_{trial}", [float(random.uniform(0.3, 1.0)) * whole])
+        if not was_caught:  # it ended first: the machine is less busy than when it was timed
+            whole = min(whole, time.perf_counter() - began)
+        caught += was_caught
         same_results(desk, name, f"{name}_{trial}")
     assert caught >= 10
 
