@@ -24,6 +24,7 @@ from steady_ppl.errors import DataError
 STRIPS, BINS, BINS_OF_PAIRS = 10, 5, 4
 FEWEST = 8  # residuals in a cell
 LAGS = (0, 1, 2, 5, 10)  # rows
+SHARE = 0.5  # of the simulated sets that must have a cell, too
 LEVEL = 0.05
 
 Array = np.ndarray[Any, Any]
@@ -220,26 +221,30 @@ def _all_cells(
         yield from _sums(data, "time", strip, strips)
         both = [drive | when for drive in each for when in strips]
         yield from _sums(data, "drive and time", drives * len(strips) + strip, both)
-    sorted_by = {name: np.broadcast_to(value, data.there.shape[:-1]) for name, value in controls.items()}
-    sorted_by |= data.variables
+    sorted_by = {name: value[None] for name, value in controls.items()} | data.variables
     for name, values in sorted_by.items():
         labels, ranges = _binned(values, inside, BINS)
-        if len(ranges) > 1:
+        if ranges:
             yield from _sums(data, "regime", labels, [{name: between} for between in ranges])
     for first, second in pairs:
         (one, ranges), (other, across) = (_binned(sorted_by[name], inside, BINS_OF_PAIRS) for name in (first, second))
-        if len(ranges) > 1 and len(across) > 1:
+        if ranges and across:
             where = [{first: a, second: b} for a in ranges for b in across]
             yield from _sums(data, "pair", one * len(across) + other, where)
     yield from _correlations(data, inside, controls)
 
 
 def _binned(values: Array, inside: Array, bins: int) -> tuple[Array, list[tuple[float, float]]]:
-    """Numbers of the ranges that hold equally many of the first set's values, and the ranges."""
-    known = values[0][inside]
-    edges = np.unique(np.quantile(known, np.linspace(0, 1, bins + 1)).astype(known.dtype))
-    ranges = [(float(a), float(b)) for a, b in itertools.pairwise(edges)]
-    return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(ranges) - 1, 0)), ranges
+    """Numbers of the ranges that hold equally many of a set's values, `(1 + M, T, B)`, and the first set's ranges, none
+    where its values are all the same.
+
+    Every set has ranges of its own: a single drive dwells in the ranges that its own values make and would pass through
+    those of another, so that averages in them would scatter less.
+    """
+    edges = np.quantile(values[:, inside], np.linspace(0, 1, bins + 1), axis=1).astype(values.dtype)
+    labels = sum(values >= edge[:, None, None] for edge in edges[1:-1])
+    ranges = [(float(a), float(b)) for a, b in itertools.pairwise(edges[:, 0])]
+    return np.asarray(labels), ranges if edges[0, 0] < edges[-1, 0] else []
 
 
 def _sums(data: Residuals, kind: str, labels: Array, where: list[dict[str, Any]]) -> Iterator[tuple[Cell, Array]]:
@@ -251,10 +256,11 @@ def _sums(data: Residuals, kind: str, labels: Array, where: list[dict[str, Any]]
         at = index[there]
         count = np.bincount(at, minlength=size).reshape(sets, -1)
         total = np.bincount(at, data.values[..., residual][there], minlength=size).reshape(sets, -1)
-        average = np.where(count > 0, total / np.sqrt(np.maximum(count, 1)), np.nan)
+        enough = count >= FEWEST
+        average = np.where(enough, total / np.sqrt(np.maximum(count, 1)), np.nan)
         mean = _means(data, residual, index[0], count[0])
         for cell, place in enumerate(where):
-            if count[0, cell] >= FEWEST and (count[1:, cell] > 0).mean() > 0.8:
+            if enough[0, cell] and enough[1:, cell].mean() > SHARE:
                 yield Cell(kind, residual, place, int(count[0, cell]), mean[cell] if mean else None), average[:, cell]
 
 
