@@ -28,6 +28,7 @@ import calibration_evidence as evidence  # noqa: E402
 import calibration_parameters as parameters  # noqa: E402
 import calibration_states as states  # noqa: E402
 from calibration_tables import tables  # noqa: E402
+from calibration_variational import FAMILIES  # noqa: E402
 from resumable import Record, digest, run  # noqa: E402
 
 import steady_ppl  # noqa: E402
@@ -52,10 +53,12 @@ class Size:
     clean: int
     single: int
     problems: tuple[str, ...] = states.STATES
+    guides: tuple[str, ...] = tuple(states.GUIDES)
 
 
+QUICK_GUIDES = tuple(guide for guide in states.GUIDES if guide not in FAMILIES)  # SVI's are trained, a minute each
 FULL = Size(drives=states.DRIVES, runs=evidence.COUNT, data_sets=200, clean=60, single=52)
-QUICK = Size(drives=200, runs=200, data_sets=4, clean=1, single=1, problems=("cart", "pendulum"))
+QUICK = Size(drives=200, runs=200, data_sets=4, clean=1, single=1, problems=("cart", "pendulum"), guides=QUICK_GUIDES)
 
 
 def work(kind: str, *arguments: Any) -> Record:
@@ -66,10 +69,15 @@ def work(kind: str, *arguments: Any) -> Record:
 def jobs(size: Size) -> dict[str, tuple[Any, ...]]:
     """The arguments of every job, by its name."""
     every: list[tuple[Any, ...]] = [
-        ("states", problem, guide, size.drives) for problem in size.problems for guide in states.GUIDES
+        ("states", problem, guide, size.drives) for problem in size.problems for guide in size.guides
     ]
-    every += [("nuts", problem, guide) for problem in size.problems if problem != "cart" for guide in states.GUIDES]
-    every += [("evidence", problem, which, size.runs) for problem in size.problems for which in evidence.FILTERS]
+    every += [("nuts", problem, guide) for problem in size.problems if problem != "cart" for guide in size.guides]
+    every += [
+        ("evidence", problem, which, size.runs)
+        for problem in size.problems
+        for which in evidence.ESTIMATORS
+        if which in size.guides
+    ]
     every += [("parameters", seed) for seed in range(1, size.data_sets + 1)]
     every += [("discovery", "clean", index) for index in range(size.clean)]
     every += [("discovery", "single", index) for index in range(size.single)]

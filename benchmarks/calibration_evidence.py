@@ -3,7 +3,7 @@
 A particle filter's estimate of p(y), not of its logarithm, is unbiased with any number of particles (Del Moral 2004,
 section 7.4.1). The cart's exact value is that of its linearisation, which is the cart itself. The other programs have
 none: there the estimates are held against those of the filter that looks ahead with 4,000 particles, the least
-scattered.
+scattered. SVI's guides estimate p(y) by importance sampling, a draw at a time.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from functools import cache
 
 import torch
 from calibration_states import problem
+from calibration_variational import FAMILIES, log_weights
 from references import runs
 from torch import Tensor
 
@@ -25,7 +26,9 @@ FILTERS = {
     "lookahead 100": (100, True),
     "lookahead 1000": (1000, True),
 }
+ESTIMATORS = (*FILTERS, *FAMILIES)
 FINE, COUNT = 4000, 1000
+DRAWS_A_RUN = 20  # of SVI's guides, whose draws cost less than a filter's run
 
 
 @cache
@@ -57,7 +60,7 @@ def mean_and_error(log_values: Tensor, about: float) -> tuple[float, float]:
 
 
 def unbiased(name: str, which: str, count: int = COUNT) -> dict:
-    """A filter's mean p(y) over the exact or the finest, and how many standard errors it is off."""
+    """An estimator's mean p(y) over the exact or the finest, and how many standard errors it is off."""
     torch.set_num_threads(1)
     program, data = drive(name)
     linear = float(find_and_smooth(program, data).log_likelihood)
@@ -66,7 +69,11 @@ def unbiased(name: str, which: str, count: int = COUNT) -> dict:
         fine = estimates(name, FINE, True, max(8, count // 10))
         about = float(fine.logsumexp(0)) - math.log(len(fine))
         error = mean_and_error(fine, about)[1]
-    found = estimates(name, *FILTERS[which], count)
+    if which in FAMILIES:
+        with seeded("evidence", which):
+            found = log_weights(program, FAMILIES[which], data, DRAWS_A_RUN * count)
+    else:
+        found = estimates(name, *FILTERS[which], count)
     ratio, own = mean_and_error(found, about)
     return {
         "ratio": ratio,

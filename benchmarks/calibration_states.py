@@ -2,15 +2,17 @@
 
 The programs are those of `tests/reference`, of which NUTS knows one drive each, and the linear cart. Every drive has
 its own start, noise and measurements; guides see the program that made them and draw 99 paths of each, as an E step
-does.
+does. SVI's are trained on the drives first.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
+from calibration_variational import FAMILIES, Variational
 from examples import drives, example
 from references import PROBLEMS, errors_off, reference, runs
 from uniformity import inside, ranks, together, uniform
@@ -48,12 +50,13 @@ def gaussian(program: Program) -> PathGuide:
     return GaussianGuide(program, draws=DRAWS, tempering=ENDED)
 
 
-GUIDES: dict[str, Callable[[Program], PathGuide]] = {
+GUIDES: dict[str, Callable[[Program], PathGuide | Variational]] = {
     "bootstrap 200": bootstrap(200),
     "bootstrap 4000": bootstrap(4000),
     "lookahead 100": lookahead(100),
     "lookahead 1000": lookahead(1000),
     "gaussian": gaussian,
+    **{name: partial(Variational, family=family, draws=DRAWS) for name, family in FAMILIES.items()},
 }
 STATES = ("cart", *PROBLEMS)
 

@@ -16,7 +16,7 @@ from steady_ppl.checkpoint import read_tensors
 from steady_ppl.commanded import command_line
 from steady_ppl.errors import RunError
 from steady_ppl.given_files import misfit, read_json, require_file
-from steady_ppl.run_forms import BEGUN_RECORD, FINISHED, FINISHED_RECORD, FOUND
+from steady_ppl.run_forms import BEGUN_RECORD, FINISHED, FINISHED_RECORD, FORMAT, FOUND
 from steady_ppl.whole_file import whole_file
 
 PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY = (
@@ -156,7 +156,7 @@ def _remove_journal(folder: Path) -> None:
 def write_record(folder: Path, record: dict[str, Any]) -> None:
     """Write `run.json`, whole or not at all."""
     with whole_file(folder / RECORD, RunError) as beside:
-        beside.write_text(json.dumps({"command": command_line(), **record}, indent=1) + "\n")
+        beside.write_text(json.dumps({"format": FORMAT, "command": command_line(), **record}, indent=1) + "\n")
 
 
 def require_same(folder: Path, begun: Mapping[str, Any]) -> None:
@@ -183,12 +183,18 @@ def read_record(folder: Path) -> dict[str, Any]:
     """Read `run.json`.
 
     Raises:
-        RunError: there is none, or it is damaged.
+        RunError: there is none, it is damaged, or a newer steady-ppl wrote it.
     """
     try:
         record = read_json(folder / RECORD, RunError)
     except (FileNotFoundError, NotADirectoryError):
         raise RunError(f"{folder} is not a run: it has no {RECORD}") from None
+    form = record.get("format", FORMAT) if isinstance(record, dict) else FORMAT
+    if isinstance(form, int) and form > FORMAT:
+        raise RunError(
+            f"{folder} was written by a newer steady-ppl: its form is number {form}, this one reads up to {FORMAT}; "
+            "install that version or a later one to read it"
+        )
     problem = misfit(record, BEGUN_RECORD)
     if problem is None and record["status"] in FINISHED:
         problem = misfit(record, FINISHED_RECORD)

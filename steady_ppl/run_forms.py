@@ -6,7 +6,11 @@ from steady_ppl.given_files import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, 
 
 FINISHED = ("finished", "interrupted")  # what the record of a run that can be used says
 
+FORMAT = 1
+"""Number of the form of a run folder, in `run.json`; a change that this reader could not read raises it."""
+
 BEGUN_RECORD = {
+    "format": Absent(WHOLE),
     "program": Maybe({"class": TEXT, "file": TEXT, "sha256": TEXT}),
     "recipe": TEXT,
     "status": TEXT,

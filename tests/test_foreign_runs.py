@@ -58,6 +58,19 @@ def commands(run: Path, table: Path, out: Path) -> list[tuple]:
     ]
 
 
+def test_a_run_of_a_newer_version_says_so_to_every_command(run, tmp_path, capsys):
+    table = tmp_path / "train.csv"
+    assert json.loads((run / "run.json").read_text())["format"] == 1
+    rerecorded(run, format=2, status=["what it would be then"])
+    every = [*commands(run, table, tmp_path), ("fit", HOVERCRAFT, table, "--out", run, "--resume")]
+    (run / "checkpoint.safetensors").touch()
+    for command in every:
+        assert steady(*command) == 2
+        said = capsys.readouterr().err
+        assert "newer steady-ppl" in said and "number 2" in said and "up to 1" in said, command
+    assert not list(tmp_path.glob("*.html")) and not list(tmp_path.glob("added.py"))
+
+
 @pytest.mark.parametrize("place", ["run/mine.py", "run/deep/mine.py", "other/mine.py"])
 def test_no_command_executes_a_program_that_came_with_a_run(tmp_path: Path, capsys, run: Path, place: str) -> None:
     mark, file = tmp_path / "executed", payload(tmp_path / place, tmp_path / "executed")
