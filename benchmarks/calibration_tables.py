@@ -95,8 +95,8 @@ def _nuts(records: Sequence[Record], musts: Musts) -> str:
 def _evidence(records: Sequence[Record], musts: Musts) -> str:
     lines = [
         f"**p(y)**, the mean of {records[0]['of'][-1]} runs (SVI: of twenty times as many draws) over the exact value "
-        "(of the cart) or the finest filter's; beside it how far log p(y) of the linearised program, which the Gaussian "
-        "guide goes by, is off.",
+        "(of the cart) or the finest filter's; beside it how far log p(y) of the linearised program is off, which the "
+        "Gaussian guide goes by.",
         "",
         "| program | filter | mean ratio | standard errors | sd of log p(y), nats | linearised, nats |",
         "|---|---|---|---|---|---|",
