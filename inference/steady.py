@@ -24,6 +24,7 @@ from steady_ppl import (
     train,
     why_not_linear,
 )
+from steady_ppl.paths import few_starts
 
 # What the paper and its authors' code use, best with AuthorsHovercraft or AuthorsTruck; hours on two cores:
 # steady.fit(program, table, valid, **PAPER). They kept the single best validation, by a bootstrap of 100,000 particles
@@ -131,10 +132,9 @@ def fit(
     trained = train(program, e_step, data, validation, optimization, known_start=known_start, seed=seed, **run)
     if e_step.in_plain_torch:
         notes.append(f"the E steps ran in plain torch, without compiled kernels: {e_step.in_plain_torch}")
-    roots = trained.history[-1].get("roots", math.inf) if trained.history else math.inf
-    if roots < 10:
-        advice = ", or try guide=lookahead" if guide == "bootstrap" else ""
-        notes.append(f"of the particles' starts {roots:.0f} survive a drive: raise particles{advice}")
+    scarce = few_starts(trained.history[-1].get("roots", math.inf) if trained.history else math.inf)
+    if scarce:
+        notes.append(scarce + (", or try guide=lookahead" if guide == "bootstrap" else ""))
     blown_up = sum("weights_blown_up" in entry for entry in trained.history)
     if blown_up:
         notes.append(

@@ -9,6 +9,8 @@ import typer
 
 from steady_ppl.errors import UsageError
 
+OFTEN = 0.1  # share of the measured rows after which hardly a particle is left
+
 
 def evaluate(
     arguments: Annotated[list[Path], typer.Argument(metavar="RUN... TABLE", help="Run folders, then the table.")],
@@ -32,6 +34,7 @@ def evaluate(
     """The paper's errors where true states exist; errors in measurement space always."""
     from steady_ppl.command_parts import load_runs, present, run_labels, say, used_before
     from steady_ppl.evaluation import evaluate_all, incomparable, table_of
+    from steady_ppl.paths import FEW
     from steady_ppl.program_file import load_program
     from steady_ppl.run_recipe import fingerprint
     from steady_ppl.table import read_table
@@ -60,3 +63,9 @@ def evaluate(
     for run, result in zip(runs, results, strict=True):
         if result["filter"] != "lookahead":
             say(f"{run}: judged by the filter {result['filter']}")
+        share, count = (result["scarce"][key] for key in ("share", "particles"))
+        if share > OFTEN:
+            say(
+                f"{run}: after {share:.0%} of the measured rows fewer than {FEW} of the filter's {count} particles "
+                "were in effect: its log p(y) scatters and is mostly too low, raise --particles"
+            )

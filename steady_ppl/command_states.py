@@ -28,7 +28,9 @@ def states(
 
     The table has for each state its median and the ends of its 90 % interval, `…_low` and `…_high`.
     """
+    from steady_ppl.command_parts import say
     from steady_ppl.fit import Fit
+    from steady_ppl.paths import few_starts
     from steady_ppl.posterior_files import require_states_file, write_states
     from steady_ppl.table import read_table
     from steady_ppl.whole_file import require_place
@@ -36,5 +38,9 @@ def states(
     require_states_file(out)
     require_place(out)
     fit, drives = Fit.load(run, program), read_table(table)
-    write_states(fit.posterior(drives, draws=draws, particles=particles, seed=seed), out)
+    posterior = fit.posterior(drives, draws=draws, particles=particles, seed=seed)
+    write_states(posterior, out)
     tell(f"{out}: {len(drives)} drives, {draws} draws of each")
+    scarce = few_starts(float(posterior["sample_stats"]["roots"].mean()))
+    if scarce:
+        say(scarce)

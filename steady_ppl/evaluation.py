@@ -10,7 +10,7 @@ import torch
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError, SteadyError, UsageError
-from steady_ppl.filtering import choose_filter, log_likelihood
+from steady_ppl.filtering import choose_filter, evidence
 from steady_ppl.fit import Fit
 from steady_ppl.measurement_errors import measurement_errors
 from steady_ppl.metrics import forward, forward_mean, map_errors, state_estimation
@@ -45,9 +45,10 @@ def evaluate(
 
     Returns:
         `known_start` and `measured` (what log p(y) is given and is of), `filter` ("lookahead", or "bootstrap" and why),
-        `log_likelihood` (mean per trajectory at every tenth row), `forward`, `forward_mean`, `state_estimation` (error
-        groups; empty without true states), `measurement` and, if asked for, `map` (see `map_errors`; `learned`: whether
-        the landmarks are elsewhere than declared).
+        `log_likelihood` (mean per trajectory at every tenth row), `scarce` (how many `particles` its filter had, and
+        the `share` of measured rows after which fewer than ten of them were in effect), `forward`, `forward_mean`,
+        `state_estimation` (error groups; empty without true states), `measurement` and, if asked for, `map` (see
+        `map_errors`; `learned`: whether the landmarks are elsewhere than declared).
 
     Raises:
         DataError: the table lacks a column or a known start.
@@ -67,8 +68,9 @@ def evaluate(
     with stages(("log p(y)", 1), ("states", 2), ("measurements", 2)) as begin:
         begin()
         with seeded(seed, "log_likelihood"):
-            values = log_likelihood(program, data, **settings)
-            result["log_likelihood"] = float(values.mean())
+            found = evidence(program, data, **settings)
+            result["log_likelihood"] = float(found.log_likelihood.mean())
+            result["scarce"] = {"share": float(found.scarce.mean()), "particles": choice.particles}
         result |= {"forward": {}, "forward_mean": {}, "state_estimation": {}}
         begin()
         if has_truth(data):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -105,7 +106,21 @@ def neglected(
     return filtered.log_likelihood - ahead.log_likelihood
 
 
-def log_likelihood(
+@dataclass(frozen=True)
+class Evidence:
+    """What a filter says of given drives, without their states.
+
+    Attributes:
+        log_likelihood: the estimate of log p(y) of each trajectory, `(B,)`.
+        scarce: share of each trajectory's measured rows after which hardly a particle was left, see `Filtered.scarce`,
+            `(B,)`. The estimate then hangs on a few particles: it scatters, and is mostly too low.
+    """
+
+    log_likelihood: Tensor
+    scarce: Tensor
+
+
+def evidence(
     program: Program,
     data: Trajectories,
     *,
@@ -114,7 +129,7 @@ def log_likelihood(
     every: int = 10,
     look_ahead: bool = False,
     kernels: bool | None = None,
-) -> Tensor:
+) -> Evidence:
     """Estimate log p(y) of each trajectory, untempered.
 
     Args:
@@ -125,9 +140,6 @@ def log_likelihood(
         every: use the measurements of every n-th row only, the first included (10 turns 10 Hz into 1 Hz).
         look_ahead: propose with a view to the later measurements instead of blindly.
         kernels: see `particle_filter`.
-
-    Returns:
-        `(B,)`.
 
     Raises:
         DataError: a trajectory has measurements, but none at these rows.
@@ -141,8 +153,9 @@ def log_likelihood(
             "let it begin at a measured row",
             trajectory=label,
         )
-    parts = [
-        run_filter(
+    values, scarce = [], []
+    for part in in_parts(thinned, particles, look_ahead=look_ahead):
+        filtered = run_filter(
             program,
             part,
             particles=particles,
@@ -150,10 +163,15 @@ def log_likelihood(
             look_ahead=look_ahead,
             keep_history=False,
             kernels=kernels,
-        ).log_likelihood
-        for part in in_parts(thinned, particles, look_ahead=look_ahead)
-    ]
-    return torch.cat(parts)
+        )
+        values.append(filtered.log_likelihood)
+        scarce.append(filtered.scarce(part))
+    return Evidence(torch.cat(values), torch.cat(scarce))
+
+
+def log_likelihood(program: Program, data: Trajectories, **settings: Any) -> Tensor:
+    """The estimate of `evidence`, `(B,)`; settings and errors are its."""
+    return evidence(program, data, **settings).log_likelihood
 
 
 def smoothed_states(program: Program, data: Trajectories, *, known_start: bool) -> Tensor:

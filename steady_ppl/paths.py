@@ -11,6 +11,8 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.resampling import systematic, take
 
+FEW = 10  # particles in effect: with fewer, what a filter says hangs on a handful of draws
+
 
 @dataclass(frozen=True)
 class Paths:
@@ -76,6 +78,11 @@ class Filtered:
     event_dims: dict[str, int]
     in_plain_torch: str | None = None
 
+    def scarce(self, data: Trajectories) -> Tensor:
+        """Share of each trajectory's measured rows after which fewer than `FEW` particles were in effect, `(B,)`."""
+        measured = data.observed.any(-1)
+        return ((self.effective_sizes < FEW) & measured).sum(0) / measured.sum(0).clamp(min=1)
+
     def paths(self, draws: int) -> Paths:
         """Equally weighted paths, resampled systematically from all surviving lineages and traced back."""
         index = systematic(self.log_weights.exp(), draws)
@@ -93,3 +100,8 @@ class Filtered:
             noise={site: torch.stack(values[::-1], 1) for site, values in noise.items()},
             event_dims=self.event_dims,
         )
+
+
+def few_starts(roots: float) -> str | None:
+    """What is to be said where so many of the particles' starts, on average, survive a drive: all paths begin alike."""
+    return f"of the particles' starts {roots:.0f} survive a drive: raise particles" if roots < FEW else None
