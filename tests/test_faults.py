@@ -101,15 +101,19 @@ def desk(tmp_path_factory) -> Path:
     return desk
 
 
-def started(desk: Path, *words: object) -> subprocess.Popen:
-    program = "import sys; from steady_ppl.command_line import main; sys.exit(main(sys.argv[1:]))"
-    return subprocess.Popen(
-        [sys.executable, "-c", program, *map(str, words)],
-        cwd=desk,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
+def started(desk: Path, *words: object, room: int = -1) -> subprocess.Popen:
+    """A command in a process of its own, none of whose files grows beyond `room` bytes."""
+    program = f"""import resource, sys; from steady_ppl.command_line import main
+resource.setrlimit(resource.RLIMIT_FSIZE, ({room}, {room}))
+sys.exit(main(sys.argv[1:]))"""
+    with (desk / "errors").open("w") as errors:
+        return subprocess.Popen(
+            [sys.executable, "-c", program, *map(str, words)],
+            cwd=desk,
+            stdout=subprocess.DEVNULL,
+            stderr=errors,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )
 
 
 def killed_and_resumed(desk: Path, name: str, out: str, moments: list[float]) -> int:
@@ -158,6 +162,23 @@ def test_a_command_that_is_killed_goes_on_to_the_same_result(desk: Path, name: s
     process.wait()
     assert started(desk, *COMMANDS[name], "--out", out, "--resume").wait() == 0
     same_results(desk, name, out)
+
+
+@pytest.mark.parametrize(
+    ("room", "pieces"), [(20_000, {"000001.safetensors", "000002.safetensors"}), (4_000, set())], ids=["some", "none"]
+)
+def test_a_search_on_a_disk_that_fills_up_goes_on_when_there_is_room(desk: Path, room: int, pieces: set) -> None:
+    out = f"full_{room}"
+    command = (*COMMANDS["discover"], "--out", out)
+    assert started(desk, *command, room=room).wait() == 2
+    (said,) = (desk / "errors").read_text().splitlines()
+    assert said.startswith("steady: ") and "cannot be written" in said and said.endswith("File too large (os error 27)")
+    if not pieces:
+        assert not (desk / out).exists()
+        return
+    assert {file.name for file in (desk / out / "journal").iterdir()} == pieces
+    assert started(desk, *command, "--resume").wait() == 0
+    same_results(desk, "discover", out)
 
 
 @pytest.mark.slow
