@@ -30,7 +30,7 @@ def check_picture(found: Check) -> Figure:
     panels = left.subplots(shown, 1, sharex=True, squeeze=False)[:, 0]
     for component, axes in enumerate(panels):
         predictions(found, drive, component, axes)
-    panels[0].set_title(f"measured and predicted, drive {found.data.labels[drive]}", fontsize=9)
+    panels[0].set_title(f"measured and predicted, drive {found.data.labels[drive]}", fontsize=9, parse_math=False)
     panels[-1].set_xlabel("time [s]", fontsize=8)
     left.legend(*panels[0].get_legend_handles_labels(), fontsize=8, ncols=3, loc="outside lower center")
     figure.suptitle("\n".join(textwrap.wrap(verdict(found), WIDTH)), fontsize=10)
@@ -119,7 +119,7 @@ def where_and_when(found: Check, axes: Axes) -> None:
             start, end = finding.cell.where["time"]
             axes.plot((start + end) / 2, finding.cell.where["drive"] + 1, "k*", ms=5)
     step = max(1, len(grid) // 8)
-    axes.set_yticks(np.arange(1, len(grid) + 1, step), found.data.labels[::step], fontsize=7)
+    axes.set_yticks(np.arange(1, len(grid) + 1, step), found.data.labels[::step], fontsize=7, parse_math=False)
     axes.set_xlabel("time [s]  (★ significant)", fontsize=8)
     axes.set_ylabel("drive", fontsize=8)
     axes.figure.colorbar(mesh, ax=axes).set_label("simulated sd", fontsize=8)

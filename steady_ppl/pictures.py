@@ -116,7 +116,7 @@ def innovations(found: Check, trajectory: str, *, axes: Axes | None = None) -> A
     axes.axhline(0, color="black", lw=0.6)
     axes.set_xlabel("time [s]")
     axes.set_ylabel("innovation [standard deviations]")
-    axes.set_title(f"trajectory {trajectory}")
+    axes.set_title(f"trajectory {trajectory}", parse_math=False)
     axes.legend(fontsize=7, ncols=4)
     return axes
 

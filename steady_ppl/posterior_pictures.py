@@ -56,7 +56,7 @@ def posterior_trajectories(
     axes.set_ylabel(with_unit(plane[1], draws[1]))
     if draws[0].attrs.get("units") == draws[1].attrs.get("units"):
         axes.set_aspect("equal", "box")
-    axes.set_title(f"trajectory {trajectory}")
+    axes.set_title(f"trajectory {trajectory}", parse_math=False)
     for line in axes.get_lines():
         if line.get_label() == label:
             line.set_rasterized(True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import matplotlib
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from examples import example
 from small import simulated
 
 from steady_ppl import Fit, UsageError, check
+from steady_ppl.check_pictures import check_picture
 from steady_ppl.posterior import posterior
 from steady_ppl.training import Trained
 
@@ -93,6 +96,20 @@ def test_a_trajectory_that_is_not_there_is_an_error(drawn) -> None:
             picture(drawn, "nine")
     with pytest.raises(UsageError, match="no state speed in this posterior; there are x, y, heading"):
         posterior_states(drawn, "1", ["x", "speed"])
+
+
+def test_names_from_a_table_are_not_read_as_formulas() -> None:
+    program = example("hovercraft", torch.float32)
+    data = replace(simulated(rows=81), labels=(r"$\frac{$", "$x^2$", "3"))
+    drives = posterior(program, data, draws=4, particles=30)
+    found = check(Fit(program.requires_grad_(False), "hand"), data, simulations=20)
+    figures = [posterior_trajectories(drives, name).figure for name in data.labels]
+    figures += [innovations(found, name).figure for name in data.labels]
+    figures += [check_picture(found)]
+    for figure in figures:
+        figure.canvas.draw()
+    written = [text.get_text() for text in figures[-1].findobj(plt.Text) if not text.get_parse_math()]
+    assert set(data.labels) < set(written) and any(text.startswith("measured and predicted, drive") for text in written)
 
 
 def test_any_components_are_drawn_by_their_names_and_units(drawn) -> None:
