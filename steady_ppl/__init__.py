@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from steady_ppl.likelihood_fit import fit_by_likelihood
     from steady_ppl.linearization import why_not_linear
     from steady_ppl.linearized_guides import GaussianGuide, LookaheadGuide
+    from steady_ppl.long_drives import cut
     from steady_ppl.parameter_draws import ParameterPosterior, parameter_posterior
     from steady_ppl.particles import particle_filter, roll_out
     from steady_ppl.paths import Filtered, Paths
@@ -76,6 +77,7 @@ _HOMES = {
     "likelihood_fit": ("fit_by_likelihood",),
     "linearization": ("why_not_linear",),
     "linearized_guides": ("GaussianGuide", "LookaheadGuide"),
+    "long_drives": ("cut",),
     "parameter_draws": ("ParameterPosterior", "parameter_posterior"),
     "particles": ("particle_filter", "roll_out"),
     "paths": ("Filtered", "Paths"),

@@ -24,6 +24,7 @@ from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
 from steady_ppl.gaussian_smoother import find_and_smooth
 from steady_ppl.linearization import why_not_linear
+from steady_ppl.long_drives import refuse_long
 from steady_ppl.misfit_maps import Misfit, Residuals, judge
 from steady_ppl.predictions import Prediction, named_horizons, predict
 from steady_ppl.program import Program, for_program, names
@@ -103,7 +104,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
 
     Raises:
         UsageError: the program's noise is not normal, or there are too few simulations.
-        DataError: nothing to compare, or no known start.
+        DataError: nothing to compare, a drive that is too long (`refuse_long`), or no known start.
         FilterError: the linearised program broke down.
 
     Example:
@@ -164,6 +165,7 @@ def _require(program: Program, data: Trajectories, known_start: bool, simulation
         raise UsageError(f"got {simulations} simulations: bands need at least {FEWEST}, and 100 are better")
     if data.time.shape[0] < 2 or not bool(data.observed[1:].any()):
         raise DataError("nothing to compare: no trajectory has a measurement after its first row")
+    refuse_long(data)
     if known_start:
         _ = data.known_start
     why = why_not_linear(program, data, known_start=known_start)

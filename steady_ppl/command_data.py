@@ -1,4 +1,4 @@
-"""`steady data`: published logs to tables."""
+"""`steady data`: published logs to tables, and long drives in pieces."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from steady_ppl.harmless import tell
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -28,6 +30,30 @@ def alpha_truck(
     write_table(read_alpha_truck(folder, sigma_degrees=sigma_deg, seed=seed), out)
 
 
+@app.command("cut", epilog="Example:  steady data cut log.csv --seconds 60 --out drives.csv")
+def cut(
+    table: Annotated[Path, typer.Argument(help="Drives.")],
+    seconds: Annotated[float, typer.Option(help="Length of a piece, s.")],
+    out: Annotated[Path, typer.Option("--out", help="Table to write, .csv or .parquet.")],
+) -> None:
+    """Long drives in pieces, `…-1`, `…-2`, … of the drive's name.
+
+    Each begins at its first row that has a measurement; pieces of one row or without a measurement are left out.
+    """
+    from steady_ppl.command_parts import say
+    from steady_ppl.long_drives import cut
+    from steady_ppl.table import read_table, require_table_file, write_table
+
+    require_table_file(out)
+    drives = read_table(table)
+    pieces = cut(drives, seconds)
+    write_table(pieces, out)
+    tell(f"{out}: {len(pieces)} drives")
+    left_out = int(drives.lengths.sum() - pieces.lengths.sum())
+    if left_out:
+        say(f"{left_out} rows left out: before a piece's first measurement, or in pieces that have none or one row")
+
+
 @app.callback()
 def data() -> None:
-    """Published logs to tables."""
+    """Published logs to tables; long drives in pieces."""

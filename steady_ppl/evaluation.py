@@ -9,17 +9,16 @@ from typing import Any
 import torch
 
 from steady_ppl.data import Trajectories
-from steady_ppl.errors import DataError, SteadyError, UsageError
+from steady_ppl.errors import SteadyError, UsageError
 from steady_ppl.filtering import choose_filter, evidence
 from steady_ppl.fit import Fit
+from steady_ppl.long_drives import refuse_long
 from steady_ppl.measurement_errors import measurement_errors
 from steady_ppl.metrics import forward, forward_mean, map_errors, state_estimation
 from steady_ppl.planar_vehicle import UnknownMap
 from steady_ppl.program import Program, for_program, names
 from steady_ppl.progress import stages
 from steady_ppl.seeding import seeded
-
-MOST_ROWS = 20_000  # of a trajectory: the filtered particles of every row are kept, some .17 MB a row
 
 
 def evaluate(
@@ -51,7 +50,7 @@ def evaluate(
         `map_errors`; `learned`: whether the landmarks are elsewhere than declared).
 
     Raises:
-        DataError: the table lacks a column or a known start.
+        DataError: the table lacks a column or a known start, or a drive is too long (`refuse_long`).
         UsageError: the map is none, or another vehicle's.
         FilterError: the filter broke down.
     """
@@ -124,13 +123,7 @@ def _labelled(label: str) -> Iterator[None]:
 def _checked(fit: Fit, table: Trajectories, surveyed: Program | None) -> Trajectories:
     """The columns that the program reads, if table and map suit it."""
     data = for_program(fit.program, table)
-    longest = int(data.lengths.argmax())
-    if int(data.lengths[longest]) > MOST_ROWS:
-        raise DataError(
-            f"trajectory {data.labels[longest]} has {int(data.lengths[longest])} rows: at most {MOST_ROWS} are "
-            "evaluated in one piece, cut it into several trajectories",
-            trajectory=data.labels[longest],
-        )
+    refuse_long(data)
     if fit.known_start:
         _ = data.known_start
     if surveyed is not None:

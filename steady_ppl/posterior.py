@@ -11,6 +11,7 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.filtering import choose_filter, in_parts, run_filter
+from steady_ppl.long_drives import refuse_long
 from steady_ppl.program import Program, for_program, names, units
 from steady_ppl.progress import stages
 from steady_ppl.seeding import seeded
@@ -54,6 +55,7 @@ def posterior(
         attributes.
     """
     run = for_program(program, data).observed_every(every)
+    refuse_long(run)
     states: list[Tensor] = []
     noise: dict[str, list[Tensor]] = {}
     evidence: list[Tensor] = []

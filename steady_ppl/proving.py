@@ -18,6 +18,7 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
+from steady_ppl.long_drives import refuse_long
 from steady_ppl.paired_bootstrap import FEWEST
 from steady_ppl.predictions import named_horizons
 from steady_ppl.program import Program, names
@@ -110,7 +111,7 @@ def prove(
 
     Raises:
         UsageError: a row's program cannot be linearised, or the rows measure different things.
-        DataError: fewer than 5 trajectories, nothing to compare, or no known start.
+        DataError: fewer than 5 trajectories or one that is too long, nothing to compare, or no known start.
         FilterError: a linearised program broke down.
 
     Example:
@@ -197,6 +198,7 @@ def _require(programs: Mapping[str, Program], reference: str, truth: str | None,
         )
     if data.time.shape[0] < 2 or not bool(data.observed[1:].any()):
         raise DataError("nothing to compare: no trajectory has a measurement after its first row")
+    refuse_long(data)
 
 
 def _few_starts(data: Trajectories, horizons: Mapping[str, int], known_start: bool) -> list[str]:

@@ -180,13 +180,6 @@ def test_degrees_are_suspected_in_controls_and_known_headings(tmp_path: Path, ca
     assert st.doubts.doubts_of_units(program, st.for_program(program, data)) == []
 
 
-def test_a_trajectory_too_long_to_evaluate_in_memory_is_refused(tmp_path: Path, cart_run: Path, refused) -> None:
-    rows = 20_001
-    frame = pd.DataFrame({"trajectory": "long", "time": np.arange(rows) / 10, "u.push": 0.0, "y.position": 0.0})
-    frame.to_parquet(tmp_path / "t.parquet")
-    refused(2, "trajectory long has 20001 rows: at most 20000", "evaluate", cart_run, tmp_path / "t.parquet")
-
-
 @pytest.mark.slow
 def test_a_hundred_thousand_rows_are_handled_in_bounded_memory(tmp_path: Path, cart_run: Path) -> None:
     rows = 100_000

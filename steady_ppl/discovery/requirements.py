@@ -10,6 +10,7 @@ from steady_ppl.data import Trajectories
 from steady_ppl.elements import elements
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.linearization import why_not_linear
+from steady_ppl.long_drives import refuse_long
 from steady_ppl.program import Program, names
 
 FEWEST_DRIVES, FEWEST_SETS = 5, 50
@@ -20,7 +21,8 @@ def require(program: Program, train: Trajectories, valid: Trajectories, known_st
 
     Raises:
         UsageError: a network, a program that cannot be linearised, or too few simulations.
-        DataError: too few drives, no known start, nothing measured, or controls that never change.
+        DataError: too few drives, one that is too long, no known start, nothing measured, or controls that never
+            change.
     """
     if simulations < FEWEST_SETS:
         raise UsageError(f"got {simulations} simulations: the calibration needs at least {FEWEST_SETS}, 200 are better")
@@ -35,6 +37,7 @@ def require(program: Program, train: Trajectories, valid: Trajectories, known_st
             )
         if drives.time.shape[0] < 3 or not bool(drives.observed[1:].any()):
             raise DataError(f"the {name} drives have no measurements after their first rows")
+        refuse_long(drives)
         if known_start:
             _ = drives.known_start
     both = shared(train, valid)
