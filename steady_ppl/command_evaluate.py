@@ -33,8 +33,10 @@ def evaluate(
 ) -> None:
     """The paper's errors where true states exist; errors in measurement space always."""
     from steady_ppl.command_parts import load_runs, present, run_labels, say, used_before
+    from steady_ppl.doubts import doubts_of_units
     from steady_ppl.evaluation import evaluate_all, incomparable, table_of
     from steady_ppl.paths import FEW
+    from steady_ppl.program import for_program
     from steady_ppl.program_file import load_program
     from steady_ppl.run_recipe import fingerprint
     from steady_ppl.table import read_table
@@ -58,7 +60,13 @@ def evaluate(
             lines.append(f"{label}: landmarks off by {error['rms']:.3g} m rms, {error['most']:.3g} m at most{how}")
     rows = [{"run": folder, **result} for folder, result in zip(folders, results, strict=True)]
     present("\n".join(lines), {"runs": rows}, json_file)
-    for reason in incomparable(results, folders) + used_before(labels, fingerprint(drives)) + drives.uneven_steps:
+    doubts = {doubt: None for fit in fits for doubt in doubts_of_units(fit.program, for_program(fit.program, drives))}
+    for reason in [
+        *incomparable(results, folders),
+        *used_before(labels, fingerprint(drives)),
+        *drives.uneven_steps,
+        *doubts,
+    ]:
         say(reason)
     for run, result in zip(runs, results, strict=True):
         if result["filter"] != "lookahead":

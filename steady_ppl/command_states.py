@@ -29,9 +29,11 @@ def states(
     The table has for each state its median and the ends of its 90 % interval, `…_low` and `…_high`.
     """
     from steady_ppl.command_parts import say
+    from steady_ppl.doubts import doubts_of_units
     from steady_ppl.fit import Fit
     from steady_ppl.paths import few_starts
     from steady_ppl.posterior_files import require_states_file, write_states
+    from steady_ppl.program import for_program
     from steady_ppl.table import read_table
     from steady_ppl.whole_file import require_place
 
@@ -42,5 +44,5 @@ def states(
     write_states(posterior, out)
     tell(f"{out}: {len(drives)} drives, {draws} draws of each")
     scarce = few_starts(float(posterior["sample_stats"]["roots"].mean()))
-    if scarce:
-        say(scarce)
+    for doubt in [*doubts_of_units(fit.program, for_program(fit.program, drives)), *([scarce] if scarce else [])]:
+        say(doubt)

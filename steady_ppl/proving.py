@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
+from steady_ppl.doubts import doubts_of_units
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
 from steady_ppl.long_drives import refuse_long
@@ -142,7 +143,11 @@ def prove(
     if isinstance(floor, Judged):
         found[FLOOR] = as_row(floor, _counted([floor]))
     horizons = named_horizons(before.data, SECONDS)
-    notes += before.data.uneven_steps + _few_starts(before.data, horizons, known_start)
+    notes += (
+        before.data.uneven_steps
+        + doubts_of_units(before.program, before.data)
+        + _few_starts(before.data, horizons, known_start)
+    )
     return Proof(
         rows=found,
         reference=reference,

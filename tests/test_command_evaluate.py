@@ -239,3 +239,20 @@ def test_figures_that_cannot_be_written_are_refused_first(tmp_path: Path, work: 
     assert steady("evaluate", work / "hand", work / "train.csv", "--json", file) == 2
     said = capsys.readouterr()
     assert "cannot be written: there is no folder" in said.err and not said.out
+
+
+def test_degrees_are_suspected_by_whatever_judges(tmp_path: Path, capsys) -> None:
+    data = simulated(trajectories=6)
+    turned = replace(data, measurements=data.measurements * 180 / math.pi)
+    run, other, table = tmp_path / "run", tmp_path / "other", written(tmp_path / "t.csv", turned)
+    for folder in (run, other):
+        assert steady("fit", HOVERCRAFT, written(tmp_path / "r.csv", data), "--recipe", "hand", "--out", folder) == 0
+    for command in (
+        ("evaluate", run, table, *QUICK),
+        ("states", run, table, "--out", tmp_path / "states.csv"),
+        ("prove", run, other, table),
+    ):
+        capsys.readouterr()
+        assert steady(*command) in (0, 1)
+        said = "".join(capsys.readouterr())
+        assert said.count("y.bearing_0 is between") == 1 and "are these degrees?" in said, command
