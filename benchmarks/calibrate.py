@@ -90,11 +90,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="two programs and a few sets, in two minutes")
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--only", choices=list(WORK), help="run these jobs alone, and print no tables")
     chosen = parser.parse_args(arguments)
     version = digest(Path(steady_ppl.__file__).parent, ROOT / "tests", Path(__file__).parent)
     size = QUICK if chosen.quick else FULL
-    wanted = jobs(size)
+    wanted = {name: job for name, job in jobs(size).items() if chosen.only in (None, job[0])}
     records = run(work, wanted, chosen.results, version=version, workers=chosen.workers)
+    if chosen.only:
+        return any("failed" in record for record in records)
     text, missed = tables(sorted(records, key=lambda record: list(wanted).index(record["set"])))
     chosen.results.with_suffix(".md").write_text(text)
     print(text)

@@ -28,9 +28,10 @@ from steady_ppl.parameter_draws import (
 )
 from steady_ppl.program import for_program
 
-DRAWS, DRIVES, VALUES = 99, 4, 240
+DRAWS, DRIVES = 99, 4
+VALUES = 400  # as many as users get
 SPREAD = 0.4  # of the logarithms, a priori
-BLIND = 200  # particles of the bootstrap filter
+BLIND, BLIND_VALUES = 200, 120  # particles of the bootstrap filter, and of how many values it judges
 
 
 class Hovercraft(type(example("hovercraft:HovercraftTruth"))):
@@ -76,13 +77,17 @@ def ranked(seed: int) -> dict:
     with seeded(seed, "parameters"):
         maximum = maximise(program, data)
         shape = about_maximum(program, data, maximum.path)
-        judges = {"linearised": linearised(data, maximum.path), f"bootstrap {BLIND}": blind(data)}
-        values, log_weights = adapt(program, shape, judges["linearised"], VALUES)
-        density = weighed(program, values, judges["linearised"]) - log_weights
+        judge = linearised(data, maximum.path)
+        values, log_weights = adapt(program, shape, judge, VALUES)
+        some = torch.randperm(VALUES)[:BLIND_VALUES]
+        density = weighed(program, values[some], judge) - log_weights[some]
+        blindly = weighed(program, values[some], blind(data)) - density
         record = {"names": list(maximum.names), "truth": own_values(truth).tolist()}
-        for name, judge in judges.items():
-            weights = log_weights if name == "linearised" else weighed(program, values, judge) - density
-            found = resampled(program, values, weights, DRAWS)
+        for name, (at, weights) in {
+            "linearised": (values, log_weights),
+            f"bootstrap {BLIND}": (values[some], blindly),
+        }.items():
+            found = resampled(program, at, weights, DRAWS)
             record[name] = {
                 "ranks": ranks(own_values(truth).numpy(), found.draws.numpy()).tolist(),
                 "tail_index": found.tail_index,

@@ -36,7 +36,7 @@ FITS = {
     "fit, svi": (NETWORK, *SHORT, "--recipe", "svi"),
     "fit, steady-minus": (NETWORK, *SHORT, "--recipe", "steady-minus"),
     "fit, fit-truth": (NETWORK, *SHORT, "--recipe", "fit-truth"),
-    "fit, fit-hand": (NETWORK, *SHORT, "--recipe", "fit-hand"),
+    "fit, fit-hand": (NETWORK, *SHORT, "--recipe", "fit-hand", "--hand", HOVERCRAFT),
     "fit, fit-tv": (NETWORK, *SHORT, "--recipe", "fit-tv"),
 }
 COMMANDS: dict[str, tuple[str, ...]] = {

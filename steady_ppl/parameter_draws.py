@@ -1,9 +1,10 @@
 """How far drives leave a program's parameters open: draws of them, from the linearised program's likelihood.
 
 The likelihood's maximum and curvature give a Student t, from which values are drawn and weighed by likelihood and
-prior; these shape a second and a third (adaptive importance sampling, Cappé, Guillin, Marin and Robert 2004). Draws are
-resampled from the last by weights with a smoothed tail (Vehtari, Simpson, Gelman, Yao and Gabry 2024, JMLR 25:72),
-whose index says where that distribution is too far from the posterior.
+prior; these shape a second and a third. All values count, as draws of the mixture of all three (adaptive multiple
+importance sampling, Cornuet, Marin, Mira and Robert 2012). Draws are resampled by weights with a smoothed tail
+(Vehtari, Simpson, Gelman, Yao and Gabry 2024, JMLR 25:72), whose index says where that mixture is too far from the
+posterior.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     import arviz
 
 FREEDOM = 5.0  # of the Student t: its tails are heavier than those of any posterior that data tell
-ROUNDS = (0.25, 0.25, 0.5)  # shares of the values; each round draws about what the one before found
+ROUNDS = (0.25, 0.25, 0.5)  # shares of the values; each round draws about what those before found
 ENOUGH = 4  # effective values a number, for which the weights that shape the next round are tempered
 RELIABLE = 0.7  # Pareto tail index above which weights are not to be trusted (Vehtari et al. 2024)
 
@@ -124,13 +125,18 @@ class Shape:
     centre: Tensor
     root: Tensor
 
-    def draws(self, count: int) -> tuple[Tensor, Tensor]:
-        """Values `(K, P)` and the log-density `(K,)`, but for a constant."""
+    def draws(self, count: int) -> Tensor:
+        """Values `(K, P)`."""
         size = len(self.centre)
         student = torch.distributions.Chi2(torch.tensor(FREEDOM, dtype=torch.float64)).sample((count, 1))
         white = torch.randn(count, size, dtype=torch.float64) * (FREEDOM / student).sqrt()
-        density = -0.5 * (FREEDOM + size) * torch.log1p(white.square().sum(-1) / FREEDOM)
-        return self.centre + white @ self.root.T, density
+        return self.centre + white @ self.root.T
+
+    def density(self, values: Tensor) -> Tensor:
+        """Its logarithm `(K,)` at values `(K, P)`, but for a constant that all shapes share."""
+        white = torch.linalg.solve(self.root, (values - self.centre).T)
+        tail = -0.5 * (FREEDOM + len(self.centre)) * torch.log1p(white.square().sum(0) / FREEDOM)
+        return tail - torch.linalg.slogdet(self.root)[1]
 
 
 def about_maximum(program: Program, data: Trajectories, path: Path, known_start: bool = False) -> Shape:
@@ -143,14 +149,19 @@ def about_maximum(program: Program, data: Trajectories, path: Path, known_start:
 
 
 def adapt(program: Program, shape: Shape, judge: LogLikelihood, count: int) -> tuple[Tensor, Tensor]:
-    """Values of the last round, `(K, P)`, and their log weights, `(K,)`."""
-    values, log_weights = torch.empty(0), torch.empty(0)
+    """Values of all rounds, `(K, P)`, and their log weights, `(K,)`."""
+    shapes: list[Shape] = []
+    values, judged = shape.centre.new_empty(0, len(shape.centre)), shape.centre.new_empty(0)
+    log_weights = judged
     with stages(*(("", share) for share in ROUNDS)) as begin:
         for share in ROUNDS:
             begin()
-            shape = _shaped(shape, values, log_weights) if len(values) else shape
-            values, density = shape.draws(round(share * count))
-            log_weights = weighed(program, values, judge) - density
+            shapes.append(_shaped(shapes[-1], values, log_weights) if shapes else shape)
+            new = shapes[-1].draws(round(share * count))
+            values, judged = torch.cat([values, new]), torch.cat([judged, weighed(program, new, judge)])
+            drawn = torch.tensor(ROUNDS[: len(shapes)], dtype=values.dtype).log()
+            mixture = torch.stack([one.density(values) for one in shapes]) + drawn[:, None]
+            log_weights = judged - mixture.logsumexp(0)
     return values, log_weights
 
 
