@@ -57,7 +57,7 @@ class Size:
 
 
 QUICK_GUIDES = tuple(guide for guide in states.GUIDES if guide not in FAMILIES)  # SVI's are trained, a minute each
-FULL = Size(drives=states.DRIVES, runs=evidence.COUNT, data_sets=200, clean=60, single=52)
+FULL = Size(drives=states.DRIVES, runs=evidence.COUNT, data_sets=120, clean=60, single=52)
 QUICK = Size(drives=200, runs=200, data_sets=4, clean=1, single=1, problems=("cart", "pendulum"), guides=QUICK_GUIDES)
 
 

@@ -1,0 +1,59 @@
+"""The page of promises names what there is, and its figures are those of the records."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections import Counter
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+PAGE = (ROOT / "docs" / "promises.md").read_text()
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+import calibrate  # noqa: E402
+from calibration_tables import tables  # noqa: E402
+
+
+def records(name: str) -> list[dict]:
+    return [json.loads(line) for line in (RESULTS / f"{name}.jsonl").read_text().splitlines()]
+
+
+def rows(text: str) -> list[list[str]]:
+    """Cells of every line of every table."""
+    return [
+        [cell.strip() for cell in line.strip("| ").split("|")] for line in text.splitlines() if line.startswith("|")
+    ]
+
+
+def test_every_file_that_is_named_is_there():
+    named = set(re.findall(r"`((?:tests|benchmarks)/[\w./-]+)`", PAGE))
+    assert len(named) > 10 and [name for name in named if not (ROOT / name).exists()] == []
+
+
+def test_the_calibration_is_that_of_its_records_and_the_page_has_its_musts():
+    found = records("calibration")
+    wanted = list(calibrate.jobs(calibrate.FULL))
+    assert sorted(record["set"] for record in found) == sorted(wanted)
+    versions = {(record["kind"] == "parameters", record["version"]) for record in found}
+    assert len(versions) == 2  # parameters were drawn anew
+    text, missed = tables(sorted(found, key=lambda record: wanted.index(record["set"])))
+    assert (RESULTS / "calibration.md").read_text() == text
+    musts = text.partition("\n\n")[0]
+    assert musts in PAGE and musts.count("**no**") == missed
+
+
+def test_the_hostile_trials_are_those_of_their_records():
+    found = records("hostile")
+    outcomes = Counter(record["outcome"] for record in found)
+    assert set(outcomes) <= {"accepted", "refused", "failed with a line"}
+    figures = [
+        len({(record["kind"], record["mutant"]) for record in found}),
+        len(found),
+        *(outcomes[name] for name in ("accepted", "refused", "failed with a line", "crashed", "hung")),
+        max(record["seconds"] for record in found),
+        max(record["mib"] for record in found),
+    ]
+    assert [f"{figure:,}" for figure in figures] in rows(PAGE)
