@@ -27,6 +27,7 @@ from steady_ppl import (
     command_report,
     command_simulate,
     command_states,
+    command_study,
 )
 from steady_ppl.command_parts import hushed, say
 from steady_ppl.commanded import commanded
@@ -42,11 +43,13 @@ EVERYWHERE = {"--debug": "debug", "--quiet": "quiet", "-q": "quiet"}  # before o
 
 
 class Command(NamedTuple):
-    """A command, what `steady --help` says of it, and examples for its own help."""
+    """A command, what `steady --help` says of it, examples for its own help, and whether another one's help names it:
+    one screen is full."""
 
     function: Callable[..., None]
     about: str
     examples: tuple[str, ...]
+    hidden: bool = False
 
     @property
     def name(self) -> str:
@@ -133,6 +136,20 @@ COMMANDS = (
         ),
     ),
     Command(
+        command_study.study,
+        "Compute a grid of fits or searches, here or on a cluster.",
+        (
+            "steady study studies/observation-noise.toml --data logs --out noise",
+            "steady study mine.toml --cluster tcp://scheduler:8786 --out mine",
+        ),
+    ),
+    Command(
+        command_study.plot_study,
+        "Draw what a study has found so far.",
+        ("steady plot-study noise --out noise.png",),
+        hidden=True,
+    ),
+    Command(
         command_effects.effects,
         "List the physical effects that a program may lack.",
         ("steady effects", "steady effects models/hovercraft.py"),
@@ -151,8 +168,9 @@ for command in COMMANDS:
         command.name,
         short_help=command.about,
         epilog="\n".join(["\b", title, *(f"  {line}" for line in command.examples)]),
+        hidden=command.hidden,
     )(command.function)
-app.add_typer(command_data.app, name="data", short_help="Published logs to tables.")
+app.add_typer(command_data.app, name="data", short_help="Published logs to tables; long drives in pieces.")
 
 
 def say_version(asked: bool) -> None:
@@ -167,7 +185,7 @@ def options(
     debug: Annotated[bool, typer.Option("--debug", hidden=True, help="Show the traceback of an error.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no notes, only results.")] = False,
     version: Annotated[
-        bool, typer.Option("--version", callback=say_version, is_eager=True, help="Show the version and exit.")
+        bool, typer.Option("--version", callback=say_version, is_eager=True, hidden=True, help="Show the version.")
     ] = False,
 ) -> None:
     """Learn how a vehicle moves from noisy measurements. To see it: steady demo"""

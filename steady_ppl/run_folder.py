@@ -49,7 +49,7 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
         raise RunError(f"{folder} has no {CHECKPOINT} to resume from, nor the {JOURNAL} of a search")
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
-        with _only_writer(folder):
+        with only_writer(folder):
             _refuse_links(folder)
             if not resume:
                 _put_aside(folder)
@@ -65,7 +65,7 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
 
 
 @contextmanager
-def _only_writer(folder: Path) -> Iterator[None]:
+def only_writer(folder: Path) -> Iterator[None]:
     """Make a folder and keep other processes from writing to it. The lock is the process's own: it ends with it,
     however it ends."""
     lock = FileLock(folder / LOCK)

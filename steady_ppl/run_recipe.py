@@ -63,6 +63,29 @@ def find_recipe(name: str) -> Recipe:
     return found
 
 
+def require_settings(name: str, recipe: Recipe, options: Mapping[str, Any]) -> None:
+    """Refuse what is no setting of a recipe, or of another kind.
+
+    Raises:
+        UsageError: naming it, and the settings that there are.
+    """
+    settings = [
+        setting
+        for setting, parameter in list(inspect.signature(recipe).parameters.items())[3:]
+        if parameter.kind is not parameter.VAR_KEYWORD and setting not in ("known_start", "seed")
+    ]
+    for option, value in options.items():
+        if option not in settings:
+            raise UsageError(f"recipe {name} has no setting {option}; it has {', '.join(settings) or 'none'}")
+        _require_kind(recipe, option, value)
+
+
+def trains(recipe: Recipe) -> bool:
+    """Whether a recipe takes checkpoint, resume and progress of `train`."""
+    parameters = inspect.signature(recipe).parameters.values()
+    return any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+
+
 def run_recipe(
     name: str,
     program: Program,
@@ -92,16 +115,7 @@ def run_recipe(
         RunError: the folder exists, or does not match on `resume`.
     """
     recipe = find_recipe(name)
-    takes = inspect.signature(recipe).parameters
-    settings = [
-        setting
-        for setting, parameter in list(takes.items())[3:]
-        if parameter.kind is not parameter.VAR_KEYWORD and setting not in ("known_start", "seed")
-    ]
-    for option, value in options.items():
-        if option not in settings:
-            raise UsageError(f"recipe {name} has no setting {option}; it has {', '.join(settings) or 'none'}")
-        _require_kind(recipe, option, value)
+    require_settings(name, recipe, options)
     if device == "cuda" and not torch.cuda.is_available():
         raise UsageError("--device cuda: this machine has no CUDA device")
     program.to(device)
@@ -125,9 +139,8 @@ def run_recipe(
         "valid_sha256": fingerprint(valid) if valid is not None else None,
         "versions": versions(),
     }
-    trains = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in takes.values())
     arguments = {"known_start": known_start, "seed": seed, **options}
-    if trains:
+    if trains(recipe):
         arguments |= {"checkpoint": folder / CHECKPOINT, "resume": resume, "progress": progress}
     try:
         call = inspect.signature(recipe).bind(program, table, valid, **arguments)
@@ -143,7 +156,7 @@ def run_recipe(
         if not isinstance(fitted, Fit):
             raise UsageError(f"recipe {name} returned {type(fitted).__name__}, not a Fit")
         fitted.notes += doubts + doubts_of_fit(fitted, declared)
-        if valid is None and trains and not (fitted.trained and fitted.trained.interrupted):
+        if valid is None and trains(recipe) and not (fitted.trained and fitted.trained.interrupted):
             fitted.notes.append("no --valid table: trained to the last step, nothing held out decides when to stop")
         fitted.save_into(folder, table, begun)
     return fitted

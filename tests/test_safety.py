@@ -32,6 +32,11 @@ ALLOWED = {
     ("steady_ppl/program_file.py", "exec_module"): "a program or recipe that the person names is code",
     ("steady_ppl/__init__.py", "importlib.import_module"): "the package's own names, from a list in the file",
     ("steady_ppl/__init__.py", "import_module"): "the package's own names, from a list in the file",
+    (
+        "steady_ppl/studies/runner.py",
+        "joblib",
+    ): "hands jobs to its own processes, or to a cluster that is named",
+    ("steady_ppl/command_study.py", "joblib"): "counts the cores",
     ("benchmarks/vmapped.py", "runpy.run_path"): "runs the script that the person names",
     ("benchmarks/report_page.py", "urllib"): "asks the browser that it started on this machine",
 }

@@ -1,0 +1,63 @@
+"""`steady study` and `steady plot-study`: grids of fits or searches, and pictures of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from steady_ppl.errors import UsageError
+from steady_ppl.harmless import tell
+
+
+def study(
+    plan: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="What is compared with what.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the results; one that is there is gone on with.")],
+    workers: Annotated[
+        int | None, typer.Option(help="Processes of this machine; its cores when not given.", min=1)
+    ] = None,
+    cluster: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, tcp://HOST:PORT, in place of processes.")
+    ] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of the logs or tables, if elsewhere.")] = None,
+    again: Annotated[bool, typer.Option("--again", help="Try jobs that have failed once more.")] = False,
+) -> None:
+    """Compute a grid of programs, data, recipes, settings and seeds, each job by itself.
+
+    Results come into DIR/results.parquet, a row a job. The same command goes on where it was stopped, and computes only
+    what is not there or has changed. `steady plot-study DIR` draws it.
+    """
+    import joblib
+
+    from steady_ppl.command_parts import say
+    from steady_ppl.studies.job import require_runnable
+    from steady_ppl.studies.plan import read_plan
+    from steady_ppl.studies.runner import Cluster, Local, run_study
+
+    if workers is not None and cluster is not None:
+        raise UsageError("--workers are processes of this machine: take it or --cluster")
+    read = read_plan(plan, data)
+    require_runnable(read)
+    place = Cluster(cluster) if cluster else Local(workers or joblib.cpu_count(only_physical_cores=True), out)
+    failed = run_study(read, out, place, again=again, say=say)
+    tell(f"{out / 'results.parquet'}: {len(read.jobs) - failed} of {len(read.jobs)} jobs done")
+    if failed:
+        say(f"{failed} jobs failed: column reason says why, --again tries them once more", always=True)
+        raise typer.Exit(1)
+
+
+def plot_study(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of `steady study`.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Picture to write; DIR/study.png when not given.")] = None,
+) -> None:
+    """Draw what a study has found so far, as its [picture] says, beside what is published."""
+    from steady_ppl.picture_files import require_picture, write_picture
+    from steady_ppl.studies.pictures import study_picture
+    from steady_ppl.studies.plan import recorded_plan
+    from steady_ppl.studies.table import read_results
+
+    place = out or folder / "study.png"
+    require_picture(place)
+    write_picture(study_picture(recorded_plan(folder), read_results(folder)), place)
+    tell(place)

@@ -1,0 +1,180 @@
+"""One job of a study: what a worker computes, on whichever machine it is."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import resource
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from steady_ppl.alpha_truck import read_alpha_truck
+from steady_ppl.command_effects import with_effects
+from steady_ppl.data import Trajectories
+from steady_ppl.discovery import discover
+from steady_ppl.effects import parsed
+from steady_ppl.errors import DataError, SteadyError, UsageError
+from steady_ppl.evaluation import evaluate
+from steady_ppl.program import Program
+from steady_ppl.program_file import load_program
+from steady_ppl.run_recipe import find_recipe, require_settings, trains
+from steady_ppl.seeding import seeded
+from steady_ppl.simulation import simulate
+from steady_ppl.studies.plan import Job, Plan
+from steady_ppl.table import read_table
+
+PARTS = ("train", "valid", "test")
+GROUPS = ("forward", "forward_mean", "state_estimation", "measurement")
+Split = dict[str, Trajectories]
+_one_at_a_time = threading.Lock()  # torch's random state and Pyro's parameters are the process's
+
+
+def run(job: Job) -> dict[str, Any]:
+    """Compute a job, on one thread; whatever goes wrong is its outcome, in one line.
+
+    Returns:
+        Columns of the table: those of the job, `outcome` ("done" or "failed"), `reason`, `seconds`, `peak_mib` (of
+        this process so far) and the figures.
+    """
+    with _one_at_a_time:
+        torch.set_num_threads(1)
+        began = time.perf_counter()
+        try:
+            found: dict[str, Any] = {"outcome": "done"} | TASKS[job.task](job)
+        except Exception as error:  # a study goes on without this job
+            lines = str(error).strip().splitlines() or [""]
+            found = {"outcome": "failed", "reason": f"{type(error).__name__}: {lines[0]}"}
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        return job.columns | {"seconds": time.perf_counter() - began, "peak_mib": peak} | found
+
+
+def require_runnable(plan: Plan) -> None:
+    """Load every program and look at every method's settings, before anything is sent out.
+
+    Raises:
+        SteadyError: naming the method.
+    """
+    for job in {(job.method, job.program, repr(job.settings)): job for job in plan.jobs}.values():
+        try:
+            _told(load_program(job.program), job)
+            if job.task == "fit":
+                require_settings(job.recipe, find_recipe(job.recipe), job.settings)
+            else:
+                inspect.signature(discover).bind_partial(**job.settings)
+        except SteadyError as error:
+            error.args = (f"method {job.method}: {error}",)
+            raise
+        except TypeError as error:
+            raise UsageError(f"method {job.method}: discover {error}") from error
+
+
+def _fit(job: Job) -> dict[str, Any]:
+    """Errors on the test drives, and what it took."""
+    data = drives(job)
+    with seeded(job.seed, "program"):
+        program = _told(load_program(job.program), job)
+    recipe = find_recipe(job.recipe)
+    require_settings(job.recipe, recipe, job.settings)
+    silent = {"progress": False} if trains(recipe) else {}
+    began = time.perf_counter()
+    fitted = recipe(
+        program,
+        data["train"],
+        data["valid"],
+        known_start=job.known_start,
+        seed=job.seed,
+        **silent,
+        **job.settings,
+    )
+    seconds = time.perf_counter() - began
+    judged = evaluate(fitted, data["test"], seed=job.seed)
+    figures = {f"{group}.{name}": value for group in GROUPS for name, value in judged[group].items()}
+    figures |= {f"{group}.total": sum(judged[group].values()) for group in GROUPS[:3] if judged[group]}
+    history = fitted.trained.history if fitted.trained else []
+    held_out = [entry["log_likelihood"] for entry in history if "log_likelihood" in entry]
+    return figures | {
+        "log_likelihood": judged["log_likelihood"],
+        "valid_log_likelihood": max(held_out, default=math.nan),
+        "fit_seconds": seconds,
+        "steps": history[-1]["step"] if history else 0.0,
+        "filter": judged["filter"].partition(" ")[0],
+        "notes": "; ".join(fitted.notes),
+    }
+
+
+def _discover(job: Job) -> dict[str, Any]:
+    """Whether what is missing is named, and how surely."""
+    data = drives(job)
+    figures = discover(
+        _told(load_program(job.program), job),
+        data["train"],
+        data["valid"],
+        known_start=job.known_start,
+        seed=job.seed,
+        **job.settings,
+    ).figures
+    planted, _, _, value = parsed(job.data["effect"]) if job.data["effect"] else ("", "", {}, None)
+    named = [one["effect"].partition(":")[0] for one in figures["effects"]]
+    classes = [other.partition(":")[0] for one in figures["effects"] for other in one["class"]]
+    limits = [
+        one["detection_limit"]
+        for one in figures["candidates"]
+        if one["effect"].partition(":")[0] == planted and one["detection_limit"] is not None
+    ]
+    limit = _size(limits[0]) if limits else math.nan
+    return {
+        "p_value": figures["p_value"],
+        "verdict": figures["verdict"],
+        "named": ", ".join(named),
+        "planted": planted,
+        "found": figures["verdict"] != "none",
+        "right": planted in named if planted else not named,
+        "in_class": planted in classes if planted else not named,
+        "in_limits": _size(value) / limit if value and limits else math.nan,  # how large what is missing is
+    }
+
+
+TASKS = {"fit": _fit, "discover": _discover}
+
+
+def drives(job: Job) -> Split:
+    """Train, valid and test drives, with their true states where there are any.
+
+    Raises:
+        DataError: there are none, or they are damaged.
+    """
+    told = job.data
+    if "tables" in told:
+        return {part: read_table(_table(Path(told["tables"]), part)) for part in PARTS}
+    if "alpha_truck" in told:
+        folder, degrees = Path(told["alpha_truck"]), told["sigma_deg"]
+        return {part: read_alpha_truck(folder / part, seed=job.seed, sigma_degrees=degrees) for part in PARTS}
+    truth = _told(load_program(told["simulate"]), job)
+    if told["effect"]:
+        truth = with_effects(truth, [told["effect"]], say=lambda line: None)
+    return {part: simulate(truth, told[part], seed=10 * job.seed + i) for i, part in enumerate(PARTS, 1)}
+
+
+def _told(program: Program, job: Job) -> Program:
+    """With the noise of its bearings, which is known."""
+    degrees = job.data.get("sigma_deg")
+    if degrees is not None:
+        if not hasattr(program, "bearing_sd"):
+            raise UsageError(f"{job.program} has no bearing_sd that sigma_deg could set")
+        program.bearing_sd = math.radians(degrees)
+    return program
+
+
+def _table(folder: Path, part: str) -> Path:
+    found = [file for file in (folder / f"{part}.csv", folder / f"{part}.parquet") if file.is_file()]
+    if not found:
+        raise DataError(f"{folder} has no {part}.csv and no {part}.parquet")
+    return found[0]
+
+
+def _size(value: Any) -> float:
+    return max(map(abs, value)) if isinstance(value, list | tuple) else abs(float(value))

@@ -1,0 +1,107 @@
+"""What has come in of a study: one Parquet table, and beside it what came since it was last written.
+
+A result is on disk, whole, before the next one is taken; the table is written anew when enough have come, which keeps
+ten thousand results from being written ten thousand times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pyarrow
+
+from steady_ppl.errors import RunError
+from steady_ppl.run_folder import only_writer
+from steady_ppl.whole_file import whole_file
+
+TABLE, ARRIVED = "results.parquet", "arrived"
+ENOUGH = 100  # results for which the table is written anew
+
+
+class StudyTable:
+    """The results in a folder, a row a job; of a job that was computed again the later row counts.
+
+    Args:
+        folder: of the study.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.waiting = folder, 0
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """Keep a result.
+
+        Raises:
+            RunError: it cannot be written.
+        """
+        _write(pd.DataFrame([dict(row)]), self.folder / ARRIVED / f"{row['key']}.parquet")
+        self.waiting += 1
+        if self.waiting >= ENOUGH:
+            self.merge()
+
+    def merge(self) -> None:
+        """Write the table with all that has come.
+
+        Raises:
+            RunError: it cannot be written, or a file in the folder is damaged.
+        """
+        arrived = list((self.folder / ARRIVED).glob("*.parquet"))
+        if arrived:
+            _write(read_results(self.folder), self.folder / TABLE)
+        for file in arrived:
+            file.unlink()
+        self.waiting = 0
+
+
+@contextmanager
+def study_table(folder: Path) -> Iterator[StudyTable]:
+    """The table of a study for the block that fills it, whole at its end however that comes.
+
+    Raises:
+        RunError: the folder cannot be made, or another process writes to it.
+    """
+    with only_writer(folder):
+        try:
+            (folder / ARRIVED).mkdir(exist_ok=True)
+        except OSError as error:
+            raise RunError(f"{folder} cannot be written: {error.strerror}") from error
+        table = StudyTable(folder)
+        try:
+            yield table
+        finally:
+            table.merge()
+            (folder / ARRIVED).rmdir()
+
+
+def read_results(folder: Path) -> pd.DataFrame:
+    """All results that are there, the last of each job; empty where there are none.
+
+    Raises:
+        RunError: a file is damaged.
+    """
+    table = folder / TABLE
+    files = [*([table] if table.is_file() else []), *sorted((folder / ARRIVED).glob("*.parquet"))]
+    parts = [_read(file) for file in files]
+    if not parts:
+        return pd.DataFrame({"key": []})
+    return pd.concat(parts, ignore_index=True).drop_duplicates("key", keep="last", ignore_index=True)
+
+
+def _read(file: Path) -> pd.DataFrame:
+    try:
+        found = pd.read_parquet(file)
+    except (OSError, ValueError, pyarrow.ArrowException) as error:
+        reason = str(error).partition("\n")[0]
+        raise RunError(f"{file} is damaged: {reason}; move it away, and its jobs are computed again") from error
+    if "key" not in found or "outcome" not in found:
+        raise RunError(f"{file} is no table of a study: it has no columns key and outcome")
+    return found
+
+
+def _write(frame: pd.DataFrame, file: Path) -> None:
+    with whole_file(file, RunError) as beside:
+        frame.to_parquet(beside, index=False)

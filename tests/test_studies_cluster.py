@@ -1,0 +1,182 @@
+"""A study on a Dask cluster of its own: the same results, whoever dies on the way."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from small import MODELS, steady
+
+from steady_ppl.studies.table import read_results
+
+pytest.importorskip("distributed", reason="needs dask.distributed: pip install 'steady-ppl[cluster]'")
+pytestmark = pytest.mark.slow
+
+CART = MODELS / "linear_gaussian.py"
+RECIPE = """
+import time
+from steady_ppl import Fit
+
+def fit(program, table, valid=None, *, known_start=False, seconds=0.0, seed=0):
+    time.sleep(seconds)
+    return Fit(program, "slow", {}, seed=seed, known_start=known_start)
+"""
+
+
+class Dask:
+    """A scheduler and workers, each a process, on loopback."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.processes, self.port = folder, list[subprocess.Popen](), free_port()
+
+    @property
+    def address(self) -> str:
+        return f"tcp://127.0.0.1:{self.port}"
+
+    def start(self, *words: str) -> subprocess.Popen:
+        command = [sys.executable, "-m", "distributed.cli.dask_" + words[0], *words[1:]]
+        with (self.folder / "dask.log").open("a") as log:
+            process = subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, "OMP_NUM_THREADS": "1"})
+        self.processes.append(process)
+        return process
+
+    def scheduler(self) -> subprocess.Popen:
+        words = ("--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard", "--no-show")
+        process = self.start("scheduler", *words)
+        wait_for(lambda: answers(self.port))
+        return process
+
+    def worker(self) -> subprocess.Popen:
+        words = ("--nthreads", "1", "--no-dashboard", "--no-nanny", "--local-directory", str(self.folder))
+        return self.start("worker", self.address, *words)
+
+    def end(self) -> None:
+        for process in reversed(self.processes):
+            process.kill()
+            process.wait()
+
+
+def free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return found.getsockname()[1]
+
+
+def answers(port: int) -> bool:
+    with socket.socket() as caller:
+        return caller.connect_ex(("127.0.0.1", port)) == 0
+
+
+def wait_for(condition, seconds: float = 60) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+@pytest.fixture
+def dask(tmp_path: Path) -> Iterator[Dask]:
+    cluster = Dask(tmp_path)
+    try:
+        yield cluster
+    finally:
+        cluster.end()
+
+
+def study(folder: Path, seeds: int = 6, seconds: float = 1.0) -> Path:
+    (folder / "slow.py").write_text(RECIPE)
+    (folder / "study.toml").write_text(
+        f"""
+title = "On a cluster"
+seeds = {list(range(1, seeds + 1))}
+known_start = true
+[data]
+simulate = "{CART}"
+train = 2
+valid = 2
+test = 2
+[[method]]
+name = "slow"
+program = "{CART}"
+recipe = "slow.py"
+settings = {{seconds = {seconds}}}
+"""
+    )
+    return folder / "study.toml"
+
+
+@contextmanager
+def begun(file: Path, dask: Dask, out: Path) -> Iterator[subprocess.Popen]:
+    """`steady study` in a process, when its first results are there."""
+    program = "import sys; from steady_ppl.command_line import main; sys.exit(main(sys.argv[1:]))"
+    words = ["study", str(file), "--cluster", dask.address, "--out", str(out)]
+    with (out.parent / "said").open("w") as said:
+        process = subprocess.Popen([sys.executable, "-c", program, *words], stdout=said, stderr=said)
+    try:
+        wait_for(lambda: process.poll() is not None or (out.is_dir() and len(read_results(out)) >= 2))
+        assert process.poll() is None, (out.parent / "said").read_text()
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def figures(out: Path) -> pd.DataFrame:
+    """What does not depend on the machine."""
+    found = read_results(out).sort_values("key").set_index("key")
+    return found.drop(columns=["seconds", "peak_mib", "fit_seconds"])
+
+
+def test_a_cluster_finds_what_this_machine_finds(tmp_path: Path, dask: Dask):
+    file = study(tmp_path, seeds=4, seconds=0.0)
+    dask.scheduler()
+    for _ in range(2):
+        dask.worker()
+    assert steady("study", file, "--workers", 1, "--out", tmp_path / "here") == 0
+    assert steady("study", file, "--cluster", dask.address, "--out", tmp_path / "there") == 0
+    pd.testing.assert_frame_equal(figures(tmp_path / "here"), figures(tmp_path / "there"))
+
+
+def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path: Path, dask: Dask):
+    file, out = study(tmp_path), tmp_path / "out"
+    dask.scheduler()
+    first, _ = dask.worker(), dask.worker()
+    with begun(file, dask, out) as process:
+        os.kill(first.pid, signal.SIGKILL)
+        assert process.wait(120) == 0, (tmp_path / "said").read_text()
+    found = read_results(out)
+    assert len(found) == 6 and (found["outcome"] == "done").all()
+
+
+def test_a_study_goes_on_when_its_scheduler_is_there_again(tmp_path: Path, dask: Dask):
+    file, out = study(tmp_path), tmp_path / "out"
+    scheduler = dask.scheduler()
+    for _ in range(2):
+        dask.worker()
+    with begun(file, dask, out) as process:
+        os.kill(scheduler.pid, signal.SIGKILL)
+        assert process.wait(120) == 1
+    said = (tmp_path / "said").read_text()
+    there = int(re.search(r"the cluster is gone .*: (\d) of 6 jobs are kept", said)[1])  # type: ignore[index]
+    assert "Traceback" not in said and len(read_results(out)) == there >= 2
+    dask.end()
+    dask.scheduler()
+    dask.worker()
+    assert steady("study", file, "--cluster", dask.address, "--out", out) == 0
+    assert (read_results(out)["outcome"] == "done").sum() == 6
+
+
+def test_nobody_who_answers_is_one_line(tmp_path: Path, capsys):
+    address = f"tcp://127.0.0.1:{free_port()}"
+    assert steady("study", study(tmp_path), "--cluster", address, "--out", tmp_path / "out") == 2
+    assert f"no Dask scheduler answers at {address}" in capsys.readouterr().err
