@@ -40,6 +40,7 @@ WORK: dict[str, Callable[..., Record]] = {
     "evidence": evidence.unbiased,
     "parameters": parameters.ranked,
     "discovery": discovery.judged,
+    "check": discovery.checked,
 }
 
 
@@ -52,13 +53,16 @@ class Size:
     data_sets: int
     clean: int
     single: int
+    checks: int
     problems: tuple[str, ...] = states.STATES
     guides: tuple[str, ...] = tuple(states.GUIDES)
 
 
 QUICK_GUIDES = tuple(guide for guide in states.GUIDES if guide not in FAMILIES)  # SVI's are trained, a minute each
-FULL = Size(drives=states.DRIVES, runs=evidence.COUNT, data_sets=120, clean=60, single=52)
-QUICK = Size(drives=200, runs=200, data_sets=4, clean=1, single=1, problems=("cart", "pendulum"), guides=QUICK_GUIDES)
+FULL = Size(drives=states.DRIVES, runs=evidence.COUNT, data_sets=120, clean=60, single=52, checks=60)
+QUICK = Size(
+    drives=200, runs=200, data_sets=4, clean=1, single=1, checks=1, problems=("cart", "pendulum"), guides=QUICK_GUIDES
+)
 
 
 def work(kind: str, *arguments: Any) -> Record:
@@ -81,6 +85,7 @@ def jobs(size: Size) -> dict[str, tuple[Any, ...]]:
     every += [("parameters", seed) for seed in range(1, size.data_sets + 1)]
     every += [("discovery", "clean", index) for index in range(size.clean)]
     every += [("discovery", "single", index) for index in range(size.single)]
+    every += [("check", kind, index) for kind in discovery.CLEAN for index in range(size.checks)]
     return {" ".join(map(str, arguments)): arguments for arguments in every}
 
 

@@ -1,6 +1,7 @@
-"""Whether `discover` is as sure as it may be: p-values where nothing is missing, intervals where something is.
+"""Whether `discover` and `check` are as sure as they may be where nothing is missing, and intervals where something is.
 
-The sets are made like those of the discovery benchmark (`discovery_sets.py`), with seeds that it has not seen.
+The sets of `discover` are made like those of the discovery benchmark (`discovery_sets.py`), with seeds that it has not
+seen; `check` gets clean ones of two kinds.
 """
 
 from __future__ import annotations
@@ -8,9 +9,11 @@ from __future__ import annotations
 import torch
 from discovery_sets import BenchmarkSet, benchmark_sets, owner, tables
 
+from steady_ppl import Fit, check, simulate
 from steady_ppl.discovery import discover
 
 SEED = 60_000
+CLEAN = {"one long drive": (1, 30.0, False), "twelve drives": (12, 6.0, True)}  # number, s, known start
 
 
 def fresh(stratum: str, index: int) -> BenchmarkSet:
@@ -35,3 +38,14 @@ def judged(stratum: str, index: int) -> dict:
         "effects": list(chosen.effects),
         "found": found,
     }
+
+
+def checked(kind: str, index: int) -> dict:
+    """Whom `check` accuses of clean drives of the program itself."""
+    torch.set_num_threads(1)
+    drives, seconds, known_start = CLEAN[kind]
+    program = owner(())
+    program.duration = seconds
+    data = simulate(program, drives, seed=SEED + 2000 + index)
+    figures = check(Fit(program, "hand", known_start=known_start), data, seed=index).figures
+    return {"p_value": figures["p_value"], "who": figures["who"], "findings": len(figures["findings"])}
