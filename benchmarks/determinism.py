@@ -92,12 +92,16 @@ def steady(folder: Path, words: tuple[str, ...], environment: dict[str, str]) ->
 def results(folder: Path) -> dict[str, bytes]:
     """What a command has written, file by file, but for where and by what command line it was; of tensors their
     numbers, since safetensors writes its metadata in any order."""
-    files = [file for file in sorted(folder.rglob("*")) if file.is_file() and "cache" not in file.parts]
-    return {
+    files = [file for file in sorted(folder.rglob("*")) if file.is_file()]
+    files = [file for file in files if "cache" not in file.relative_to(folder).parts]
+    found = {
         str(file.relative_to(folder)): _tensors(file) if file.suffix == ".safetensors" else file.read_bytes()
         for file in files
         if file.name not in ("run.json", "posterior.nc")
     }
+    if not found:
+        raise RuntimeError(f"{folder} has no results")
+    return found
 
 
 def _tensors(file: Path) -> bytes:
@@ -105,9 +109,11 @@ def _tensors(file: Path) -> bytes:
 
 
 def furthest(one: Path, other: Path) -> float:
-    """How far the numbers of two results are apart at most, relative to the largest of their array or 1; NaN if they
-    have not the same numbers."""
+    """How far the numbers of two results are apart at most, relative to the largest of their array or 1; NaN where
+    that is not told."""
     found = [0.0]
+    if any(Path(file).suffix not in (".csv", ".json", ".safetensors") for file in results(one)):
+        return float("nan")
     for file in results(one):
         a, b = (_numbers(folder / file) for folder in (one, other))
         if a.keys() != b.keys() or any(a[key].shape != b[key].shape for key in a):

@@ -71,9 +71,9 @@ def evaluate(
     for run, result in zip(runs, results, strict=True):
         if result["filter"] != "lookahead":
             say(f"{run}: judged by the filter {result['filter']}")
-        share, count = (result["scarce"][key] for key in ("share", "particles"))
+        share, count, drive = (result["scarce"][key] for key in ("share", "particles", "trajectory"))
         if share > OFTEN:
             say(
-                f"{run}: after {share:.0%} of the measured rows fewer than {FEW} of the filter's {count} particles "
-                "were in effect: its log p(y) scatters and is mostly too low, raise --particles"
+                f"{run}: after {share:.0%} of drive {drive}'s measured rows fewer than {FEW} of the filter's {count} "
+                "particles were in effect: its log p(y) scatters and is mostly too low, raise --particles"
             )

@@ -43,6 +43,6 @@ def states(
     posterior = fit.posterior(drives, draws=draws, particles=particles, seed=seed)
     write_states(posterior, out)
     tell(f"{out}: {len(drives)} drives, {draws} draws of each")
-    scarce = few_starts(float(posterior["sample_stats"]["roots"].mean()))
+    scarce = few_starts(float(posterior["sample_stats"]["roots"].min()))
     for doubt in [*doubts_of_units(fit.program, for_program(fit.program, drives)), *([scarce] if scarce else [])]:
         say(doubt)

@@ -44,10 +44,10 @@ def evaluate(
 
     Returns:
         `known_start` and `measured` (what log p(y) is given and is of), `filter` ("lookahead", or "bootstrap" and why),
-        `log_likelihood` (mean per trajectory at every tenth row), `scarce` (how many `particles` its filter had, and
-        the `share` of measured rows after which fewer than ten of them were in effect), `forward`, `forward_mean`,
-        `state_estimation` (error groups; empty without true states), `measurement` and, if asked for, `map` (see
-        `map_errors`; `learned`: whether the landmarks are elsewhere than declared).
+        `log_likelihood` (mean per trajectory at every tenth row), `scarce` (how many `particles` its filter had, and in
+        which `trajectory` after the largest `share` of measured rows fewer than ten of them were in effect), `forward`,
+        `forward_mean`, `state_estimation` (error groups; empty without true states), `measurement` and, if asked for,
+        `map` (see `map_errors`; `learned`: whether the landmarks are elsewhere than declared).
 
     Raises:
         DataError: the table lacks a column or a known start, or a drive is too long (`refuse_long`).
@@ -69,7 +69,12 @@ def evaluate(
         with seeded(seed, "log_likelihood"):
             found = evidence(program, data, **settings)
             result["log_likelihood"] = float(found.log_likelihood.mean())
-            result["scarce"] = {"share": float(found.scarce.mean()), "particles": choice.particles}
+            worst = int(found.scarce.argmax())
+            result["scarce"] = {
+                "trajectory": data.labels[worst],
+                "share": float(found.scarce[worst]),
+                "particles": choice.particles,
+            }
         result |= {"forward": {}, "forward_mean": {}, "state_estimation": {}}
         begin()
         if has_truth(data):

@@ -10,6 +10,7 @@ from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError, require
 from steady_ppl.table import from_frame, to_frame
 
+MOST_PIECES = 1_000_000
 MOST_ROWS = 20_000
 """Of a trajectory: filters keep the particles of every row, some .17 MB, and `check` simulates it a hundred times."""
 
@@ -55,8 +56,9 @@ def cut(data: Trajectories, seconds: float) -> Trajectories:
     frame = to_frame(data)
     drives = frame.groupby("trajectory", sort=False)
     since = frame["time"] - drives["time"].transform("first")
+    require(float(since.max()) / seconds < MOST_PIECES, "seconds", seconds, f"enough for {MOST_PIECES} pieces")
     piece = np.floor(since / seconds + 1e-6).astype(int)  # a row that rounding puts before its time is in time
-    measured = frame.filter(like="y.").notna().any(axis=1)
+    measured = frame.filter(regex=r"^y\.").notna().any(axis=1)
     place = [frame["trajectory"], piece]
     kept = measured.groupby(place).cummax()
     kept &= kept.groupby(place).transform("sum") > 1

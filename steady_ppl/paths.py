@@ -103,5 +103,5 @@ class Filtered:
 
 
 def few_starts(roots: float) -> str | None:
-    """What is to be said where so many of the particles' starts, on average, survive a drive: all paths begin alike."""
+    """What is to be said where so many of the particles' starts survive a drive: all paths begin alike."""
     return f"of the particles' starts {roots:.0f} survive a drive: raise particles" if roots < FEW else None

@@ -67,7 +67,8 @@ def test_particles_that_collapse_are_said(tmp_path: Path, capsys) -> None:
     said = capsys.readouterr().err
     found = json.loads((tmp_path / "found.json").read_text())["runs"][0]["scarce"]
     assert found["particles"] == 50 and 0.5 < found["share"] <= 1
-    assert f"after {found['share']:.0%} of the measured rows fewer than 10 of the filter's 50 particles" in said
+    after = f"after {found['share']:.0%} of drive {found['trajectory']}'s measured rows"
+    assert f"{after} fewer than 10 of the filter's 50 particles" in said
     assert steady("states", run, table, "--particles", 50, "--out", tmp_path / "states.csv") == 0
     assert "starts 1 survive a drive: raise particles" in capsys.readouterr().err
 

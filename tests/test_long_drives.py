@@ -35,7 +35,15 @@ def test_a_piece_begins_with_a_measurement_and_has_two_rows():
     assert pieces.observed[0].any(-1).all()
 
 
-@pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_control_may_have_y_in_its_name():
+    data = simulated(trajectories=1, rows=21)
+    observed = data.observed.clone()
+    observed[:10] = False
+    pieces = st.cut(replace(data, observed=observed, control_names=("battery.volts", "right")), 1.0)
+    assert pieces.labels == ("1-2",)
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf"), 1e-20, 1e-320])
 def test_no_length_of_time_is_refused(seconds):
     with pytest.raises(st.UsageError, match="seconds"):
         st.cut(simulated(), seconds)

@@ -266,19 +266,24 @@ def _source(path: Path, given: Mapping[str, Any], folder: Path | None) -> dict[s
     if kind != "simulate" and not Path(place).is_dir():
         raise UsageError(f"{path}: there is no folder {place} (data.{kind}); --data names another")
     said = {name: given.get(name, usual) for name, usual in SOURCES[kind].items()}
+    for name, value in said.items():
+        form = TEXT if name == "effect" else NUMBER if name == "sigma_deg" else WHOLE
+        problem = misfit(value if isinstance(value, list) else [value], [Maybe(form)], f"data.{name}")
+        if problem is not None:
+            raise UsageError(f"{path}: {problem}")
     return {kind: place} | {name: value for name, value in said.items() if value is not None}
 
 
 def _jobs(path: Path, content: Mapping[str, Any], task: str, source: Mapping[str, Any]) -> Iterator[Job]:
     files = _contents(path, [Path(value) for name, value in source.items() if name in ("alpha_truck", "tables")])
     for seed in content["seeds"]:
-        for data in _grid(source):
+        for data in _grid(path, source):
             for method in content["method"]:
                 program = str(_beside(path, method["program"]))
                 recipe = method.get("recipe", "steady") if task == "fit" else ""
                 recipe = str(_beside(path, recipe)) if recipe.endswith(".py") else recipe
                 given = {name: _resolved(path, value) for name, value in method.get("settings", {}).items()}
-                for settings in _grid(given):
+                for settings in _grid(path, given):
                     start = content.get("known_start", False)
                     job = Job(task, method["name"], program, recipe, data, settings, seed, start, key=files)
                     named = [program, recipe, *data.values(), *settings.values()]
@@ -287,8 +292,13 @@ def _jobs(path: Path, content: Mapping[str, Any], task: str, source: Mapping[str
                     yield replace(job, key=_hash(said.encode(), _contents(path, programs).encode()))
 
 
-def _grid(values: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+def _grid(path: Path, values: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     axes = [value if isinstance(value, list) else [value] for value in values.values()]
+    for name, axis in zip(values, axes, strict=True):
+        if not axis:
+            raise UsageError(f"{path}: {name} is an axis without a value")
+        if not all(isinstance(value, str | int | float | bool | list) for value in axis):
+            raise UsageError(f"{path}: {name} is {axis}, expected numbers, text, true or false")
     for cell in itertools.product(*axes):
         yield dict(zip(values, cell, strict=True))
 
