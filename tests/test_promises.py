@@ -14,6 +14,7 @@ PAGE = (ROOT / "docs" / "promises.md").read_text()
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import calibrate  # noqa: E402
+import determinism  # noqa: E402
 from calibration_tables import tables  # noqa: E402
 
 
@@ -58,3 +59,9 @@ def test_the_hostile_trials_are_those_of_their_records():
         max(record["mib"] for record in found),
     ]
     assert [f"{figure:,}" for figure in figures] in rows(PAGE)
+
+
+def test_what_repeats_is_said_of_every_command_that_was_run():
+    told = {cells[0]: cells[1:] for cells in rows(PAGE) if cells[0] in determinism.COMMANDS}
+    assert len(told) >= 11 and {tuple(cells[:2]) for cells in told.values()} == {("same", "same")}
+    assert "DETERMINISM" not in PAGE
