@@ -10,6 +10,7 @@ import pytest
 from small import MODELS, steady
 
 from steady_ppl.errors import RunError, UsageError
+from steady_ppl.studies.job import require_runnable
 from steady_ppl.studies.pictures import study_picture
 from steady_ppl.studies.plan import read_plan
 from steady_ppl.studies.runner import Local, run_study
@@ -118,6 +119,13 @@ def test_what_no_job_could_do_is_said_before_any_is_begun(tmp_path: Path, capsys
     file = written(tmp_path, STUDY.replace(old, new, 1))
     assert steady("study", file, "--out", tmp_path / "out") == 2
     assert says in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("file", sorted((MODELS.parent / "studies").glob("*.toml")), ids=lambda file: file.stem)
+def test_a_ready_study_can_be_begun(tmp_path: Path, file: Path):
+    plan = read_plan(file, tmp_path)
+    require_runnable(plan)
+    assert plan.jobs and plan.picture is not None
 
 
 # --- the table --------------------------------------------------------------------------------------------------------
