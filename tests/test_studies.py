@@ -12,8 +12,8 @@ from small import MODELS, steady
 from steady_ppl.errors import RunError, UsageError
 from steady_ppl.studies.job import require_runnable
 from steady_ppl.studies.pictures import study_picture
-from steady_ppl.studies.plan import read_plan
 from steady_ppl.studies.runner import Local, run_study
+from steady_ppl.studies.study_file import read_plan
 from steady_ppl.studies.table import ARRIVED, TABLE, StudyTable, read_results, study_table
 
 CART = f"{MODELS / 'linear_gaussian.py'}"
@@ -123,7 +123,7 @@ def test_what_no_job_could_do_is_said_before_any_is_begun(tmp_path: Path, capsys
 
 @pytest.mark.parametrize("file", sorted((MODELS.parent / "studies").glob("*.toml")), ids=lambda file: file.stem)
 def test_a_ready_study_can_be_begun(tmp_path: Path, file: Path):
-    plan = read_plan(file, tmp_path)
+    plan = read_plan(file, tmp_path if "alpha_truck" in file.read_text() else None)
     require_runnable(plan)
     assert plan.jobs and plan.picture is not None
 
