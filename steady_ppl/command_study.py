@@ -39,7 +39,7 @@ def study(
         raise UsageError("--workers are processes of this machine: take it or --cluster")
     read = read_plan(plan, data)
     require_runnable(read)
-    place = Cluster(cluster) if cluster else Local(workers or joblib.cpu_count(only_physical_cores=True), out)
+    place = Cluster(cluster) if cluster is not None else Local(workers or joblib.cpu_count(only_physical_cores=True))
     failed = run_study(read, out, place, again=again, say=say)
     tell(f"{out / 'results.parquet'}: {len(read.jobs) - failed} of {len(read.jobs)} jobs done")
     if failed:

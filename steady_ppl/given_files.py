@@ -47,6 +47,20 @@ def read_json(path: Path, refused: type[SteadyError]) -> Any:
         raise refused(f"{path} is damaged: it is nested too deeply") from None
 
 
+def refuse_newer(record: Any, known: int, folder: Path, refused: type[SteadyError]) -> None:
+    """Refuse a record whose `format` is a number that is not known yet.
+
+    Raises:
+        SteadyError, of the kind that is `refused`.
+    """
+    form = record.get("format", known) if isinstance(record, dict) else known
+    if isinstance(form, int) and form > known:
+        raise refused(
+            f"{folder} was written by a newer steady-ppl: its form is number {form}, this one reads up to {known}; "
+            "install that version or a later one to read it"
+        )
+
+
 class Maybe(NamedTuple):
     """A form that may be null."""
 

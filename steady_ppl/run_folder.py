@@ -15,7 +15,7 @@ from filelock import FileLock, Timeout
 from steady_ppl.checkpoint import read_tensors
 from steady_ppl.commanded import command_line
 from steady_ppl.errors import RunError
-from steady_ppl.given_files import misfit, read_json, require_file
+from steady_ppl.given_files import misfit, read_json, refuse_newer, require_file
 from steady_ppl.run_forms import BEGUN_RECORD, FINISHED, FINISHED_RECORD, FORMAT, FOUND
 from steady_ppl.whole_file import whole_file
 
@@ -189,12 +189,7 @@ def read_record(folder: Path) -> dict[str, Any]:
         record = read_json(folder / RECORD, RunError)
     except (FileNotFoundError, NotADirectoryError):
         raise RunError(f"{folder} is not a run: it has no {RECORD}") from None
-    form = record.get("format", FORMAT) if isinstance(record, dict) else FORMAT
-    if isinstance(form, int) and form > FORMAT:
-        raise RunError(
-            f"{folder} was written by a newer steady-ppl: its form is number {form}, this one reads up to {FORMAT}; "
-            "install that version or a later one to read it"
-        )
+    refuse_newer(record, FORMAT, folder, RunError)
     problem = misfit(record, BEGUN_RECORD)
     if problem is None and record["status"] in FINISHED:
         problem = misfit(record, FINISHED_RECORD)

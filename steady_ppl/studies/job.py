@@ -7,6 +7,9 @@ import math
 import resource
 import threading
 import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +29,10 @@ from steady_ppl.program_file import load_program
 from steady_ppl.run_recipe import find_recipe, require_settings, trains
 from steady_ppl.seeding import seeded
 from steady_ppl.simulation import simulate
-from steady_ppl.studies.plan import Job, Plan
+from steady_ppl.studies.keys import PARTS, TABLES
+from steady_ppl.studies.plan import IN_LIMITS, Job, Plan
 from steady_ppl.table import read_table
 
-PARTS = ("train", "valid", "test")
 GROUPS = ("forward", "forward_mean", "state_estimation", "measurement")
 Split = dict[str, Trajectories]
 _one_at_a_time = threading.Lock()  # torch's random state and Pyro's parameters are the process's
@@ -40,7 +43,7 @@ def run(job: Job) -> dict[str, Any]:
 
     Returns:
         Columns of the table: those of the job, `outcome` ("done" or "failed"), `reason`, `seconds`, `peak_mib` (of
-        this process so far) and the figures.
+        this process so far), `version` of steady-ppl and the figures.
     """
     with _one_at_a_time:
         torch.set_num_threads(1)
@@ -51,27 +54,43 @@ def run(job: Job) -> dict[str, Any]:
             lines = str(error).strip().splitlines() or [""]
             found = {"outcome": "failed", "reason": f"{type(error).__name__}: {lines[0]}"}
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        return job.columns | {"seconds": time.perf_counter() - began, "peak_mib": peak} | found
+        spent = {"seconds": time.perf_counter() - began, "peak_mib": peak, "version": version("steady-ppl")}
+        return job.columns | spent | found
 
 
 def require_runnable(plan: Plan) -> None:
-    """Load every program and look at every method's settings, before anything is sent out.
+    """Load every program, plant every effect and look at every method's settings, before anything is sent out.
 
     Raises:
         SteadyError: naming the method.
     """
-    for job in {(job.method, job.program, repr(job.settings)): job for job in plan.jobs}.values():
-        try:
+    for job in {(job.method, repr(job.settings)): job for job in plan.jobs}.values():
+        with _named(f"method {job.method}"):
             _told(load_program(job.program), job)
             if job.task == "fit":
                 require_settings(job.recipe, find_recipe(job.recipe), job.settings)
             else:
-                inspect.signature(discover).bind_partial(**job.settings)
-        except SteadyError as error:
-            error.args = (f"method {job.method}: {error}",)
-            raise
-        except TypeError as error:
-            raise UsageError(f"method {job.method}: discover {error}") from error
+                _require_search_settings(job.settings)
+    for job in {repr(job.data): job for job in plan.jobs if "simulate" in job.data}.values():
+        with _named("data"):
+            _truth(job)
+
+
+@contextmanager
+def _named(what: str) -> Iterator[None]:
+    try:
+        yield
+    except SteadyError as error:
+        error.args = (f"{what}: {error}",)
+        raise
+
+
+def _require_search_settings(settings: Mapping[str, Any]) -> None:
+    given = set(list(inspect.signature(discover).parameters)[:3]) | {"known_start", "seed"}  # by the study itself
+    known = [name for name in inspect.signature(discover).parameters if name not in given]
+    unknown = [name for name in settings if name not in known]
+    if unknown:
+        raise UsageError(f"discover has no setting {unknown[0]}; there are {', '.join(known)}")
 
 
 def _fit(job: Job) -> dict[str, Any]:
@@ -150,7 +169,7 @@ def _discover(job: Job) -> dict[str, Any]:
         "found": figures["verdict"] != "none",
         "right": planted in named if planted else not named,
         "in_class": planted in classes if planted else not named,
-        "in_limits": _size(value) / limit if value and limits else math.nan,  # how large what is missing is
+        IN_LIMITS: _size(value) / limit if value and limits else math.nan,
     }
 
 
@@ -169,10 +188,14 @@ def drives(job: Job) -> Split:
     if "alpha_truck" in told:
         folder, degrees = Path(told["alpha_truck"]), told["sigma_deg"]
         return {part: read_alpha_truck(folder / part, seed=job.seed, sigma_degrees=degrees) for part in PARTS}
-    truth = _told(load_program(told["simulate"]), job)
-    if told["effect"]:
-        truth = with_effects(truth, [told["effect"]], say=lambda line: None)
+    truth = _truth(job)
     return {part: simulate(truth, told[part], seed=10 * job.seed + i) for i, part in enumerate(PARTS, 1)}
+
+
+def _truth(job: Job) -> Program:
+    """What simulates the drives, with the effect that its owner's program lacks."""
+    truth, effect = _told(load_program(job.data["simulate"]), job), job.data["effect"]
+    return with_effects(truth, [effect], say=lambda line: None) if effect else truth
 
 
 def _told(program: Program, job: Job) -> Program:
@@ -186,9 +209,10 @@ def _told(program: Program, job: Job) -> Program:
 
 
 def _table(folder: Path, part: str) -> Path:
-    found = [file for file in (folder / f"{part}.csv", folder / f"{part}.parquet") if file.is_file()]
+    files = [folder / f"{part}{ending}" for ending in TABLES]
+    found = [file for file in files if file.is_file()]
     if not found:
-        raise DataError(f"{folder} has no {part}.csv and no {part}.parquet")
+        raise DataError(f"{folder} has no {' and no '.join(file.name for file in files)}")
     return found[0]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,52 +12,87 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from steady_ppl.errors import UsageError
+from steady_ppl.harmless import harmless
 from steady_ppl.proof_pictures import COLORS, MARKS
-from steady_ppl.studies.plan import Picture, Plan
+from steady_ppl.studies.plan import IN_LIMITS, Picture, Plan
+from steady_ppl.studies.study_file import LARGEST
 
 SIZES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0)  # ends of ranges of what is missing, in detection limits
-IN_LIMITS = "in_limits"
+Points = Sequence[Sequence[float]]
 
 
 def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
     """The panels of a study: means of the seeds with their standard deviations, lines of methods and of what else was
-    varied; of shares (true or false) exact 95 % intervals.
+    varied; of shares (true or false) exact 95 % intervals; a horizontal line where a method has no x; a cross at the
+    upper edge where a job has failed.
 
     Args:
         plan: the study, with a `[picture]`.
         results: its table.
 
     Raises:
-        UsageError: it has no picture, nothing of it is done yet, or it has no such column.
+        UsageError: it has no picture, nothing of it is done yet, or a column is not there or holds no numbers.
     """
-    if plan.picture is None:
+    picture = plan.picture
+    if picture is None:
         raise UsageError("the study has no [picture]: say there which columns x and y are")
     keys = {job.key for job in plan.jobs}
-    done = results[results["key"].isin(keys) & (results["outcome"] == "done")] if len(results) else results
+    own = results[results["key"].isin(keys)] if len(results) else results
+    done = own[own["outcome"] == "done"] if len(own) else own
     if not len(done):
         raise UsageError("no job of the study is done yet")
-    missing = [name for name in (plan.picture.x, *plan.picture.y) if name not in done]
+    missing = [name for name in picture.columns if name not in own]
     if missing:
-        numbers = ", ".join(name for name in done if pd.api.types.is_numeric_dtype(done[name]))
-        raise UsageError(f"the table has no column {missing[0]}; of numbers it has {numbers}")
-    figure = Figure(figsize=(6.2 * len(plan.picture.y), 4.4), layout="constrained")
-    figure.suptitle(plan.title, fontsize=11, parse_math=False)
-    lines = list(_lines(plan, done))
-    for panel, column in zip(figure.subplots(1, len(plan.picture.y), squeeze=False)[0], plan.picture.y, strict=True):
-        _panel(panel, plan.picture, column, lines)
+        raise UsageError(f"the table has no column {missing[0]}; it has {', '.join(map(str, own))}")
+    own = own.assign(**{name: _numbers(own, name) for name in picture.columns})
+    if picture.chosen_by:
+        own = chosen(picture, own)
+    figure = Figure(figsize=(6.2 * len(picture.y), 4.4), layout="constrained")
+    figure.suptitle(harmless(plan.title), fontsize=11, parse_math=False)
+    lines = _lines(picture, own)
+    for panel, column in zip(figure.subplots(1, len(picture.y), squeeze=False)[0], picture.y, strict=True):
+        _panel(panel, picture, column, lines)
     return figure
 
 
-def _lines(plan: Plan, done: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+def _numbers(rows: pd.DataFrame, name: str) -> pd.Series:
+    """A column as numbers, or as true and false; NaN where a job has none, and where it is beyond what can be drawn."""
+    values = rows[name]
+    there = values[values.notna()]
+    if there.map(lambda value: isinstance(value, bool | np.bool_)).all():
+        return values
+    if not there.map(lambda value: isinstance(value, int | float | np.number)).all():
+        raise UsageError(f"column {name} of the table holds no numbers")
+    numbers = values.astype(float)
+    return numbers.where(numbers.abs() <= LARGEST)
+
+
+def chosen(picture: Picture, rows: pd.DataFrame) -> pd.DataFrame:
+    """Of each method's settings at each x those whose mean of `chosen_by` is largest, in rows of all seeds; settings
+    with which a seed has failed come after those with which none has."""
+    settings = [name for name in rows if str(name).startswith("settings.") and name != picture.x]
+    kept = []
+    for _, tried in rows.groupby(["method", picture.x], sort=False, dropna=False):
+        varied = [name for name in settings if tried[name].nunique(dropna=False) > 1]
+        groups = [part for _, part in tried.groupby(varied, sort=False, dropna=False)] if varied else [tried]
+        kept.append(max(groups, key=lambda part: _merit(part, picture.chosen_by)).assign(**dict.fromkeys(varied)))
+    return pd.concat(kept)
+
+
+def _merit(rows: pd.DataFrame, column: str) -> tuple[int, float]:
+    mean = rows[column].mean()
+    return -int((rows["outcome"] == "failed").sum()), float(mean) if mean == mean else -math.inf
+
+
+def _lines(picture: Picture, rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     """Rows of a method, apart where a setting or what is said of the data was varied besides x."""
-    assert plan.picture is not None
-    axes = [name for name in done if name.startswith(("data.", "settings.")) and name != plan.picture.x]
-    if plan.picture.x == IN_LIMITS:
-        return [(str(method), rows) for method, rows in done.groupby("method", sort=False)]
+    if picture.x == IN_LIMITS:
+        return [(str(method), part) for method, part in rows.groupby("method", sort=False)]
+    axes = [name for name in rows if str(name).startswith(("data.", "settings.")) and name != picture.x]
     found = []
-    for method, rows in done.groupby("method", sort=False):
-        varied = [name for name in axes if rows[name].nunique(dropna=False) > 1]
-        for values, part in rows.groupby(varied, sort=False, dropna=False) if varied else [((), rows)]:
+    for method, own in rows.groupby("method", sort=False):
+        varied = [name for name in axes if own[name].nunique(dropna=False) > 1]
+        for values, part in own.groupby(varied, sort=False, dropna=False) if varied else [((), own)]:
             said = [f"{name.partition('.')[2]} {value}" for name, value in zip(varied, values, strict=True)]
             found.append((", ".join([str(method), *said]), part))
     return found
@@ -68,34 +102,59 @@ def _panel(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str,
     published = dict(picture.published.get(column, {}))
     for index, (name, rows) in enumerate(lines):
         mark, color = MARKS[index % len(MARKS)], COLORS[index % len(COLORS)]
-        x, middle, low, high = _points(rows, picture.x, column)
-        axes.errorbar(x, middle, (low, high), fmt=f"{mark}-", color=color, ms=5, lw=1.5, capsize=3, label=name)
-        _published(axes, published.pop(name, []), color, f"{name}, published")
-    for index, (name, points) in enumerate(published.items(), len(lines)):
-        _published(axes, points, COLORS[index % len(COLORS)], f"{name}, published")
-    values = np.array([value for _, rows in lines for value in rows[picture.x].dropna()], dtype=float)
-    if picture.x != IN_LIMITS and len(values) and values.min() > 0 and values.max() > 4 * values.min():
-        axes.set_xscale("log")
-        axes.set_xticks(sorted(set(values)), [f"{value:g}" for value in sorted(set(values))], minor=False)
-        axes.minorticks_off()
-    axes.set_xlabel(picture.labels.get(picture.x, picture.x), parse_math=False)
-    axes.set_ylabel(picture.labels.get(column, column), parse_math=False)
+        points, said = _points(rows, picture.x, column), harmless(name, kept="")
+        if rows[picture.x].isna().all() and rows[column].notna().any():  # the same wherever x is
+            axes.axhline(float(rows[column].astype(float).mean()), color=color, lw=1.5, ls=":", label=said)
+        elif points:
+            x, middle, low, high = zip(*points, strict=True)
+            axes.errorbar(x, middle, (low, high), fmt=f"{mark}-", color=color, ms=5, lw=1.5, capsize=3, label=said)
+        _published(axes, published.pop(name, []), color, name)
+        _failed(axes, rows, picture.x, color, name)
+    for index, (name, others) in enumerate(published.items(), len(lines)):
+        _published(axes, others, COLORS[index % len(COLORS)], name)
+    _scale(axes, picture, lines)
+    axes.set_xlabel(harmless(picture.labels.get(picture.x, picture.x)), parse_math=False)
+    axes.set_ylabel(harmless(picture.labels.get(column, column)), parse_math=False)
     axes.grid(alpha=0.25)
-    axes.legend(fontsize=7)
+    if axes.get_legend_handles_labels()[0]:
+        for text in axes.legend(fontsize=7).get_texts():
+            text.set_parse_math(False)
 
 
-def _published(axes: Axes, points: Sequence[Sequence[float]], color: str, name: str) -> None:
+def _published(axes: Axes, points: Points, color: str, name: str) -> None:
     if points:
-        axes.plot(*zip(*points, strict=True), "--", color=color, marker="*", ms=7, lw=0.9, alpha=0.6, label=name)
+        said = f"{harmless(name, kept='')}, published"
+        axes.plot(*zip(*points, strict=True), "--", color=color, marker="*", ms=7, lw=0.9, alpha=0.6, label=said)
 
 
-def _points(rows: pd.DataFrame, x: str, y: str) -> tuple[list[float], list[float], list[float], list[float]]:
+def _failed(axes: Axes, rows: pd.DataFrame, x: str, color: str, name: str) -> None:
+    """A cross at the upper edge for each place where jobs have failed."""
+    failed = rows[rows["outcome"] == "failed"]
+    places = failed[x].dropna().unique()
+    if len(places):
+        said = f"{harmless(name, kept='')}: {len(failed)} of {len(rows)} failed"
+        edge = axes.get_xaxis_transform()
+        axes.plot(
+            places, [0.98] * len(places), "x", color=color, ms=8, mew=2, transform=edge, clip_on=False, label=said
+        )
+
+
+def _scale(axes: Axes, picture: Picture, lines: Sequence[tuple[str, pd.DataFrame]]) -> None:
+    """Logarithmic, with a tick a value, where x goes over more than a factor of four."""
+    values = np.unique(np.concatenate([rows[picture.x].dropna().to_numpy(float) for _, rows in lines]))
+    if picture.x != IN_LIMITS and len(values) and values[0] > 0 and values[-1] > 4 * values[0]:
+        axes.set_xscale("log")
+        if len(values) <= 12:
+            axes.set_xticks(values, [f"{value:g}" for value in values])
+            axes.minorticks_off()
+
+
+def _points(rows: pd.DataFrame, x: str, y: str) -> list[tuple[float, float, float, float]]:
     """Places, middles and how far bars reach below and above."""
     rows = rows[rows[x].notna() & rows[y].notna()]
     share = rows[y].map(lambda value: isinstance(value, bool | np.bool_)).all()
-    groups: Any = rows.groupby(pd.cut(rows[x], SIZES), observed=True) if x == IN_LIMITS else rows.groupby(x)
     found = []
-    for _, part in groups:
+    for _, part in rows.groupby(pd.cut(rows[x], SIZES), observed=True) if x == IN_LIMITS else rows.groupby(x):
         values = part[y].astype(float)
         middle = float(values.mean())
         if share:
@@ -104,4 +163,4 @@ def _points(rows: pd.DataFrame, x: str, y: str) -> tuple[list[float], list[float
             spread = float(values.std()) if len(values) > 1 else 0.0
             low, high = middle - spread, middle + spread
         found.append((float(part[x].mean()), middle, middle - low, high - middle))
-    return tuple(map(list, zip(*found, strict=True))) if found else ([math.nan],) * 4  # type: ignore
+    return found

@@ -8,10 +8,22 @@ from pathlib import Path
 from typing import Any
 
 from steady_ppl.errors import RunError
-from steady_ppl.given_files import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Maybe, misfit, read_json
+from steady_ppl.given_files import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Maybe, misfit, read_json, refuse_newer
 from steady_ppl.whole_file import whole_file
 
+IN_LIMITS = "in_limits"  # how large what is missing is, in detection limits
+TASKS = ("fit", "discover")
+FIGURES = {
+    "fit": (
+        *("forward.", "forward_mean.", "state_estimation.", "measurement."),
+        *("log_likelihood", "valid_log_likelihood", "fit_seconds", "steps", "seconds", "peak_mib"),
+    ),
+    "discover": ("p_value", "found", "right", "in_class", IN_LIMITS, "seconds", "peak_mib"),
+}
+"""Columns of numbers that a task fills, or how they begin."""
+
 POINTS = {str: {str: [[NUMBER]]}}
+FORMAT = 1
 RECORD = "study.json"
 RECORDED: dict[str, Any] = {
     "title": TEXT,
@@ -24,7 +36,7 @@ RECORDED: dict[str, Any] = {
             "known_start": TRUTH,
         }
     ],
-    "picture": Maybe({"x": TEXT, "y": LINES, "labels": {str: TEXT}, "published": POINTS}),
+    "picture": Maybe({"x": TEXT, "y": LINES, "labels": {str: TEXT}, "published": POINTS, "chosen_by": TEXT}),
 }
 
 
@@ -58,7 +70,7 @@ class Job:
 
     @property
     def columns(self) -> dict[str, Any]:
-        """What the table says of it: `data.…` and `settings.…` are the axes, paths are names."""
+        """What the table says of it: `data.…` and `settings.…` are the axes, paths are names, lists are JSON."""
         source = {f"data.{name}": without_folder(value) for name, value in self.data.items()}
         chosen = {f"settings.{name}": without_folder(value) for name, value in self.settings.items()}
         return {
@@ -100,12 +112,20 @@ class Picture:
         y: columns, a panel each.
         labels: of axes, by their columns.
         published: of a panel, by the method's name: points that others have found, `(x, y)`.
+        chosen_by: a column of held-out drives; of a method's settings only the one with its largest mean at each x is
+            drawn. All of them when empty.
     """
 
     x: str
     y: list[str]
     labels: dict[str, str] = field(default_factory=dict)
     published: dict[str, dict[str, list[list[float]]]] = field(default_factory=dict)
+    chosen_by: str = ""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """All that is drawn or chosen by, each once."""
+        return tuple(dict.fromkeys(name for name in (self.x, *self.y, self.chosen_by) if name))
 
 
 def record_plan(plan: Plan, folder: Path) -> None:
@@ -115,19 +135,20 @@ def record_plan(plan: Plan, folder: Path) -> None:
         RunError: it cannot be written.
     """
     with whole_file(folder / RECORD, RunError) as beside:
-        beside.write_text(json.dumps(asdict(plan), indent=1) + "\n")
+        beside.write_text(json.dumps({"format": FORMAT, **asdict(plan)}, indent=1) + "\n")
 
 
 def recorded_plan(folder: Path) -> Plan:
     """The plan that the results in a folder are of.
 
     Raises:
-        RunError: there is none, or it is damaged.
+        RunError: there is none, it is damaged, or a newer steady-ppl wrote it.
     """
     try:
         content = read_json(folder / RECORD, RunError)
     except (FileNotFoundError, NotADirectoryError):
         raise RunError(f"{folder} is not a study: it has no {RECORD}") from None
+    refuse_newer(content, FORMAT, folder, RunError)
     problem = misfit(content, RECORDED)
     if problem is not None:
         raise RunError(f"{folder / RECORD} is damaged: {problem}")
@@ -137,5 +158,7 @@ def recorded_plan(folder: Path) -> Plan:
 
 
 def without_folder(value: Any) -> Any:
-    """The name of a file, whose folder is one machine's; anything else as it is."""
+    """The name of a file, whose folder is one machine's; a list as JSON; anything else as it is."""
+    if isinstance(value, list):
+        return json.dumps([without_folder(one) for one in value])
     return Path(value).name if isinstance(value, str) and "/" in value else value

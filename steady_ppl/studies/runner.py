@@ -8,6 +8,7 @@ given up.
 from __future__ import annotations
 
 import logging
+import tempfile
 import time
 import uuid
 from collections import Counter
@@ -63,24 +64,20 @@ class Local(Place):
 
     Args:
         workers: how many.
-        folder: of the study; a job that is begun leaves a mark in it.
     """
 
     died = (TerminatedWorkerError,)
 
-    def __init__(self, workers: int, folder: Path) -> None:
-        self.workers, self.marks = workers, folder / "begun"
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
 
     def __enter__(self) -> Local:
-        self.marks.mkdir(exist_ok=True)
-        for mark in self.marks.iterdir():  # of a study that was killed
-            mark.unlink()
+        self.folder = tempfile.TemporaryDirectory(prefix="steady-study-")
+        self.marks = Path(self.folder.name)  # a job that is begun leaves its mark there
         return self
 
     def __exit__(self, *raised: Any) -> None:
-        for mark in self.marks.iterdir():
-            mark.unlink()
-        self.marks.rmdir()
+        self.folder.cleanup()
 
     def results(self, jobs: Sequence[Job]) -> Iterator[Row]:
         with joblib.parallel_config("loky", n_jobs=self.workers, inner_max_num_threads=1):

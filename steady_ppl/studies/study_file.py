@@ -18,6 +18,7 @@
     [picture]                               # optional
     x = "data.sigma_deg"                    # a column of the table
     y = ["forward.total"]                   # a panel each
+    chosen_by = "valid_log_likelihood"      # of settings that were tried only the best at each x is drawn
     labels = {"data.sigma_deg" = "noise of the bearings [°]"}
     published = {"forward.total" = {STEADY = [[1.25, 0.434], [5, 0.456]]}}
 
@@ -27,27 +28,28 @@ with each of every other's, and with each seed. Paths are relative to the file.
 
 from __future__ import annotations
 
-import hashlib
 import itertools
-import json
+import math
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-from steady_ppl.errors import UsageError
+from steady_ppl.errors import UsageError, shown
 from steady_ppl.given_files import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Absent, Maybe, misfit, require_file
-from steady_ppl.studies.plan import POINTS, Job, Picture, Plan, without_folder
+from steady_ppl.studies.keys import Keys, is_program
+from steady_ppl.studies.plan import FIGURES, POINTS, TASKS, Job, Picture, Plan, without_folder
 
-TASKS = ("fit", "discover")
 SOURCES: dict[str, dict[str, Any]] = {
     "simulate": {"train": 16, "valid": 16, "test": 32, "effect": "", "sigma_deg": None},
     "alpha_truck": {"sigma_deg": 5.0},
     "tables": {},
 }
 """Where data come from, and what else may be said of them, with what it is when nothing is said."""
+
+MOST_JOBS, MOST_PANELS = 100_000, 12
+LARGEST = 1e100  # a number beyond is no setting, and cannot be drawn
 
 FORM = {
     "title": TEXT,
@@ -60,6 +62,7 @@ FORM = {
             "x": TEXT,
             "y": LINES,
             "labels": Absent({str: TEXT}),
+            "chosen_by": Absent(TEXT),
             "published": Absent(POINTS),
         }
     ),
@@ -84,20 +87,36 @@ def read_plan(path: Path, data: Path | None = None) -> Plan:
         raise UsageError(f"there is no study {path}") from None
     except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"{path} cannot be read as TOML: {error}") from error
+    try:
+        return _plan(content, path.parent, data)
+    except UsageError as error:
+        error.args = (f"{path}: {error}",)
+        raise
+
+
+def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
     problem = misfit(content, FORM) or _surplus(content)
     if problem is not None:
-        raise UsageError(f"{path}: {problem}")
+        raise UsageError(problem)
     task = content.get("task", "fit")
     if task not in TASKS:
-        raise UsageError(f"{path}: task is {task!r}, expected {' or '.join(TASKS)}")
+        raise UsageError(f"task is {task!r}, expected {' or '.join(TASKS)}")
     if task == "discover" and "simulate" not in content["data"]:
-        raise UsageError(f"{path}: task discover needs data that are simulated, of which it knows what is missing")
-    source = _source(path, content["data"], data)
+        raise UsageError("task discover needs data that are simulated, of which it knows what is missing")
+    source = _source(folder, content["data"], data)
     if not content["seeds"] or not content["method"]:
-        raise UsageError(f"{path}: expected at least one seed and one method")
-    jobs = tuple(_jobs(path, content, task, source))
+        raise UsageError("expected at least one seed and one method")
+    methods = [_method(folder, one, task) for one in content["method"]]
+    cells = len(content["seeds"]) * _size(source) * sum(_size(one["settings"]) for one in methods)
+    if cells > MOST_JOBS:
+        raise UsageError(f"{cells:,} jobs; expected at most {MOST_JOBS:,} of one study")
+    keys = Keys()
+    cut = _jobs(content, task, source, methods)
+    jobs = _labelled(_without_doubles(tuple(replace(job, key=keys.of(job)) for job in cut)))
     picture = Picture(**content["picture"]) if "picture" in content else None
-    return Plan(content["title"], task, _labelled(_without_doubles(path, jobs)), picture)
+    if picture is not None:
+        _require_drawable(picture, task, jobs)
+    return Plan(content["title"], task, jobs, picture)
 
 
 def _surplus(content: Mapping[str, Any]) -> str | None:
@@ -111,90 +130,95 @@ def _surplus(content: Mapping[str, Any]) -> str | None:
     return None
 
 
-def _source(path: Path, given: Mapping[str, Any], folder: Path | None) -> dict[str, Any]:
-    """The source of the data with its path, and all that is said of it."""
+def _source(folder: Path, given: Mapping[str, Any], instead: Path | None) -> dict[str, list[Any]]:
+    """The source of the data with its path, and all that is said of it, each a list of values."""
     named = [name for name in SOURCES if name in given]
     if len(named) != 1:
-        raise UsageError(f"{path}: data has {' and '.join(named) or 'no source'}, expected one of {', '.join(SOURCES)}")
+        raise UsageError(f"data has {' and '.join(named) or 'no source'}, expected one of {', '.join(SOURCES)}")
     (kind,) = named
     surplus = [name for name in given if name not in {kind, *SOURCES[kind]}]
     if surplus:
         known = ", ".join(SOURCES[kind]) or "nothing else"
-        raise UsageError(f"{path}: data.{surplus[0]} means nothing beside {kind}; there is {known}")
+        raise UsageError(f"data.{surplus[0]} means nothing beside {kind}; there is {known}")
     if not isinstance(given[kind], str):
-        raise UsageError(f"{path}: data.{kind} is {given[kind]!r}, expected a path")
-    if folder is not None and kind == "simulate":
-        raise UsageError(f"{path}: its data are simulated, --data is for logs and tables")
-    place = str(_beside(path, given[kind])) if folder is None else str(folder.resolve())
+        raise UsageError(f"data.{kind} is {given[kind]!r}, expected a path")
+    if instead is not None and kind == "simulate":
+        raise UsageError("its data are simulated, --data is for logs and tables")
+    place = _beside(folder, given[kind]) if instead is None else _beside(Path(), str(instead))
     if kind != "simulate" and not Path(place).is_dir():
-        raise UsageError(f"{path}: there is no folder {place} (data.{kind}); --data names another")
-    said = {name: given.get(name, usual) for name, usual in SOURCES[kind].items()}
-    for name, value in said.items():
+        raise UsageError(f"there is no folder {place} (data.{kind}); --data names another")
+    axes = {kind: [place]}
+    for name, usual in SOURCES[kind].items():
+        values = _axis(f"data.{name}", given.get(name, usual))
         form = TEXT if name == "effect" else NUMBER if name == "sigma_deg" else WHOLE
-        problem = misfit(value if isinstance(value, list) else [value], [Maybe(form)], f"data.{name}")
+        problem = misfit(values, [Maybe(form)], f"data.{name}")
         if problem is not None:
-            raise UsageError(f"{path}: {problem}")
-    return {kind: place} | {name: value for name, value in said.items() if value is not None}
+            raise UsageError(problem)
+        least = [value for value in values if value is not None and form != TEXT and value <= 0]
+        if least:
+            raise UsageError(f"data.{name} is {least[0]}, expected more than 0")
+        if values != [None]:
+            axes[name] = values
+    return axes
 
 
-def _jobs(path: Path, content: Mapping[str, Any], task: str, source: Mapping[str, Any]) -> Iterator[Job]:
-    files = _contents(path, [Path(value) for name, value in source.items() if name in ("alpha_truck", "tables")])
+def _method(folder: Path, given: Mapping[str, Any], task: str) -> dict[str, Any]:
+    """A method whose files have their folders and whose settings are lists of values."""
+    recipe = given.get("recipe", "steady") if task == "fit" else ""
+    axes = {name: _axis(name, value) for name, value in given.get("settings", {}).items()}
+    return {
+        "method": given["name"],
+        "program": _beside(folder, given["program"]),
+        "recipe": _beside(folder, recipe) if recipe.endswith(".py") else recipe,
+        "settings": {name: [_resolved(folder, one) for one in axis] for name, axis in axes.items()},
+    }
+
+
+def _axis(name: str, value: Any) -> list[Any]:
+    axis = value if isinstance(value, list) else [value]
+    if not axis:
+        raise UsageError(f"{name} is an axis without a value")
+    problems = [one for one in axis if one is not None and not _is_plain(one)]
+    if problems:
+        raise UsageError(f"{name} is {shown(repr(problems[0]), 40)}, expected numbers, text, true or false")
+    return axis
+
+
+def _is_plain(value: Any, depth: int = 0) -> bool:
+    """Whether a table can hold it: finite numbers that are no larger than any use, text, truth, and lists of them."""
+    if isinstance(value, list):
+        return depth < 2 and all(_is_plain(one, depth + 1) for one in value)
+    if isinstance(value, bool | str):
+        return True
+    if isinstance(value, int):
+        return abs(value) < 2**63
+    return isinstance(value, float) and math.isfinite(value) and abs(value) <= LARGEST
+
+
+def _size(axes: Mapping[str, list[Any]]) -> int:
+    return math.prod(map(len, axes.values()))
+
+
+def _grid(axes: Mapping[str, list[Any]]) -> Iterator[dict[str, Any]]:
+    for cell in itertools.product(*axes.values()):
+        yield dict(zip(axes, cell, strict=True))
+
+
+def _jobs(content: Mapping[str, Any], task: str, source: Mapping[str, list[Any]], methods: list[dict]) -> Iterator[Job]:
+    start = content.get("known_start", False)
     for seed in content["seeds"]:
-        for data in _grid(path, source):
-            for method in content["method"]:
-                program = str(_beside(path, method["program"]))
-                recipe = method.get("recipe", "steady") if task == "fit" else ""
-                recipe = str(_beside(path, recipe)) if recipe.endswith(".py") else recipe
-                given = {name: _resolved(path, value) for name, value in method.get("settings", {}).items()}
-                for settings in _grid(path, given):
-                    start = content.get("known_start", False)
-                    job = Job(task, method["name"], program, recipe, data, settings, seed, start, key=files)
-                    named = [program, recipe, *data.values(), *settings.values()]
-                    programs = [Path(file.partition(".py")[0] + ".py") for file in named if _is_program(file)]
-                    said = json.dumps(job.columns, sort_keys=True)
-                    yield replace(job, key=_hash(said.encode(), _contents(path, programs).encode()))
+        for data in _grid(source):
+            for method in methods:
+                for settings in _grid(method["settings"]):
+                    yield Job(**method | {"settings": settings}, task=task, data=data, seed=seed, known_start=start)
 
 
-def _grid(path: Path, values: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    axes = [value if isinstance(value, list) else [value] for value in values.values()]
-    for name, axis in zip(values, axes, strict=True):
-        if not axis:
-            raise UsageError(f"{path}: {name} is an axis without a value")
-        if not all(isinstance(value, str | int | float | bool | list) for value in axis):
-            raise UsageError(f"{path}: {name} is {axis}, expected numbers, text, true or false")
-    for cell in itertools.product(*axes):
-        yield dict(zip(values, cell, strict=True))
-
-
-@cache
-def _contents_of(files: tuple[Path, ...]) -> str:
-    return _hash(*(file.read_bytes() for file in files))
-
-
-def _contents(path: Path, places: Sequence[Path]) -> str:
-    """A hash of what is in some files and folders; where they are does not count."""
-    files = [file for place in places for file in (sorted(place.rglob("*")) if place.is_dir() else [place])]
-    try:
-        return _contents_of(tuple(file for file in files if not file.is_dir()))
-    except OSError as error:
-        raise UsageError(f"{path}: {error.filename} cannot be read: {error.strerror}") from error
-
-
-def _hash(*parts: bytes) -> str:
-    digest = hashlib.sha256()
-    for part in parts:
-        digest.update(hashlib.sha256(part).digest())
-    return digest.hexdigest()[:16]
-
-
-def _without_doubles(path: Path, jobs: tuple[Job, ...]) -> tuple[Job, ...]:
-    seen: dict[str, Job] = {}
+def _without_doubles(jobs: tuple[Job, ...]) -> tuple[Job, ...]:
+    seen: set[str] = set()
     for job in jobs:
         if job.key in seen:
-            raise UsageError(
-                f"{path}: {job.method} is there twice: methods need names of their own, and axes other values"
-            )
-        seen[job.key] = job
+            raise UsageError(f"{job.method} is there twice: methods need names of their own, and axes other values")
+        seen.add(job.key)
     return jobs
 
 
@@ -214,16 +238,36 @@ def _labelled(jobs: tuple[Job, ...]) -> tuple[Job, ...]:
     return tuple(replace(job, label=label(job)) for job in jobs)
 
 
-def _beside(path: Path, name: str) -> Path:
-    return (path.parent / name).resolve()
+def _require_drawable(picture: Picture, task: str, jobs: tuple[Job, ...]) -> None:
+    """What would otherwise be met when everything has been computed."""
+    if not 1 <= len(picture.y) <= MOST_PANELS:
+        raise UsageError(f"picture.y has {len(picture.y)} columns, expected 1 to {MOST_PANELS}")
+    said: dict[str, list[Any]] = {}
+    for job in jobs:
+        for name, value in job.columns.items():
+            said.setdefault(name, []).append(value)
+    for name in picture.columns:
+        known = any(name == figure or (figure.endswith(".") and name.startswith(figure)) for figure in FIGURES[task])
+        if name in said and not all(isinstance(value, int | float) for value in said[name]):
+            raise UsageError(f"picture: column {name} is no number")
+        if name not in said and not known:
+            there = ", ".join([*(one for one in said if one.startswith(("data.", "settings."))), *FIGURES[task]])
+            raise UsageError(f"picture: there will be no column {name}; there will be {there}")
+    for column, methods in picture.published.items():
+        for name, points in methods.items():
+            for point in points:
+                if len(point) != 2 or max(map(abs, point)) > LARGEST:
+                    raise UsageError(f"picture.published: {column}, {name}: {point} is no point, expected [x, y]")
 
 
-def _resolved(path: Path, value: Any) -> Any:
+def _beside(folder: Path, name: str) -> str:
+    if "\0" in name:
+        raise UsageError(f"{name!r} is no path: it has a character 0")
+    return str((folder / name).resolve())
+
+
+def _resolved(folder: Path, value: Any) -> Any:
     """Settings that name programs are paths as well."""
     if isinstance(value, list):
-        return [_resolved(path, one) for one in value]
-    return str(_beside(path, value)) if _is_program(value) else value
-
-
-def _is_program(value: Any) -> bool:
-    return isinstance(value, str) and (value.endswith(".py") or ".py:" in value)
+        return [_resolved(folder, one) for one in value]
+    return _beside(folder, value) if is_program(value) else value

@@ -11,10 +11,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pyarrow
+import pyarrow.parquet
 
 from steady_ppl.errors import RunError
+from steady_ppl.given_files import require_file
 from steady_ppl.run_folder import only_writer
 from steady_ppl.whole_file import whole_file
 
@@ -65,16 +68,20 @@ def study_table(folder: Path) -> Iterator[StudyTable]:
         RunError: the folder cannot be made, or another process writes to it.
     """
     with only_writer(folder):
+        arrived = folder / ARRIVED
+        if arrived.is_symlink():
+            raise RunError(f"{arrived} is a link: results are kept in a folder of the study's own")
         try:
-            (folder / ARRIVED).mkdir(exist_ok=True)
+            arrived.mkdir(exist_ok=True)
         except OSError as error:
-            raise RunError(f"{folder} cannot be written: {error.strerror}") from error
+            raise RunError(f"{arrived} cannot be written: {error.strerror}") from error
         table = StudyTable(folder)
         try:
             yield table
         finally:
             table.merge()
-            (folder / ARRIVED).rmdir()
+            if not any(arrived.iterdir()):
+                arrived.rmdir()
 
 
 def read_results(folder: Path) -> pd.DataFrame:
@@ -92,16 +99,35 @@ def read_results(folder: Path) -> pd.DataFrame:
 
 
 def _read(file: Path) -> pd.DataFrame:
+    require_file(file, RunError)
     try:
-        found = pd.read_parquet(file)
-    except (OSError, ValueError, pyarrow.ArrowException) as error:
+        columns = pyarrow.parquet.read_table(file)
+        columns.validate(full=True)  # text that is none
+        found = columns.to_pandas(ignore_metadata=True)
+    except (OSError, ValueError, TypeError, pyarrow.ArrowException) as error:
         reason = str(error).partition("\n")[0]
         raise RunError(f"{file} is damaged: {reason}; move it away, and its jobs are computed again") from error
-    if "key" not in found or "outcome" not in found:
-        raise RunError(f"{file} is no table of a study: it has no columns key and outcome")
+    for name in ("key", "outcome"):
+        if name not in found or not found[name].map(lambda value: isinstance(value, str)).all():
+            raise RunError(f"{file} is no table of a study: it has no column {name} of text")
     return found
 
 
 def _write(frame: pd.DataFrame, file: Path) -> None:
+    """Write a table; a column of several kinds of values becomes text, since Parquet's have one."""
+    frame = frame.copy(deep=False)
+    for name in frame:
+        kinds = {_kind(value) for value in frame[name] if not _is_absent(value)}
+        if len(kinds) > 1 or "other" in kinds:
+            frame[name] = [None if _is_absent(value) else str(value) for value in frame[name]]
     with whole_file(file, RunError) as beside:
         frame.to_parquet(beside, index=False)
+
+
+def _kind(value: object) -> str:
+    names = {bool: "truth", np.bool_: "truth", str: "text"}
+    return names.get(type(value), "number" if isinstance(value, int | float | np.number) else "other")
+
+
+def _is_absent(value: object) -> bool:
+    return value is None or (isinstance(value, float) and np.isnan(value))
