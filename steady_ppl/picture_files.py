@@ -24,7 +24,7 @@ def require_picture(path: Path | None) -> None:
         return
     from matplotlib.figure import Figure
 
-    formats = Figure().canvas.get_supported_filetypes()
+    formats = set(Figure().canvas.get_supported_filetypes()) - {"pgf"}  # which needs TeX
     if path.suffix.lower()[1:] not in formats:
         raise UsageError(f"{path}: expected a picture's name that ends in one of {', '.join(sorted(formats))}")
 

@@ -116,6 +116,8 @@ def test_a_job_is_known_by_what_it_depends_on_and_not_by_where_it_is(tmp_path: P
         ('["log_likelihood"]', "[]", "picture.y has 0 columns"),
         ("[60, -4.0]", "[60]", r"learned: \[60\] is no point"),
         ("[60, -4.0]", "[60, 1e200]", "is no point"),
+        ('title = "Small"', f'title = "{"x" * 1001}"', "more than 1000 characters"),
+        ("train = 2", "train = 9223372036854775807", "at most 1,000,000"),
     ],
 )
 def test_what_is_wrong_with_a_study_is_named(tmp_path: Path, old: str, new: str, says: str):
@@ -283,10 +285,13 @@ def test_a_link_is_not_followed_and_what_is_not_the_studys_stays(tmp_path: Path)
     assert (out / ARRIVED / "notes.txt").exists() and (others / "mine.parquet").exists()
 
 
-def test_the_record_of_a_newer_version_is_said(tmp_path: Path):
+def test_a_damaged_record_and_one_of_a_newer_version_are_said(tmp_path: Path):
     record_plan(read_plan(written(tmp_path)), tmp_path)
     record = json.loads((tmp_path / RECORD).read_text())
     assert recorded_plan(tmp_path) == read_plan(tmp_path / "study.toml")
+    (tmp_path / RECORD).write_text(json.dumps(record | {"picture": record["picture"] | {"y": []}}))
+    with pytest.raises(RunError, match="damaged: picture.y has 0 columns"):
+        recorded_plan(tmp_path)
     (tmp_path / RECORD).write_text(json.dumps(record | {"format": 99}))
     with pytest.raises(RunError, match="written by a newer steady-ppl: its form is number 99"):
         recorded_plan(tmp_path)

@@ -14,8 +14,7 @@ from scipy import stats
 from steady_ppl.errors import UsageError
 from steady_ppl.harmless import harmless
 from steady_ppl.proof_pictures import COLORS, MARKS
-from steady_ppl.studies.plan import IN_LIMITS, Picture, Plan
-from steady_ppl.studies.study_file import LARGEST
+from steady_ppl.studies.plan import IN_LIMITS, LARGEST, Picture, Plan
 
 SIZES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0)  # ends of ranges of what is missing, in detection limits
 Points = Sequence[Sequence[float]]
@@ -57,7 +56,7 @@ def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
 
 def _numbers(rows: pd.DataFrame, name: str) -> pd.Series:
     """A column as numbers, or as true and false; NaN where a job has none, and where it is beyond what can be drawn."""
-    values = rows[name]
+    values = rows[name].astype(object)
     there = values[values.notna()]
     if there.map(lambda value: isinstance(value, bool | np.bool_)).all():
         return values

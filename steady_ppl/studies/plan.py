@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from steady_ppl.errors import RunError
+from steady_ppl.errors import RunError, shown
 from steady_ppl.given_files import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Maybe, misfit, read_json, refuse_newer
 from steady_ppl.whole_file import whole_file
 
@@ -21,6 +22,9 @@ FIGURES = {
     "discover": ("p_value", "found", "right", "in_class", IN_LIMITS, "seconds", "peak_mib"),
 }
 """Columns of numbers that a task fills, or how they begin."""
+
+MOST_PANELS, MOST_PUBLISHED, LONGEST = 12, 100, 1000  # of a picture; characters of its title and labels
+LARGEST = 1e100  # a number beyond cannot be drawn
 
 POINTS = {str: {str: [[NUMBER]]}}
 FORMAT = 1
@@ -128,6 +132,24 @@ class Picture:
         return tuple(dict.fromkeys(name for name in (self.x, *self.y, self.chosen_by) if name))
 
 
+def undrawable(title: str, picture: Mapping[str, Any]) -> str | None:
+    """What of a picture of the right form cannot be drawn, in words; None where all can."""
+    if not 1 <= len(picture["y"]) <= MOST_PANELS:
+        return f"picture.y has {len(picture['y'])} columns, expected 1 to {MOST_PANELS}"
+    published = picture.get("published", {})
+    texts = [title, *picture.get("labels", {}).values(), *(name for lines in published.values() for name in lines)]
+    if max(map(len, texts)) > LONGEST:
+        return f"picture: a title, label or name of more than {LONGEST} characters"
+    for column, lines in published.items():
+        if len(lines) > MOST_PUBLISHED:
+            return f"picture.published: {column} has {len(lines)} lines, expected at most {MOST_PUBLISHED}"
+        for name, points in lines.items():
+            for point in points:
+                if len(point) != 2 or max(map(abs, point)) > LARGEST:
+                    return f"picture.published: {column}, {name}: {shown(str(point), 40)} is no point, expected [x, y]"
+    return None
+
+
 def record_plan(plan: Plan, folder: Path) -> None:
     """Write the plan beside its results.
 
@@ -150,6 +172,8 @@ def recorded_plan(folder: Path) -> Plan:
         raise RunError(f"{folder} is not a study: it has no {RECORD}") from None
     refuse_newer(content, FORMAT, folder, RunError)
     problem = misfit(content, RECORDED)
+    if problem is None and content["picture"] is not None:
+        problem = undrawable(content["title"], content["picture"])
     if problem is not None:
         raise RunError(f"{folder / RECORD} is damaged: {problem}")
     picture = content["picture"] and Picture(**{name: content["picture"][name] for name in RECORDED["picture"].form})

@@ -39,7 +39,7 @@ from typing import Any
 from steady_ppl.errors import UsageError, shown
 from steady_ppl.given_files import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Absent, Maybe, misfit, require_file
 from steady_ppl.studies.keys import Keys, is_program
-from steady_ppl.studies.plan import FIGURES, POINTS, TASKS, Job, Picture, Plan, without_folder
+from steady_ppl.studies.plan import FIGURES, LARGEST, POINTS, TASKS, Job, Picture, Plan, undrawable, without_folder
 
 SOURCES: dict[str, dict[str, Any]] = {
     "simulate": {"train": 16, "valid": 16, "test": 32, "effect": "", "sigma_deg": None},
@@ -48,8 +48,7 @@ SOURCES: dict[str, dict[str, Any]] = {
 }
 """Where data come from, and what else may be said of them, with what it is when nothing is said."""
 
-MOST_JOBS, MOST_PANELS = 100_000, 12
-LARGEST = 1e100  # a number beyond is no setting, and cannot be drawn
+MOST_JOBS, MOST_DRIVES = 100_000, 1_000_000
 
 FORM = {
     "title": TEXT,
@@ -96,6 +95,8 @@ def read_plan(path: Path, data: Path | None = None) -> Plan:
 
 def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
     problem = misfit(content, FORM) or _surplus(content)
+    if problem is None and "picture" in content:
+        problem = undrawable(content["title"], content["picture"])
     if problem is not None:
         raise UsageError(problem)
     task = content.get("task", "fit")
@@ -113,9 +114,10 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
     keys = Keys()
     cut = _jobs(content, task, source, methods)
     jobs = _labelled(_without_doubles(tuple(replace(job, key=keys.of(job)) for job in cut)))
-    picture = Picture(**content["picture"]) if "picture" in content else None
-    if picture is not None:
-        _require_drawable(picture, task, jobs)
+    picture = None
+    if "picture" in content:
+        picture = Picture(**content["picture"])
+        _require_columns(picture, task, jobs)
     return Plan(content["title"], task, jobs, picture)
 
 
@@ -154,9 +156,9 @@ def _source(folder: Path, given: Mapping[str, Any], instead: Path | None) -> dic
         problem = misfit(values, [Maybe(form)], f"data.{name}")
         if problem is not None:
             raise UsageError(problem)
-        least = [value for value in values if value is not None and form != TEXT and value <= 0]
-        if least:
-            raise UsageError(f"data.{name} is {least[0]}, expected more than 0")
+        for value in values if form != TEXT else ():
+            if value is not None and not 0 < value <= MOST_DRIVES:
+                raise UsageError(f"data.{name} is {value}, expected more than 0 and at most {MOST_DRIVES:,}")
         if values != [None]:
             axes[name] = values
     return axes
@@ -238,10 +240,8 @@ def _labelled(jobs: tuple[Job, ...]) -> tuple[Job, ...]:
     return tuple(replace(job, label=label(job)) for job in jobs)
 
 
-def _require_drawable(picture: Picture, task: str, jobs: tuple[Job, ...]) -> None:
+def _require_columns(picture: Picture, task: str, jobs: tuple[Job, ...]) -> None:
     """What would otherwise be met when everything has been computed."""
-    if not 1 <= len(picture.y) <= MOST_PANELS:
-        raise UsageError(f"picture.y has {len(picture.y)} columns, expected 1 to {MOST_PANELS}")
     said: dict[str, list[Any]] = {}
     for job in jobs:
         for name, value in job.columns.items():
@@ -253,11 +253,6 @@ def _require_drawable(picture: Picture, task: str, jobs: tuple[Job, ...]) -> Non
         if name not in said and not known:
             there = ", ".join([*(one for one in said if one.startswith(("data.", "settings."))), *FIGURES[task]])
             raise UsageError(f"picture: there will be no column {name}; there will be {there}")
-    for column, methods in picture.published.items():
-        for name, points in methods.items():
-            for point in points:
-                if len(point) != 2 or max(map(abs, point)) > LARGEST:
-                    raise UsageError(f"picture.published: {column}, {name}: {point} is no point, expected [x, y]")
 
 
 def _beside(folder: Path, name: str) -> str:
