@@ -9,7 +9,8 @@ A mutant is a good file that was spoiled: a table, a run folder's files, a searc
 log, a program. Everything follows from its name. A command may accept it, refuse it (exit code 2), or fail with a line
 that says why (exit code 1), and it says so by an error of `steady_ppl.errors`. It crashes where the line is that of
 any other exception, where an input changed, or where something half-written is left; it hangs after ten seconds and is
-killed; a search, and a fit to the maximum, of odd but readable drives may take three minutes. Exits with 1 if one did.
+killed; a search, a study, and a fit to the maximum, of odd but readable input may take three minutes. Exits with 1 if
+one did.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ from hostile_trials import Trial, trials
 
 HERE = Path(__file__).resolve().parent
 LIMIT = 10.0  # s for one trial
-LONG = 180.0  # s for one whose command searches or climbs to a maximum, on odd but readable drives
-SEARCHES = ("discover", "fit --recipe likelihood")
+LONG = 180.0  # s for one whose command searches, climbs to a maximum or starts processes, on odd but readable input
+SEARCHES = ("discover", "fit --recipe likelihood", "study")
 WARMING = 120.0  # s for a worker to begin, or for a command on good input for the first time
 MOST_MIB = 1024  # that a small file may cost
 OUTCOMES = ("accepted", "refused", "failed with a line", "crashed", "hung")

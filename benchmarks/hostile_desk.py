@@ -21,6 +21,30 @@ ROOT = Path(__file__).resolve().parent.parent
 FEW = ("--guide", "bootstrap", "--particles", "20", "--draws", "3", "--steps", "4", "--set", "validate_every=2")
 SEARCH = ("discover", "before", "t.csv", "--valid", "v.csv", "--simulations", "50", "--out")
 TRAINING = ("fit", "models/linear_gaussian.py", "t.csv", "--valid", "v.csv", *FEW, "--out")
+STUDY = """\
+title = "A cart"
+seeds = [1, 2]
+known_start = true
+[data]
+simulate = "models/linear_gaussian.py"
+train = 2
+valid = 2
+test = 2
+[[method]]
+name = "hand"
+program = "models/linear_gaussian.py"
+recipe = "hand"
+[[method]]
+name = "likelihood"
+program = "models/linear_gaussian.py"
+recipe = "likelihood"
+settings = {validation_particles = [50, 60]}
+[picture]
+x = "settings.validation_particles"
+y = ["log_likelihood", "seconds"]
+labels = {seconds = "s"}
+published = {log_likelihood = {hand = [[50, -5.0], [60, -4.0]]}}
+"""
 _STEADY = "import sys; from steady_ppl.command_line import main; sys.exit(main(sys.argv[1:]))"
 
 
@@ -29,8 +53,8 @@ def lay(folder: Path) -> None:
 
     A cart whose fits and searches take less than a second makes the tables `t.csv`, `t.parquet` and `v.csv`, the runs
     `before` and `after`, the fit `begun`, which has a checkpoint to go on from, and the stopped search `searched`; on
-    drives with an effect the run `found`. A hovercraft that sees bearings makes `h.csv` and the runs `hover` and
-    `hover_too`.
+    drives with an effect the run `found`; `study.toml` is a study of it, and `studied` that study done. A hovercraft
+    that sees bearings makes `h.csv` and the runs `hover` and `hover_too`.
     """
     folder.mkdir(parents=True)
     shutil.copytree(ROOT / "models", folder / "models", ignore=shutil.ignore_patterns("__pycache__"))
@@ -50,6 +74,8 @@ def lay(folder: Path) -> None:
     _must(*TRAINING, "after", at=folder)
     found = (*SEARCH[:2], "pushed.csv", "--valid", "pushed_too.csv", *SEARCH[5:], "found", "--json", "found.json")
     _must(*found, at=folder)
+    (folder / "study.toml").write_text(STUDY)
+    _must("study", "study.toml", "--workers", "1", "--out", "studied", at=folder)
     shutil.copytree(folder / "after", folder / "begun")
     shutil.copytree(folder / "hover", folder / "hover_too")
     _killed(*SEARCH, "searched", at=folder, until=folder / "searched/journal/000003.safetensors")

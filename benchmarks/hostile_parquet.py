@@ -59,7 +59,7 @@ ONCE: Mapping[str, Spoil] = {
     "no columns": _table(lambda table: table.select([])),
     "columns twice": _table(lambda table: table.rename_columns(["trajectory", *["time"] * (table.num_columns - 1)])),
     "odd names": _table(lambda table: table.rename_columns([f"y.\0{i}\n<b>" for i in range(table.num_columns)])),
-    "an index of pandas": _table(lambda table: table.append_column("__index_level_0__", table.column("time"))),
+    "an index of pandas": _table(lambda table: table.append_column("__index_level_0__", table.column(1))),
     "a column named index only": _table(
         lambda table: table.rename_columns(["__index_level_0__", *table.column_names[1:]])
     ),

@@ -69,6 +69,7 @@ def on_table(table: str, program: str, run: str, others: tuple[str, ...]) -> Com
         "prove": ("prove", run, *others, table, "--json", "out/proof.json"),
         "report": ("report", run, *others, table, "--simulations", "20", "--out", "out/page.html"),
         "simulate": ("simulate", program, "--controls", table, "--out", "out/again.csv"),
+        "data cut": ("data", "cut", table, "--seconds", "0.4", "--out", "out/cut.csv"),
     }
 
 
@@ -114,6 +115,11 @@ SHOWN: Commands = {
 }
 REPORTED: Commands = {name: on_run("found")[name] for name in ("report", "add", "check")}
 LOGS: Commands = {"data alpha-truck": ("data", "alpha-truck", "logs", "--out", "out/logs.csv")}
+STUDY: Commands = {"study": ("study", "study.toml", "--workers", "1", "--out", "out/study")}
+STUDIED: Commands = {
+    "study, gone on with": ("study", "study.toml", "--workers", "1", "--out", "studied"),
+    "plot-study": ("plot-study", "studied", "--out", "out/study.png"),
+}
 PROGRAM: Commands = {
     "simulate": ("simulate", CART, "--trajectories", "2", "--out", "out/drives.csv"),
     "effects": ("effects", CART),
@@ -189,6 +195,11 @@ def trials() -> list[Trial]:
     add("definition, .msg", "boat_msgs/msg/Battery.msg", mapping, _mutants({**DEFINITION, **BYTES}, WHOLE, 6))
     for log in ("vrpn-pose.csv", "vesc_drive.csv"):
         add("logs, CSV", f"logs/{log}", LOGS, _mutants({**LOG_CELLS, **BYTES}, {**SPELT, **WHOLE}, 2))
+    add("study, TOML", "study.toml", STUDY, _mutants({**TOML, **BYTES}, {**TOML_ONCE, **WHOLE}, 8))
+    add("study, JSON", "studied/study.json", STUDIED, _mutants({**JSON, **BYTES}, {**JSON_ONCE, **WHOLE}, 4))
+    columns = {**hostile_parquet.KINDS, **BYTES}
+    results = _mutants(columns, {**hostile_parquet.ONCE, **WHOLE}, 2)
+    add("study, results", "studied/results.parquet", STUDIED, results)
     add("program, Python", CART, PROGRAM, _mutants({name: BYTES[name] for name in CUTS}, WHOLE, 3))
     return found
 

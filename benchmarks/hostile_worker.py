@@ -29,7 +29,7 @@ from steady_ppl.command_line import main
 
 ROOM = 4 << 30  # bytes of address space beside what the process has when it begins
 BIG = 5_000_000  # what is said beyond is cut
-RESUMABLE = ("checkpoint.safetensors", "journal")
+RESUMABLE = ("checkpoint.safetensors", "journal", "results.parquet")
 
 
 def attempt(folder: Path, trial: Trial) -> dict[str, Any]:
@@ -98,7 +98,7 @@ def snapshot(folder: Path) -> dict[str, str]:
 
 def _left(desk: Path, before: dict[str, str], after: dict[str, str], trial: Trial, code: int | str) -> list[str]:
     """Inputs that changed, and what is half-written."""
-    own = next((word for word in ("begun", "searched", "before") if _writes_to(trial, word)), None)
+    own = next((word for word in ("begun", "searched", "before", "studied") if _writes_to(trial, word)), None)
     mine = [name for name in after.keys() | before.keys() if own is None or not name.startswith(f"{own}/")]
     faults = [f"input {name} changed" for name in mine if name in before and after.get(name) != before[name]]
     new = [name for name in after if name not in before and name != "out"]
@@ -106,7 +106,8 @@ def _left(desk: Path, before: dict[str, str], after: dict[str, str], trial: Tria
         f"left over: {name}" for name in new if Path(name).name.startswith(".") or "previous" in Path(name).parts
     ]
     if code != 0:
-        kept = [name for name in new if not (name.startswith("out/run") and _resumable(desk / "out/run"))]
+        there = [place for place in ("out/run", "out/study") if _resumable(desk / place)]
+        kept = [name for name in new if not name.startswith(tuple(there))]
         faults += [f"half-written: {name}" for name in kept if own is None or not name.startswith(f"{own}/")]
         if own == "before" and {k: v for k, v in after.items() if k not in new} != before:
             faults.append("--force failed and the old run is not as it was")
@@ -115,7 +116,7 @@ def _left(desk: Path, before: dict[str, str], after: dict[str, str], trial: Tria
 
 def _writes_to(trial: Trial, run: str) -> bool:
     words = trial.words
-    return words[0] in ("fit", "discover") and "--out" in words and words[words.index("--out") + 1] == run
+    return words[0] in ("fit", "discover", "study") and "--out" in words and words[words.index("--out") + 1] == run
 
 
 def _resumable(run: Path) -> bool:

@@ -248,7 +248,15 @@ def test_a_column_of_several_kinds_is_text(tmp_path: Path):
     assert found["settings.steps"].tolist()[:2] == [3.0, 3.5] and pd.isna(found.loc["c", "settings.steps"])
 
 
-@pytest.mark.parametrize("damage", [{"key": [[1]]}, {"key": ["a"], "outcome": [1]}, {"outcome": ["done"]}])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"key": [[1]]},
+        {"key": ["a"], "outcome": ["done"], "settings.a": [[1]]},
+        {"key": ["a"], "outcome": [1]},
+        {"outcome": ["done"]},
+    ],
+)
 def test_a_table_of_other_columns_is_said(tmp_path: Path, damage: dict):
     pd.DataFrame(damage).to_parquet(tmp_path / TABLE)
     with pytest.raises(RunError, match="no table of a study"):
@@ -265,6 +273,16 @@ def test_text_that_is_none_and_foreign_metadata_are_said(tmp_path: Path):
     )
     pq.write_table(table, tmp_path / TABLE)
     assert read_results(tmp_path)["key"].tolist() == ["a"]
+
+
+def test_a_pipe_and_a_link_to_nothing_are_no_table(tmp_path: Path):
+    (tmp_path / TABLE).symlink_to(tmp_path / "nothing")
+    with pytest.raises(RunError, match="is damaged"):
+        read_results(tmp_path)
+    (tmp_path / TABLE).unlink()
+    os.mkfifo(tmp_path / TABLE)
+    with pytest.raises(RunError, match="is a pipe"):
+        read_results(tmp_path)
 
 
 def test_a_link_is_not_followed_and_what_is_not_the_studys_stays(tmp_path: Path):
@@ -332,7 +350,8 @@ def fit(program, table, valid=None, *, known_start=False, mark="", deadly=False,
 """
 
 
-def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(tmp_path: Path, capsys):
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(tmp_path: Path, workers: int):
     (tmp_path / "mine.py").write_text(RECIPE.format())
     (tmp_path / "marks").mkdir()
     text = STUDY[: STUDY.index("[[method]]")].replace("[1, 2]", "[1, 7, 13, 4]") + (
@@ -340,7 +359,7 @@ def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(t
         f'settings = {{{{deadly = true, mark = "{tmp_path / "marks"}"}}}}\n'
     )
     plan, out = read_plan(written(tmp_path, text)), tmp_path / "out"
-    assert run_study(plan, out, Local(2)) == 2
+    assert run_study(plan, out, Local(workers)) == 2
     found = read_results(out).set_index("seed")
     assert found["outcome"].to_dict() == {1: "done", 4: "done", 7: "failed", 13: "failed"}
     assert (
@@ -349,9 +368,9 @@ def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(t
     )
     assert (tmp_path / "marks" / "1").stat().st_size == 2 and (tmp_path / "marks" / "13").stat().st_size == 3
     assert sorted(file.name for file in out.iterdir()) == [TABLE, "study.json"]
-    assert run_study(plan, out, Local(2)) == 2  # what has failed is left
+    assert run_study(plan, out, Local(workers)) == 2  # what has failed is left
     assert (tmp_path / "marks" / "7").stat().st_size == 2
-    assert run_study(plan, out, Local(2), again=True) == 2
+    assert run_study(plan, out, Local(workers), again=True) == 2
     assert (tmp_path / "marks" / "7").stat().st_size == 3
 
 

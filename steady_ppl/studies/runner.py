@@ -80,8 +80,9 @@ class Local(Place):
         self.folder.cleanup()
 
     def results(self, jobs: Sequence[Job]) -> Iterator[Row]:
-        with joblib.parallel_config("loky", n_jobs=self.workers, inner_max_num_threads=1):
-            yield from _sent(_marked, [(job, self.marks) for job in jobs])
+        # of a single one joblib would make this process, which must not die of a job: it sees two, and one is sent work
+        with joblib.parallel_config("loky", n_jobs=max(2, self.workers), inner_max_num_threads=1):
+            yield from _sent(_marked, [(job, self.marks) for job in jobs], at_once=self.workers)
 
     def begun(self) -> Counter[str]:
         return Counter({mark.name: mark.stat().st_size for mark in self.marks.iterdir()})
@@ -151,7 +152,7 @@ class Cluster(Place):
                 return max(2, super().effective_n_jobs(n_jobs))
 
         with joblib.parallel_config(Backend(client=self.client)):
-            yield from _sent(_logged, [(job, self.topic) for job in jobs])
+            yield from _sent(_logged, [(job, self.topic) for job in jobs], at_once="all")
 
     def begun(self) -> Counter[str]:
         return Counter(said for _, said in self.client.get_events(self.topic))
@@ -171,8 +172,8 @@ def _logged(job: Job, topic: str) -> Row:
     return work.run(job)
 
 
-def _sent(function: Callable[..., Row], arguments: Sequence[tuple[Any, ...]]) -> Iterator[Row]:
-    parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")
+def _sent(function: Callable[..., Row], arguments: Sequence[tuple[Any, ...]], at_once: int | str) -> Iterator[Row]:
+    parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch=at_once)
     yield from parallel(joblib.delayed(function)(*given) for given in arguments)
 
 

@@ -6,6 +6,7 @@ ten thousand results from being written ten thousand times.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 import pandas as pd
 import pyarrow
 import pyarrow.parquet
+from pyarrow import types
 
 from steady_ppl.errors import RunError
 from steady_ppl.given_files import require_file
@@ -22,6 +24,7 @@ from steady_ppl.run_folder import only_writer
 from steady_ppl.whole_file import whole_file
 
 TABLE, ARRIVED = "results.parquet", "arrived"
+KINDS = (types.is_integer, types.is_floating, types.is_boolean, types.is_string, types.is_large_string, types.is_null)
 ENOUGH = 100  # results for which the table is written anew
 
 
@@ -91,7 +94,7 @@ def read_results(folder: Path) -> pd.DataFrame:
         RunError: a file is damaged.
     """
     table = folder / TABLE
-    files = [*([table] if table.is_file() else []), *sorted((folder / ARRIVED).glob("*.parquet"))]
+    files = [*([table] if os.path.lexists(table) else []), *sorted((folder / ARRIVED).glob("*.parquet"))]
     parts = [_read(file) for file in files]
     if not parts:
         return pd.DataFrame({"key": []})
@@ -107,6 +110,9 @@ def _read(file: Path) -> pd.DataFrame:
     except (OSError, ValueError, TypeError, pyarrow.ArrowException) as error:
         reason = str(error).partition("\n")[0]
         raise RunError(f"{file} is damaged: {reason}; move it away, and its jobs are computed again") from error
+    for column in columns.schema:
+        if not any(fits(column.type) for fits in KINDS):
+            raise RunError(f"{file} is no table of a study: its column {column.name} holds {column.type}")
     for name in ("key", "outcome"):
         if name not in found or not found[name].map(lambda value: isinstance(value, str)).all():
             raise RunError(f"{file} is no table of a study: it has no column {name} of text")
