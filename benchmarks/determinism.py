@@ -2,15 +2,18 @@
 
     python benchmarks/determinism.py [--quick]
 
-Each command runs in a process of its own with the same seed: again; with two threads; with an empty cache of compiled
-kernels; in another folder. Parameters, tables, drawn states and figures are compared as bytes; where they differ, by
-how much at most. Exits with 1 where a run with the same threads differs.
+Each command runs in a process and a folder of its own with the same seed: again; with an empty cache of compiled
+kernels; with two threads. Parameters, tables, drawn states, figures and pages are compared as bytes (not `run.json`,
+which says when and where, and not `posterior.nc`, whose draws `states` writes as a table); where they differ, by how
+much at most, if they are numbers. The table is printed and kept as results/determinism.md. Exits with 1 where a run
+with the same threads differs.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import subprocess
 import sys
@@ -49,6 +52,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "states": ("states", "{desk}/hand", "{desk}/valid.csv", "--draws", "20", "--out", "out.csv"),
     "report": ("report", "{desk}/hand", "{desk}/valid.csv", "--simulations", "20", "--out", "out.html"),
 }
+RESULTS = Path(__file__).parent / "results" / "determinism.md"
 QUICK = ("simulate", "fit, gaussian guide", "fit, lookahead guide", "fit, likelihood", "check", "states")
 
 
@@ -105,7 +109,8 @@ def results(folder: Path) -> dict[str, bytes]:
 
 
 def _tensors(file: Path) -> bytes:
-    return b"".join(name.encode() + value.tobytes() for name, value in sorted(load_file(file).items()))
+    tensors = sorted(load_file(file).items())
+    return b"".join(f"{name} {value.dtype} {value.shape}".encode() + value.tobytes() for name, value in tensors)
 
 
 def furthest(one: Path, other: Path) -> float:
@@ -151,8 +156,8 @@ def compared(desk: Path, name: str) -> dict[str, str]:
     for condition in CONDITIONS:
         folder = desk / name / condition.name
         steady(folder, words, condition.environment)
-        same = results(folder) == results(first)
-        said[condition.name] = "same" if same else f"differs by {furthest(first, folder):.1g}"
+        same, most = results(folder) == results(first), furthest(first, folder)
+        said[condition.name] = "same" if same else "differs" if math.isnan(most) else f"differs by {most:.1g}"
     return said
 
 
@@ -171,15 +176,18 @@ def main(arguments: list[str] | None = None, say: Callable[[str], None] = print)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help=f"only {', '.join(QUICK)}")
     chosen = parser.parse_args(arguments)
-    missed = 0
+    missed, lines = 0, [f"| command | {' | '.join(condition.name for condition in CONDITIONS)} |"]
+    lines.append("|---" * (len(CONDITIONS) + 1) + "|")
+    say("\n".join(lines))
     with tempfile.TemporaryDirectory() as folder:
         prepared(Path(folder))
-        say(f"| command | {' | '.join(condition.name for condition in CONDITIONS)} |")
-        say("|---" * (len(CONDITIONS) + 1) + "|")
         for name in QUICK if chosen.quick else COMMANDS:
             said = compared(Path(folder), name)
             missed += sum(condition.same and said[condition.name] != "same" for condition in CONDITIONS)
-            say(f"| {name} | {' | '.join(said.values())} |")
+            lines.append(f"| {name} | {' | '.join(said.values())} |")
+            say(lines[-1])
+    if not chosen.quick:
+        RESULTS.write_text("\n".join(lines) + "\n")
     return bool(missed)
 
 

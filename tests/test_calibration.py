@@ -13,7 +13,7 @@ BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
 import calibrate  # noqa: E402
-from calibration_tables import tables  # noqa: E402
+from calibration_tables import Musts, _check, _discovery, tables  # noqa: E402
 from uniformity import inside, near, ranks, together, uniform  # noqa: E402
 
 DRAWS, DRIVES = 99, 1000
@@ -58,12 +58,36 @@ def test_a_share_is_near_within_three_standard_errors():
     assert not near(values, 0.5)[1]
 
 
+def record_of(stratum: str, index: int, **found) -> dict:
+    return {"set": f"{stratum} {index}", "of": [stratum, index], "p_value": 0.5, "verdict": "none", **found}
+
+
+def musts(of) -> list[str]:
+    found = Musts()
+    of(found)
+    return [line.rstrip(" |").rpartition("| ")[2] for line in found.lines]
+
+
+def test_a_must_that_so_few_cannot_miss_is_not_said_to_hold():
+    few, many = ([record_of("one long drive", i, who="nothing found", findings=0) for i in range(n)] for n in (1, 60))
+    assert musts(lambda found: _check(few, found)) == ["too few to tell"]
+    assert musts(lambda found: _check(many, found)) == ["yes"]
+    accused = [one | {"who": "dynamics"} for one in many]
+    assert musts(lambda found: _check(accused, found)) == ["**no**"]
+
+
+def test_where_no_planted_effect_is_named_its_intervals_do_not_hold():
+    clean = [record_of("clean", i, p_value=(i + 0.5) / 60) for i in range(60)]
+    unnamed = [record_of("single", i, effects=[], planted=["magnus"]) for i in range(3)]
+    assert musts(lambda found: _discovery([*clean, *unnamed], found)) == ["yes", "yes", "**no**"]
+
+
 @pytest.mark.slow
 def test_the_quick_suite_meets_its_musts_and_a_job_that_fails_is_one_that_is_missed(tmp_path: Path, capsys):
     file = tmp_path / "quick.jsonl"
     assert calibrate.main(["--quick", "--results", str(file)]) == 0
     said = capsys.readouterr().out
-    assert "bootstrap 200 fails" in said and "**no**" not in said
+    assert "bootstrap 200 fails" in said and "**no**" not in said and said.count("too few to tell |") == 5
     assert file.with_suffix(".md").read_text() in said
     records = [json.loads(line) for line in file.read_text().splitlines()]
     broken = [*records, {"set": "states cart", "failed": "ValueError: no"}]
