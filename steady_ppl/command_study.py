@@ -32,7 +32,8 @@ def study(
 
     from steady_ppl.command_parts import say
     from steady_ppl.studies.job import require_runnable
-    from steady_ppl.studies.runner import Cluster, Local, run_study
+    from steady_ppl.studies.places import Cluster, Local
+    from steady_ppl.studies.runner import run_study
     from steady_ppl.studies.study_file import read_plan
 
     if workers is not None and cluster is not None:

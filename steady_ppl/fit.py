@@ -251,7 +251,12 @@ def _load_recorded(folder: Path, source: dict[str, str] | None, moved: str | Pat
 
 def versions() -> dict[str, str]:
     """Versions that a result may depend on."""
-    found = {"python": platform.python_version(), "torch_threads": str(torch.get_num_threads())}
+    return {"python": platform.python_version(), "torch_threads": str(torch.get_num_threads())} | packages()
+
+
+def packages() -> dict[str, str]:
+    """Versions of the packages that a result may depend on."""
+    found = {}
     for package in ("steady-ppl", "torch", "pyro-ppl", "numpy", "numba"):
         try:
             found[package] = version(package)

@@ -16,8 +16,9 @@ from small import MODELS, steady
 from steady_ppl.errors import RunError, UsageError
 from steady_ppl.studies.job import require_runnable
 from steady_ppl.studies.pictures import study_picture
+from steady_ppl.studies.places import Local
 from steady_ppl.studies.plan import RECORD, record_plan, recorded_plan
-from steady_ppl.studies.runner import Local, run_study
+from steady_ppl.studies.runner import run_study
 from steady_ppl.studies.study_file import read_plan
 from steady_ppl.studies.table import ARRIVED, TABLE, StudyTable, read_results, study_table
 

@@ -5,18 +5,21 @@ from __future__ import annotations
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
 import pytest
+from dask_cluster import Dask, free_port, wait_for
 from small import MODELS, steady
 
+from steady_ppl.errors import UsageError
+from steady_ppl.studies.places import Cluster
+from steady_ppl.studies.study_file import read_plan
 from steady_ppl.studies.table import read_results
 
 pytest.importorskip("distributed", reason="needs dask.distributed: pip install 'steady-ppl[cluster]'")
@@ -31,57 +34,6 @@ def fit(program, table, valid=None, *, known_start=False, seconds=0.0, seed=0):
     time.sleep(seconds)
     return Fit(program, "slow", {}, seed=seed, known_start=known_start)
 """
-
-
-class Dask:
-    """A scheduler and workers, each a process, on loopback."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.processes, self.port = folder, list[subprocess.Popen](), free_port()
-
-    @property
-    def address(self) -> str:
-        return f"tcp://127.0.0.1:{self.port}"
-
-    def start(self, *words: str) -> subprocess.Popen:
-        command = [sys.executable, "-m", "distributed.cli.dask_" + words[0], *words[1:]]
-        with (self.folder / "dask.log").open("a") as log:
-            process = subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, "OMP_NUM_THREADS": "1"})
-        self.processes.append(process)
-        return process
-
-    def scheduler(self) -> subprocess.Popen:
-        words = ("--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard", "--no-show")
-        process = self.start("scheduler", *words)
-        wait_for(lambda: answers(self.port))
-        return process
-
-    def worker(self) -> subprocess.Popen:
-        words = ("--nthreads", "1", "--no-dashboard", "--no-nanny", "--local-directory", str(self.folder))
-        return self.start("worker", self.address, *words)
-
-    def end(self) -> None:
-        for process in reversed(self.processes):
-            process.kill()
-            process.wait()
-
-
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
-
-
-def answers(port: int) -> bool:
-    with socket.socket() as caller:
-        return caller.connect_ex(("127.0.0.1", port)) == 0
-
-
-def wait_for(condition, seconds: float = 60) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.1)
 
 
 @pytest.fixture
@@ -180,3 +132,20 @@ def test_nobody_who_answers_is_one_line(tmp_path: Path, capsys):
     address = f"tcp://127.0.0.1:{free_port()}"
     assert steady("study", study(tmp_path), "--cluster", address, "--out", tmp_path / "out") == 2
     assert f"no Dask scheduler answers at {address}" in capsys.readouterr().err
+
+
+def test_workers_that_would_find_something_else_are_refused(tmp_path: Path, dask: Dask, capsys):
+    file, out = study(tmp_path), tmp_path / "out"
+    other = tmp_path / "other" / "steady_ppl-0.0.1.dist-info"
+    other.mkdir(parents=True)
+    (other / "METADATA").write_text("Metadata-Version: 2.1\nName: steady-ppl\nVersion: 0.0.1\n")
+    dask.scheduler()
+    worker = dask.worker(PYTHONPATH=str(other.parent))
+    assert steady("study", file, "--cluster", dask.address, "--out", out) == 2
+    assert "has steady-ppl 0.0.1 (here " in capsys.readouterr().err and len(read_results(out)) == 0
+    worker.kill()
+    worker.wait()
+    dask.worker()
+    cluster = Cluster(dask.address)
+    with cluster, pytest.raises(UsageError, match="does not see .*nowhere.py: workers need this machine's paths"):
+        list(cluster.results([replace(read_plan(file).jobs[0], program=str(tmp_path / "nowhere.py"))]))

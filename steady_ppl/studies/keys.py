@@ -35,9 +35,7 @@ class Keys:
             UsageError: a file cannot be read, or is none.
         """
         said = json.dumps({name: value for name, value in job.columns.items() if name != "key"}, sort_keys=True)
-        named = [job.program, job.recipe, *job.data.values(), *job.settings.values()]
-        programs = [file for name in named if is_program(name) for file in with_siblings(program_file(name))]
-        parts = [said, *(self._digest(file) for file in (*data_files(job.data), *programs))]
+        parts = [said, *map(self._digest, files_of(job))]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
     def _digest(self, file: Path) -> str:
@@ -60,6 +58,13 @@ def is_program(value: Any) -> bool:
 def program_file(name: str) -> Path:
     """The file of `PATH` or `PATH:CLASS`."""
     return Path(name.partition(".py")[0] + ".py")
+
+
+def files_of(job: Job) -> list[Path]:
+    """All that a job reads: tables or logs, and programs with what they import from their own folder."""
+    named = [job.program, job.recipe, *job.data.values(), *job.settings.values()]
+    programs = [file for name in named if is_program(name) for file in with_siblings(program_file(name))]
+    return [*data_files(job.data), *programs]
 
 
 def data_files(data: Mapping[str, Any]) -> list[Path]:

@@ -1,0 +1,202 @@
+"""Where the jobs of a study are computed: on processes of this machine or on a Dask cluster, by joblib.
+
+What is here is what joblib leaves open: that a worker dies is told apart from what a job raises, and which jobs had
+been begun is known afterwards.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+import uuid
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import joblib
+from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+from steady_ppl.errors import UsageError
+from steady_ppl.fit import packages
+from steady_ppl.studies import job as work
+from steady_ppl.studies.keys import files_of
+from steady_ppl.studies.plan import Job
+
+WORKER_WAIT = 30  # s for the first worker of a cluster
+Row = dict[str, Any]
+
+
+class Place:
+    """Where jobs are computed.
+
+    Attributes:
+        died: what joblib raises when a worker has died of a job.
+        lost: what it raises when there is nothing left to compute on.
+        suspicious: how often a job must have been begun to be suspected of it.
+        alone: how often a suspect is tried by itself before it is given up.
+    """
+
+    suspicious = 1
+    alone = 2
+    died: tuple[type[BaseException], ...] = ()
+    lost: tuple[type[BaseException], ...] = ()
+
+    def __enter__(self) -> Place:
+        return self
+
+    def __exit__(self, *raised: Any) -> None:
+        raise NotImplementedError
+
+    def results(self, jobs: Sequence[Job]) -> Iterator[Row]:
+        """What comes back, in any order."""
+        raise NotImplementedError
+
+    def begun(self) -> Counter[str]:
+        """How often each job was begun, by its key."""
+        raise NotImplementedError
+
+
+class Local(Place):
+    """Processes of this machine, each with one thread; when one dies, all jobs that are begun have to be tried again.
+
+    Args:
+        workers: how many.
+    """
+
+    died = (TerminatedWorkerError,)
+
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
+
+    def __enter__(self) -> Local:
+        self.folder = tempfile.TemporaryDirectory(prefix="steady-study-")
+        self.marks = Path(self.folder.name)  # a job that is begun leaves its mark there
+        return self
+
+    def __exit__(self, *raised: Any) -> None:
+        self.folder.cleanup()
+
+    def results(self, jobs: Sequence[Job]) -> Iterator[Row]:
+        # of a single one joblib would make this process, which must not die of a job: it sees two, and one is sent work
+        with joblib.parallel_config("loky", n_jobs=max(2, self.workers), inner_max_num_threads=1):
+            yield from _sent(_marked, [(job, self.marks) for job in jobs], at_once=self.workers)
+
+    def begun(self) -> Counter[str]:
+        return Counter({mark.name: mark.stat().st_size for mark in self.marks.iterdir()})
+
+
+def _marked(job: Job, marks: Path) -> Row:
+    with (marks / job.key).open("a") as mark:
+        mark.write("1")
+    return work.run(job)
+
+
+class Cluster(Place):
+    """A Dask cluster that is there already; when a worker dies, Dask gives its job to another, three times.
+
+    Args:
+        address: of its scheduler, for example `tcp://10.0.0.1:8786`.
+
+    Raises:
+        UsageError: dask.distributed is not installed, nobody answers there, there is no worker, one has several
+            threads, or other versions than this machine; from `results`, one does not see the files of the jobs.
+    """
+
+    suspicious, alone = 3, 0
+
+    def __init__(self, address: str) -> None:
+        try:
+            import distributed  # an extra, which --cluster alone needs
+            from distributed.comm import CommClosedError
+            from distributed.scheduler import KilledWorker
+        except ImportError as error:
+            raise UsageError("--cluster needs dask.distributed: pip install 'steady-ppl[cluster]'") from error
+        from concurrent.futures import CancelledError
+
+        self.topic = f"steady study {uuid.uuid4().hex}"
+        self.died = (KilledWorker,)
+        self.lost = (CancelledError, CommClosedError, OSError, TimeoutError)
+        try:
+            self.client = distributed.Client(address, timeout=10)
+        except (OSError, TimeoutError, ValueError) as error:
+            reason = str(error).partition("\n")[0]
+            raise UsageError(f"no Dask scheduler answers at {address}: {reason}") from error
+        _hush("distributed", "tornado", "asyncio")
+        try:
+            self.client.wait_for_workers(1, timeout=WORKER_WAIT)
+        except TimeoutError as error:
+            self.client.close()
+            raise UsageError(f"the scheduler at {address} has no worker: start some") from error
+        try:
+            self._require_alike(address)
+        except UsageError:
+            self.client.close()
+            raise
+
+    def _require_alike(self, address: str) -> None:
+        workers = self.client.scheduler_info(n_workers=-1)["workers"].values()
+        several = sum(worker["nthreads"] > 1 for worker in workers)
+        if several:
+            raise UsageError(
+                f"{several} workers have several threads, which would take turns: start them by "
+                f"`dask worker {address} --nthreads 1 --nworkers N`"
+            )
+        here = packages()
+        try:
+            there = self.client.run(packages)
+        except ImportError as error:
+            raise UsageError(f"a worker cannot import steady-ppl ({error}): install it there as here") from error
+        for worker, found in there.items():
+            other = [f"{name} {found[name]} (here {here[name]})" for name in here if found[name] != here[name]]
+            if other:
+                raise UsageError(f"the worker {worker} has {', '.join(other)}: results would not be comparable")
+
+    def _require_files(self, jobs: Sequence[Job]) -> None:
+        files = sorted({str(file) for job in jobs for file in files_of(job)})
+        for worker, lacking in self.client.run(_lacking, files).items():
+            if lacking:
+                raise UsageError(f"the worker {worker} does not see {lacking[0]}: workers need this machine's paths")
+
+    def __exit__(self, *raised: Any) -> None:
+        self.client.close(timeout=2)
+
+    def results(self, jobs: Sequence[Job]) -> Iterator[Row]:
+        from joblib._dask import DaskDistributedBackend
+
+        self._require_files(jobs)
+
+        class Backend(DaskDistributedBackend):
+            """joblib does the work itself where it sees a single worker: let it see two."""
+
+            def effective_n_jobs(self, n_jobs: int) -> int:
+                return max(2, super().effective_n_jobs(n_jobs))
+
+        with joblib.parallel_config(Backend(client=self.client)):
+            yield from _sent(_logged, [(job, self.topic) for job in jobs], at_once="all")
+
+    def begun(self) -> Counter[str]:
+        return Counter(said for _, said in self.client.get_events(self.topic))
+
+
+def _hush(*owners: str) -> None:
+    """What they log of a connection that is lost is said in one line here."""
+    for name in list(logging.root.manager.loggerDict):
+        if name.partition(".")[0] in owners:
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+
+
+def _lacking(files: Sequence[str]) -> list[str]:
+    return [file for file in files if not Path(file).is_file()]
+
+
+def _logged(job: Job, topic: str) -> Row:
+    from distributed import get_worker
+
+    get_worker().log_event(topic, job.key)
+    return work.run(job)
+
+
+def _sent(function: Callable[..., Row], arguments: Sequence[tuple[Any, ...]], at_once: int | str) -> Iterator[Row]:
+    parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch=at_once)
+    yield from parallel(joblib.delayed(function)(*given) for given in arguments)
