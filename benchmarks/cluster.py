@@ -1,0 +1,205 @@
+"""What a study costs on a Dask cluster, by which docs/studies.md plans ten thousand fits on a hundred machines.
+
+    python benchmarks/cluster.py [--quick]
+
+A scheduler and workers are started as processes on loopback. Measured are: the same fits by one worker and by two in
+turn (efficiency: seconds of one over twice the seconds of two); ten thousand jobs that end at once, for what scheduler,
+client and table can take; bytes of a job and of a result; and workers that are killed in the middle, for what that
+costs. Written to results/cluster.json; exits with 1 where the efficiency is below 90 % or a job is lost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import pickle
+import signal
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+from dask_cluster import Dask, wait_for  # noqa: E402
+
+from steady_ppl.studies.places import Cluster  # noqa: E402
+from steady_ppl.studies.runner import run_study  # noqa: E402
+from steady_ppl.studies.study_file import read_plan  # noqa: E402
+from steady_ppl.studies.table import TABLE, read_results  # noqa: E402
+
+RESULTS = Path(__file__).parent / "results" / "cluster.json"
+MUST = 0.9
+HOVERCRAFT, NETWORK, CART = (
+    ROOT / "models" / name
+    for name in ("hovercraft.py:HovercraftTruth", "neural_vehicle.py:NeuralHovercraft", "linear_gaussian.py")
+)
+ENDS_AT_ONCE = """
+from steady_ppl import UsageError
+
+def fit(program, table, valid=None, *, known_start=False, seed=0):
+    raise UsageError("it ends at once")
+"""
+
+
+def study(folder: Path, jobs: int, truth: Path, sizes: int, method: str) -> Path:
+    """A study of one method and so many seeds."""
+    text = f'title = "Cluster"\nseeds = {list(range(1, jobs + 1))}\nknown_start = true\n'
+    text += f'[data]\nsimulate = "{truth}"\ntrain = {sizes}\nvalid = {sizes}\ntest = {sizes}\n'
+    folder.mkdir(exist_ok=True)
+    (folder / "study.toml").write_text(f"{text}[[method]]\nname = 'it'\n{method}\n")
+    return folder / "study.toml"
+
+
+def fits(folder: Path, jobs: int, steps: int) -> Path:
+    """Short fits of a network by the Gaussian guide, each some seconds."""
+    settings = f"{{guide = 'gaussian', steps = {steps}, validate_every = {steps}}}"
+    return study(folder, jobs, HOVERCRAFT, 16, f"program = '{NETWORK}'\nsettings = {settings}")
+
+
+@contextmanager
+def cluster(folder: Path, workers: int) -> Iterator[Dask]:
+    """A scheduler and workers that have loaded what they need."""
+    folder.mkdir(exist_ok=True)
+    dask = Dask(folder)
+    try:
+        dask.scheduler()
+        for _ in range(workers):
+            dask.worker()
+        with Cluster(dask.address) as place:
+            wait_for(lambda: len(place.client.scheduler_info(n_workers=-1)["workers"]) == workers)
+            run_study(read_plan(fits(folder / "warm", 3 * workers, 2)), folder / "warm" / "out", place)
+        yield dask
+    finally:
+        dask.end()
+
+
+def efficiency(folder: Path, rounds: int, jobs: int, steps: int) -> dict[str, Any]:
+    """Seconds of the same study by one worker and by two, in turn."""
+    seconds: dict[int, list[float]] = {1: [], 2: []}
+    with cluster(folder / "one", 1) as one, cluster(folder / "two", 2) as two:
+        for turn in range(rounds):
+            for workers, dask in ((1, one), (2, two)) if turn % 2 == 0 else ((2, two), (1, one)):
+                out = folder / f"out-{workers}-{turn}"
+                plan = read_plan(fits(folder / "fits", jobs, steps))
+                with Cluster(dask.address) as place:
+                    began = time.perf_counter()
+                    failed = run_study(plan, out, place)
+                    seconds[workers].append(time.perf_counter() - began)
+                assert not failed and len(read_results(out)) == jobs
+    found = [alone / (2 * both) for alone, both in zip(seconds[1], seconds[2], strict=True)]
+    each = read_results(folder / "out-1-0")["seconds"]
+    return {
+        "jobs": jobs,
+        "seconds_a_job": float(each.mean()),
+        "one_worker_s": seconds[1],
+        "two_workers_s": seconds[2],
+        "efficiency": found,
+        "mean": statistics.mean(found),
+        "sd": statistics.stdev(found) if len(found) > 1 else 0.0,
+    }
+
+
+def many(folder: Path, jobs: int) -> dict[str, Any]:
+    """Jobs that end at once: what everything but the computing takes."""
+    folder.mkdir()
+    (folder / "ends.py").write_text(ENDS_AT_ONCE)
+    began = time.perf_counter()
+    plan = read_plan(study(folder, jobs, CART, 1, f"program = '{CART}'\nrecipe = 'ends.py'"))
+    planning = time.perf_counter() - began
+    with cluster(folder / "dask", 2) as dask, Cluster(dask.address) as place:
+        began = time.perf_counter()
+        failed = run_study(plan, folder / "out", place)
+        seconds = time.perf_counter() - began
+        scheduler = _resident(dask.processes[0].pid)
+    assert failed == jobs == len(read_results(folder / "out"))
+    own = float(read_results(folder / "out")["seconds"].sum())
+    return {
+        "jobs": jobs,
+        "planning_s": planning,
+        "seconds": seconds,
+        "a_second": jobs / seconds,
+        "busy": own / (2 * seconds),
+        "overhead_ms_a_job": 1000 * max(0.0, 2 * seconds - own) / jobs,
+        "client_mib": _resident(os.getpid()),
+        "scheduler_mib": scheduler,
+        "bytes_a_job": len(pickle.dumps(plan.jobs[0])),
+        "table_bytes": (folder / "out" / TABLE).stat().st_size,
+    }
+
+
+def killed(folder: Path, jobs: int, steps: int, every: float) -> dict[str, Any]:
+    """The same fits while one of two workers is killed again and again, another one taking its place."""
+    plan, kills = read_plan(fits(folder, jobs, steps)), 0
+    with cluster(folder / "dask", 2) as dask, Cluster(dask.address) as place:
+        over = threading.Event()
+
+        def kill() -> None:
+            nonlocal kills
+            while not over.wait(every):
+                victim = dask.processes.pop(1)
+                victim.kill()
+                victim.wait()
+                dask.worker()
+                kills += 1
+
+        killer = threading.Thread(target=kill)
+        killer.start()
+        began = time.perf_counter()
+        try:
+            failed = run_study(plan, folder / "out", place)
+        finally:
+            over.set()
+            killer.join()
+        seconds = time.perf_counter() - began
+        begun = sum(place.begun().values())
+    found = read_results(folder / "out")
+    row = len(pickle.dumps(found.iloc[0].to_dict()))
+    return {
+        "jobs": jobs,
+        "kills": kills,
+        "seconds": seconds,
+        "begun": begun,
+        "lost": jobs - len(found),
+        "failed": failed,
+        "bytes_a_result": row,
+    }
+
+
+def _resident(process: int) -> float:
+    words = Path(f"/proc/{process}/status").read_text().split()
+    return int(words[words.index("VmHWM:") + 1]) / 1024
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="few and short jobs; writes nothing")
+    quick = parser.parse_args().quick
+    signal.signal(signal.SIGTERM, lambda *received: sys.exit(1))  # so that what was started is ended
+    with tempfile.TemporaryDirectory() as name:
+        folder, found = Path(name), {}
+        parts = {
+            "efficiency": lambda at: efficiency(at, 1 if quick else 3, 4 if quick else 12, 5 if quick else 40),
+            "many": lambda at: many(at, 200 if quick else 10_000),
+            "killed": lambda at: killed(at, 6 if quick else 24, 5 if quick else 40, 10.0 if quick else 15.0),
+        }
+        for part, measure in parts.items():
+            if part != "many":
+                (folder / part).mkdir()
+            found[part] = measure(folder / part)
+            print(part, json.dumps(found[part]), flush=True)
+    if not quick:
+        RESULTS.write_text(json.dumps(found, indent=1) + "\n")
+    return int(found["efficiency"]["mean"] < MUST or found["killed"]["lost"] > 0 or found["killed"]["failed"] > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
