@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors import SafetensorError
+from safetensors.torch import load, save_file
 from torch import Tensor
 
 from steady_ppl.errors import RunError, shown
@@ -66,17 +66,25 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """
     require_file(path, RunError)
     try:
-        with safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            text = dict(file.metadata() or {})
+        content = path.read_bytes()  # not by name: safetensors reads none that is not UTF-8
+        tensors = load(content)
     except FileNotFoundError:
         raise RunError(f"no file {path.name} in {path.parent}") from None
     except SafetensorError as error:
         raise RunError(f"{path.name} in {path.parent} is damaged ({error})") from error
+    except OSError as error:
+        raise RunError(f"{path.name} in {path.parent} cannot be read: {error.strerror or error}") from error
+    text = _text(content)
     written = text.pop(HASH, None)
     if written is not None and written != _hash(tensors, text):
         raise _damaged(path, "its numbers are not those that were written")
     return tensors, text
+
+
+def _text(content: bytes) -> dict[str, str]:
+    """The text beside the tensors of a safetensors file that is whole: its header's length comes first."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    return json.loads(content[8:end]).get("__metadata__") or {}
 
 
 def _hash(tensors: Mapping[str, Tensor], text: Mapping[str, str]) -> str:

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from steady_ppl.counted import count, random_seed
 from steady_ppl.errors import UsageError
 
 
@@ -22,9 +23,9 @@ def check(
         Path | None,
         typer.Option(help="Write the table without the stretches that nobody measured, for fits and checks, here."),
     ] = None,
-    simulations: Annotated[int, typer.Option(help="Simulated sets for the bands.", min=20)] = 100,
+    simulations: Annotated[int, count("Simulated sets for the bands.", least=20)] = 100,
     program: Annotated[str | None, typer.Option(help="The program, if its file moved or changed.")] = None,
-    seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+    seed: Annotated[int, random_seed()] = 0,
 ) -> None:
     """Compare a run with measurements: where, when and in which regime it fails, and who is at fault."""
     from steady_ppl.checking import check as compare

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from steady_ppl.counted import random_seed
 from steady_ppl.harmless import tell
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
@@ -17,7 +18,7 @@ def alpha_truck(
     folder: Annotated[Path, typer.Argument(help="One split: holds vrpn-pose.csv and vesc_drive.csv.")],
     out: Annotated[Path, typer.Option("--out", help="Table to write, .csv or .parquet.")],
     sigma_deg: Annotated[float, typer.Option(help="Standard deviation of the simulated bearings, degrees.")] = 5.0,
-    seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+    seed: Annotated[int, random_seed()] = 0,
 ) -> None:
     """One split of the AlphaTruck logs to a table, resampled as the authors do.
 

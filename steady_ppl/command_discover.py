@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from steady_ppl.counted import count, random_seed
 from steady_ppl.errors import RunError, UsageError
 
 
@@ -28,9 +29,9 @@ def discover(
         Path | None, typer.Option("--json", help="Write the figures to this file; - prints them instead of the text.")
     ] = None,
     picture: Annotated[Path | None, typer.Option(help="Draw what was found into this file, for example .png.")] = None,
-    simulations: Annotated[int, typer.Option(help="Simulated sets for the calibration.", min=50)] = 200,
+    simulations: Annotated[int, count("Simulated sets for the calibration.", least=50)] = 200,
     program: Annotated[str | None, typer.Option(help="The run's program, if its file moved or changed.")] = None,
-    seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+    seed: Annotated[int, random_seed()] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a search that was stopped.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing run.")] = False,
 ) -> None:

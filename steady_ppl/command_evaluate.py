@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from steady_ppl.counted import count, random_seed
 from steady_ppl.errors import UsageError
 
 OFTEN = 0.1  # share of the measured rows after which hardly a particle is left
@@ -17,9 +18,9 @@ def evaluate(
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the figures to this file; - prints them instead of the text.")
     ] = None,
-    particles: Annotated[int | None, typer.Option(help="Particles of the filters.", min=2)] = None,
-    rollouts: Annotated[int, typer.Option(help="Noisy roll-outs from each true state.", min=1)] = 1000,
-    seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+    particles: Annotated[int | None, count("Particles of the filters.", least=2)] = None,
+    rollouts: Annotated[int, count("Noisy roll-outs from each true state.")] = 1000,
+    seed: Annotated[int, random_seed()] = 0,
     surveyed: Annotated[
         str | None,
         typer.Option("--map", help="The same vehicle with the true landmarks, for runs that learned theirs."),

@@ -9,7 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
-from steady_ppl.errors import UsageError
+from steady_ppl.counted import MOST, count, random_seed
+from steady_ppl.errors import UsageError, shown
 from steady_ppl.harmless import tell
 
 WORDS = {"true": True, "false": False, "none": None}
@@ -52,14 +53,14 @@ def fit(
     ] = None,
     hand: Annotated[str | None, typer.Option(help="The program written by hand, for fit-hand.")] = None,
     known_start: Annotated[bool, typer.Option(help="Give the first row's x. columns as the exact start.")] = False,
-    particles: Annotated[int | None, typer.Option(help="Particles for each drive.", min=1)] = None,
-    draws: Annotated[int | None, typer.Option(help="Paths for each drive in the M step.", min=1)] = None,
-    steps: Annotated[int | None, typer.Option(help="E steps.", min=1)] = None,
+    particles: Annotated[int | None, count("Particles for each drive.")] = None,
+    draws: Annotated[int | None, count("Paths for each drive in the M step.")] = None,
+    steps: Annotated[int | None, count("E steps.")] = None,
     setting: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Any other setting of the recipe, for example ramp=0.7."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+    seed: Annotated[int, random_seed()] = 0,
     device: Annotated[Device, typer.Option(help="Where to compute.")] = Device.cpu,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing run.")] = False,
@@ -115,4 +116,6 @@ def _settings(pairs: list[str], options: dict[str, Any]) -> dict[str, Any]:
             options[name] = ast.literal_eval(word)
         except (ValueError, SyntaxError):
             options[name] = WORDS.get(word, word)
+        if isinstance(options[name], int) and abs(options[name]) > MOST:
+            raise UsageError(f"--set {shown(pair, 60)}: expected a whole number up to {MOST}")
     return options

@@ -33,6 +33,7 @@ from steady_ppl.command_parts import hushed, say
 from steady_ppl.commanded import commanded
 from steady_ppl.errors import SteadyError
 from steady_ppl.harmless import tell
+from steady_ppl.outside import as_refusal
 from steady_ppl.progress import listening
 from steady_ppl.progress_line import progress_line
 
@@ -226,6 +227,9 @@ def main(arguments: list[str] | None = None) -> int:
                 return 2
             if "debug" in asked:
                 tell(traceback.format_exc(), aside=True)
+            if (refusal := as_refusal(error)) is not None:
+                say(str(refusal), always=True)
+                return refusal.exit_code
             lines = str(error).strip().splitlines() or [""]
             say(f"{type(error).__name__}: {lines[0]} (--debug shows where)", always=True)
             return 1

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from steady_ppl.counted import random_seed
 from steady_ppl.errors import UsageError
 
 
@@ -25,7 +26,7 @@ def prove(
         list[str] | None,
         typer.Option(help="The program, if its file moved or changed; once for each RUN and the oracle, in order."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+    seed: Annotated[int, random_seed()] = 0,
 ) -> None:
     """Prove that runs are better than the first one: log p(y), open-loop errors and noise, with paired intervals."""
     from steady_ppl.command_parts import (

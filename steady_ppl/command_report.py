@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from steady_ppl.counted import count, random_seed
 from steady_ppl.errors import UsageError
 from steady_ppl.harmless import tell
 
@@ -26,12 +27,12 @@ def report(
         typer.Option(help="What `steady discover` found: its RUN or its --json file, if none of the RUNs has it."),
     ] = None,
     title: Annotated[str | None, typer.Option(help="Of the page; the runs' names when not given.")] = None,
-    simulations: Annotated[int, typer.Option(help="Simulated sets for the bands.", min=20)] = SIMULATIONS,
+    simulations: Annotated[int, count("Simulated sets for the bands.", least=20)] = SIMULATIONS,
     program: Annotated[
         list[str] | None,
         typer.Option(help="The program, if its file moved or changed; once for each RUN, in order."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+    seed: Annotated[int, random_seed()] = 0,
 ) -> None:
     """Write one page of HTML: verdict, measured against predicted, where it fails, what is missing, before and after.
 

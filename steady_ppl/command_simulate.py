@@ -7,14 +7,15 @@ from typing import Annotated
 
 import typer
 
+from steady_ppl.counted import count, random_seed
 from steady_ppl.errors import UsageError
 
 
 def simulate(
     model: Annotated[str, typer.Argument(help="Program: models/hovercraft.py, or mine.py:Boat.")],
     out: Annotated[Path, typer.Option("--out", help="Table to write, .csv or .parquet.")],
-    trajectories: Annotated[int | None, typer.Option(help="How many drives, 16 when not given.", min=1)] = None,
-    seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+    trajectories: Annotated[int | None, count("How many drives, 16 when not given.")] = None,
+    seed: Annotated[int, random_seed()] = 0,
     controls: Annotated[Path | None, typer.Option(help="Take time, controls and gaps from this table.")] = None,
     effect: Annotated[
         list[str] | None,

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from steady_ppl.counted import count, random_seed
 from steady_ppl.harmless import tell
 
 
@@ -19,10 +20,10 @@ def states(
             "--out", help="A table (.csv, .parquet) of medians and 90 % intervals, or all draws for ArviZ (.nc)."
         ),
     ],
-    draws: Annotated[int, typer.Option(help="Paths of each drive.", min=1)] = 100,
-    particles: Annotated[int | None, typer.Option(help="Particles of the filter.", min=1)] = None,
+    draws: Annotated[int, count("Paths of each drive.")] = 100,
+    particles: Annotated[int | None, count("Particles of the filter.")] = None,
     program: Annotated[str | None, typer.Option(help="The program, if its file moved or changed.")] = None,
-    seed: Annotated[int, typer.Option(help="Random seed.", min=0)] = 0,
+    seed: Annotated[int, random_seed()] = 0,
 ) -> None:
     """Write where the vehicle probably was, given all measurements of a drive: posterior draws of its states.
 

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from steady_ppl.command_tour import WIDTH, Tour
-from steady_ppl.errors import ComputationError, RunError, UsageError
+from steady_ppl.errors import ComputationError, RunError
 from steady_ppl.program_file import load_program
-from steady_ppl.rooms import TRUTH, workbench
+from steady_ppl.rooms import TRUTH, empty_again, workbench
 from steady_ppl.run_folder import read_record
 
 RECORD = "demo.json"  # of a demonstration; a folder without one is not a demonstration's
@@ -215,13 +215,11 @@ def _open(out: Path, force: bool) -> None:
     if out.exists() and not force and not (out / RECORD).is_file():
         raise RunError(f"{out} exists and is no demo's: choose another folder, or --force to write into it")
     source = workbench() / OWNERS
-    try:
-        (out / "models").mkdir(parents=True, exist_ok=True)
+    with empty_again(out):
+        (out / "models").mkdir(exist_ok=True)
         shutil.copyfile(source, out / OWNERS)
         with chdir(out):
             _write_record({"status": "running"})
-    except OSError as error:
-        raise UsageError(f"{out} cannot be written: {error.strerror} ({error.filename})") from error
 
 
 def _write_record(content: Mapping[str, Any]) -> None:

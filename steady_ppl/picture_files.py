@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from steady_ppl.errors import UsageError
+from steady_ppl.harmless import harmless
 from steady_ppl.whole_file import require_place, whole_file
 
 if TYPE_CHECKING:
@@ -35,5 +36,9 @@ def write_picture(figure: Figure, path: Path) -> None:
     Raises:
         UsageError: the file cannot be written.
     """
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_text(harmless(text.get_text()))  # matplotlib draws no name that is not UTF-8
     with whole_file(path) as beside:
         figure.savefig(beside, format=path.suffix.lower()[1:], dpi=150)

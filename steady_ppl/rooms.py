@@ -5,11 +5,14 @@ from __future__ import annotations
 
 import shutil
 import sysconfig
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from steady_ppl.errors import UsageError
 
 ROOMS = ("models", "inference", "notebooks")
+LEFT_OUT = {"__pycache__", ".ipynb_checkpoints"}
 DRIVES = {"train": 16, "valid": 16, "test": 32}
 TRUTH = "models/hovercraft.py:HovercraftTruth"
 
@@ -39,22 +42,59 @@ def furnish(folder: Path) -> list[Path]:
         The tables, of a hovercraft with drag; of its true states only the test table has more than each first row.
 
     Raises:
-        UsageError: the folder has something in it, or cannot be written.
+        UsageError: the folder has something in it, or cannot be written. What was made by then is removed.
+        DataError: a table cannot be written.
     """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise UsageError(f"{folder} exists and is not empty: choose another folder")
+    with empty_again(folder):
+        _copy_rooms(folder)
+        return _simulate_tables(folder)
+
+
+@contextmanager
+def empty_again(folder: Path) -> Iterator[None]:
+    """Make a folder for the block that fills it. If it fails, what is in the folder is removed where that was missing
+    or empty before, with the folders that were made for it.
+
+    Raises:
+        UsageError: something in it cannot be written.
+    """
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    fresh = bool(made) or not any(folder.iterdir())
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException as error:
+        with suppress(OSError):  # where nothing can be written nothing can be removed
+            for place in folder.iterdir() if fresh else ():
+                if place.is_dir() and not place.is_symlink():
+                    shutil.rmtree(place)
+                else:
+                    place.unlink()
+            for place in made:
+                place.rmdir()
+        if isinstance(error, OSError):
+            raise UsageError(f"{folder} cannot be written: {error.strerror or error}") from error
+        raise
+
+
+def _copy_rooms(folder: Path) -> None:
+    bench = workbench()
+    files = [file for room in ROOMS for file in sorted((bench / room).rglob("*")) if file.is_file()]
+    for file in files:
+        place = file.relative_to(bench)
+        if not LEFT_OUT & {*place.parts}:
+            (folder / place).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, folder / place)
+
+
+def _simulate_tables(folder: Path) -> list[Path]:
     from steady_ppl.program_file import load_program
     from steady_ppl.progress import stages
     from steady_ppl.simulation import simulate
     from steady_ppl.table import write_table
 
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UsageError(f"{folder} exists and is not empty: choose another folder")
-    try:
-        for room in ROOMS:
-            shutil.copytree(
-                workbench() / room, folder / room, ignore=shutil.ignore_patterns("__pycache__", ".ipynb_checkpoints")
-            )
-    except OSError as error:
-        raise UsageError(f"{folder} cannot be written: {error.strerror} ({error.filename})") from error
     program = load_program(str(folder / TRUTH))
     tables = []
     with stages(*((f"simulating {name}", count) for name, count in DRIVES.items())) as begin:

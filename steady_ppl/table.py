@@ -79,9 +79,9 @@ def to_frame(data: Trajectories) -> pd.DataFrame:
             table they would be one trajectory, or a missing measurement.
     """
     labels = data.labels or tuple(str(i + 1) for i in range(len(data)))
-    for i, label in enumerate(labels):
-        if label in labels[:i]:
-            _fail("table", "two trajectories have this label", column="trajectory", trajectory=label)
+    again = pd.Series(labels, dtype=object).duplicated()
+    if again.any():
+        _fail("table", "two trajectories have this label", column="trajectory", trajectory=labels[again.argmax()])
     for t, b, k in (data.measurements.isnan() & data.observed & data.rows[..., None]).nonzero()[:1].tolist():
         row, column = int(data.lengths[:b].sum()) + t + 1, f"y.{data.measurement_names[k]}"
         _fail("table", "a measurement is NaN", column=column, trajectory=labels[b], row=row)
@@ -229,7 +229,9 @@ def _read_csv(path: Path) -> pd.DataFrame:
 def _read_parquet(path: Path) -> pd.DataFrame:
     # not pandas' reader: it turns a folder named seed=3 on the way into a column
     with path.open("rb") as file:
-        frame = pyarrow.parquet.ParquetFile(file).read().to_pandas(ignore_metadata=True)
+        table = pyarrow.parquet.ParquetFile(file).read()
+    table.validate(full=True)  # text that is not UTF-8
+    frame = table.to_pandas(ignore_metadata=True)
     return frame.drop(columns=[column for column in frame if column.startswith("__index_level_")])
 
 

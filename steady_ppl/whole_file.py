@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from steady_ppl.errors import SteadyError, UsageError
@@ -23,7 +24,7 @@ def whole_file(path: Path, refused: type[SteadyError] = UsageError, beside: Path
     Raises:
         UsageError, or `refused`: it cannot be written.
     """
-    beside = beside or path.with_name(f".{path.name}.{os.getpid()}.partial")
+    beside = beside or hidden_beside(path)
     try:
         beside.unlink(missing_ok=True)  # a link in its place would be written through
         yield beside
@@ -31,7 +32,13 @@ def whole_file(path: Path, refused: type[SteadyError] = UsageError, beside: Path
     except OSError as error:
         raise refused(f"{path} cannot be written: {error.strerror or error}") from error
     finally:
-        beside.unlink(missing_ok=True)
+        with suppress(OSError):  # where nothing can be written nothing can be removed, and what went wrong is said
+            beside.unlink(missing_ok=True)
+
+
+def hidden_beside(path: Path) -> Path:
+    """This process's hidden file in the folder of `path`. Its name is short: that of `path` may be as long as any."""
+    return path.with_name(f".{zlib.crc32(os.fsencode(path.name)):08x}.{os.getpid()}.partial")
 
 
 def require_place(path: Path | None) -> None:

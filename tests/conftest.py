@@ -24,6 +24,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("work")
     written(folder / "train.csv")
     written(folder / "valid.parquet", simulated(trajectories=2, rows=33, seed=1))
+    written(folder / "test.csv", simulated(trajectories=5, rows=13, seed=2))
     assert steady("fit", HOVERCRAFT, folder / "train.csv", "--recipe", "hand", "--out", folder / "hand") == 0
     assert steady("fit", HOVERCRAFT, folder / "train.csv", "--out", folder / "steady", *FEW) == 0
     return folder

@@ -13,6 +13,7 @@ from small import HOVERCRAFT, contents, steady, written
 
 import steady_ppl as st
 from steady_ppl.harmless import harmless, tell
+from steady_ppl.whole_file import hidden_beside
 
 PACKAGE = Path(st.__file__).parent
 PAYLOAD = "from pathlib import Path\nPath({mark!r}).touch()\n"
@@ -147,7 +148,7 @@ def test_overwriting_a_run_removes_nothing_behind_a_link(tmp_path: Path, refused
 def test_a_file_of_a_run_that_is_a_link_is_replaced_not_written_through(tmp_path: Path, run: Path) -> None:
     precious = tmp_path / "precious.txt"
     precious.write_text("kept")
-    for name in ("run.json", "parameters.safetensors", f".run.json.{os.getpid()}.partial"):
+    for name in ("run.json", "parameters.safetensors", hidden_beside(Path("run.json")).name):
         (run / name).unlink(missing_ok=True)
         (run / name).symlink_to(precious)
     assert steady("fit", HOVERCRAFT, tmp_path / "train.csv", "--recipe", "hand", "--out", run, "--force") == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -148,15 +149,23 @@ except RuntimeError as error:
 
 
 def test_a_whole_loop_reads_no_pickle_and_calls_nobody(tmp_path: Path) -> None:
-    """fit, resume, check, states, add, report, with the interpreter telling of every pickle that is read."""
-    table = written(tmp_path / "drives.csv", simulated(trajectories=4, rows=41))
+    """fit, resume, check, states, evaluate, discover, add, prove and report, with the interpreter telling of every
+    pickle that is read."""
+    table = written(tmp_path / "drives.csv", simulated(trajectories=10, rows=21))
+    shutil.copy(HOVERCRAFT, tmp_path)
     run, few = tmp_path / "run", "--guide bootstrap --particles 20 --draws 3"
+    found, windy = tmp_path / "found", tmp_path / "windy"
     lines = [
         f"fit {HOVERCRAFT} {table} --known-start {few} --steps 3 --out {run}",
         f"fit {HOVERCRAFT} {table} --known-start {few} --steps 3 --resume --out {run}",
         f"check {run} {table} --simulations 20 --json {tmp_path / 'check.json'}",
         f"states {run} {table} --out {tmp_path / 'states.nc'}",
-        f"report {run} {table} --out {tmp_path / 'page.html'}",
+        f"evaluate {run} {table} --particles 50 --rollouts 5 --json {tmp_path / 'errors.json'}",
+        f"discover {run} {table} --simulations 50 --out {found} --json {tmp_path / 'found.json'}",
+        f"add {tmp_path / 'hovercraft.py'} wind=1,1 --out {windy}.py",
+        f"fit {windy}.py {table} --recipe hand --out {windy}",
+        f"prove {run} {windy} {table} --json {tmp_path / 'proof.json'}",
+        f"report {run} {windy} {table} --discovery {found} --out {tmp_path / 'page.html'}",
     ]
     (tmp_path / "lines").write_text("\n".join(lines))
     command = [sys.executable, "-W", "ignore", "-c", LOOP, str(tmp_path / "lines")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+import time
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -491,6 +492,14 @@ def test_trajectories_of_one_label_are_not_run_together(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="two trajectories have this label") as caught:
         write_table(example().subset([0, 1, 1]), tmp_path / "drives.csv")
     assert caught.value.trajectory == "a" and list(tmp_path.iterdir()) == []
+
+
+def test_many_drives_take_no_longer_each_than_few() -> None:
+    many = np.repeat([f"drive {i}" for i in range(60_000)], 2)
+    frame = pd.DataFrame({"trajectory": many, "time": np.tile([0.0, 1.0], 60_000), "u.push": 0.0, "y.range": 1.0})
+    data, began = from_frame(frame), time.perf_counter()
+    assert to_frame(data)["trajectory"].nunique() == 60_000
+    assert time.perf_counter() - began < 5
 
 
 def test_a_measurement_that_is_nan_is_not_written_as_missing(tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ def write_page(text: str, path: Path) -> None:
         UsageError: the file cannot be written.
     """
     with whole_file(path) as beside:
-        beside.write_text(text, encoding="utf-8")
+        beside.write_bytes(text.encode(errors="backslashreplace"))  # a file's name need not be UTF-8
 
 
 def _linked(findings: list[dict[str, Any]], found: Report, label: str) -> list[dict[str, Any]]:
