@@ -1,5 +1,5 @@
-"""What users edit: programs in `models/`, recipes in `inference/`, tours in `notebooks/`; of the checkout, or as the
-wheel has them."""
+"""What users edit: programs in `models/`, recipes in `inference/`, tours in `notebooks/`, grids of fits in `studies/`;
+of the checkout, or as the wheel has them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from steady_ppl.errors import UsageError
 
-ROOMS = ("models", "inference", "notebooks")
+ROOMS = ("models", "inference", "notebooks", "studies")
 LEFT_OUT = {"__pycache__", ".ipynb_checkpoints"}
 DRIVES = {"train": 16, "valid": 16, "test": 32}
 TRUTH = "models/hovercraft.py:HovercraftTruth"
@@ -28,7 +28,7 @@ def workbench() -> Path:
         if all((folder / room).is_dir() for room in ROOMS) and (folder / "inference" / "steady.py").is_file():
             return folder
     raise UsageError(
-        f"models, recipes and notebooks are missing from this installation ({sysconfig.get_path('purelib')})"
+        f"models, recipes, notebooks and studies are missing from this installation ({sysconfig.get_path('purelib')})"
     )
 
 

@@ -72,6 +72,24 @@ def test_the_examples_of_a_page_run(name: str, tmp_path: Path, monkeypatch: pyte
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
+def test_the_study_of_the_page_is_computed_and_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With fewer drives and seeds."""
+    ((about, text),) = blocks(DOCS / "studies.md", "toml")
+    for many, few in (("[1, 2, 3]", "[1, 2]"), ("[2, 8, 32]", "[2, 4]"), ("= 16", "= 2"), ("test = 32", "test = 2")):
+        assert many in text
+        text = text.replace(many, few)
+    assert 'title="drives.toml"' in about
+    (tmp_path / "drives.toml").write_text(text)
+    (tmp_path / "models").symlink_to(ROOT / "models")
+    monkeypatch.chdir(tmp_path)
+    here = [words for words in commands(DOCS / "studies.md") if "--cluster" not in words]
+    assert [main(words) for words in here] == [0, 0] and Path("drives/study.png").is_file()
+    ((_, looked),) = blocks(DOCS / "studies.md", "python")
+    done = subprocess.run([sys.executable, "-c", looked], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+
+
 def test_a_recipe_of_the_page_fits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ((_, text),) = [one for one in blocks(DOCS / "own-recipe.md", "python") if "several_starts.py" in one[0]]
     (tmp_path / "several_starts.py").write_text(text)

@@ -25,9 +25,10 @@ def test_it_copies_the_rooms_and_simulates_drives(tmp_path: Path, capsys, refuse
     assert steady("init", lab) == 0
     said = capsys.readouterr().out
     assert "train.csv" in said and all(line in said for line in NEXT)
-    for room in ("models", "inference", "notebooks"):
+    for room in ("models", "inference", "notebooks", "studies"):
         ours = {name: text for name, text in contents(lab / room).items() if "__pycache__" not in name}
-        theirs = {path.name: path.read_bytes() for path in (ROOT / room).iterdir() if path.suffix in (".py", ".ipynb")}
+        kinds = (".py", ".ipynb", ".toml")
+        theirs = {path.name: path.read_bytes() for path in (ROOT / room).iterdir() if path.suffix in kinds}
         assert ours == theirs
     train, test = read_table(lab / "train.csv"), read_table(lab / "test.csv")
     assert len(train) == 16 and bool(train.states[1:].isnan().all()) and not bool(train.states[0].isnan().any())

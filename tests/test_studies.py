@@ -384,7 +384,7 @@ def test_what_failed_is_in_the_picture_and_names_are_no_formulas(tmp_path: Path)
     figure = study_picture(plan, pd.DataFrame(rows))
     figure.savefig(tmp_path / "study.png")
     (axes,) = figure.axes
-    said = [text.get_text() for text in axes.get_legend().get_texts()]
+    said = [text.get_text() for text in figure.legends[0].get_texts()]
     assert any("2 of 4 failed" in one for one in said) and not any("\x1b" in one for one in said)
     (crosses,) = [line for line in axes.lines if line.get_marker() == "x"]
     assert crosses.get_xdata().tolist() == [60.0]
@@ -414,11 +414,7 @@ def test_a_picture_needs_its_columns(tmp_path: Path):
     figure = study_picture(plan, pd.DataFrame(rows))
     (axes,) = figure.axes
     assert axes.get_xlabel() == "settings.validation_particles" and axes.get_ylabel() == "log_likelihood"
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == [
-        "as declared",
-        "learned, published",
-        "learned",
-    ]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["as declared", "published", "learned"]
     with pytest.raises(UsageError, match="no job of the study is done"):
         study_picture(plan, pd.DataFrame({"key": []}))
     with pytest.raises(UsageError, match="no column log_likelihood"):

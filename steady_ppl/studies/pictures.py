@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -35,8 +36,8 @@ def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
     picture = plan.picture
     if picture is None:
         raise UsageError("the study has no [picture]: say there which columns x and y are")
-    keys = {job.key for job in plan.jobs}
-    own = results[results["key"].isin(keys)] if len(results) else results
+    order = {job.key: place for place, job in enumerate(plan.jobs)}
+    own = results[results["key"].isin(order)] if len(results) else results
     done = own[own["outcome"] == "done"] if len(own) else own
     if not len(done):
         raise UsageError("no job of the study is done yet")
@@ -44,13 +45,21 @@ def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
     if missing:
         raise UsageError(f"the table has no column {missing[0]}; it has {', '.join(map(str, own))}")
     own = own.assign(**{name: _numbers(own, name) for name in picture.columns})
+    own = own.iloc[np.argsort([order[key] for key in own["key"]], kind="stable")]
     if picture.chosen_by:
         own = chosen(picture, own)
-    figure = Figure(figsize=(6.2 * len(picture.y), 4.4), layout="constrained")
+    figure = Figure(figsize=(5.4 * len(picture.y), 5.4), layout="constrained")
     figure.suptitle(harmless(plan.title), fontsize=11, parse_math=False)
     lines = _lines(picture, own)
     for panel, column in zip(figure.subplots(1, len(picture.y), squeeze=False)[0], picture.y, strict=True):
         _panel(panel, picture, column, lines)
+    entries = {str(line.get_label()): line for panel in figure.axes for line in panel.get_legend_handles_labels()[0]}
+    if entries:
+        legend = figure.legend(
+            entries.values(), entries, loc="outside lower center", ncols=2 * len(picture.y), fontsize=8
+        )
+        for text in legend.get_texts():
+            text.set_parse_math(False)
     return figure
 
 
@@ -71,10 +80,12 @@ def chosen(picture: Picture, rows: pd.DataFrame) -> pd.DataFrame:
     with which a seed has failed come after those with which none has."""
     settings = [name for name in rows if str(name).startswith("settings.") and name != picture.x]
     kept = []
-    for _, tried in rows.groupby(["method", picture.x], sort=False, dropna=False):
-        varied = [name for name in settings if tried[name].nunique(dropna=False) > 1]
-        groups = [part for _, part in tried.groupby(varied, sort=False, dropna=False)] if varied else [tried]
-        kept.append(max(groups, key=lambda part: _merit(part, picture.chosen_by)).assign(**dict.fromkeys(varied)))
+    for _, own in rows.groupby("method", sort=False):
+        varied = [name for name in settings if own[name].nunique(dropna=False) > 1]
+        for _, tried in own.groupby(picture.x, sort=False, dropna=False):
+            groups = [part for _, part in tried.groupby(varied, sort=False, dropna=False)] if varied else [tried]
+            best = max(groups, key=lambda part: _merit(part, picture.chosen_by))
+            kept.append(best.assign(**dict.fromkeys(varied)))
     return pd.concat(kept)
 
 
@@ -100,48 +111,51 @@ def _lines(picture: Picture, rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame
 def _panel(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str, pd.DataFrame]]) -> None:
     published = dict(picture.published.get(column, {}))
     for index, (name, rows) in enumerate(lines):
-        mark, color = MARKS[index % len(MARKS)], COLORS[index % len(COLORS)]
-        points, said = _points(rows, picture.x, column), harmless(name, kept="")
+        look, said = _look(index), harmless(name, kept="")
+        points = _points(rows, picture.x, column)
         if rows[picture.x].isna().all() and rows[column].notna().any():  # the same wherever x is
-            axes.axhline(float(rows[column].astype(float).mean()), color=color, lw=1.5, ls=":", label=said)
+            axes.axhline(float(rows[column].astype(float).mean()), color=look["color"], lw=1.5, ls=":", label=said)
         elif points:
             x, middle, low, high = zip(*points, strict=True)
-            axes.errorbar(x, middle, (low, high), fmt=f"{mark}-", color=color, ms=5, lw=1.5, capsize=3, label=said)
-        _published(axes, published.pop(name, []), color, name)
-        _failed(axes, rows, picture.x, color, name)
+            axes.errorbar(x, middle, (low, high), ms=5, lw=1.5, capsize=3, label=said, **look)
+        _published(axes, published.pop(name, []), look, "published")
+        _failed(axes, rows, picture.x, look, said)
     for index, (name, others) in enumerate(published.items(), len(lines)):
-        _published(axes, others, COLORS[index % len(COLORS)], name)
-    _scale(axes, picture, lines)
+        _published(axes, others, _look(index), f"{harmless(name, kept='')}, published")
+    _scale(axes, picture, column, lines)
     axes.set_xlabel(harmless(picture.labels.get(picture.x, picture.x)), parse_math=False)
     axes.set_ylabel(harmless(picture.labels.get(column, column)), parse_math=False)
     axes.grid(alpha=0.25)
-    if axes.get_legend_handles_labels()[0]:
-        for text in axes.legend(fontsize=7).get_texts():
-            text.set_parse_math(False)
 
 
-def _published(axes: Axes, points: Points, color: str, name: str) -> None:
+def _look(index: int) -> dict[str, Any]:
+    """A colour, a mark and a line that no other of the first 49 has together."""
+    turn, place = divmod(index, len(COLORS))
+    return {"color": COLORS[place], "marker": MARKS[(place + turn) % len(MARKS)], "ls": ("-", "-.")[turn % 2]}
+
+
+def _published(axes: Axes, points: Points, look: Mapping[str, Any], name: str) -> None:
     if points:
-        said = f"{harmless(name, kept='')}, published"
-        axes.plot(*zip(*points, strict=True), "--", color=color, marker="*", ms=7, lw=0.9, alpha=0.6, label=said)
+        style: dict[str, Any] = {"ls": "--", "marker": "*", "ms": 7, "lw": 0.9, "alpha": 0.6, "color": look["color"]}
+        axes.plot(*zip(*points, strict=True), label=name, **style)
 
 
-def _failed(axes: Axes, rows: pd.DataFrame, x: str, color: str, name: str) -> None:
+def _failed(axes: Axes, rows: pd.DataFrame, x: str, look: Mapping[str, Any], name: str) -> None:
     """A cross at the upper edge for each place where jobs have failed."""
     failed = rows[rows["outcome"] == "failed"]
     places = failed[x].dropna().unique()
     if len(places):
-        said = f"{harmless(name, kept='')}: {len(failed)} of {len(rows)} failed"
-        edge = axes.get_xaxis_transform()
-        axes.plot(
-            places, [0.98] * len(places), "x", color=color, ms=8, mew=2, transform=edge, clip_on=False, label=said
-        )
+        said, edge = f"{name}: {len(failed)} of {len(rows)} failed", axes.get_xaxis_transform()
+        style: dict[str, Any] = {"ls": "", "marker": "x", "ms": 8, "mew": 2, "color": look["color"]}
+        axes.plot(places, [0.98] * len(places), transform=edge, clip_on=False, label=said, **style)
 
 
-def _scale(axes: Axes, picture: Picture, lines: Sequence[tuple[str, pd.DataFrame]]) -> None:
-    """Logarithmic, with a tick a value, where x goes over more than a factor of four."""
-    values = np.unique(np.concatenate([rows[picture.x].dropna().to_numpy(float) for _, rows in lines]))
-    if picture.x != IN_LIMITS and len(values) and values[0] > 0 and values[-1] > 4 * values[0]:
+def _scale(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str, pd.DataFrame]]) -> None:
+    """Logarithmic, with a tick a value, where x goes over a factor of four or more."""
+    own = [rows[picture.x].dropna().to_numpy(float) for _, rows in lines]
+    others = [point[0] for points in picture.published.get(column, {}).values() for point in points]
+    values = np.unique(np.concatenate([*own, others]))
+    if picture.x != IN_LIMITS and len(values) and values[0] > 0 and values[-1] >= 4 * values[0]:
         axes.set_xscale("log")
         if len(values) <= 12:
             axes.set_xticks(values, [f"{value:g}" for value in values])
