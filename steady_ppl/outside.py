@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+
 from steady_ppl.errors import ComputationError, SteadyError, UsageError, shown
 
+FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "Storage size calculation overflowed")
 
 
@@ -16,6 +19,8 @@ def as_refusal(error: Exception) -> SteadyError | None:
     """
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return UsageError(f"{shown(str(error.filename), 100)}: {error.strerror}")
+    if isinstance(error, OSError) and error.errno in FULL:  # numba says no name of its cache
+        return UsageError(f"a file cannot be written: {error.strerror}")
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(w in str(error) for w in MEMORY)):
         return ComputationError("this needs more memory than there is: take fewer or shorter drives, or less of each")
     return None

@@ -110,6 +110,8 @@ def test_a_name_may_be_as_long_as_the_file_system_has_them(tmp_path: Path, lengt
 def test_another_error_of_a_file_is_a_line_too_and_a_defect_is_none() -> None:
     said = as_refusal(PermissionError(errno.EACCES, "Permission denied", "locked/run"))
     assert isinstance(said, UsageError) and str(said) == "locked/run: Permission denied"
+    full = as_refusal(OSError(errno.ENOSPC, "No space left on device"))  # as when numba keeps a compiled kernel
+    assert isinstance(full, UsageError) and str(full) == "a file cannot be written: No space left on device"
     assert isinstance(as_refusal(MemoryError()), ComputationError)
     assert as_refusal(OSError("nothing is known of it")) is None and as_refusal(RuntimeError("a defect")) is None
 
