@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from steady_ppl.counted import count
 from steady_ppl.errors import UsageError
 from steady_ppl.harmless import tell
 
@@ -14,9 +15,7 @@ from steady_ppl.harmless import tell
 def study(
     plan: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="What is compared with what.")],
     out: Annotated[Path, typer.Option("--out", help="Folder of the results; one that is there is gone on with.")],
-    workers: Annotated[
-        int | None, typer.Option(help="Processes of this machine; its cores when not given.", min=1)
-    ] = None,
+    workers: Annotated[int | None, count("Processes of this machine; its cores when not given.")] = None,
     cluster: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, tcp://HOST:PORT, in place of processes.")
     ] = None,
