@@ -26,9 +26,7 @@ def load_program(source: str | Path) -> Program:
     Raises:
         ProgramError: the file does not exist or does not import, or has no such class.
     """
-    path, _, class_name = str(source).rpartition(":")
-    if not class_name.isidentifier() or not path:
-        path, class_name = str(source), ""
+    path, class_name = _parted(str(source))
     file = Path(path)
     module = run_file(file)
     own = [c for c in vars(module).values() if inspect.isclass(c) and c.__module__ == module.__name__]
@@ -47,6 +45,16 @@ def load_program(source: str | Path) -> Program:
         raise
     except (Exception, SystemExit) as error:
         raise ProgramError(f"{class_name}() of {file.name} failed: {one_line(error)}") from error
+
+
+def program_file(source: str | Path) -> Path:
+    """The file of `PATH` or `PATH:CLASS`."""
+    return Path(_parted(str(source))[0])
+
+
+def _parted(source: str) -> tuple[str, str]:
+    path, _, class_name = source.rpartition(":")
+    return (path, class_name) if class_name.isidentifier() and path else (source, "")
 
 
 class _AsWritten(SourceFileLoader):

@@ -17,7 +17,7 @@ from steady_ppl.doubts import doubts_of_fit, doubts_of_units
 from steady_ppl.errors import UsageError, require
 from steady_ppl.fit import Fit, program_source, sha256, versions
 from steady_ppl.program import Program, for_program
-from steady_ppl.program_file import run_file
+from steady_ppl.program_file import program_file, run_file
 from steady_ppl.rooms import workbench
 from steady_ppl.run_folder import CHECKPOINT, require_same, run_folder, write_record
 
@@ -41,22 +41,30 @@ def _require_kind(recipe: Recipe, option: str, value: Any) -> None:
     require(fits, option, repr(value), " or ".join(words[kind] for kind in kinds))
 
 
+def recipe_file(name: str) -> Path:
+    """Where a recipe is: `fit-truth` is `inference/fit_truth.py`, others are paths.
+
+    Raises:
+        UsageError: there is no such recipe.
+    """
+    if name.endswith(".py"):
+        if not Path(name).is_file():
+            raise UsageError(f"no recipe file {name}")
+        return Path(name)
+    folder = recipe_folder()
+    known = sorted(path.stem.replace("_", "-") for path in folder.glob("[!_]*.py"))
+    if name not in known:
+        raise UsageError(f"no recipe {name!r}; there are {', '.join(known)}, or a PATH.py of your own")
+    return folder / f"{name.replace('-', '_')}.py"
+
+
 def find_recipe(name: str) -> Recipe:
     """The `fit` function of a recipe: a name (`fit-truth` is `inference/fit_truth.py`) or a path.
 
     Raises:
         UsageError: there is no such recipe, or its file has no function `fit`.
     """
-    if name.endswith(".py"):
-        file = Path(name)
-        if not file.is_file():
-            raise UsageError(f"no recipe file {name}")
-    else:
-        folder = recipe_folder()
-        file = folder / f"{name.replace('-', '_')}.py"
-        known = sorted(path.stem.replace("_", "-") for path in folder.glob("[!_]*.py"))
-        if name not in known:
-            raise UsageError(f"no recipe {name!r}; there are {', '.join(known)}, or a PATH.py of your own")
+    file = recipe_file(name)
     found = getattr(run_file(file), "fit", None)
     if not callable(found):
         raise UsageError(f"recipe {file.name} has no function fit(program, table, valid, ...)")
@@ -172,5 +180,5 @@ def fingerprint(table: Trajectories) -> str:
 
 def _files(options: Mapping[str, Any]) -> dict[str, str]:
     """Hashes of the programs that options name."""
-    named = {name: Path(value.partition(".py")[0] + ".py") for name, value in options.items() if ".py" in str(value)}
+    named = {name: program_file(value) for name, value in options.items() if ".py" in str(value)}
     return {name: sha256(file) for name, file in named.items() if file.is_file()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 from small import MODELS, steady
 
 from steady_ppl.errors import RunError, UsageError
-from steady_ppl.studies.job import require_runnable
+from steady_ppl.studies.job import _told_settings, require_runnable, run
 from steady_ppl.studies.pictures import study_picture
 from steady_ppl.studies.places import Local
 from steady_ppl.studies.plan import RECORD, record_plan, recorded_plan
@@ -113,6 +114,8 @@ def test_a_job_is_known_by_what_it_depends_on_and_not_by_where_it_is(tmp_path: P
         ("[50, 60]", "[1e200]", "validation_particles is 1e.200, expected numbers"),
         ('"settings.validation_particles"', '"method"', "picture: column method is no number"),
         ('"settings.validation_particles"', '"settings.particles"', "there will be no column settings.particles"),
+        ("y = [", 'chosen_by = "valid_log_likelihood"\ny = [', "x is settings.validation_particles, expected data"),
+        ("published = {{log_likelihood", "published = {{likelihood", "likelihood is no panel; y has log_likelihood"),
         ('["log_likelihood"]', '["log_likelyhood"]', "there will be no column log_likelyhood; .*data.train, .*steps"),
         ('["log_likelihood"]', "[]", "picture.y has 0 columns"),
         ("[60, -4.0]", "[60]", r"learned: \[60\] is no point"),
@@ -196,6 +199,28 @@ def test_a_pipe_is_no_program(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe.py")
     with pytest.raises(UsageError, match=r"pipe.py is a pipe"):
         read_plan(written(tmp_path, STUDY.replace('program = "{model}"', 'program = "pipe.py"')))
+
+
+def test_every_program_of_a_job_knows_the_noise_of_the_bearings(tmp_path: Path):
+    hovercraft = MODELS / "hovercraft.py"
+    text = STUDY[: STUDY.index("[[method]]")].format(model=hovercraft) + "sigma_deg = 20.0\n"
+    text += f'[[method]]\nname = "by hand"\nprogram = "{hovercraft}"\nrecipe = "fit-hand"\n'
+    text += f'settings = {{hand = "{hovercraft}", lineages = 2}}\n'
+    (tmp_path / "study.toml").write_text(text)
+    settings = _told_settings(read_plan(tmp_path / "study.toml").jobs[0])
+    assert settings["hand"].bearing_sd == pytest.approx(math.radians(20)) and settings["lineages"] == 2
+
+
+def test_what_was_changed_while_a_study_went_on_is_no_result(tmp_path: Path):
+    folder = tmp_path / "a.pyenv"  # a folder may be called so
+    folder.mkdir()
+    (folder / "mine.py").write_text((MODELS / "linear_gaussian.py").read_text())
+    text = STUDY.replace('program = "{model}"', 'program = "a.pyenv/mine.py:LinearGaussian"')
+    job = read_plan(written(tmp_path, text)).jobs[0]
+    assert run(job)["outcome"] == "done"
+    with (folder / "mine.py").open("a") as file:
+        file.write("# changed\n")
+    assert "is not what it was when the study was begun" in run(job)["reason"]
 
 
 # --- the table --------------------------------------------------------------------------------------------------------
@@ -347,6 +372,8 @@ def fit(program, table, valid=None, *, known_start=False, mark="", deadly=False,
         os.kill(os.getpid(), signal.SIGKILL)
     if seed == 7:
         raise ValueError("seven\\nis not liked")
+    if seed == 4:
+        raise SystemExit("four \\udcff")
     return Fit(program, "mine", {{}}, seed=seed, known_start=known_start)
 """
 
@@ -360,18 +387,19 @@ def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(t
         f'settings = {{{{deadly = true, mark = "{tmp_path / "marks"}"}}}}\n'
     )
     plan, out = read_plan(written(tmp_path, text)), tmp_path / "out"
-    assert run_study(plan, out, Local(workers)) == 2
+    assert run_study(plan, out, Local(workers)) == 3
     found = read_results(out).set_index("seed")
-    assert found["outcome"].to_dict() == {1: "done", 4: "done", 7: "failed", 13: "failed"}
+    assert found["outcome"].to_dict() == {1: "done", 4: "failed", 7: "failed", 13: "failed"}
+    assert found.loc[4, "reason"] == "SystemExit: four \\udcff"
     assert (
         found.loc[7, "reason"] == "ValueError: seven"
         and found.loc[13, "reason"] == "its worker died each time that it was tried"
     )
     assert (tmp_path / "marks" / "1").stat().st_size == 2 and (tmp_path / "marks" / "13").stat().st_size == 3
     assert sorted(file.name for file in out.iterdir()) == [TABLE, "study.json"]
-    assert run_study(plan, out, Local(workers)) == 2  # what has failed is left
+    assert run_study(plan, out, Local(workers)) == 3  # what has failed is left
     assert (tmp_path / "marks" / "7").stat().st_size == 2
-    assert run_study(plan, out, Local(workers), again=True) == 2
+    assert run_study(plan, out, Local(workers), again=True) == 3
     assert (tmp_path / "marks" / "7").stat().st_size == 3
 
 
@@ -403,6 +431,13 @@ def test_of_settings_that_were_tried_the_best_on_held_out_drives_is_drawn(tmp_pa
             rows[-1] |= {"valid_log_likelihood": 99.0}
             if job.seed == 2:  # better where it did not fail
                 rows[-1] |= {"outcome": "failed", "valid_log_likelihood": None, "log_likelihood": None}
+        if tried == 50 and more and job.seed == 2:  # a seed that only these settings have come to, and a large one
+            rows[-1] |= {"valid_log_likelihood": 1000.0}
+    rows = [
+        one
+        for one in rows
+        if not (one.get("settings.validation_particles") == 60 and one["data.train"] == 4 and one["seed"] == 2)
+    ]
     (axes,) = study_picture(plan, pd.DataFrame(rows)).axes
     found = {str(bars.get_label()): bars.lines[0].get_ydata().tolist() for bars in axes.containers}
     assert found == {"as declared": [0.0, 0.0], "learned": [50.0, 60.0]}

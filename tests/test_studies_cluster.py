@@ -19,6 +19,7 @@ from small import MODELS, steady
 
 from steady_ppl.errors import UsageError
 from steady_ppl.studies.places import Cluster
+from steady_ppl.studies.runner import run_study
 from steady_ppl.studies.study_file import read_plan
 from steady_ppl.studies.table import read_results
 
@@ -108,6 +109,24 @@ def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path: Path, dask: Das
         assert process.wait(120) == 0, (tmp_path / "said").read_text()
     found = read_results(out)
     assert len(found) == 6 and (found["outcome"] == "done").all()
+
+
+DEADLY = RECIPE.replace("time.sleep(seconds)", "time.sleep(seconds)\n    if seed in (2, 5): os._exit(9)").replace(
+    "import time", "import os, time"
+)
+
+
+def test_jobs_that_kill_every_worker_are_given_up_and_no_other(tmp_path: Path, dask: Dask):
+    file, out = study(tmp_path, seeds=6, seconds=0.5), tmp_path / "out"
+    (tmp_path / "slow.py").write_text(DEADLY)
+    dask.scheduler()
+    for _ in range(9):  # four of them die of each
+        dask.worker()
+    wait_for(lambda: (tmp_path / "dask.log").read_text().count("Register worker") >= 9)
+    with Cluster(dask.address) as place:
+        assert run_study(read_plan(file), out, place) == 2
+    found = read_results(out).set_index("seed")
+    assert found["outcome"].to_dict() == {seed: "failed" if seed in (2, 5) else "done" for seed in range(1, 7)}
 
 
 def test_a_study_goes_on_when_its_scheduler_is_there_again(tmp_path: Path, dask: Dask):

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from steady_ppl.command_effects import with_effects
 from steady_ppl.data import Trajectories
 from steady_ppl.discovery import discover
 from steady_ppl.effects import parsed
-from steady_ppl.errors import DataError, SteadyError, UsageError
+from steady_ppl.errors import DataError, RunError, SteadyError, UsageError, one_line
 from steady_ppl.evaluation import evaluate
 from steady_ppl.filtering import choose_filter, log_likelihood
 from steady_ppl.fit import Fit
@@ -29,7 +30,7 @@ from steady_ppl.program_file import load_program
 from steady_ppl.run_recipe import find_recipe, require_settings, trains
 from steady_ppl.seeding import seeded
 from steady_ppl.simulation import simulate
-from steady_ppl.studies.keys import PARTS, TABLES
+from steady_ppl.studies.keys import PARTS, TABLES, Keys, is_program
 from steady_ppl.studies.plan import IN_LIMITS, Job, Plan
 from steady_ppl.table import read_table
 
@@ -49,13 +50,19 @@ def run(job: Job) -> dict[str, Any]:
         torch.set_num_threads(1)
         began = time.perf_counter()
         try:
+            _require_unchanged(job)
             found: dict[str, Any] = {"outcome": "done"} | TASKS[job.task](job)
-        except Exception as error:  # a study goes on without this job
-            lines = str(error).strip().splitlines() or [""]
-            found = {"outcome": "failed", "reason": f"{type(error).__name__}: {lines[0]}"}
+        except (Exception, SystemExit) as error:  # a study goes on without this job
+            found = {"outcome": "failed", "reason": one_line(error)}
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         spent = {"seconds": time.perf_counter() - began, "peak_mib": peak, "version": version("steady-ppl")}
         return job.columns | spent | found
+
+
+def _require_unchanged(job: Job) -> None:
+    """Files change while a study goes on, and may be others on another machine: what is kept is kept by its key."""
+    if Keys().of(replace(job, key="")) != job.key:
+        raise RunError("its program, recipe or table is not what it was when the study was begun: begin it again")
 
 
 def require_runnable(plan: Plan) -> None:
@@ -110,9 +117,11 @@ def _fit(job: Job) -> dict[str, Any]:
         known_start=job.known_start,
         seed=job.seed,
         **silent,
-        **job.settings,
+        **_told_settings(job),
     )
     seconds = time.perf_counter() - began
+    if fitted.trained and fitted.trained.interrupted:
+        raise RunError("it was interrupted")
     judged = evaluate(fitted, data["test"], seed=job.seed)
     figures = {f"{group}.{name}": value for group in GROUPS for name, value in judged[group].items()}
     figures |= {f"{group}.total": math.hypot(*judged[group].values()) for group in GROUPS[:3] if judged[group]}
@@ -206,6 +215,15 @@ def _told(program: Program, job: Job) -> Program:
             raise UsageError(f"{job.program} has no bearing_sd that sigma_deg could set")
         program.bearing_sd = math.radians(degrees)
     return program
+
+
+def _told_settings(job: Job) -> dict[str, Any]:
+    """Settings whose programs know the noise of the bearings as well."""
+    if "sigma_deg" not in job.data:
+        return job.settings
+    return {
+        name: _told(load_program(value), job) if is_program(value) else value for name, value in job.settings.items()
+    }
 
 
 def _table(folder: Path, part: str) -> Path:

@@ -11,6 +11,8 @@ from typing import Any
 
 from steady_ppl.errors import UsageError
 from steady_ppl.given_files import require_file
+from steady_ppl.program_file import program_file
+from steady_ppl.run_recipe import recipe_file
 from steady_ppl.studies.plan import Job
 
 PARTS = ("train", "valid", "test")
@@ -35,6 +37,7 @@ class Keys:
             UsageError: a file cannot be read, or is none.
         """
         said = json.dumps({name: value for name, value in job.columns.items() if name != "key"}, sort_keys=True)
+        said += json.dumps(job.settings) if any(isinstance(one, list) for one in job.settings.values()) else ""
         parts = [said, *map(self._digest, files_of(job))]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
@@ -55,16 +58,24 @@ def is_program(value: Any) -> bool:
     return isinstance(value, str) and (value.endswith(".py") or ".py:" in value)
 
 
-def program_file(name: str) -> Path:
-    """The file of `PATH` or `PATH:CLASS`."""
-    return Path(name.partition(".py")[0] + ".py")
-
-
 def files_of(job: Job) -> list[Path]:
-    """All that a job reads: tables or logs, and programs with what they import from their own folder."""
-    named = [job.program, job.recipe, *job.data.values(), *job.settings.values()]
-    programs = [file for name in named if is_program(name) for file in with_siblings(program_file(name))]
-    return [*data_files(job.data), *programs]
+    """All that a job reads: tables or logs, and programs and its recipe with what these import from their own folder.
+
+    Raises:
+        UsageError: there is no such recipe.
+    """
+    files = [program_file(name) for name in _texts([job.program, job.data, job.settings]) if is_program(name)]
+    if job.recipe:
+        files.append(recipe_file(job.recipe))
+    return [*data_files(job.data), *(one for file in files for one in with_siblings(file))]
+
+
+def _texts(value: Any) -> Iterator[str]:
+    inner = value.values() if isinstance(value, Mapping) else value if isinstance(value, list) else ()
+    if isinstance(value, str):
+        yield value
+    for one in inner:
+        yield from _texts(one)
 
 
 def data_files(data: Mapping[str, Any]) -> list[Path]:

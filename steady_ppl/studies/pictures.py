@@ -76,22 +76,25 @@ def _numbers(rows: pd.DataFrame, name: str) -> pd.Series:
 
 
 def chosen(picture: Picture, rows: pd.DataFrame) -> pd.DataFrame:
-    """Of each method's settings at each x those whose mean of `chosen_by` is largest, in rows of all seeds; settings
-    with which a seed has failed come after those with which none has."""
-    settings = [name for name in rows if str(name).startswith("settings.") and name != picture.x]
+    """Of each method's settings on the same data those whose mean of `chosen_by` is largest, by the seeds that all of
+    them have; settings with which more of these have failed come last, and what is beyond every number does so too."""
+    settings = [name for name in rows if str(name).startswith("settings.")]
+    data = [name for name in rows if str(name).startswith("data.")]
     kept = []
     for _, own in rows.groupby("method", sort=False):
         varied = [name for name in settings if own[name].nunique(dropna=False) > 1]
-        for _, tried in own.groupby(picture.x, sort=False, dropna=False):
+        for _, tried in own.groupby(data, sort=False, dropna=False):
             groups = [part for _, part in tried.groupby(varied, sort=False, dropna=False)] if varied else [tried]
-            best = max(groups, key=lambda part: _merit(part, picture.chosen_by))
+            shared = set.intersection(*(set(part["seed"]) for part in groups))
+            best = max(groups, key=lambda part: _merit(part[part["seed"].isin(shared)], picture.chosen_by))
             kept.append(best.assign(**dict.fromkeys(varied)))
     return pd.concat(kept)
 
 
 def _merit(rows: pd.DataFrame, column: str) -> tuple[int, float]:
-    mean = rows[column].mean()
-    return -int((rows["outcome"] == "failed").sum()), float(mean) if mean == mean else -math.inf
+    failed = rows["outcome"] == "failed"
+    values = rows[column][~failed].astype(float).fillna(-math.inf)
+    return -int(failed.sum()), float(values.mean()) if len(values) else -math.inf
 
 
 def _lines(picture: Picture, rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:

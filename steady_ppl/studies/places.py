@@ -10,7 +10,7 @@ import logging
 import tempfile
 import uuid
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ class Place:
     def __exit__(self, *raised: Any) -> None:
         raise NotImplementedError
 
-    def results(self, jobs: Sequence[Job]) -> Iterator[Row]:
+    def results(self, jobs: Sequence[Job]) -> Generator[Row]:
         """What comes back, in any order."""
         raise NotImplementedError
 
@@ -77,8 +77,8 @@ class Local(Place):
     def __exit__(self, *raised: Any) -> None:
         self.folder.cleanup()
 
-    def results(self, jobs: Sequence[Job]) -> Iterator[Row]:
-        # of a single one joblib would make this process, which must not die of a job: it sees two, and one is sent work
+    def results(self, jobs: Sequence[Job]) -> Generator[Row]:
+        # of a single one joblib would make this process, which must not die of a job: it starts two, sent work in turn
         with joblib.parallel_config("loky", n_jobs=max(2, self.workers), inner_max_num_threads=1):
             yield from _sent(_marked, [(job, self.marks) for job in jobs], at_once=self.workers)
 
@@ -114,11 +114,12 @@ class Cluster(Place):
             raise UsageError("--cluster needs dask.distributed: pip install 'steady-ppl[cluster]'") from error
         from concurrent.futures import CancelledError
 
-        self.topic = f"steady study {uuid.uuid4().hex}"
+        self.address, self.topic = address, ""
+        self.connect = distributed.Client
         self.died = (KilledWorker,)
         self.lost = (CancelledError, CommClosedError, OSError, TimeoutError)
         try:
-            self.client = distributed.Client(address, timeout=10)
+            self.client = self.connect(address, timeout=10)
         except (OSError, TimeoutError, ValueError) as error:
             reason = str(error).partition("\n")[0]
             raise UsageError(f"no Dask scheduler answers at {address}: {reason}") from error
@@ -145,8 +146,8 @@ class Cluster(Place):
         here = packages()
         try:
             there = self.client.run(packages)
-        except ImportError as error:
-            raise UsageError(f"a worker cannot import steady-ppl ({error}): install it there as here") from error
+        except (ImportError, AttributeError) as error:
+            raise UsageError(f"a worker has no such steady-ppl ({error}): install it there as here") from error
         for worker, found in there.items():
             other = [f"{name} {found[name]} (here {here[name]})" for name in here if found[name] != here[name]]
             if other:
@@ -161,10 +162,11 @@ class Cluster(Place):
     def __exit__(self, *raised: Any) -> None:
         self.client.close(timeout=2)
 
-    def results(self, jobs: Sequence[Job]) -> Iterator[Row]:
+    def results(self, jobs: Sequence[Job]) -> Generator[Row]:
         from joblib._dask import DaskDistributedBackend
 
         self._require_files(jobs)
+        self.topic = f"steady study {uuid.uuid4().hex}"
 
         class Backend(DaskDistributedBackend):
             """joblib does the work itself where it sees a single worker: let it see two."""
@@ -172,11 +174,16 @@ class Cluster(Place):
             def effective_n_jobs(self, n_jobs: int) -> int:
                 return max(2, super().effective_n_jobs(n_jobs))
 
-        with joblib.parallel_config(Backend(client=self.client)):
-            yield from _sent(_logged, [(job, self.topic) for job in jobs], at_once="all")
+        with self.connect(self.address, timeout=10) as client, joblib.parallel_config(Backend(client=client)):
+            yield from _sent(_logged, [(job, self.topic) for job in jobs], at_once="all")  # forgotten with the client
 
     def begun(self) -> Counter[str]:
-        return Counter(said for _, said in self.client.get_events(self.topic))
+        return Counter(
+            job
+            for topic, events in self.client.get_events().items()
+            if topic.startswith(self.topic)
+            for _, job in events
+        )
 
 
 def _hush(*owners: str) -> None:
@@ -193,10 +200,10 @@ def _lacking(files: Sequence[str]) -> list[str]:
 def _logged(job: Job, topic: str) -> Row:
     from distributed import get_worker
 
-    get_worker().log_event(topic, job.key)
+    get_worker().log_event(f"{topic} {job.key}", job.key)
     return work.run(job)
 
 
-def _sent(function: Callable[..., Row], arguments: Sequence[tuple[Any, ...]], at_once: int | str) -> Iterator[Row]:
+def _sent(function: Callable[..., Row], arguments: Sequence[tuple[Any, ...]], at_once: int | str) -> Generator[Row]:
     parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch=at_once)
     yield from parallel(joblib.delayed(function)(*given) for given in arguments)

@@ -82,7 +82,7 @@ class Job:
             "task": self.task,
             "method": self.method,
             "program": without_folder(self.program),
-            "recipe": self.recipe,
+            "recipe": without_folder(self.recipe),
             "seed": self.seed,
             "known_start": self.known_start,
             **source,
@@ -182,7 +182,7 @@ def recorded_plan(folder: Path) -> Plan:
 
 
 def without_folder(value: Any) -> Any:
-    """The name of a file, whose folder is one machine's; a list as JSON; anything else as it is."""
+    """The name of a file, whose absolute path is one machine's; a list as JSON; anything else as it is."""
     if isinstance(value, list):
         return json.dumps([without_folder(one) for one in value])
-    return Path(value).name if isinstance(value, str) and "/" in value else value
+    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 from steady_ppl.errors import ComputationError
@@ -36,9 +37,9 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
         ComputationError: there is nothing left to compute on; all that had come is kept.
     """
     with study_table(folder) as table:
-        record_plan(plan, folder)
         wanted = {job.key: job for job in plan.jobs}
         rows = {row["key"]: row for row in read_results(folder).to_dict("records") if row["key"] in wanted}
+        record_plan(plan, folder)
         kept = {key: row["outcome"] for key, row in rows.items() if not (again and row["outcome"] == "failed")}
         left = {key: job for key, job in wanted.items() if key not in kept}
         if kept:
@@ -53,15 +54,24 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
         with place:
             try:
                 while left:
+                    before = len(left)
                     try:
-                        for row in place.results(list(left.values())):
-                            keep(row)
-                    except place.died:
+                        with closing(place.results(list(left.values()))) as results:
+                            for row in results:
+                                keep(row)
+                    except place.died as error:
                         begun = place.begun()
                         suspects = [job for key, job in left.items() if begun[key] >= place.suspicious]
                         say(f"a worker died; of the jobs that were begun {len(suspects)} are tried by themselves")
                         for job in suspects:
                             keep(_alone(place, job))
+                        if len(left) == before:
+                            raise ComputationError(
+                                f"workers die before they begin: {len(kept)} of {len(wanted)} jobs are kept in {folder}"
+                            ) from error
+            except KeyboardInterrupt:
+                say(f"{len(kept)} of {len(wanted)} jobs are kept in {folder}; the same command goes on")
+                raise
             except place.lost as error:
                 raise ComputationError(
                     f"the cluster is gone ({type(error).__name__}): {len(kept)} of {len(wanted)} jobs are kept in "

@@ -113,7 +113,7 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
         raise UsageError(f"{cells:,} jobs; expected at most {MOST_JOBS:,} of one study")
     keys = Keys()
     cut = _jobs(content, task, source, methods)
-    jobs = _labelled(_without_doubles(tuple(replace(job, key=keys.of(job)) for job in cut)))
+    jobs = _labelled(_without_doubles(tuple(replace(job, key=_key(keys, job)) for job in cut)))
     picture = None
     if "picture" in content:
         picture = Picture(**content["picture"])
@@ -215,6 +215,14 @@ def _jobs(content: Mapping[str, Any], task: str, source: Mapping[str, list[Any]]
                     yield Job(**method | {"settings": settings}, task=task, data=data, seed=seed, known_start=start)
 
 
+def _key(keys: Keys, job: Job) -> str:
+    try:
+        return keys.of(job)
+    except UsageError as error:
+        error.args = (f"method {job.method}: {error}",)
+        raise
+
+
 def _without_doubles(jobs: tuple[Job, ...]) -> tuple[Job, ...]:
     seen: set[str] = set()
     for job in jobs:
@@ -242,6 +250,8 @@ def _labelled(jobs: tuple[Job, ...]) -> tuple[Job, ...]:
 
 def _require_columns(picture: Picture, task: str, jobs: tuple[Job, ...]) -> None:
     """What would otherwise be met when everything has been computed."""
+    if picture.chosen_by and not picture.x.startswith("data."):
+        raise UsageError(f"picture: chosen_by picks settings for the same data; x is {picture.x}, expected data.…")
     said: dict[str, list[Any]] = {}
     for job in jobs:
         for name, value in job.columns.items():
@@ -253,6 +263,9 @@ def _require_columns(picture: Picture, task: str, jobs: tuple[Job, ...]) -> None
         if name not in said and not known:
             there = ", ".join([*(one for one in said if one.startswith(("data.", "settings."))), *FIGURES[task]])
             raise UsageError(f"picture: there will be no column {name}; there will be {there}")
+    for column in picture.published:
+        if column not in picture.y:
+            raise UsageError(f"picture.published: {column} is no panel; y has {', '.join(picture.y)}")
 
 
 def _beside(folder: Path, name: str) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from pyarrow import types
 
 from steady_ppl.errors import RunError
 from steady_ppl.given_files import require_file
+from steady_ppl.harmless import harmless
 from steady_ppl.run_folder import only_writer
 from steady_ppl.whole_file import whole_file
 
@@ -44,7 +45,8 @@ class StudyTable:
         Raises:
             RunError: it cannot be written.
         """
-        _write(pd.DataFrame([dict(row)]), self.folder / ARRIVED / f"{row['key']}.parquet")
+        seen = {name: harmless(value) if isinstance(value, str) else value for name, value in row.items()}
+        _write(pd.DataFrame([seen]), self.folder / ARRIVED / f"{row['key']}.parquet")
         self.waiting += 1
         if self.waiting >= ENOUGH:
             self.merge()
@@ -59,7 +61,8 @@ class StudyTable:
         if arrived:
             _write(read_results(self.folder), self.folder / TABLE)
         for file in arrived:
-            file.unlink()
+            with suppress(OSError):  # it is in the table
+                file.unlink()
         self.waiting = 0
 
 
