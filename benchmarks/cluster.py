@@ -1,4 +1,4 @@
-"""What a study costs on a Dask cluster, by which docs/studies.md plans ten thousand fits on a hundred machines.
+"""What a study costs on a Dask cluster: what one needs to know to plan ten thousand fits on a hundred machines.
 
     python benchmarks/cluster.py [--quick]
 
@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import pickle
 import signal
 import statistics
 import sys
@@ -22,6 +21,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -131,7 +131,7 @@ def many(folder: Path, jobs: int) -> dict[str, Any]:
         "overhead_ms_a_job": 1000 * max(0.0, 2 * seconds - own) / jobs,
         "client_mib": _resident(os.getpid()),
         "scheduler_mib": scheduler,
-        "bytes_a_job": len(pickle.dumps(plan.jobs[0])),
+        "bytes_a_job": len(json.dumps(asdict(plan.jobs[0]))),
         "table_bytes": (folder / "out" / TABLE).stat().st_size,
     }
 
@@ -160,14 +160,12 @@ def killed(folder: Path, jobs: int, steps: int, every: float) -> dict[str, Any]:
             over.set()
             killer.join()
         seconds = time.perf_counter() - began
-        begun = sum(place.begun().values())
     found = read_results(folder / "out")
-    row = len(pickle.dumps(found.iloc[0].to_dict()))
+    row = len(json.dumps(found.iloc[0].to_dict(), default=str))
     return {
         "jobs": jobs,
         "kills": kills,
         "seconds": seconds,
-        "begun": begun,
         "lost": jobs - len(found),
         "failed": failed,
         "bytes_a_result": row,
