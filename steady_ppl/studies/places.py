@@ -1,15 +1,14 @@
-"""Where the jobs of a study are computed: on processes of this machine or on a Dask cluster, by joblib.
+"""Where the jobs of a study are computed: on processes of this machine by joblib, or on a Dask cluster.
 
-What is here is what joblib leaves open: that a worker dies is told apart from what a job raises, and which jobs had
-been begun is known afterwards.
+What is here is what these leave open: that a worker dies is told apart from what a job raises, and which jobs had been
+begun is known afterwards. joblib's own way to Dask is not taken: when a job had killed four workers, it waited for ever
+if there was another such job, and otherwise had everything that was left computed twice.
 """
 
 from __future__ import annotations
 
 import logging
 import tempfile
-import uuid
-from collections import Counter
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,14 +30,10 @@ class Place:
     """Where jobs are computed.
 
     Attributes:
-        died: what joblib raises when a worker has died of a job.
+        died: what `results` raises when a worker has died and taken others with it.
         lost: what it raises when there is nothing left to compute on.
-        suspicious: how often a job must have been begun to be suspected of it.
-        alone: how often a suspect is tried by itself before it is given up.
     """
 
-    suspicious = 1
-    alone = 2
     died: tuple[type[BaseException], ...] = ()
     lost: tuple[type[BaseException], ...] = ()
 
@@ -52,9 +47,14 @@ class Place:
         """What comes back, in any order."""
         raise NotImplementedError
 
-    def begun(self) -> Counter[str]:
-        """How often each job was begun, by its key."""
-        raise NotImplementedError
+    def begun(self) -> set[str]:
+        """The keys of the jobs that had been begun when a worker died."""
+        return set()
+
+
+def given_up(job: Job) -> Row:
+    """The row of a job that kills its workers."""
+    return job.columns | {"outcome": "failed", "reason": "its worker died each time that it was tried"}
 
 
 class Local(Place):
@@ -82,13 +82,12 @@ class Local(Place):
         with joblib.parallel_config("loky", n_jobs=max(2, self.workers), inner_max_num_threads=1):
             yield from _sent(_marked, [(job, self.marks) for job in jobs], at_once=self.workers)
 
-    def begun(self) -> Counter[str]:
-        return Counter({mark.name: mark.stat().st_size for mark in self.marks.iterdir()})
+    def begun(self) -> set[str]:
+        return {mark.name for mark in self.marks.iterdir()}
 
 
 def _marked(job: Job, marks: Path) -> Row:
-    with (marks / job.key).open("a") as mark:
-        mark.write("1")
+    (marks / job.key).touch()
     return work.run(job)
 
 
@@ -103,8 +102,6 @@ class Cluster(Place):
             threads, or other versions than this machine; from `results`, one does not see the files of the jobs.
     """
 
-    suspicious, alone = 3, 0
-
     def __init__(self, address: str) -> None:
         try:
             import distributed  # an extra, which --cluster alone needs
@@ -114,12 +111,10 @@ class Cluster(Place):
             raise UsageError("--cluster needs dask.distributed: pip install 'steady-ppl[cluster]'") from error
         from concurrent.futures import CancelledError
 
-        self.address, self.topic = address, ""
-        self.connect = distributed.Client
-        self.died = (KilledWorker,)
+        self.killed = KilledWorker
         self.lost = (CancelledError, CommClosedError, OSError, TimeoutError)
         try:
-            self.client = self.connect(address, timeout=10)
+            self.client = distributed.Client(address, timeout=10)
         except (OSError, TimeoutError, ValueError) as error:
             reason = str(error).partition("\n")[0]
             raise UsageError(f"no Dask scheduler answers at {address}: {reason}") from error
@@ -163,27 +158,19 @@ class Cluster(Place):
         self.client.close(timeout=2)
 
     def results(self, jobs: Sequence[Job]) -> Generator[Row]:
-        from joblib._dask import DaskDistributedBackend
+        from distributed import as_completed
 
         self._require_files(jobs)
-        self.topic = f"steady study {uuid.uuid4().hex}"
-
-        class Backend(DaskDistributedBackend):
-            """joblib does the work itself where it sees a single worker: let it see two."""
-
-            def effective_n_jobs(self, n_jobs: int) -> int:
-                return max(2, super().effective_n_jobs(n_jobs))
-
-        with self.connect(self.address, timeout=10) as client, joblib.parallel_config(Backend(client=client)):
-            yield from _sent(_logged, [(job, self.topic) for job in jobs], at_once="all")  # forgotten with the client
-
-    def begun(self) -> Counter[str]:
-        return Counter(
-            job
-            for topic, events in self.client.get_events().items()
-            if topic.startswith(self.topic)
-            for _, job in events
-        )
+        sent = {self.client.submit(work.run, job, pure=False): job for job in jobs}
+        try:
+            for future in as_completed(list(sent)):
+                if future.status == "error" and isinstance(future.exception(), self.killed):
+                    yield given_up(sent[future])
+                else:
+                    yield future.result()
+                del sent[future]
+        finally:
+            self.client.cancel(list(sent))
 
 
 def _hush(*owners: str) -> None:
@@ -197,13 +184,6 @@ def _lacking(files: Sequence[str]) -> list[str]:
     return [file for file in files if not Path(file).is_file()]
 
 
-def _logged(job: Job, topic: str) -> Row:
-    from distributed import get_worker
-
-    get_worker().log_event(f"{topic} {job.key}", job.key)
-    return work.run(job)
-
-
-def _sent(function: Callable[..., Row], arguments: Sequence[tuple[Any, ...]], at_once: int | str) -> Generator[Row]:
+def _sent(function: Callable[..., Row], arguments: Sequence[tuple[Any, ...]], at_once: int) -> Generator[Row]:
     parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch=at_once)
     yield from parallel(joblib.delayed(function)(*given) for given in arguments)

@@ -12,7 +12,7 @@ from contextlib import closing
 from pathlib import Path
 
 from steady_ppl.errors import ComputationError
-from steady_ppl.studies.places import Place, Row
+from steady_ppl.studies.places import Place, Row, given_up
 from steady_ppl.studies.plan import Job, Plan, record_plan
 from steady_ppl.studies.table import read_results, study_table
 
@@ -61,7 +61,7 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
                                 keep(row)
                     except place.died as error:
                         begun = place.begun()
-                        suspects = [job for key, job in left.items() if begun[key] >= place.suspicious]
+                        suspects = [job for key, job in left.items() if key in begun]
                         say(f"a worker died; of the jobs that were begun {len(suspects)} are tried by themselves")
                         for job in suspects:
                             keep(_alone(place, job))
@@ -81,14 +81,14 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
 
 
 def _alone(place: Place, job: Job) -> Row:
-    """The result of a job that may have killed its worker; what is to be kept if it does so again."""
-    for _ in range(place.alone):
+    """The result of a job that may have killed its worker; what is to be kept if it does so again, and again."""
+    for _ in range(2):
         try:
             (row,) = place.results([job])
             return row
         except place.died:
             continue
-    return job.columns | {"outcome": "failed", "reason": "its worker died each time that it was tried"}
+    return given_up(job)
 
 
 def _in_words(row: Row) -> str:
