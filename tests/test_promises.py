@@ -15,6 +15,8 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import calibrate  # noqa: E402
 import determinism  # noqa: E402
+import hostile  # noqa: E402
+import hostile_trials  # noqa: E402
 from calibration_tables import tables  # noqa: E402
 
 
@@ -51,6 +53,9 @@ def test_the_hostile_trials_are_those_of_their_records():
     found = records("hostile")
     outcomes = Counter(record["outcome"] for record in found)
     assert set(outcomes) <= {"accepted", "refused", "failed with a line"}
+    assert [record["set"] for record in found] == [trial.name for trial in hostile_trials.trials()]
+    quick = [record["seconds"] for record in found if not record["command"].startswith(hostile.SEARCHES)]
+    assert max(quick) < hostile.LIMIT
     figures = [
         len({(record["kind"], record["mutant"]) for record in found}),
         len(found),

@@ -12,6 +12,8 @@ import torch
 from report_pages import FOUND, Elements, content, in_a_browser, opened, with_script
 
 import steady_ppl as st
+from steady_ppl.errors import ComputationError
+from steady_ppl.reporting.writing import _data
 
 IMAGE = "<img src=x onerror=window.broken=1>"
 LINK = '<a href="javascript:window.broken=1">x</a>'  # plotly makes links of these
@@ -112,3 +114,8 @@ def test_hostile_names_are_text_in_a_browser(page: Path) -> None:
     dom, log = opened(with_script(page, script, "hostile.html"), "--dump-dom", "--window-size=1280,9000")
     assert "could not be drawn" not in dom.split("<script")[0], log
     assert dom.partition("<title>")[2].partition("</title>")[0] == "undefined 0 0 true true"
+
+
+def test_a_figure_that_is_not_finite_is_one_line():
+    with pytest.raises(ComputationError, match="the page is not written: a figure is not finite"):
+        _data({"rmse": [1.0, float("inf")]})

@@ -15,6 +15,7 @@ from markupsafe import Markup, escape
 from plotly.offline import get_plotlyjs
 
 from steady_ppl.check_report import strongest
+from steady_ppl.errors import ComputationError
 from steady_ppl.fit import versions
 from steady_ppl.reporting.program_page import program_page
 from steady_ppl.whole_file import whole_file
@@ -107,8 +108,15 @@ def _asset(name: str) -> Markup:
 
 
 def _data(content: Mapping[str, Any]) -> Markup:
-    """JSON that cannot end the element that holds it."""
-    text = json.dumps(content, separators=(",", ":"), allow_nan=False)
+    """JSON that cannot end the element that holds it.
+
+    Raises:
+        ComputationError: a figure is not finite.
+    """
+    try:
+        text = json.dumps(content, separators=(",", ":"), allow_nan=False)
+    except ValueError as error:
+        raise ComputationError("the page is not written: a figure is not finite, the program has blown up") from error
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
 
 
