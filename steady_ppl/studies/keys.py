@@ -21,7 +21,7 @@ TABLES = (".csv", ".parquet")
 
 
 class Keys:
-    """Keys of the jobs of one study; each file is read once.
+    """Keys of the jobs of one study; each file is hashed once.
 
     What counts: all that is said of a job, the contents of its tables or logs, its program and recipe, programs among
     its settings, and what these import from their own folder (`from .sibling import …`). Where files are does not.
