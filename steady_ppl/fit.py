@@ -218,7 +218,8 @@ def program_source(program: Program, folder: Path) -> dict[str, str] | None:
 
 def sha256(file: Path) -> str:
     """The hash of a file, in hexadecimal."""
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _load_recorded(folder: Path, source: dict[str, str] | None, moved: str | Path | None) -> Program:

@@ -10,6 +10,24 @@ import torch
 from examples import drives, example
 from small import FEW, HOVERCRAFT, contents, simulated, steady, tree, written
 
+ONE_JOB = f"""
+title = "One job"
+seeds = [1]
+known_start = true
+[data]
+simulate = "{HOVERCRAFT}"
+train = 2
+valid = 2
+test = 2
+[[method]]
+name = "as declared"
+program = "{HOVERCRAFT}"
+recipe = "hand"
+[picture]
+x = "data.train"
+y = ["log_likelihood"]
+"""
+
 
 @pytest.fixture(autouse=True)
 def _same_random_numbers():
@@ -20,13 +38,15 @@ def _same_random_numbers():
 
 @pytest.fixture(scope="session")
 def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Tables, and a run of each of two recipes."""
+    """Tables, a run of each of two recipes, and a study of one job."""
     folder = tmp_path_factory.mktemp("work")
     written(folder / "train.csv")
     written(folder / "valid.parquet", simulated(trajectories=2, rows=33, seed=1))
     written(folder / "test.csv", simulated(trajectories=5, rows=13, seed=2))
     assert steady("fit", HOVERCRAFT, folder / "train.csv", "--recipe", "hand", "--out", folder / "hand") == 0
     assert steady("fit", HOVERCRAFT, folder / "train.csv", "--out", folder / "steady", *FEW) == 0
+    (folder / "study.toml").write_text(ONE_JOB)
+    assert steady("study", folder / "study.toml", "--workers", 1, "--out", folder / "study") == 0
     return folder
 
 

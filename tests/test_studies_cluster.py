@@ -18,6 +18,7 @@ from dask_cluster import Dask, free_port, wait_for
 from small import MODELS, steady
 
 from steady_ppl.errors import UsageError
+from steady_ppl.studies import places
 from steady_ppl.studies.places import Cluster
 from steady_ppl.studies.runner import run_study
 from steady_ppl.studies.study_file import read_plan
@@ -111,6 +112,24 @@ def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path: Path, dask: Das
     assert len(found) == 6 and (found["outcome"] == "done").all()
 
 
+def test_a_cluster_without_a_worker_is_said_and_waited_for(tmp_path: Path, dask: Dask, monkeypatch):
+    monkeypatch.setattr(places, "WORKER_WAIT", 2)
+    said, out = list[str](), tmp_path / "out"
+
+    def hear(line: str) -> None:
+        said.append(line)
+        if "no worker left" in line:
+            dask.worker()
+        elif line.startswith("2/"):
+            os.kill(only.pid, signal.SIGKILL)
+
+    dask.scheduler()
+    only = dask.worker()
+    with Cluster(dask.address) as place:
+        assert run_study(read_plan(study(tmp_path, seeds=4)), out, place, say=hear) == 0
+    assert len(read_results(out)) == 4 and sum("no worker left" in line for line in said) == 1
+
+
 DEADLY = RECIPE.replace("time.sleep(seconds)", "time.sleep(seconds)\n    if seed in (2, 5): os._exit(9)").replace(
     "import time", "import os, time"
 )
@@ -167,4 +186,4 @@ def test_workers_that_would_find_something_else_are_refused(tmp_path: Path, dask
     dask.worker()
     cluster = Cluster(dask.address)
     with cluster, pytest.raises(UsageError, match="does not see .*nowhere.py: workers need this machine's paths"):
-        list(cluster.results([replace(read_plan(file).jobs[0], program=str(tmp_path / "nowhere.py"))]))
+        list(cluster.results([replace(read_plan(file).jobs[0], program=str(tmp_path / "nowhere.py"))], print))

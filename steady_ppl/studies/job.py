@@ -4,43 +4,42 @@ from __future__ import annotations
 
 import inspect
 import math
-import resource
+import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import torch
 
-from steady_ppl.alpha_truck import read_alpha_truck
-from steady_ppl.command_effects import with_effects
 from steady_ppl.data import Trajectories
 from steady_ppl.discovery import discover
 from steady_ppl.effects import parsed
-from steady_ppl.errors import DataError, RunError, SteadyError, UsageError, one_line
+from steady_ppl.errors import RunError, SteadyError, UsageError, one_line
 from steady_ppl.evaluation import evaluate
 from steady_ppl.filtering import choose_filter, log_likelihood
-from steady_ppl.fit import Fit
-from steady_ppl.program import Program, for_program
+from steady_ppl.fit import Fit, packages
+from steady_ppl.program import for_program
 from steady_ppl.program_file import load_program
 from steady_ppl.run_recipe import find_recipe, require_settings, trains
 from steady_ppl.seeding import seeded
-from steady_ppl.simulation import simulate
-from steady_ppl.studies.keys import PARTS, TABLES, Keys, is_program
+from steady_ppl.studies.job_data import drives, told, told_settings, truth
+from steady_ppl.studies.job_files import JobFiles
 from steady_ppl.studies.plan import IN_LIMITS, Job, Plan
-from steady_ppl.table import read_table
 
 GROUPS = ("forward", "forward_mean", "state_estimation", "measurement")
-Split = dict[str, Trajectories]
 _one_at_a_time = threading.Lock()  # torch's random state and Pyro's parameters are the process's
 
 
-def run(job: Job) -> dict[str, Any]:
+def run(job: Job, asked_with: Mapping[str, str] | None = None) -> dict[str, Any]:
     """Compute a job, on one thread; whatever goes wrong is its outcome, in one line.
+
+    Args:
+        job: what to compute.
+        asked_with: versions of the packages where the study is kept, if that may be another machine.
 
     Returns:
         Columns of the table: those of the job, `outcome` ("done" or "failed"), `reason`, `seconds`, `peak_mib` (of
@@ -50,37 +49,62 @@ def run(job: Job) -> dict[str, Any]:
         torch.set_num_threads(1)
         began = time.perf_counter()
         try:
+            _require_alike(asked_with)
             _require_unchanged(job)
             found: dict[str, Any] = {"outcome": "done"} | TASKS[job.task](job)
         except (Exception, SystemExit) as error:  # a study goes on without this job
             found = {"outcome": "failed", "reason": one_line(error)}
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        spent = {"seconds": time.perf_counter() - began, "peak_mib": peak, "version": version("steady-ppl")}
+        spent = {"seconds": time.perf_counter() - began, "peak_mib": _peak_mib(), "version": version("steady-ppl")}
         return job.columns | spent | found
+
+
+def _peak_mib() -> float:
+    """The most memory that this process has taken; NaN on Windows, which cannot be asked for it."""
+    if sys.platform == "win32":
+        return math.nan
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 1024)
+
+
+def _require_alike(asked_with: Mapping[str, str] | None) -> None:
+    """A worker may have joined after all that were there had been looked at."""
+    other = differing(asked_with, packages()) if asked_with else ""
+    if other:
+        raise RunError(f"its worker had {other}: results would not be comparable")
+
+
+def differing(here: Mapping[str, str], there: Mapping[str, str]) -> str:
+    """The packages whose versions are other ones there, in words; empty where none is."""
+    return ", ".join(f"{name} {there[name]} (here {here[name]})" for name in here if there[name] != here[name])
 
 
 def _require_unchanged(job: Job) -> None:
     """Files change while a study goes on, and may be others on another machine: what is kept is kept by its key."""
-    if Keys().of(replace(job, key="")) != job.key:
+    if JobFiles().key(replace(job, key="")) != job.key:
         raise RunError("its program, recipe or table is not what it was when the study was begun: begin it again")
 
 
 def require_runnable(plan: Plan) -> None:
-    """Load every program, plant every effect and look at every method's settings, before anything is sent out.
+    """Load every program, plant every effect, look at every method's settings and read every log or table once, before
+    anything is sent out.
 
     Raises:
         SteadyError: naming the method.
     """
     for job in {(job.method, repr(job.settings)): job for job in plan.jobs}.values():
         with _named(f"method {job.method}"):
-            _told(load_program(job.program), job)
+            told(load_program(job.program), job)
             if job.task == "fit":
                 require_settings(job.recipe, find_recipe(job.recipe), job.settings)
             else:
                 _require_search_settings(job.settings)
     for job in {repr(job.data): job for job in plan.jobs if "simulate" in job.data}.values():
         with _named("data"):
-            _truth(job)
+            truth(job)
+    if "simulate" not in plan.jobs[0].data:
+        with _named("data"):
+            drives(plan.jobs[0])
 
 
 @contextmanager
@@ -105,7 +129,7 @@ def _fit(job: Job) -> dict[str, Any]:
     metres, radians and their rates."""
     data = drives(job)
     with seeded(job.seed, "program"):
-        program = _told(load_program(job.program), job)
+        program = told(load_program(job.program), job)
     recipe = find_recipe(job.recipe)
     require_settings(job.recipe, recipe, job.settings)
     silent = {"progress": False} if trains(recipe) else {}
@@ -117,7 +141,7 @@ def _fit(job: Job) -> dict[str, Any]:
         known_start=job.known_start,
         seed=job.seed,
         **silent,
-        **_told_settings(job),
+        **told_settings(job),
     )
     seconds = time.perf_counter() - began
     if fitted.trained and fitted.trained.interrupted:
@@ -154,14 +178,14 @@ def _discover(job: Job) -> dict[str, Any]:
     """Whether what is missing is named, and how surely."""
     data = drives(job)
     figures = discover(
-        _told(load_program(job.program), job),
+        told(load_program(job.program), job),
         data["train"],
         data["valid"],
         known_start=job.known_start,
         seed=job.seed,
         **job.settings,
     ).figures
-    planted, _, _, value = parsed(job.data["effect"]) if job.data["effect"] else ("", "", {}, None)
+    planted, _, _, value = parsed(job.data["effect"]) if job.data["effect"] else ("", "", {}, 0.0)
     named = [one["effect"].partition(":")[0] for one in figures["effects"]]
     classes = [other.partition(":")[0] for one in figures["effects"] for other in one["class"]]
     limits = [
@@ -169,7 +193,6 @@ def _discover(job: Job) -> dict[str, Any]:
         for one in figures["candidates"]
         if one["effect"].partition(":")[0] == planted and one["detection_limit"] is not None
     ]
-    limit = _size(limits[0]) if limits else math.nan
     return {
         "p_value": figures["p_value"],
         "verdict": figures["verdict"],
@@ -178,61 +201,19 @@ def _discover(job: Job) -> dict[str, Any]:
         "found": figures["verdict"] != "none",
         "right": planted in named if planted else not named,
         "in_class": planted in classes if planted else not named,
-        IN_LIMITS: _size(value) / limit if value and limits else math.nan,
+        IN_LIMITS: in_limits(value, limits),
     }
 
 
 TASKS = {"fit": _fit, "discover": _discover}
 
 
-def drives(job: Job) -> Split:
-    """Train, valid and test drives, with their true states where there are any.
+def in_limits(value: Any, limits: list[Any]) -> float:
+    """How large an effect is, in detection limits: 0 where none was planted, NaN where the search says no limit."""
 
-    Raises:
-        DataError: there are none, or they are damaged.
-    """
-    told = job.data
-    if "tables" in told:
-        return {part: read_table(_table(Path(told["tables"]), part)) for part in PARTS}
-    if "alpha_truck" in told:
-        folder, degrees = Path(told["alpha_truck"]), told["sigma_deg"]
-        return {part: read_alpha_truck(folder / part, seed=job.seed, sigma_degrees=degrees) for part in PARTS}
-    truth = _truth(job)
-    return {part: simulate(truth, told[part], seed=10 * job.seed + i) for i, part in enumerate(PARTS, 1)}
+    def size(one: Any) -> float:
+        return max(map(abs, one)) if isinstance(one, list | tuple) else abs(float(one))
 
-
-def _truth(job: Job) -> Program:
-    """What simulates the drives, with the effect that its owner's program lacks."""
-    truth, effect = _told(load_program(job.data["simulate"]), job), job.data["effect"]
-    return with_effects(truth, [effect], say=lambda line: None) if effect else truth
-
-
-def _told(program: Program, job: Job) -> Program:
-    """With the noise of its bearings, which is known."""
-    degrees = job.data.get("sigma_deg")
-    if degrees is not None:
-        if not hasattr(program, "bearing_sd"):
-            raise UsageError(f"{job.program} has no bearing_sd that sigma_deg could set")
-        program.bearing_sd = math.radians(degrees)
-    return program
-
-
-def _told_settings(job: Job) -> dict[str, Any]:
-    """Settings whose programs know the noise of the bearings as well."""
-    if "sigma_deg" not in job.data:
-        return job.settings
-    return {
-        name: _told(load_program(value), job) if is_program(value) else value for name, value in job.settings.items()
-    }
-
-
-def _table(folder: Path, part: str) -> Path:
-    files = [folder / f"{part}{ending}" for ending in TABLES]
-    found = [file for file in files if file.is_file()]
-    if not found:
-        raise DataError(f"{folder} has no {' and no '.join(file.name for file in files)}")
-    return found[0]
-
-
-def _size(value: Any) -> float:
-    return max(map(abs, value)) if isinstance(value, list | tuple) else abs(float(value))
+    if value is None or (size(value) > 0 and not limits):
+        return math.nan
+    return size(value) / size(limits[0]) if size(value) > 0 else 0.0

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Callable, Generator, Sequence
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,12 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from steady_ppl.errors import UsageError
 from steady_ppl.fit import packages
 from steady_ppl.studies import job as work
-from steady_ppl.studies.keys import files_of
+from steady_ppl.studies.job_files import JobFiles
 from steady_ppl.studies.plan import Job
 
-WORKER_WAIT = 30  # s for the first worker of a cluster
+WORKER_WAIT = 30  # s for the first worker of a cluster, and between looks at whether there still is one
 Row = dict[str, Any]
+Say = Callable[[str], None]
 
 
 class Place:
@@ -43,8 +45,8 @@ class Place:
     def __exit__(self, *raised: Any) -> None:
         raise NotImplementedError
 
-    def results(self, jobs: Sequence[Job]) -> Generator[Row]:
-        """What comes back, in any order."""
+    def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
+        """What comes back, in any order; `say` hears of what holds it up."""
         raise NotImplementedError
 
     def begun(self) -> set[str]:
@@ -77,7 +79,7 @@ class Local(Place):
     def __exit__(self, *raised: Any) -> None:
         self.folder.cleanup()
 
-    def results(self, jobs: Sequence[Job]) -> Generator[Row]:
+    def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
         # of a single one joblib would make this process, which must not die of a job: it starts two, sent work in turn
         with joblib.parallel_config("loky", n_jobs=max(2, self.workers), inner_max_num_threads=1):
             yield from _sent(_marked, [(job, self.marks) for job in jobs], at_once=self.workers)
@@ -92,7 +94,8 @@ def _marked(job: Job, marks: Path) -> Row:
 
 
 class Cluster(Place):
-    """A Dask cluster that is there already; when a worker dies, Dask gives its job to another, three times.
+    """A Dask cluster that is there already; when a worker dies, Dask gives its job to another, three times. Workers may
+    come and go while a study goes on.
 
     Args:
         address: of its scheduler, for example `tcp://10.0.0.1:8786`.
@@ -144,12 +147,13 @@ class Cluster(Place):
         except (ImportError, AttributeError) as error:
             raise UsageError(f"a worker has no such steady-ppl ({error}): install it there as here") from error
         for worker, found in there.items():
-            other = [f"{name} {found[name]} (here {here[name]})" for name in here if found[name] != here[name]]
+            other = work.differing(here, found)
             if other:
-                raise UsageError(f"the worker {worker} has {', '.join(other)}: results would not be comparable")
+                raise UsageError(f"the worker {worker} has {other}: results would not be comparable")
 
     def _require_files(self, jobs: Sequence[Job]) -> None:
-        files = sorted({str(file) for job in jobs for file in files_of(job)})
+        read = JobFiles()
+        files = sorted({str(file) for job in jobs for file in read.of(job)})
         for worker, lacking in self.client.run(_lacking, files).items():
             if lacking:
                 raise UsageError(f"the worker {worker} does not see {lacking[0]}: workers need this machine's paths")
@@ -157,13 +161,12 @@ class Cluster(Place):
     def __exit__(self, *raised: Any) -> None:
         self.client.close(timeout=2)
 
-    def results(self, jobs: Sequence[Job]) -> Generator[Row]:
-        from distributed import as_completed
-
+    def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
         self._require_files(jobs)
-        sent = {self.client.submit(work.run, job, pure=False): job for job in jobs}
+        here = packages()
+        sent = {self.client.submit(work.run, job, here, pure=False): job for job in jobs}
         try:
-            for future in as_completed(list(sent)):
+            for future in self._ended(list(sent), say):
                 if future.status == "error" and isinstance(future.exception(), self.killed):
                     yield given_up(sent[future])
                 else:
@@ -171,6 +174,22 @@ class Cluster(Place):
                 del sent[future]
         finally:
             self.client.cancel(list(sent))
+
+    def _ended(self, sent: Sequence[Any], say: Say) -> Iterator[Any]:
+        """Futures as they end, with a line when there is no worker left to end any."""
+        from distributed import as_completed
+
+        running, looked, deserted = as_completed(sent), time.monotonic(), False
+        while not running.is_empty():
+            if running.has_ready():
+                yield from running.next_batch(block=False)
+            elif time.monotonic() - looked < WORKER_WAIT:
+                time.sleep(0.05)
+            else:
+                alone = not self.client.scheduler_info(n_workers=-1)["workers"]
+                if alone and not deserted:
+                    say("the cluster has no worker left: start some, or stop this and go on later")
+                looked, deserted = time.monotonic(), alone
 
 
 def _hush(*owners: str) -> None:

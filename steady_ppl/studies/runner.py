@@ -7,16 +7,13 @@ that kills one worker after the other is given up.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
 from steady_ppl.errors import ComputationError
-from steady_ppl.studies.places import Place, Row, given_up
+from steady_ppl.studies.places import Place, Row, Say, given_up
 from steady_ppl.studies.plan import Job, Plan, record_plan
 from steady_ppl.studies.table import read_results, study_table
-
-Say = Callable[[str], None]
 
 
 def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, say: Say = lambda line: None) -> int:
@@ -56,7 +53,7 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
                 while left:
                     before = len(left)
                     try:
-                        with closing(place.results(list(left.values()))) as results:
+                        with closing(place.results(list(left.values()), say)) as results:
                             for row in results:
                                 keep(row)
                     except place.died as error:
@@ -64,7 +61,7 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
                         suspects = [job for key, job in left.items() if key in begun]
                         say(f"a worker died; of the jobs that were begun {len(suspects)} are tried by themselves")
                         for job in suspects:
-                            keep(_alone(place, job))
+                            keep(_alone(place, job, say))
                         if len(left) == before:
                             raise ComputationError(
                                 f"workers die before they begin: {len(kept)} of {len(wanted)} jobs are kept in {folder}"
@@ -80,11 +77,11 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
     return sum(outcome == "failed" for outcome in kept.values())
 
 
-def _alone(place: Place, job: Job) -> Row:
+def _alone(place: Place, job: Job, say: Say) -> Row:
     """The result of a job that may have killed its worker; what is to be kept if it does so again, and again."""
     for _ in range(2):
         try:
-            (row,) = place.results([job])
+            (row,) = place.results([job], say)
             return row
         except place.died:
             continue

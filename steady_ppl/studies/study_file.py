@@ -28,29 +28,21 @@ with each of every other's, and with each seed. Paths are relative to the file.
 
 from __future__ import annotations
 
-import itertools
-import math
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from steady_ppl.errors import UsageError, shown
-from steady_ppl.given_files import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Absent, Maybe, misfit, require_file
-from steady_ppl.studies.keys import Keys, is_program
-from steady_ppl.studies.plan import FIGURES, LARGEST, POINTS, TASKS, Job, Picture, Plan, undrawable, without_folder
+from steady_ppl.errors import UsageError
+from steady_ppl.given_files import ANYTHING, LINES, TEXT, TRUTH, WHOLE, Absent, misfit, require_file
+from steady_ppl.studies.axes import Axes, count, grid, method_axes, source_axes
+from steady_ppl.studies.job_files import JobFiles
+from steady_ppl.studies.plan import FIGURES, POINTS, TASKS, Job, Picture, Plan, undrawable, without_folder
 
-SOURCES: dict[str, dict[str, Any]] = {
-    "simulate": {"train": 16, "valid": 16, "test": 32, "effect": "", "sigma_deg": None},
-    "alpha_truck": {"sigma_deg": 5.0},
-    "tables": {},
-}
-"""Where data come from, and what else may be said of them, with what it is when nothing is said."""
+MOST_JOBS = 100_000
 
-MOST_JOBS, MOST_DRIVES = 100_000, 1_000_000
-
-FORM = {
+FORM: dict[str, Any] = {
     "title": TEXT,
     "task": Absent(TEXT),
     "seeds": [WHOLE],
@@ -104,16 +96,16 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
         raise UsageError(f"task is {task!r}, expected {' or '.join(TASKS)}")
     if task == "discover" and "simulate" not in content["data"]:
         raise UsageError("task discover needs data that are simulated, of which it knows what is missing")
-    source = _source(folder, content["data"], data)
+    source = source_axes(folder, content["data"], data, task)
     if not content["seeds"] or not content["method"]:
         raise UsageError("expected at least one seed and one method")
-    methods = [_method(folder, one, task) for one in content["method"]]
-    cells = len(content["seeds"]) * _size(source) * sum(_size(one["settings"]) for one in methods)
+    methods = [method_axes(folder, one, task) for one in content["method"]]
+    cells = len(content["seeds"]) * count(source) * sum(count(one["settings"]) for one in methods)
     if cells > MOST_JOBS:
         raise UsageError(f"{cells:,} jobs; expected at most {MOST_JOBS:,} of one study")
-    keys = Keys()
+    files = JobFiles()
     cut = _jobs(content, task, source, methods)
-    jobs = _labelled(_without_doubles(tuple(replace(job, key=_key(keys, job)) for job in cut)))
+    jobs = _labelled(_without_doubles(tuple(replace(job, key=_key(files, job)) for job in cut)))
     picture = None
     if "picture" in content:
         picture = Picture(**content["picture"])
@@ -123,8 +115,8 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
 
 def _surplus(content: Mapping[str, Any]) -> str | None:
     """A name that means nothing, so that one that is misspelt does not pass for a default."""
-    places = [("", content, FORM), *(("method.", one, FORM["method"][0]) for one in content["method"])]  # type: ignore
-    places += [("picture.", content["picture"], FORM["picture"].form)] if "picture" in content else []  # type: ignore
+    places = [("", content, FORM), *(("method.", one, FORM["method"][0]) for one in content["method"])]
+    places += [("picture.", content["picture"], FORM["picture"].form)] if "picture" in content else []
     for place, given, known in places:
         for name in given:
             if name not in known:
@@ -132,92 +124,18 @@ def _surplus(content: Mapping[str, Any]) -> str | None:
     return None
 
 
-def _source(folder: Path, given: Mapping[str, Any], instead: Path | None) -> dict[str, list[Any]]:
-    """The source of the data with its path, and all that is said of it, each a list of values."""
-    named = [name for name in SOURCES if name in given]
-    if len(named) != 1:
-        raise UsageError(f"data has {' and '.join(named) or 'no source'}, expected one of {', '.join(SOURCES)}")
-    (kind,) = named
-    surplus = [name for name in given if name not in {kind, *SOURCES[kind]}]
-    if surplus:
-        known = ", ".join(SOURCES[kind]) or "nothing else"
-        raise UsageError(f"data.{surplus[0]} means nothing beside {kind}; there is {known}")
-    if not isinstance(given[kind], str):
-        raise UsageError(f"data.{kind} is {given[kind]!r}, expected a path")
-    if instead is not None and kind == "simulate":
-        raise UsageError("its data are simulated, --data is for logs and tables")
-    place = _beside(folder, given[kind]) if instead is None else _beside(Path(), str(instead))
-    if kind != "simulate" and not Path(place).is_dir():
-        raise UsageError(f"there is no folder {place} (data.{kind}); --data names another")
-    axes = {kind: [place]}
-    for name, usual in SOURCES[kind].items():
-        values = _axis(f"data.{name}", given.get(name, usual))
-        form = TEXT if name == "effect" else NUMBER if name == "sigma_deg" else WHOLE
-        problem = misfit(values, [Maybe(form)], f"data.{name}")
-        if problem is not None:
-            raise UsageError(problem)
-        for value in values if form != TEXT else ():
-            if value is not None and not 0 < value <= MOST_DRIVES:
-                raise UsageError(f"data.{name} is {value}, expected more than 0 and at most {MOST_DRIVES:,}")
-        if values != [None]:
-            axes[name] = values
-    return axes
-
-
-def _method(folder: Path, given: Mapping[str, Any], task: str) -> dict[str, Any]:
-    """A method whose files have their folders and whose settings are lists of values."""
-    recipe = given.get("recipe", "steady") if task == "fit" else ""
-    axes = {name: _axis(name, value) for name, value in given.get("settings", {}).items()}
-    return {
-        "method": given["name"],
-        "program": _beside(folder, given["program"]),
-        "recipe": _beside(folder, recipe) if recipe.endswith(".py") else recipe,
-        "settings": {name: [_resolved(folder, one) for one in axis] for name, axis in axes.items()},
-    }
-
-
-def _axis(name: str, value: Any) -> list[Any]:
-    axis = value if isinstance(value, list) else [value]
-    if not axis:
-        raise UsageError(f"{name} is an axis without a value")
-    problems = [one for one in axis if one is not None and not _is_plain(one)]
-    if problems:
-        raise UsageError(f"{name} is {shown(repr(problems[0]), 40)}, expected numbers, text, true or false")
-    return axis
-
-
-def _is_plain(value: Any, depth: int = 0) -> bool:
-    """Whether a table can hold it: finite numbers that are no larger than any use, text, truth, and lists of them."""
-    if isinstance(value, list):
-        return depth < 2 and all(_is_plain(one, depth + 1) for one in value)
-    if isinstance(value, bool | str):
-        return True
-    if isinstance(value, int):
-        return abs(value) < 2**63
-    return isinstance(value, float) and math.isfinite(value) and abs(value) <= LARGEST
-
-
-def _size(axes: Mapping[str, list[Any]]) -> int:
-    return math.prod(map(len, axes.values()))
-
-
-def _grid(axes: Mapping[str, list[Any]]) -> Iterator[dict[str, Any]]:
-    for cell in itertools.product(*axes.values()):
-        yield dict(zip(axes, cell, strict=True))
-
-
-def _jobs(content: Mapping[str, Any], task: str, source: Mapping[str, list[Any]], methods: list[dict]) -> Iterator[Job]:
+def _jobs(content: Mapping[str, Any], task: str, source: Axes, methods: list[dict]) -> Iterator[Job]:
     start = content.get("known_start", False)
     for seed in content["seeds"]:
-        for data in _grid(source):
+        for data in grid(source):
             for method in methods:
-                for settings in _grid(method["settings"]):
+                for settings in grid(method["settings"]):
                     yield Job(**method | {"settings": settings}, task=task, data=data, seed=seed, known_start=start)
 
 
-def _key(keys: Keys, job: Job) -> str:
+def _key(files: JobFiles, job: Job) -> str:
     try:
-        return keys.of(job)
+        return files.key(job)
     except UsageError as error:
         error.args = (f"method {job.method}: {error}",)
         raise
@@ -266,16 +184,3 @@ def _require_columns(picture: Picture, task: str, jobs: tuple[Job, ...]) -> None
     for column in picture.published:
         if column not in picture.y:
             raise UsageError(f"picture.published: {column} is no panel; y has {', '.join(picture.y)}")
-
-
-def _beside(folder: Path, name: str) -> str:
-    if "\0" in name:
-        raise UsageError(f"{name!r} is no path: it has a character 0")
-    return str((folder / name).resolve())
-
-
-def _resolved(folder: Path, value: Any) -> Any:
-    """Settings that name programs are paths as well."""
-    if isinstance(value, list):
-        return [_resolved(folder, one) for one in value]
-    return _beside(folder, value) if is_program(value) else value

@@ -1,4 +1,4 @@
-"""The key of a job: a hash of all that its result depends on, but for the engine and what is installed."""
+"""The files that a job reads, and its key: a hash of all that its result depends on, but for what is installed."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from steady_ppl.errors import UsageError
+from steady_ppl.fit import sha256
 from steady_ppl.given_files import require_file
 from steady_ppl.program_file import program_file
 from steady_ppl.run_recipe import recipe_file
@@ -20,8 +21,8 @@ LOGS = ("vrpn-pose.csv", "vesc_drive.csv")
 TABLES = (".csv", ".parquet")
 
 
-class Keys:
-    """Keys of the jobs of one study; each file is hashed once.
+class JobFiles:
+    """The files that the jobs of a study read, and what of these their results depend on; each is looked at once.
 
     What counts: all that is said of a job, the contents of its tables or logs, its program and recipe, programs among
     its settings, and what these import from their own folder (`from .sibling import …`). Where files are does not.
@@ -29,24 +30,48 @@ class Keys:
 
     def __init__(self) -> None:
         self.digests: dict[Path, str] = {}
+        self.siblings: dict[Path, list[Path]] = {}
 
-    def of(self, job: Job) -> str:
-        """The key.
+    def key(self, job: Job) -> str:
+        """The hash.
 
         Raises:
             UsageError: a file cannot be read, or is none.
         """
         said = json.dumps({name: value for name, value in job.columns.items() if name != "key"}, sort_keys=True)
         said += json.dumps(job.settings) if any(isinstance(one, list) for one in job.settings.values()) else ""
-        parts = [said, *map(self._digest, files_of(job))]
+        parts = [said, *map(self._digest, self.of(job))]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+    def of(self, job: Job) -> list[Path]:
+        """All that a job reads: tables or logs, and programs and its recipe with what these import from their own
+        folder.
+
+        Raises:
+            UsageError: there is no such recipe.
+        """
+        files = [program_file(name) for name in _texts([job.program, job.data, job.settings]) if is_program(name)]
+        if job.recipe:
+            files.append(recipe_file(job.recipe))
+        return [*data_files(job.data), *(one for file in files for one in self._with_siblings(file))]
+
+    def _with_siblings(self, file: Path) -> list[Path]:
+        """A Python file, and those of its folder that it imports relatively, and that these import."""
+        if file not in self.siblings:
+            found, left = dict[Path, None](), [file]
+            while left:
+                one = left.pop()
+                if one not in found:
+                    found[one] = None
+                    left += [name for name in _imported(one) if name.is_file()]
+            self.siblings[file] = list(found)
+        return self.siblings[file]
 
     def _digest(self, file: Path) -> str:
         if file not in self.digests:
             require_file(file, UsageError)
             try:
-                with file.open("rb") as stream:
-                    content = hashlib.file_digest(stream, "sha256").hexdigest()
+                content = sha256(file)
             except OSError as error:
                 raise UsageError(f"{file} cannot be read: {error.strerror}") from error
             self.digests[file] = f"{file.name} {content}"
@@ -56,18 +81,6 @@ class Keys:
 def is_program(value: Any) -> bool:
     """Whether it names a Python file, or a class of one."""
     return isinstance(value, str) and (value.endswith(".py") or ".py:" in value)
-
-
-def files_of(job: Job) -> list[Path]:
-    """All that a job reads: tables or logs, and programs and its recipe with what these import from their own folder.
-
-    Raises:
-        UsageError: there is no such recipe.
-    """
-    files = [program_file(name) for name in _texts([job.program, job.data, job.settings]) if is_program(name)]
-    if job.recipe:
-        files.append(recipe_file(job.recipe))
-    return [*data_files(job.data), *(one for file in files for one in with_siblings(file))]
 
 
 def _texts(value: Any) -> Iterator[str]:
@@ -86,17 +99,6 @@ def data_files(data: Mapping[str, Any]) -> list[Path]:
     if "alpha_truck" in data:
         files = [Path(data["alpha_truck"]) / part / log for part in PARTS for log in LOGS]
     return [file for file in files if file.exists()]
-
-
-def with_siblings(file: Path) -> list[Path]:
-    """A Python file, and those of its folder that it imports relatively, and that these import."""
-    found, left = dict[Path, None](), [file]
-    while left:
-        file = left.pop()
-        if file not in found:
-            found[file] = None
-            left += [name for name in _imported(file) if name.is_file()]
-    return list(found)
 
 
 def _imported(file: Path) -> Iterator[Path]:

@@ -1,0 +1,70 @@
+"""The drives of a job and the programs of them, which know the noise of their bearings."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from steady_ppl.alpha_truck import read_alpha_truck
+from steady_ppl.command_effects import with_effects
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import DataError, UsageError
+from steady_ppl.program import Program
+from steady_ppl.program_file import load_program
+from steady_ppl.simulation import simulate
+from steady_ppl.studies.job_files import PARTS, TABLES, is_program
+from steady_ppl.studies.plan import Job
+from steady_ppl.table import read_table
+
+Split = dict[str, Trajectories]
+
+
+def drives(job: Job) -> Split:
+    """Train, valid and test drives, with their true states where there are any; no test drives for a search.
+
+    Raises:
+        DataError: there are none, or they are damaged.
+    """
+    said = job.data
+    if "tables" in said:
+        return {part: read_table(_table(Path(said["tables"]), part)) for part in PARTS}
+    if "alpha_truck" in said:
+        folder, degrees = Path(said["alpha_truck"]), said["sigma_deg"]
+        return {part: read_alpha_truck(folder / part, seed=job.seed, sigma_degrees=degrees) for part in PARTS}
+    owner = truth(job)
+    seeds = {part: 10 * job.seed + i for i, part in enumerate(PARTS, 1)}
+    return {part: simulate(owner, said[part], seed=seeds[part]) for part in PARTS if part in said}
+
+
+def truth(job: Job) -> Program:
+    """What simulates the drives, with the effect that its owner's program lacks."""
+    owner, effect = told(load_program(job.data["simulate"]), job), job.data["effect"]
+    return with_effects(owner, [effect], say=lambda line: None) if effect else owner
+
+
+def told(program: Program, job: Job) -> Program:
+    """With the noise of its bearings, which is known."""
+    degrees = job.data.get("sigma_deg")
+    if degrees is not None:
+        if not hasattr(program, "bearing_sd"):
+            raise UsageError(f"{job.program} has no bearing_sd that sigma_deg could set")
+        program.bearing_sd = math.radians(degrees)
+    return program
+
+
+def told_settings(job: Job) -> dict[str, Any]:
+    """Settings whose programs know the noise of the bearings as well."""
+    if "sigma_deg" not in job.data:
+        return job.settings
+    return {
+        name: told(load_program(value), job) if is_program(value) else value for name, value in job.settings.items()
+    }
+
+
+def _table(folder: Path, part: str) -> Path:
+    files = [folder / f"{part}{ending}" for ending in TABLES]
+    found = [file for file in files if file.is_file()]
+    if not found:
+        raise DataError(f"{folder} has no {' and no '.join(file.name for file in files)}")
+    return found[0]
