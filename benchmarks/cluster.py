@@ -3,9 +3,10 @@
     python benchmarks/cluster.py [--quick]
 
 A scheduler and workers are started as processes on loopback. Measured are: the same fits by one worker and by two in
-turn (efficiency: seconds of one over twice the seconds of two); ten thousand jobs that end at once, for what scheduler,
-client and table can take; bytes of a job and of a result; and workers that are killed in the middle, for what that
-costs. Written to results/cluster.json; exits with 1 where the efficiency is below 90 % or a job is lost.
+turn (efficiency: seconds of one over twice the seconds of two), beside them by one and two processes without a cluster;
+ten thousand jobs that end at once, for what scheduler, client and table can take (processor time, so that it matters
+little what else the machine does); bytes of a job and of a result; and workers that are killed in the middle, for what
+that costs. Written to results/cluster.json; exits with 1 where the efficiency is below 90 % or a job is lost.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -31,7 +32,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from dask_cluster import Dask, wait_for  # noqa: E402
 
-from steady_ppl.studies.places import Cluster  # noqa: E402
+from steady_ppl.studies.places import Cluster, Local, Place  # noqa: E402
 from steady_ppl.studies.runner import run_study  # noqa: E402
 from steady_ppl.studies.study_file import read_plan  # noqa: E402
 from steady_ppl.studies.table import TABLE, read_results  # noqa: E402
@@ -83,29 +84,39 @@ def cluster(folder: Path, workers: int) -> Iterator[Dask]:
 
 
 def efficiency(folder: Path, rounds: int, jobs: int, steps: int) -> dict[str, Any]:
-    """Seconds of the same study by one worker and by two, in turn."""
-    seconds: dict[int, list[float]] = {1: [], 2: []}
+    """Seconds of the same study by one worker and by two, in turn, on a cluster and on processes of this machine."""
+    seconds: dict[str, list[float]] = {"cluster, 1": [], "cluster, 2": [], "processes, 1": [], "processes, 2": []}
+    plan = read_plan(fits(folder / "fits", jobs, steps))
     with cluster(folder / "one", 1) as one, cluster(folder / "two", 2) as two:
+        places: dict[str, Callable[[], Place]] = {
+            "cluster, 1": lambda: Cluster(one.address),
+            "cluster, 2": lambda: Cluster(two.address),
+            "processes, 1": lambda: Local(1),
+            "processes, 2": lambda: Local(2),
+        }
+        run_study(read_plan(fits(folder / "warm", 6, 2)), folder / "warm" / "out", Local(2))
         for turn in range(rounds):
-            for workers, dask in ((1, one), (2, two)) if turn % 2 == 0 else ((2, two), (1, one)):
-                out = folder / f"out-{workers}-{turn}"
-                plan = read_plan(fits(folder / "fits", jobs, steps))
-                with Cluster(dask.address) as place:
-                    began = time.perf_counter()
-                    failed = run_study(plan, out, place)
-                    seconds[workers].append(time.perf_counter() - began)
+            for name in list(places) if turn % 2 == 0 else reversed(places):
+                out = folder / f"{name}, {turn}"
+                place = places[name]()
+                began = time.perf_counter()
+                failed = run_study(plan, out, place)
+                seconds[name].append(time.perf_counter() - began)
+                print(f"{name}: {seconds[name][-1]:.1f} s", flush=True)
                 assert not failed and len(read_results(out)) == jobs
-    found = [alone / (2 * both) for alone, both in zip(seconds[1], seconds[2], strict=True)]
-    each = read_results(folder / "out-1-0")["seconds"]
+    found = {where: _efficiency(seconds[f"{where}, 1"], seconds[f"{where}, 2"]) for where in ("cluster", "processes")}
     return {
         "jobs": jobs,
-        "seconds_a_job": float(each.mean()),
-        "one_worker_s": seconds[1],
-        "two_workers_s": seconds[2],
-        "efficiency": found,
-        "mean": statistics.mean(found),
-        "sd": statistics.stdev(found) if len(found) > 1 else 0.0,
+        "seconds_a_job": float(read_results(folder / "cluster, 1, 0")["seconds"].mean()),
+        "seconds": seconds,
+        **found,
     }
+
+
+def _efficiency(alone: list[float], both: list[float]) -> dict[str, Any]:
+    found = [one / (2 * two) for one, two in zip(alone, both, strict=True)]
+    spread = statistics.stdev(found) if len(found) > 1 else 0.0
+    return {"rounds": found, "mean": statistics.mean(found), "sd": spread}
 
 
 def many(folder: Path, jobs: int) -> dict[str, Any]:
@@ -116,10 +127,11 @@ def many(folder: Path, jobs: int) -> dict[str, Any]:
     plan = read_plan(study(folder, jobs, CART, 1, f"program = '{CART}'\nrecipe = 'ends.py'"))
     planning = time.perf_counter() - began
     with cluster(folder / "dask", 2) as dask, Cluster(dask.address) as place:
-        began = time.perf_counter()
+        scheduling = dask.processes[0].pid
+        began, client, scheduler = time.perf_counter(), time.process_time(), _processor_seconds(scheduling)
         failed = run_study(plan, folder / "out", place)
-        seconds = time.perf_counter() - began
-        scheduler = _resident(dask.processes[0].pid)
+        seconds, client = time.perf_counter() - began, time.process_time() - client
+        scheduler, resident = _processor_seconds(scheduling) - scheduler, _resident(scheduling)
     assert failed == jobs == len(read_results(folder / "out"))
     own = float(read_results(folder / "out")["seconds"].sum())
     return {
@@ -127,10 +139,11 @@ def many(folder: Path, jobs: int) -> dict[str, Any]:
         "planning_s": planning,
         "seconds": seconds,
         "a_second": jobs / seconds,
-        "busy": own / (2 * seconds),
-        "overhead_ms_a_job": 1000 * max(0.0, 2 * seconds - own) / jobs,
+        "worker_ms_a_job": 1000 * own / jobs,
+        "client_ms_a_job": 1000 * client / jobs,
+        "scheduler_ms_a_job": 1000 * scheduler / jobs,
         "client_mib": _resident(os.getpid()),
-        "scheduler_mib": scheduler,
+        "scheduler_mib": resident,
         "bytes_a_job": len(json.dumps(asdict(plan.jobs[0]))),
         "table_bytes": (folder / "out" / TABLE).stat().st_size,
     }
@@ -177,6 +190,12 @@ def _resident(process: int) -> float:
     return int(words[words.index("VmHWM:") + 1]) / 1024
 
 
+def _processor_seconds(process: int) -> float:
+    """What it has used until now, by itself and for the system."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="few and short jobs; writes nothing")
@@ -196,7 +215,9 @@ def main() -> int:
             print(part, json.dumps(found[part]), flush=True)
     if not quick:
         RESULTS.write_text(json.dumps(found, indent=1) + "\n")
-    return int(found["efficiency"]["mean"] < MUST or found["killed"]["lost"] > 0 or found["killed"]["failed"] > 0)
+    return int(
+        found["efficiency"]["cluster"]["mean"] < MUST or found["killed"]["lost"] > 0 or found["killed"]["failed"] > 0
+    )
 
 
 if __name__ == "__main__":

@@ -75,6 +75,7 @@ def test_a_job_is_known_by_what_it_depends_on_and_not_by_where_it_is(tmp_path: P
         ("published = {{log_likelihood", "published = {{likelihood", "likelihood is no panel; y has log_likelihood"),
         ('["log_likelihood"]', '["log_likelyhood"]', "there will be no column log_likelyhood; .*data.train, .*steps"),
         ('["log_likelihood"]', "[]", "picture.y has 0 columns"),
+        ("x = ", 'leave_out = ["learnt"]\nx = ', "leave_out: learnt is no method; there are as declared, learned"),
         ("[60, -4.0]", "[60]", r"learned: \[60\] is no point"),
         ("[60, -4.0]", "[60, 1e200]", "is no point"),
         ('title = "Small"', f'title = "{"x" * 1001}"', "more than 1000 characters"),

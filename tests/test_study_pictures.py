@@ -62,6 +62,8 @@ def test_a_picture_needs_its_columns(tmp_path: Path):
     (axes,) = figure.axes
     assert axes.get_xlabel() == "settings.validation_particles" and axes.get_ylabel() == "log_likelihood"
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["as declared", "published", "learned"]
+    alone = replace(plan, picture=replace(plan.picture, leave_out=["as declared"], published={}))
+    assert [text.get_text() for text in study_picture(alone, pd.DataFrame(rows)).legends[0].get_texts()] == ["learned"]
     with pytest.raises(UsageError, match="no job of the study is done"):
         study_picture(plan, pd.DataFrame({"key": []}))
     with pytest.raises(UsageError, match="no column log_likelihood"):

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 from scipy import stats
 
 from steady_ppl.errors import UsageError
@@ -39,6 +40,7 @@ def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
         raise UsageError("the study has no [picture]: say there which columns x and y are")
     order = {job.key: place for place, job in enumerate(plan.jobs)}
     own = results[results["key"].isin(order)] if len(results) else results
+    own = own[~own["method"].isin(picture.leave_out)] if len(own) else own
     done = own[own["outcome"] == "done"] if len(own) else own
     if not len(done):
         raise UsageError("no job of the study is done yet")
@@ -116,11 +118,11 @@ def _panel(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str,
     published = dict(picture.published.get(column, {}))
     for index, (name, rows) in enumerate(lines):
         look, said = _look(index), harmless(name, kept="")
-        points = _points(rows, picture.x, column)
+        found = points(rows, picture.x, column)
         if rows[picture.x].isna().all() and rows[column].notna().any():  # the same wherever x is
             axes.axhline(float(rows[column].astype(float).mean()), color=look["color"], lw=1.5, ls=":", label=said)
-        elif points:
-            x, middle, low, high = zip(*points, strict=True)
+        elif found:
+            x, middle, low, high = zip(*found, strict=True)
             axes.errorbar(x, middle, (low, high), ms=5, lw=1.5, capsize=3, label=said, **look)
         _published(axes, published.pop(name, []), look, "published")
         _failed(axes, rows, picture.x, look, said)
@@ -155,7 +157,7 @@ def _failed(axes: Axes, rows: pd.DataFrame, x: str, look: Mapping[str, Any], nam
 
 
 def _scale(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str, pd.DataFrame]]) -> None:
-    """Logarithmic, with a tick a value, where x goes over a factor of four or more."""
+    """Logarithmic, with a tick a value, where x goes over a factor of four or more; and y where it goes over ten."""
     own = [rows[picture.x].dropna().to_numpy(float) for _, rows in lines]
     others = [point[0] for points in picture.published.get(column, {}).values() for point in points]
     values = np.unique(np.concatenate([*own, others]))
@@ -164,10 +166,15 @@ def _scale(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str,
         if len(values) <= 12:
             axes.set_xticks(values, [f"{value:g}" for value in values])
             axes.minorticks_off()
+    heights = [height for _, rows in lines for _, height, *_ in points(rows, picture.x, column)]
+    if heights and 0 < 10 * min(heights) <= max(heights):
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
 
 
-def _points(rows: pd.DataFrame, x: str, y: str) -> list[tuple[float, float, float, float]]:
-    """Places, middles and how far bars reach below and above."""
+def points(rows: pd.DataFrame, x: str, y: str) -> list[tuple[float, float, float, float]]:
+    """What is drawn of a line: places on x, middles and how far bars reach below and above."""
     rows = rows[rows[x].notna() & rows[y].notna()]
     share = rows[y].map(lambda value: isinstance(value, bool | np.bool_)).all()
     found = []

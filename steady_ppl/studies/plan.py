@@ -40,7 +40,9 @@ RECORDED: dict[str, Any] = {
             "known_start": TRUTH,
         }
     ],
-    "picture": Maybe({"x": TEXT, "y": LINES, "labels": {str: TEXT}, "published": POINTS, "chosen_by": TEXT}),
+    "picture": Maybe(
+        {"x": TEXT, "y": LINES, "labels": {str: TEXT}, "published": POINTS, "chosen_by": TEXT, "leave_out": LINES}
+    ),
 }
 
 
@@ -118,6 +120,7 @@ class Picture:
         published: of a panel, by the method's name: points that others have found, `(x, y)`.
         chosen_by: a column of held-out drives; of a method's settings only the one with its largest mean at each x is
             drawn. All of them when empty.
+        leave_out: methods that are in the table alone.
     """
 
     x: str
@@ -125,6 +128,7 @@ class Picture:
     labels: dict[str, str] = field(default_factory=dict)
     published: dict[str, dict[str, list[list[float]]]] = field(default_factory=dict)
     chosen_by: str = ""
+    leave_out: list[str] = field(default_factory=list)
 
     @property
     def columns(self) -> tuple[str, ...]:

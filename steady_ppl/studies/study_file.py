@@ -19,6 +19,7 @@
     x = "data.sigma_deg"                    # a column of the table
     y = ["forward.total"]                   # a panel each
     chosen_by = "valid_log_likelihood"      # of settings that were tried only the best at each x is drawn
+    leave_out = []                          # methods that are in the table alone
     labels = {"data.sigma_deg" = "noise of the bearings [°]"}
     published = {"forward.total" = {STEADY = [[1.25, 0.434], [5, 0.456]]}}
 
@@ -54,6 +55,7 @@ FORM: dict[str, Any] = {
             "y": LINES,
             "labels": Absent({str: TEXT}),
             "chosen_by": Absent(TEXT),
+            "leave_out": Absent(LINES),
             "published": Absent(POINTS),
         }
     ),
@@ -181,6 +183,10 @@ def _require_columns(picture: Picture, task: str, jobs: tuple[Job, ...]) -> None
         if name not in said and not known:
             there = ", ".join([*(one for one in said if one.startswith(("data.", "settings."))), *FIGURES[task]])
             raise UsageError(f"picture: there will be no column {name}; there will be {there}")
+    methods = {job.method: None for job in jobs}
+    for name in picture.leave_out:
+        if name not in methods:
+            raise UsageError(f"picture.leave_out: {name} is no method; there are {', '.join(methods)}")
     for column in picture.published:
         if column not in picture.y:
             raise UsageError(f"picture.published: {column} is no panel; y has {', '.join(picture.y)}")

@@ -1,0 +1,173 @@
+"""What the ready studies found, from their tables.
+
+    python benchmarks/studies.py [STUDY=DIR …]
+
+Tables of `steady study studies/STUDY.toml --out DIR` are filed as results/STUDY.parquet, and results/studies.md is
+written from all that are: means ± standard deviations of seeds, and whether the musts hold; exits with 1 where one does
+not.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from steady_ppl.studies.pictures import chosen, points
+from steady_ppl.studies.plan import IN_LIMITS, Picture
+from steady_ppl.studies.table import TABLE
+
+RESULTS = Path(__file__).parent / "results"
+SIGMA, PARTICLES, DRIVES = "data.sigma_deg", "settings.particles", "data.train"
+ERROR, HELD_OUT = "forward.total", "valid_log_likelihood"
+LEARNERS = ("FitHand", "FitTV", "SVI", "STEADY−", "STEADY−, bootstrap")  # without true states, besides STEADY
+WITHIN, VISIBLY, IN_TIME = 1.1, 1.1, 0.1
+Musts = list[tuple[str, str, bool]]
+
+
+def main(words: Sequence[str]) -> int:
+    """File tables, write the page, and say whether all musts hold."""
+    for word in words:
+        name, _, folder = word.partition("=")
+        shutil.copyfile(Path(folder) / TABLE, RESULTS / f"{name}.parquet")
+    page, missed = tables(RESULTS)
+    (RESULTS / "studies.md").write_text(page)
+    print(page)
+    return int(missed > 0)
+
+
+def tables(folder: Path) -> tuple[str, int]:
+    """The page of all studies that are filed, and how many musts are missed."""
+    parts, missed = ["# The ready studies", "Means of seeds ± their standard deviation. Written by `studies.py`."], 0
+    for name, part in STUDIES.items():
+        if (folder / f"{name}.parquet").exists():
+            text, musts = part(pd.read_parquet(folder / f"{name}.parquet"))
+            parts += [f"## {name}", text]
+            missed += sum(not holds for _, _, holds in musts)
+            if musts:
+                lines = [f"| {what} | {found} | {'yes' if holds else '**no**'} |" for what, found, holds in musts]
+                parts.append("\n".join(["| must | found | holds |", "|---|---|---|", *lines]))
+    return "\n\n".join(parts) + "\n", missed
+
+
+def table(rows: pd.DataFrame, x: str, column: str, title: str, digits: int = 3) -> str:
+    """A row a method, a column a value of x."""
+    places = sorted(rows[x].dropna().unique())
+    lines = [f"| {title} | " + " | ".join(f"{place:g}" for place in places) + " |", "|---|" + "---|" * len(places)]
+    for method, own in rows.groupby("method", sort=False):
+        cells = [_cell(own[own[x] == place], column, digits) for place in places]
+        lines.append(f"| {method} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _cell(rows: pd.DataFrame, column: str, digits: int) -> str:
+    done, failed = rows[column].dropna(), int((rows["outcome"] == "failed").sum())
+    spread = f" ± {done.std():.{digits}f}" if len(done) > 1 else ""
+    said = f"{done.mean():.{digits}f}{spread}" if len(done) else "–"
+    return f"{said} ({failed} of {len(rows)} failed)" if failed else said
+
+
+def observation_noise(rows: pd.DataFrame) -> tuple[str, Musts]:
+    """Errors against the noise of the bearings; STEADY's ramp is chosen at each by held-out drives."""
+    best = chosen(Picture(SIGMA, [ERROR], chosen_by=HELD_OUT), rows)
+    text = [
+        f"{len(rows)} fits, seeds {_listed(rows['seed'])}, {rows['seconds'].sum() / 3600:.1f} hours of one core.",
+        table(best, SIGMA, ERROR, "error of 1 s roll-outs, root of all squares, at °"),
+        table(best, SIGMA, "forward_mean.total", "of the means of the roll-outs"),
+        table(best, SIGMA, "state_estimation.location", "error of estimated location, m"),
+        table(best, SIGMA, "log_likelihood", "log p(y) of a test drive at 1 Hz, nats", 2),
+        table(best, SIGMA, "fit_seconds", "seconds of the fit", 0),
+    ]
+    musts: Musts = []
+    error = best.groupby(["method", SIGMA])[ERROR].mean()
+    for sigma in sorted(best[SIGMA].unique()):
+        others = {name: error[name, sigma] for name in LEARNERS if (name, sigma) in error.index}
+        others = {name: value for name, value in others.items() if pd.notna(value)}
+        if others and ("STEADY", sigma) in error.index:
+            rival = min(others, key=lambda name: others[name])
+            own = error["STEADY", sigma]
+            found = f"{own:.3f}; the best other, {rival}, {others[rival]:.3f}"
+            musts.append((f"STEADY errs least of all learners at {sigma:g}°", found, bool(own < others[rival])))
+    for sigma, rival, least, what in (
+        (1.25, "FitTruth", 1 / WITHIN, "STEADY within 10 % of FitTruth at 1.25°"),
+        (1.25, "STEADY−", VISIBLY, "STEADY− worse than STEADY by 10 % and more at 1.25°"),
+        (2.5, "STEADY−", VISIBLY, "STEADY− worse than STEADY by 10 % and more at 2.5°"),
+    ):
+        if {("STEADY", sigma), (rival, sigma)} <= set(error.index):
+            own, other = error["STEADY", sigma], error[rival, sigma]
+            musts.append((what, f"{own:.3f} and {other:.3f}", bool(other >= least * own)))
+    return "\n\n".join(text), musts
+
+
+def particles(rows: pd.DataFrame) -> tuple[str, Musts]:
+    """What more particles buy."""
+    text = [
+        f"{len(rows)} fits, seeds {_listed(rows['seed'])}, {rows['seconds'].sum() / 3600:.1f} hours of one core.",
+        table(rows, PARTICLES, ERROR, "error of 1 s roll-outs, root of all squares, by particles"),
+        table(rows, PARTICLES, "state_estimation.location", "error of estimated location, m"),
+        table(rows, PARTICLES, HELD_OUT, "log p(y) of a valid drive at 1 Hz, nats", 2),
+        table(rows, PARTICLES, "log_likelihood", "of a test drive", 2),
+        table(rows, PARTICLES, "fit_seconds", "seconds of the fit, one core", 0),
+    ]
+    ours = rows[(rows["method"] == "lookahead") & (rows[PARTICLES] == 100)].set_index("seed")
+    paper = rows[(rows["method"] == "bootstrap") & (rows[PARTICLES] == 20_000)].set_index("seed")
+    musts: Musts = []
+    for column in (ERROR, "state_estimation.location", "log_likelihood", HELD_OUT):
+        sign = -1 if column.endswith("likelihood") else 1
+        apart = sign * (ours[column] - paper[column])
+        spread = max(ours[column].std(), paper[column].std())
+        found = f"{ours[column].mean():.3f} and {paper[column].mean():.3f}, apart by seed {apart.mean():+.3f} "
+        what = f"lookahead 100 no worse than bootstrap 20,000 by more than a standard deviation of seeds: {column}"
+        musts.append((what, f"{found}± {apart.std():.3f} (worse is +)", bool(apart.mean() <= spread)))
+    ratio = ours["fit_seconds"] / paper["fit_seconds"]
+    what = "lookahead 100 in at most a tenth of the time of bootstrap 20,000"
+    musts.append((what, f"{ratio.mean():.3f} ± {ratio.std():.3f} of it", bool(ratio.max() <= IN_TIME)))
+    return "\n\n".join(text), musts
+
+
+def data_size(rows: pd.DataFrame) -> tuple[str, Musts]:
+    """Errors against the number of drives."""
+    return "\n\n".join(
+        [
+            f"{len(rows)} fits, seeds {_listed(rows['seed'])}, {rows['seconds'].sum() / 3600:.1f} hours of one core.",
+            table(rows, DRIVES, "forward.location", "location error of 1 s roll-outs, m, by drives", 4),
+            table(rows, DRIVES, "state_estimation.location", "error of estimated location, m"),
+            table(rows, DRIVES, "log_likelihood", "log p(y) of a test drive at 1 Hz, nats", 2),
+            table(rows, DRIVES, "fit_seconds", "seconds of the fit", 0),
+        ]
+    ), []
+
+
+def discovery(rows: pd.DataFrame) -> tuple[str, Musts]:
+    """Shares against the size of what is missing, with exact 95 % intervals."""
+    done = rows[rows["outcome"] == "done"]
+    text = [f"{len(rows)} searches, seeds {_listed(rows['seed'])}, {rows['seconds'].sum() / 3600:.1f} hours of a core."]
+    columns = ("found", "in_class", "right")
+    lines = [
+        "| size in detection limits | says that something is missing | its class | names it |",
+        "|---|---|---|---|",
+    ]
+    found = {column: points(done, IN_LIMITS, column) for column in columns}
+    for place in range(len(found["found"])):
+        shares = (found[column][place] for column in columns)
+        cells = [f"{middle:.0%} ({middle - low:.0%}–{middle + high:.0%})" for _, middle, low, high in shares]
+        lines.append(f"| {found['found'][place][0]:.2f} | " + " | ".join(cells) + " |")
+    return "\n\n".join([*text, "\n".join(lines)]), []
+
+
+def _listed(values: pd.Series) -> str:
+    return ", ".join(str(value) for value in sorted(values.unique()))
+
+
+STUDIES: dict[str, Callable[[pd.DataFrame], tuple[str, Musts]]] = {
+    "observation-noise": observation_noise,
+    "particles": particles,
+    "data-size": data_size,
+    "discovery": discovery,
+}
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
