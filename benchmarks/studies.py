@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -20,10 +21,15 @@ from steady_ppl.studies.pictures import chosen, points
 from steady_ppl.studies.plan import IN_LIMITS, Picture
 from steady_ppl.studies.table import TABLE
 
-RESULTS = Path(__file__).parent / "results"
+RESULTS, STUDY_FILES = Path(__file__).parent / "results", Path(__file__).parents[1] / "studies"
 SIGMA, PARTICLES, DRIVES = "data.sigma_deg", "settings.particles", "data.train"
 ERROR, HELD_OUT = "forward.total", "valid_log_likelihood"
 LEARNERS = ("FitHand", "FitTV", "SVI", "STEADY−", "STEADY−, bootstrap")  # without true states, besides STEADY
+MEASURES = {
+    ERROR: "errs least in roll-outs",
+    "forward_mean.total": "errs least in means of roll-outs",
+    "log_likelihood": "has the largest log p(y) of test drives",
+}
 WITHIN, VISIBLY, IN_TIME = 1.1, 1.1, 0.1
 Musts = list[tuple[str, str, bool]]
 
@@ -44,13 +50,20 @@ def tables(folder: Path) -> tuple[str, int]:
     parts, missed = ["# The ready studies", "Means of seeds ± their standard deviation. Written by `studies.py`."], 0
     for name, part in STUDIES.items():
         if (folder / f"{name}.parquet").exists():
-            text, musts = part(pd.read_parquet(folder / f"{name}.parquet"))
+            text, musts = part(_in_order(pd.read_parquet(folder / f"{name}.parquet"), name))
             parts += [f"## {name}", text]
             missed += sum(not holds for _, _, holds in musts)
             if musts:
                 lines = [f"| {what} | {found} | {'yes' if holds else '**no**'} |" for what, found, holds in musts]
                 parts.append("\n".join(["| must | found | holds |", "|---|---|---|", *lines]))
     return "\n\n".join(parts) + "\n", missed
+
+
+def _in_order(rows: pd.DataFrame, study: str) -> pd.DataFrame:
+    """By its methods as the study names them: rows come in as they end."""
+    with (STUDY_FILES / f"{study}.toml").open("rb") as file:
+        names = [method["name"] for method in tomllib.load(file)["method"]]
+    return rows.sort_values(["method", "seed"], key=lambda one: one.map(names.index) if one.name == "method" else one)
 
 
 def table(rows: pd.DataFrame, x: str, column: str, title: str, digits: int = 3) -> str:
@@ -82,15 +95,9 @@ def observation_noise(rows: pd.DataFrame) -> tuple[str, Musts]:
         table(best, SIGMA, "fit_seconds", "seconds of the fit", 0),
     ]
     musts: Musts = []
+    for measure, what in MEASURES.items():
+        musts += [_best_of_all(best[best[SIGMA] == sigma], measure, f"{what} at {sigma:g}°") for sigma in noises(best)]
     error = best.groupby(["method", SIGMA])[ERROR].mean()
-    for sigma in sorted(best[SIGMA].unique()):
-        others = {name: error[name, sigma] for name in LEARNERS if (name, sigma) in error.index}
-        others = {name: value for name, value in others.items() if pd.notna(value)}
-        if others and ("STEADY", sigma) in error.index:
-            rival = min(others, key=lambda name: others[name])
-            own = error["STEADY", sigma]
-            found = f"{own:.3f}; the best other, {rival}, {others[rival]:.3f}"
-            musts.append((f"STEADY errs least of all learners at {sigma:g}°", found, bool(own < others[rival])))
     for sigma, rival, least, what in (
         (1.25, "FitTruth", 1 / WITHIN, "STEADY within 10 % of FitTruth at 1.25°"),
         (1.25, "STEADY−", VISIBLY, "STEADY− worse than STEADY by 10 % and more at 1.25°"),
@@ -100,6 +107,21 @@ def observation_noise(rows: pd.DataFrame) -> tuple[str, Musts]:
             own, other = error["STEADY", sigma], error[rival, sigma]
             musts.append((what, f"{own:.3f} and {other:.3f}", bool(other >= least * own)))
     return "\n\n".join(text), musts
+
+
+def noises(rows: pd.DataFrame) -> list[float]:
+    """Those at which STEADY and others are there."""
+    by = rows[rows["outcome"] == "done"].groupby(SIGMA)["method"].agg(set)
+    return [float(sigma) for sigma, methods in by.items() if "STEADY" in methods and methods & set(LEARNERS)]
+
+
+def _best_of_all(rows: pd.DataFrame, column: str, what: str) -> tuple[str, str, bool]:
+    """Whether STEADY is, of the learners that do not see the true states."""
+    sign = -1 if column.endswith("likelihood") else 1
+    means = rows.groupby("method")[column].mean().dropna()
+    rival = min((name for name in LEARNERS if name in means.index), key=lambda name: sign * means[name])
+    found = f"{means['STEADY']:.3f}; the best other, {rival}, {means[rival]:.3f}"
+    return f"STEADY {what}", found, bool(sign * means["STEADY"] < sign * means[rival])
 
 
 def particles(rows: pd.DataFrame) -> tuple[str, Musts]:

@@ -1,0 +1,136 @@
+"""How long ten thousand fits take on a hundred machines, from what was measured on one.
+
+    python benchmarks/cluster_plan.py
+
+Reads results/cluster.json (of `cluster.py`) and results/observation-noise.parquet (of `studies.py`) and writes
+results/cluster.md, the tables of docs/cluster.md. Fits are drawn from those of the noise study, and handed to workers
+one after the other as the scheduler does; machines that die are exponential, and take what they compute with them.
+"""
+
+from __future__ import annotations
+
+import heapq
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+RESULTS = Path(__file__).parent / "results"
+FITS, MACHINES, CORES = 10_000, 100, 16
+DRAWS = 20  # of fits, their order, and deaths
+LIVES = (math.inf, 1000.0, 100.0)  # hours until a machine dies, in the mean
+BACK = 300.0  # s until it is there again
+
+
+def schedule(
+    seconds: np.ndarray, machines: int, cores: int, life: float, generator: np.random.Generator
+) -> tuple[float, float]:
+    """Of fits in their order, each begun by the worker that is free first: when the last one ends, s, and the share of
+    all the workers' time that was of use.
+
+    Args:
+        seconds: of each fit.
+        machines: how many.
+        cores: workers of each.
+        life: of a machine, hours in the mean; all its workers die together, and are there again after `BACK`.
+        generator: of the deaths.
+    """
+    deaths = [_deaths(life, generator) for _ in range(machines)]
+    # when a worker is free, or has died: then the fit that it had begun is there again
+    events = [(0.0, machine, worker, 0.0) for machine in range(machines) for worker in range(cores)]
+    left, idle, last, done = list(reversed(seconds)), list[tuple[int, int]](), 0.0, 0
+    while done < len(seconds):
+        at, machine, worker, lost = heapq.heappop(events)
+        if lost:
+            left.append(lost)
+            heapq.heappush(events, (at + BACK, machine, worker, 0.0))
+            if idle:
+                heapq.heappush(events, (at, *idle.pop(), 0.0))
+        elif not left:
+            idle.append((machine, worker))
+        else:
+            own = left.pop()
+            death = next((death for death in deaths[machine] if death + BACK > at), math.inf)
+            if death < at + own:
+                heapq.heappush(events, (max(at, death), machine, worker, own))
+            else:
+                done, last = done + 1, max(last, at + own)
+                heapq.heappush(events, (at + own, machine, worker, 0.0))
+    return last, float(np.sum(seconds)) / (last * machines * cores)
+
+
+def _deaths(life: float, generator: np.random.Generator) -> list[float]:
+    """Until a month is over."""
+    found, at = list[float](), 0.0
+    while math.isfinite(life) and at < 30 * 86_400:
+        at += generator.exponential(3600 * life)
+        found.append(at)
+        at += BACK
+    return found
+
+
+def tables(cluster: dict[str, Any], fits: pd.DataFrame) -> str:
+    """What was measured, and what follows."""
+    generator = np.random.default_rng(0)
+    seconds = fits["seconds"].to_numpy(float)
+    many, killed = cluster["many"], cluster["killed"]
+    failed = int((fits["outcome"] == "failed").sum())
+    measured = [
+        ("a fit, one core", f"{seconds.mean():.0f} s ± {seconds.std(ddof=1):.0f}, at most {seconds.max():.0f} s"),
+        ("memory of a worker", f"at most {fits['peak_mib'].max():.0f} MiB"),
+        ("fits that fail by themselves", f"{failed} of {len(fits)}"),
+        ("efficiency of two workers", _spread(cluster["efficiency"]["cluster"])),
+        ("of two processes without a cluster", _spread(cluster["efficiency"]["processes"])),
+        ("a job, to the worker", f"{many['bytes_a_job']} bytes"),
+        ("a result, in the table", f"{many['table_bytes'] / many['jobs']:.0f} bytes"),
+        ("planning", f"{many['planning_s']:.1f} s for {many['jobs']:,} jobs"),
+        ("processor time of the client, a job", f"{many['client_ms_a_job']:.1f} ms"),
+        ("of the scheduler", f"{many['scheduler_ms_a_job']:.1f} ms"),
+        ("of the worker, besides the fit", f"{many['worker_ms_a_job']:.1f} ms"),
+        ("memory of client and scheduler", f"{many['client_mib']:.0f} and {many['scheduler_mib']:.0f} MiB"),
+        ("workers that were killed", f"{killed['kills']} while {killed['jobs']} fits ran, {killed['lost']} fits lost"),
+    ]
+    lines = ["| measured | |", "|---|---|", *(f"| {name} | {value} |" for name, value in measured)]
+    slots, busiest = MACHINES * CORES, max(many["client_ms_a_job"], many["scheduler_ms_a_job"])
+    rate = slots / seconds.mean()
+    planned = [
+        ("hours of one core", f"{FITS * seconds.mean() / 3600:,.0f}"),
+        ("jobs that end in a second", f"{rate:.0f}; client and scheduler take at most {1000 / busiest:.0f}"),
+        ("shortest fits that keep all workers busy", f"{slots * busiest / 1000:.0f} s"),
+        ("sent to the workers", f"{FITS * many['bytes_a_job'] / 2**20:.1f} MiB"),
+        ("table of results", f"{FITS * many['table_bytes'] / many['jobs'] / 2**20:.1f} MiB"),
+        ("memory of a machine", f"{CORES * fits['peak_mib'].max() / 1024:.0f} GiB"),
+        ("fits that will have failed", f"about {FITS * failed / len(fits):,.0f}"),
+    ]
+    lines += ["", f"| {FITS:,} such fits on {MACHINES} machines of {CORES} cores | |", "|---|---|"]
+    lines += [f"| {name} | {value} |" for name, value in planned]
+    lines += ["", "| a machine dies every | minutes | of the workers' time is of use |", "|---|---|---|"]
+    for life in LIVES:
+        found = np.array(
+            [schedule(generator.choice(seconds, FITS), MACHINES, CORES, life, generator) for _ in range(DRAWS)]
+        )
+        minutes, used = found[:, 0] / 60, found[:, 1]
+        name = f"{life:,.0f} hours" if math.isfinite(life) else "never"
+        lines.append(f"| {name} | {minutes.mean():.1f} ± {minutes.std(ddof=1):.1f} | {used.mean():.0%} |")
+    return "\n".join(lines) + "\n"
+
+
+def _spread(found: dict[str, Any]) -> str:
+    return f"{found['mean']:.2f} ± {found['sd']:.2f}"
+
+
+def main() -> int:
+    """Write the tables."""
+    cluster = json.loads((RESULTS / "cluster.json").read_text())
+    found = tables(cluster, pd.read_parquet(RESULTS / "observation-noise.parquet"))
+    (RESULTS / "cluster.md").write_text(found)
+    print(found)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

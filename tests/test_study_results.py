@@ -1,0 +1,36 @@
+"""What is filed of the ready studies is what their tables give, and pages say the same."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+import cluster_plan  # noqa: E402
+
+import studies  # noqa: E402
+
+
+def test_the_filed_tables_are_those_of_the_filed_results():
+    page, _ = studies.tables(RESULTS)
+    assert (RESULTS / "studies.md").read_text() == page
+
+
+def test_fits_are_handed_to_the_worker_that_is_free_first():
+    alike = cluster_plan.schedule(np.full(10, 60.0), 2, 2, math.inf, np.random.default_rng(0))
+    assert alike == (180.0, pytest.approx(10 / 12))
+    unlike = cluster_plan.schedule(np.array([1.0, 1.0, 1.0, 9.0]), 1, 2, math.inf, np.random.default_rng(0))
+    assert unlike == (10.0, pytest.approx(12 / 20))
+
+
+def test_machines_that_die_cost_what_they_compute_and_their_rest():
+    """An hour in the mean, fits of 600 s: of 3900 s 300 are rest and 300 are a fit that is half done."""
+    last, used = cluster_plan.schedule(np.full(2000, 600.0), 4, 2, 1.0, np.random.default_rng(0))
+    assert used == pytest.approx(3300 / 3900, abs=0.03) and last > 2000 * 600 / 8
