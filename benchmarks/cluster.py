@@ -32,7 +32,8 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from dask_cluster import Dask, wait_for  # noqa: E402
 
-from steady_ppl.studies.places import Cluster, Local, Place  # noqa: E402
+from steady_ppl.studies.cluster import Cluster  # noqa: E402
+from steady_ppl.studies.places import Local, Place  # noqa: E402
 from steady_ppl.studies.runner import run_study  # noqa: E402
 from steady_ppl.studies.study_file import read_plan  # noqa: E402
 from steady_ppl.studies.table import TABLE, read_results  # noqa: E402

@@ -30,8 +30,9 @@ def study(
     import joblib
 
     from steady_ppl.command_parts import say
-    from steady_ppl.studies.job import require_runnable
-    from steady_ppl.studies.places import Cluster, Local
+    from steady_ppl.studies.cluster import Cluster
+    from steady_ppl.studies.places import Local
+    from steady_ppl.studies.runnable import require_runnable
     from steady_ppl.studies.runner import run_study
     from steady_ppl.studies.study_file import read_plan
 

@@ -44,14 +44,26 @@ class Dask:
 
     def worker(self, **environment: str) -> subprocess.Popen:
         """Start one of a single thread, which lives as long as its scheduler."""
-        words = ("--nthreads", "1", "--no-dashboard", "--no-nanny", "--local-directory", str(self.folder))
-        return self.start("worker", self.address, *words, **environment)
+        return self.start("worker", self.address, "--no-nanny", *self._words, **environment)
+
+    def nanny(self) -> subprocess.Popen:
+        """Start one whose process is replaced when it dies."""
+        return self.start("worker", self.address, *self._words)
+
+    @property
+    def _words(self) -> tuple[str, ...]:
+        return ("--nthreads", "1", "--no-dashboard", "--local-directory", str(self.folder))
 
     def end(self) -> None:
-        """Kill all that were started."""
+        """End all that were started."""
         for process in reversed(self.processes):
-            process.kill()
-            process.wait()
+            process.terminate()  # a nanny takes its worker with it
+        for process in self.processes:
+            try:
+                process.wait(5)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
 def free_port() -> int:

@@ -65,7 +65,11 @@ def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(t
         found.loc[7, "reason"] == "ValueError: seven"
         and found.loc[13, "reason"] == "its worker died each time that it was tried"
     )
-    assert (tmp_path / "marks" / "1").stat().st_size == 2 and (tmp_path / "marks" / "13").stat().st_size == 3
+    # with two workers the other one may have died of 13 while 1 was begun again
+    assert (
+        2 <= (tmp_path / "marks" / "1").stat().st_size <= 1 + workers
+        and (tmp_path / "marks" / "13").stat().st_size == 3
+    )
     assert sorted(file.name for file in out.iterdir()) == [TABLE, "study.json"]
     assert run_study(plan, out, Local(workers)) == 3  # what has failed is left
     assert (tmp_path / "marks" / "7").stat().st_size == 2

@@ -14,11 +14,12 @@ import pytest
 from small_studies import row, written
 
 from steady_ppl.errors import RunError
+from steady_ppl.studies.job import CHANGED
 from steady_ppl.studies.places import Local
 from steady_ppl.studies.plan import RECORD, record_plan, recorded_plan
 from steady_ppl.studies.runner import run_study
 from steady_ppl.studies.study_file import read_plan
-from steady_ppl.studies.table import ARRIVED, TABLE, StudyTable, read_results, study_table
+from steady_ppl.studies.table import ARRIVED, EARLIER, TABLE, StudyTable, read_results, study_table
 
 
 def test_a_result_is_there_at_once_and_the_later_one_of_a_job_counts(tmp_path: Path):
@@ -130,3 +131,50 @@ def test_a_damaged_record_and_one_of_a_newer_version_are_said(tmp_path: Path):
     (tmp_path / RECORD).write_text(json.dumps(record | {"format": 99}))
     with pytest.raises(RunError, match="written by a newer steady-ppl: its form is number 99"):
         recorded_plan(tmp_path)
+
+
+def test_results_of_jobs_that_are_no_longer_asked_for_are_set_aside_and_come_back(tmp_path: Path):
+    with study_table(tmp_path) as table:
+        for key in "abc":
+            table.add(row(key, figure=1.0))
+        table.keep({"a", "d"})
+        assert set(read_results(tmp_path)["key"]) == {"a"} and set(pd.read_parquet(tmp_path / EARLIER)["key"]) == {
+            "b",
+            "c",
+        }
+        table.add(row("b", figure=2.0))
+        table.keep({"a", "b", "c"})
+    found = pd.read_parquet(tmp_path / TABLE).set_index("key")["figure"].to_dict()
+    assert found == {"a": 1.0, "b": 2.0, "c": 1.0}
+
+
+def test_what_is_merged_while_it_is_read_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with study_table(tmp_path) as table:
+        for key in "ab":
+            table.add(row(key))
+        read = pq.read_table
+
+        def meanwhile(file: Path, **words: object) -> object:
+            monkeypatch.undo()
+            table.merge()
+            return read(file, **words)
+
+        monkeypatch.setattr("pyarrow.parquet.read_table", meanwhile)
+        assert set(read_results(tmp_path)["key"]) == {"a", "b"}
+
+
+def test_a_folder_of_another_study_is_left_alone(tmp_path: Path):
+    plan, out = read_plan(written(tmp_path)), tmp_path / "out"
+    run_study(replace(plan, jobs=()), out, Local(1))
+    with pytest.raises(RunError, match="holds another study, 'Small': choose another folder"):
+        run_study(replace(plan, title="Other", jobs=()), out, Local(1))
+
+
+def test_files_that_had_changed_are_tried_again_by_the_same_command(tmp_path: Path):
+    plan, out = read_plan(written(tmp_path)), tmp_path / "out"
+    plan = replace(plan, jobs=plan.jobs[:2])
+    with study_table(out) as table:
+        table.add(row(plan.jobs[0].key, "failed", reason=CHANGED, seconds=0.0))
+        table.add(row(plan.jobs[1].key, "failed", reason="no"))
+    assert run_study(plan, out, Local(1)) == 1
+    assert read_results(out)["outcome"].tolist() == ["failed", "done"]

@@ -61,6 +61,8 @@ def source_axes(folder: Path, given: Mapping[str, Any], instead: Path | None, ta
 
 def method_axes(folder: Path, given: Mapping[str, Any], task: str) -> dict[str, Any]:
     """A method whose files have their folders and whose settings are lists of values."""
+    if task == "discover" and "recipe" in given:
+        raise UsageError(f"method {given['name']}: a recipe means nothing to a search")
     recipe = given.get("recipe", "steady") if task == "fit" else ""
     axes = {name: _axis(name, value) for name, value in given.get("settings", {}).items()}
     return {

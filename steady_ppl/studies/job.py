@@ -2,64 +2,74 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from steady_ppl.data import Trajectories
 from steady_ppl.discovery import discover
-from steady_ppl.effects import parsed
-from steady_ppl.errors import RunError, SteadyError, UsageError, one_line
+from steady_ppl.errors import RunError, one_line
 from steady_ppl.evaluation import evaluate
 from steady_ppl.filtering import choose_filter, log_likelihood
-from steady_ppl.fit import Fit, packages
+from steady_ppl.fit import Fit
 from steady_ppl.program import for_program
 from steady_ppl.program_file import load_program
 from steady_ppl.run_recipe import find_recipe, require_settings, trains
 from steady_ppl.seeding import seeded
-from steady_ppl.studies.job_data import drives, told, told_settings, truth
+from steady_ppl.studies.job_data import drives, planted, told, told_settings
 from steady_ppl.studies.job_files import JobFiles
-from steady_ppl.studies.plan import IN_LIMITS, Job, Plan
+from steady_ppl.studies.plan import HELD_OUT, IN_LIMITS, Job
 
-GROUPS = ("forward", "forward_mean", "state_estimation", "measurement")
+ERRORS = ("forward", "forward_mean", "state_estimation")
+CHANGED = "its program, recipe or table is not what it was when the study was begun: the same command tries it again"
 _one_at_a_time = threading.Lock()  # torch's random state and Pyro's parameters are the process's
 
 
-def run(job: Job, asked_with: Mapping[str, str] | None = None) -> dict[str, Any]:
+def run(job: Job) -> dict[str, Any]:
     """Compute a job, on one thread; whatever goes wrong is its outcome, in one line.
 
-    Args:
-        job: what to compute.
-        asked_with: versions of the packages where the study is kept, if that may be another machine.
-
     Returns:
-        Columns of the table: those of the job, `outcome` ("done" or "failed"), `reason`, `seconds`, `peak_mib` (of
-        this process so far), `version` of steady-ppl and the figures.
+        Columns of the table: those of the job, `outcome` ("done" or "failed"), `reason`, `seconds`, `peak_mib` (the
+        most memory that this process took: on Linux during the job, else until its end), `version` of steady-ppl and
+        the figures.
     """
     with _one_at_a_time:
         torch.set_num_threads(1)
         began = time.perf_counter()
+        _forget_peak()
         try:
-            _require_alike(asked_with)
-            _require_unchanged(job)
-            found: dict[str, Any] = {"outcome": "done"} | TASKS[job.task](job)
+            # files change while a study goes on, and may be others on another machine
+            found = _done(job) if JobFiles().is_of(job) else {"outcome": "failed", "reason": CHANGED}
         except (Exception, SystemExit) as error:  # a study goes on without this job
             found = {"outcome": "failed", "reason": one_line(error)}
         spent = {"seconds": time.perf_counter() - began, "peak_mib": _peak_mib(), "version": version("steady-ppl")}
         return job.columns | spent | found
 
 
+def _done(job: Job) -> dict[str, Any]:
+    return {"outcome": "done"} | TASKS[job.task](job)
+
+
+def _forget_peak() -> None:
+    """Count the most memory that this process takes from here on, where the system can do that (Linux)."""
+    if sys.platform == "linux":
+        with suppress(PermissionError):  # then it is counted from the process's beginning
+            Path("/proc/self/clear_refs").write_text("5")
+
+
 def _peak_mib() -> float:
     """The most memory that this process has taken; NaN on Windows, which cannot be asked for it."""
+    if sys.platform == "linux":
+        words = Path("/proc/self/status").read_text().split()
+        return int(words[words.index("VmHWM:") + 1]) / 1024
     if sys.platform == "win32":
         return math.nan
     import resource
@@ -67,61 +77,10 @@ def _peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 1024)
 
 
-def _require_alike(asked_with: Mapping[str, str] | None) -> None:
-    """A worker may have joined after all that were there had been looked at."""
-    other = differing(asked_with, packages()) if asked_with else ""
-    if other:
-        raise RunError(f"its worker had {other}: results would not be comparable")
-
-
 def differing(here: Mapping[str, str], there: Mapping[str, str]) -> str:
     """The packages whose versions are other ones there, in words; empty where none is."""
-    return ", ".join(f"{name} {there[name]} (here {here[name]})" for name in here if there[name] != here[name])
-
-
-def _require_unchanged(job: Job) -> None:
-    """Files change while a study goes on, and may be others on another machine: what is kept is kept by its key."""
-    if JobFiles().key(replace(job, key="")) != job.key:
-        raise RunError("its program, recipe or table is not what it was when the study was begun: begin it again")
-
-
-def require_runnable(plan: Plan) -> None:
-    """Load every program, plant every effect, look at every method's settings and read every log or table once, before
-    anything is sent out.
-
-    Raises:
-        SteadyError: naming the method.
-    """
-    for job in {(job.method, repr(job.settings)): job for job in plan.jobs}.values():
-        with _named(f"method {job.method}"):
-            told(load_program(job.program), job)
-            if job.task == "fit":
-                require_settings(job.recipe, find_recipe(job.recipe), job.settings)
-            else:
-                _require_search_settings(job.settings)
-    for job in {repr(job.data): job for job in plan.jobs if "simulate" in job.data}.values():
-        with _named("data"):
-            truth(job)
-    if "simulate" not in plan.jobs[0].data:
-        with _named("data"):
-            drives(plan.jobs[0])
-
-
-@contextmanager
-def _named(what: str) -> Iterator[None]:
-    try:
-        yield
-    except SteadyError as error:
-        error.args = (f"{what}: {error}",)
-        raise
-
-
-def _require_search_settings(settings: Mapping[str, Any]) -> None:
-    given = set(list(inspect.signature(discover).parameters)[:3]) | {"known_start", "seed"}  # by the study itself
-    known = [name for name in inspect.signature(discover).parameters if name not in given]
-    unknown = [name for name in settings if name not in known]
-    if unknown:
-        raise UsageError(f"discover has no setting {unknown[0]}; there are {', '.join(known)}")
+    unlike = [name for name in here if there.get(name) != here[name]]
+    return ", ".join(f"{name} {there.get(name, 'none')} (here {here[name]})" for name in unlike)
 
 
 def _fit(job: Job) -> dict[str, Any]:
@@ -147,11 +106,11 @@ def _fit(job: Job) -> dict[str, Any]:
     if fitted.trained and fitted.trained.interrupted:
         raise RunError("it was interrupted")
     judged = evaluate(fitted, data["test"], seed=job.seed)
-    figures = {f"{group}.{name}": value for group in GROUPS for name, value in judged[group].items()}
-    figures |= {f"{group}.total": math.hypot(*judged[group].values()) for group in GROUPS[:3] if judged[group]}
+    figures = {f"{group}.{name}": value for group in (*ERRORS, "measurement") for name, value in judged[group].items()}
+    figures |= {f"{group}.total": math.hypot(*judged[group].values()) for group in ERRORS if judged[group]}
     return figures | {
         "log_likelihood": judged["log_likelihood"],
-        "valid_log_likelihood": _held_out(fitted, data["valid"], job.seed),
+        HELD_OUT: _held_out(fitted, data["valid"], job.seed),
         "fit_seconds": seconds,
         "steps": fitted.trained.history[-1]["step"] if fitted.trained and fitted.trained.history else 0.0,
         "filter": judged["filter"].partition(" ")[0],
@@ -185,35 +144,33 @@ def _discover(job: Job) -> dict[str, Any]:
         seed=job.seed,
         **job.settings,
     ).figures
-    planted, _, _, value = parsed(job.data["effect"]) if job.data["effect"] else ("", "", {}, 0.0)
-    named = [one["effect"].partition(":")[0] for one in figures["effects"]]
-    classes = [other.partition(":")[0] for one in figures["effects"] for other in one["class"]]
-    limits = [
-        one["detection_limit"]
-        for one in figures["candidates"]
-        if one["effect"].partition(":")[0] == planted and one["detection_limit"] is not None
-    ]
+    named = [one["effect"] for one in figures["effects"]]
+    classes = [name for one in figures["effects"] for name in one["class"]]
+    variant, value = planted(job)
+    limits = [one["detection_limit"] for one in figures["candidates"] if variant and one["effect"] == variant.name]
     return {
         "p_value": figures["p_value"],
         "verdict": figures["verdict"],
         "named": ", ".join(named),
-        "planted": planted,
+        "planted": variant.name if variant else "",
         "found": figures["verdict"] != "none",
-        "right": planted in named if planted else not named,
-        "in_class": planted in classes if planted else not named,
-        IN_LIMITS: in_limits(value, limits),
+        "right": named == ([variant.name] if variant else []),
+        "in_class": variant.name in classes if variant else not named,
+        IN_LIMITS: in_limits(value, limits[0] if limits else None),
     }
 
 
 TASKS = {"fit": _fit, "discover": _discover}
 
 
-def in_limits(value: Any, limits: list[Any]) -> float:
-    """How large an effect is, in detection limits: 0 where none was planted, NaN where the search says no limit."""
+def in_limits(value: Sequence[float], limit: float | Sequence[float] | None) -> float:
+    """How large an effect is, in detection limits: 0 where none was planted, NaN where the search says no limit.
 
-    def size(one: Any) -> float:
-        return max(map(abs, one)) if isinstance(one, list | tuple) else abs(float(one))
-
-    if value is None or (size(value) > 0 and not limits):
-        return math.nan
-    return size(value) / size(limits[0]) if size(value) > 0 else 0.0
+    Args:
+        value: how far each component of the coefficient is from where the effect is absent.
+        limit: of it, or of each of its components.
+    """
+    size = max(map(abs, value), default=0.0)
+    if size == 0.0:
+        return 0.0
+    return math.nan if limit is None else size / (max(limit) if isinstance(limit, Sequence) else limit)

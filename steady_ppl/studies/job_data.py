@@ -6,9 +6,12 @@ import math
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from steady_ppl.alpha_truck import read_alpha_truck
 from steady_ppl.command_effects import with_effects
 from steady_ppl.data import Trajectories
+from steady_ppl.effects import Variant, chosen_variant, parsed
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.program import Program
 from steady_ppl.program_file import load_program
@@ -43,12 +46,23 @@ def truth(job: Job) -> Program:
     return with_effects(owner, [effect], say=lambda line: None) if effect else owner
 
 
+def planted(job: Job) -> tuple[Variant | None, list[float]]:
+    """The effect that the drives of a job have and its owner's program lacks, and how far each component of its
+    coefficient is from where it would be absent."""
+    if not job.data["effect"]:
+        return None, []
+    name, at, options, value = parsed(job.data["effect"])
+    variant = chosen_variant(told(load_program(job.data["simulate"]), job), name, at, **options)
+    coefficient = variant.coefficient(value, torch.zeros(()))
+    return variant, (coefficient - variant.effect.null).flatten().tolist()
+
+
 def told(program: Program, job: Job) -> Program:
     """With the noise of its bearings, which is known."""
     degrees = job.data.get("sigma_deg")
     if degrees is not None:
         if not hasattr(program, "bearing_sd"):
-            raise UsageError(f"{job.program} has no bearing_sd that sigma_deg could set")
+            raise UsageError(f"{type(program).__name__} has no bearing_sd that sigma_deg could set")
         program.bearing_sd = math.radians(degrees)
     return program
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,8 @@ class JobFiles:
     """The files that the jobs of a study read, and what of these their results depend on; each is looked at once.
 
     What counts: all that is said of a job, the contents of its tables or logs, its program and recipe, programs among
-    its settings, and what these import from their own folder (`from .sibling import …`). Where files are does not.
+    its settings, and what these import from their own folder and from packages in it (`from .sibling import …`). Where
+    files are does not.
     """
 
     def __init__(self) -> None:
@@ -39,9 +41,32 @@ class JobFiles:
             UsageError: a file cannot be read, or is none.
         """
         said = json.dumps({name: value for name, value in job.columns.items() if name != "key"}, sort_keys=True)
-        said += json.dumps(job.settings) if any(isinstance(one, list) for one in job.settings.values()) else ""
+        said += "".join(f" {name} is a list" for name, one in job.settings.items() if isinstance(one, list))
         parts = [said, *map(self._digest, self.of(job))]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+    def is_of(self, job: Job) -> bool:
+        """Whether its files are there, and as they were when its key was made."""
+        try:
+            return self.key(replace(job, key="")) == job.key
+        except UsageError:
+            return False
+
+    def digests_of(self, jobs: Sequence[Job]) -> dict[str, str]:
+        """Hashes of all that jobs read, by the files' paths.
+
+        Raises:
+            UsageError: as `key`.
+        """
+        files = dict.fromkeys(file for job in jobs for file in self.of(job))
+        return {str(file): self._digest(file) for file in files}
+
+    def digest_or_none(self, file: str) -> str | None:
+        """A hash as `digests_of` has it; None where the file cannot be read."""
+        try:
+            return self._digest(Path(file))
+        except UsageError:
+            return None
 
     def of(self, job: Job) -> list[Path]:
         """All that a job reads: tables or logs, and programs and its recipe with what these import from their own
@@ -56,7 +81,7 @@ class JobFiles:
         return [*data_files(job.data), *(one for file in files for one in self._with_siblings(file))]
 
     def _with_siblings(self, file: Path) -> list[Path]:
-        """A Python file, and those of its folder that it imports relatively, and that these import."""
+        """A Python file, and those that it imports relatively, and that these import."""
         if file not in self.siblings:
             found, left = dict[Path, None](), [file]
             while left:
@@ -108,6 +133,10 @@ def _imported(file: Path) -> Iterator[Path]:
     except (OSError, SyntaxError, ValueError, RecursionError):
         return  # who loads it says so
     for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.level == 1:
-            names = [node.module.partition(".")[0]] if node.module else [alias.name for alias in node.names]
-            yield from (file.with_name(f"{name}.py") for name in names)
+        if isinstance(node, ast.ImportFrom) and node.level:
+            place = file.parents[node.level - 1] if node.level <= len(file.parents) else file.parent
+            for part in node.module.split(".") if node.module else ():
+                place /= part
+                yield from (place.with_suffix(".py"), place / "__init__.py")
+            for alias in node.names:
+                yield from (place / f"{alias.name}.py", place / alias.name / "__init__.py")

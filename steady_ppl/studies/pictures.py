@@ -18,7 +18,7 @@ from steady_ppl.harmless import harmless
 from steady_ppl.proof_pictures import COLORS, MARKS
 from steady_ppl.studies.plan import IN_LIMITS, LARGEST, Picture, Plan
 
-SIZES = (-1.0, 0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, math.inf)
+SIZES = (-1.0, 0.0, 0.25, 0.75, 1.25, 1.75, 2.5, 3.5, 5.0, 8.0, 12.0, math.inf)
 """Ends of ranges of what is missing, in detection limits; the first is of drives that lack nothing."""
 Points = Sequence[Sequence[float]]
 

@@ -9,15 +9,28 @@ from pathlib import Path
 from typing import Any
 
 from steady_ppl.errors import RunError, shown
-from steady_ppl.given_files import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Maybe, misfit, read_json, refuse_newer
+from steady_ppl.given_files import (
+    ANYTHING,
+    LINES,
+    NUMBER,
+    TEXT,
+    TRUTH,
+    WHOLE,
+    Absent,
+    Maybe,
+    misfit,
+    read_json,
+    refuse_newer,
+)
 from steady_ppl.whole_file import whole_file
 
+HELD_OUT = "valid_log_likelihood"  # of validation drives
 IN_LIMITS = "in_limits"  # how large what is missing is, in detection limits
 TASKS = ("fit", "discover")
 FIGURES = {
     "fit": (
         *("forward.", "forward_mean.", "state_estimation.", "measurement."),
-        *("log_likelihood", "valid_log_likelihood", "fit_seconds", "steps", "seconds", "peak_mib"),
+        *("log_likelihood", HELD_OUT, "fit_seconds", "steps", "seconds", "peak_mib"),
     ),
     "discover": ("p_value", "found", "right", "in_class", IN_LIMITS, "seconds", "peak_mib"),
 }
@@ -41,7 +54,14 @@ RECORDED: dict[str, Any] = {
         }
     ],
     "picture": Maybe(
-        {"x": TEXT, "y": LINES, "labels": {str: TEXT}, "published": POINTS, "chosen_by": TEXT, "leave_out": LINES}
+        {
+            "x": TEXT,
+            "y": LINES,
+            "labels": {str: TEXT},
+            "published": POINTS,
+            "chosen_by": TEXT,
+            "leave_out": Absent(LINES),
+        }
     ),
 }
 
@@ -180,7 +200,9 @@ def recorded_plan(folder: Path) -> Plan:
         problem = undrawable(content["title"], content["picture"])
     if problem is not None:
         raise RunError(f"{folder / RECORD} is damaged: {problem}")
-    picture = content["picture"] and Picture(**{name: content["picture"][name] for name in RECORDED["picture"].form})
+    picture = content["picture"]
+    if picture is not None:
+        picture = Picture(**{name: picture[name] for name in RECORDED["picture"].form if name in picture})
     jobs = tuple(Job(**{name: job[name] for name in RECORDED["jobs"][0]}) for job in content["jobs"])
     return Plan(content["title"], content["task"], jobs, picture)
 

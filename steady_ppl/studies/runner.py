@@ -7,13 +7,19 @@ that kills one worker after the other is given up.
 from __future__ import annotations
 
 import time
+from collections import Counter
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
-from steady_ppl.errors import ComputationError
+from steady_ppl.errors import ComputationError, RunError
+from steady_ppl.studies.job import CHANGED
 from steady_ppl.studies.places import Place, Row, Say, given_up
-from steady_ppl.studies.plan import Job, Plan, record_plan
+from steady_ppl.studies.plan import RECORD, Job, Plan, record_plan, recorded_plan
 from steady_ppl.studies.table import read_results, study_table
+
+IN_VAIN = 3  # rounds in which workers died and nothing had been begun
 
 
 def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, say: Say = lambda line: None) -> int:
@@ -30,14 +36,16 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
         How many jobs have failed.
 
     Raises:
-        RunError: the folder cannot be written or read, or another process writes to it.
+        RunError: the folder cannot be written or read, holds another study, or another process writes to it.
         ComputationError: there is nothing left to compute on; all that had come is kept.
     """
     with study_table(folder) as table:
         wanted = {job.key: job for job in plan.jobs}
-        rows = {row["key"]: row for row in read_results(folder).to_dict("records") if row["key"] in wanted}
+        _require_same_study(plan, folder)
+        table.keep(wanted)
         record_plan(plan, folder)
-        kept = {key: row["outcome"] for key, row in rows.items() if not (again and row["outcome"] == "failed")}
+        rows = read_results(folder).to_dict("records")
+        kept = {row["key"]: row["outcome"] for row in rows if not _is_tried_again(row, again)}
         left = {key: job for key, job in wanted.items() if key not in kept}
         if kept:
             say(f"{len(kept)} of {len(wanted)} jobs are there already")
@@ -48,44 +56,61 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
             kept[row["key"]] = row["outcome"]
             say(f"{len(kept)}/{len(wanted)} {left.pop(row['key']).label}: {_in_words(row)}, {clock.tick()}")
 
-        with place:
-            try:
-                while left:
-                    before = len(left)
-                    try:
-                        with closing(place.results(list(left.values()), say)) as results:
-                            for row in results:
-                                keep(row)
-                    except place.died as error:
-                        begun = place.begun()
-                        suspects = [job for key, job in left.items() if key in begun]
-                        say(f"a worker died; of the jobs that were begun {len(suspects)} are tried by themselves")
-                        for job in suspects:
-                            keep(_alone(place, job, say))
-                        if len(left) == before:
-                            raise ComputationError(
-                                f"workers die before they begin: {len(kept)} of {len(wanted)} jobs are kept in {folder}"
-                            ) from error
-            except KeyboardInterrupt:
-                say(f"{len(kept)} of {len(wanted)} jobs are kept in {folder}; the same command goes on")
+        ended: tuple[type[BaseException], ...] = (ComputationError, KeyboardInterrupt, *place.lost)
+        try:
+            with place:
+                _compute(place, left, keep, say)
+        except ended as error:
+            so_far = f"{len(kept)} of {len(wanted)} jobs are kept in {folder}; the same command goes on"
+            if isinstance(error, KeyboardInterrupt):
+                say(so_far)
                 raise
-            except place.lost as error:
-                raise ComputationError(
-                    f"the cluster is gone ({type(error).__name__}): {len(kept)} of {len(wanted)} jobs are kept in "
-                    f"{folder}; the same command goes on"
-                ) from error
+            gone = f"the cluster is gone ({type(error).__name__})"
+            reason = str(error) if isinstance(error, ComputationError) else gone
+            raise ComputationError(f"{reason}: {so_far}") from error
     return sum(outcome == "failed" for outcome in kept.values())
 
 
-def _alone(place: Place, job: Job, say: Say) -> Row:
-    """The result of a job that may have killed its worker; what is to be kept if it does so again, and again."""
-    for _ in range(2):
+def _compute(place: Place, left: dict[str, Job], keep: Callable[[Row], None], say: Say) -> None:
+    """Until nothing is left: what had been begun when a worker died twice is tried by itself."""
+    deaths, in_vain = Counter[str](), 0
+    while left:
+        before = len(left)
         try:
-            (row,) = place.results([job], say)
-            return row
-        except place.died:
-            continue
-    return given_up(job)
+            with closing(place.results(list(left.values()), say)) as results:
+                for row in results:
+                    keep(row)
+        except place.died as error:
+            begun = place.begun() & left.keys()
+            deaths.update(begun)
+            suspects = [job for key, job in left.items() if deaths[key] > 1]
+            say(f"a worker died: {len(begun)} jobs are begun again, {len(suspects)} of them each by itself")
+            for job in suspects:
+                keep(_alone(place, job, say))
+            in_vain = 0 if begun or len(left) < before else in_vain + 1
+            if in_vain == IN_VAIN:
+                raise ComputationError("workers die before they begin") from error
+
+
+def _require_same_study(plan: Plan, folder: Path) -> None:
+    """Its results are not to be put aside for those of another."""
+    if (folder / RECORD).exists():
+        there = recorded_plan(folder)
+        if there.title != plan.title and not {job.key for job in there.jobs} & {job.key for job in plan.jobs}:
+            raise RunError(f"{folder} holds another study, {there.title!r}: choose another folder")
+
+
+def _is_tried_again(row: Mapping[str, Any], again: bool) -> bool:
+    return row["outcome"] == "failed" and (again or row.get("reason") == CHANGED)
+
+
+def _alone(place: Place, job: Job, say: Say) -> Row:
+    """The result of a job whose workers have died twice; what is to be kept if this one does so too."""
+    try:
+        (row,) = place.results([job], say)
+        return row
+    except place.died:
+        return given_up(job)
 
 
 def _in_words(row: Row) -> str:

@@ -39,7 +39,7 @@ from steady_ppl.errors import UsageError
 from steady_ppl.given_files import ANYTHING, LINES, TEXT, TRUTH, WHOLE, Absent, misfit, require_file
 from steady_ppl.studies.axes import Axes, count, grid, method_axes, source_axes
 from steady_ppl.studies.job_files import JobFiles
-from steady_ppl.studies.plan import FIGURES, POINTS, TASKS, Job, Picture, Plan, undrawable, without_folder
+from steady_ppl.studies.plan import FIGURES, HELD_OUT, POINTS, TASKS, Job, Picture, Plan, undrawable, without_folder
 
 MOST_JOBS = 100_000
 
@@ -170,6 +170,8 @@ def _labelled(jobs: tuple[Job, ...]) -> tuple[Job, ...]:
 
 def _require_columns(picture: Picture, task: str, jobs: tuple[Job, ...]) -> None:
     """What would otherwise be met when everything has been computed."""
+    if picture.chosen_by not in ("", HELD_OUT):
+        raise UsageError(f"picture: chosen_by is {picture.chosen_by}, expected {HELD_OUT}: of drives that are held out")
     if picture.chosen_by and not picture.x.startswith("data."):
         raise UsageError(f"picture: chosen_by picks settings for the same data; x is {picture.x}, expected data.…")
     said: dict[str, list[Any]] = {}

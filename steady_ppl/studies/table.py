@@ -1,13 +1,14 @@
 """What has come in of a study: one Parquet table, and beside it what came since it was last written.
 
 A result is on disk, whole, before the next one is taken; the table is written anew when enough have come, which keeps
-ten thousand results from being written ten thousand times.
+ten thousand results from being written ten thousand times. Results of jobs that the study no longer has are in a second
+table, from which they come back when it has them again.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from steady_ppl.harmless import harmless
 from steady_ppl.run_folder import only_writer
 from steady_ppl.whole_file import whole_file
 
-TABLE, ARRIVED = "results.parquet", "arrived"
+TABLE, EARLIER, ARRIVED = "results.parquet", "earlier.parquet", "arrived"
 KINDS = (types.is_integer, types.is_floating, types.is_boolean, types.is_string, types.is_large_string, types.is_null)
 ENOUGH = 100  # results for which the table is written anew
 
@@ -50,6 +51,24 @@ class StudyTable:
         self.waiting += 1
         if self.waiting >= ENOUGH:
             self.merge()
+
+    def keep(self, keys: Collection[str]) -> None:
+        """Have the table hold what there is of these jobs, and nothing else.
+
+        Raises:
+            RunError: as `merge`.
+        """
+        self.merge()
+        table, earlier = self.folder / TABLE, self.folder / EARLIER
+        now = read_results(self.folder)
+        before = _read(earlier) if os.path.lexists(earlier) else now[:0]
+        everything = _joined([before, now])
+        own = everything["key"].isin(keys)
+        if set(everything["key"][own]) == set(now["key"]):
+            return
+        _write(everything, earlier)  # all of it, so that nothing is lost between here and the last line
+        _write(everything[own], table)
+        _write(everything[~own], earlier)
 
     def merge(self) -> None:
         """Write the table with all that has come.
@@ -97,8 +116,18 @@ def read_results(folder: Path) -> pd.DataFrame:
         RunError: a file is damaged.
     """
     table = folder / TABLE
-    files = [*([table] if os.path.lexists(table) else []), *sorted((folder / ARRIVED).glob("*.parquet"))]
-    parts = [_read(file) for file in files]
+    # before the table: what its writer merges meanwhile is in the table when that is read
+    arrived = []
+    for file in sorted((folder / ARRIVED).glob("*.parquet")):
+        try:
+            arrived.append(_read(file))
+        except RunError:
+            if os.path.lexists(file):
+                raise
+    return _joined([*([_read(table)] if os.path.lexists(table) else []), *arrived])
+
+
+def _joined(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
     if not parts:
         return pd.DataFrame({"key": []})
     return pd.concat(parts, ignore_index=True).drop_duplicates("key", keep="last", ignore_index=True)

@@ -1,0 +1,228 @@
+"""A Dask cluster that computes the jobs of a study.
+
+joblib's own way to Dask is not taken: when a job had killed four workers, it waited for ever if there was another such
+job, and otherwise had everything that was left computed twice. A result is let go of when it is here, so that a worker
+that dies later does not have it computed again.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+import uuid
+from collections import Counter
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import CancelledError
+from typing import Any, NamedTuple
+
+from steady_ppl.errors import ComputationError, UsageError, one_line
+from steady_ppl.fit import packages
+from steady_ppl.studies import job as work
+from steady_ppl.studies.job_files import JobFiles
+from steady_ppl.studies.places import Place, Row, Say, given_up
+from steady_ppl.studies.plan import Job
+
+WORKER_WAIT = 30  # s for the first worker, and between looks at whether there still is one
+TRIES = 3  # of a job whose workers die
+
+
+class Cluster(Place):
+    """A cluster that is there already. Workers may come and go while a study goes on: when one dies, its job is given
+    to another; one that joins late and would find something else is not used.
+
+    Args:
+        address: of its scheduler, for example `tcp://10.0.0.1:8786`.
+
+    Raises:
+        UsageError: dask.distributed is not installed, nobody answers there, there is no worker, one has several
+            threads, or other versions than this machine; from `results`, one does not see the files of the jobs as
+            they are here.
+        ComputationError: from `results`: no worker is left that is like this machine, or one cannot begin a job.
+    """
+
+    def __init__(self, address: str) -> None:
+        try:
+            import distributed  # an extra, which --cluster alone needs
+            from distributed.comm import CommClosedError
+            from distributed.scheduler import KilledWorker
+        except ImportError as error:
+            raise UsageError("--cluster needs dask.distributed: pip install 'steady-ppl[cluster]'") from error
+        self.killed, self.looked, self.deserted = KilledWorker, time.monotonic(), False
+        self.lost = (CancelledError, CommClosedError, OSError, TimeoutError)
+        try:
+            self.client = distributed.Client(address, timeout=10)
+        except (OSError, TimeoutError, ValueError, TypeError) as error:  # the last of an address that needs TLS
+            reason = str(error).partition("\n")[0]
+            raise UsageError(f"no Dask scheduler answers at {address}: {reason}") from error
+        _hush("distributed", "tornado", "asyncio")
+        try:
+            self.client.wait_for_workers(1, timeout=WORKER_WAIT)
+            self._require_alike(address)
+        except TimeoutError as error:
+            self.client.close()
+            raise UsageError(f"the scheduler at {address} has no worker: start some") from error
+        except UsageError:
+            self.client.close()
+            raise
+
+    def __exit__(self, *raised: Any) -> None:
+        self.client.close(timeout=2)
+
+    def _require_alike(self, address: str) -> None:
+        several = sum(worker["nthreads"] > 1 for worker in self._workers().values())
+        if several:
+            raise UsageError(
+                f"{several} workers have several threads, which would take turns: start them by "
+                f"`dask worker {address} --nthreads 1 --nworkers N`"
+            )
+        here = packages()
+        for worker, there in self._ask(packages).items():
+            other = work.differing(here, there)
+            if other:
+                raise UsageError(f"the worker {worker} has {other}: results would not be comparable")
+
+    def _require_files(self, jobs: Sequence[Job]) -> None:
+        for worker, other in self._ask(other_files, JobFiles().digests_of(jobs)).items():
+            if other:
+                raise UsageError(f"the worker {worker} does not see {other[0]} as it is here: it needs the same paths")
+
+    def _workers(self) -> dict[str, Any]:
+        return self.client.scheduler_info(n_workers=-1)["workers"]
+
+    def _ask(self, function: Callable[..., Any], *given: Any) -> dict[str, Any]:
+        """What every worker answers."""
+        try:
+            answers = self.client.run(function, *given, on_error="return")
+        except (ImportError, AttributeError) as error:
+            raise UsageError(f"a worker has no such steady-ppl ({error}): install it there as here") from error
+        for worker, answer in answers.items():
+            if isinstance(answer, BaseException):
+                raise UsageError(f"the worker {worker} cannot take part: {one_line(answer)}")
+        return answers
+
+    def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
+        self._require_files(jobs)
+        sent = _Sent(self.client)
+        try:
+            for job in jobs:
+                sent.send(job)
+            while sent.jobs:
+                for future, answer in self._batch(sent.running, say):
+                    job = sent.jobs.pop(future)
+                    if isinstance(answer, Answer):
+                        if row := self._usable(answer, job, sent, say):
+                            yield row
+                    elif isinstance(answer, tuple) and isinstance(answer[1], self.killed):
+                        if sent.has_killed(job):
+                            yield given_up(job)
+                        else:
+                            sent.send(job)
+                    elif isinstance(answer, tuple):
+                        raise ComputationError(f"a worker cannot begin a job: {one_line(answer[1])}") from answer[1]
+                    else:
+                        raise CancelledError
+        finally:
+            self.client.cancel(list(sent.jobs))
+
+    def _batch(self, running: Any, say: Say) -> list[tuple[Any, Any]]:
+        """What has ended, with a line when there is no worker left to end anything."""
+        while not running.has_ready():
+            time.sleep(0.05)
+            if time.monotonic() - self.looked > WORKER_WAIT:
+                alone = not self._workers()
+                if alone and not self.deserted:
+                    say("the cluster has no worker left: start some, or stop this and go on later")
+                self.looked, self.deserted = time.monotonic(), alone
+        return running.next_batch(block=False)
+
+    def _usable(self, answer: Answer, job: Job, sent: _Sent, say: Say) -> Row | None:
+        """Its row; None, and the job is sent to others, where the worker is unlike this machine."""
+        reason = answer.unlike
+        if answer.row.get("reason") == work.CHANGED and JobFiles().is_of(job):
+            reason = "other files than there are here"
+        if not reason:
+            return answer.row
+        if answer.worker not in sent.refused:
+            say(f"the worker {answer.worker} is not used: it has {reason}")
+            sent.refused.add(answer.worker)
+        others = [worker for worker in self._workers() if worker not in sent.refused]
+        if not others:
+            raise ComputationError(f"no worker is left that is like this machine; the last had {reason}")
+        sent.send(job, workers=others, allow_other_workers=True)  # if these are gone when its turn comes
+        return None
+
+
+class Answer(NamedTuple):
+    """Of a worker.
+
+    Attributes:
+        worker: its address.
+        unlike: what it has that this machine has not; empty where nothing.
+        row: of the job; empty where it is unlike.
+    """
+
+    worker: str
+    unlike: str
+    row: Row
+
+
+class _Sent:
+    """What is on the cluster.
+
+    Attributes:
+        jobs: by their futures.
+        running: hands out futures as they end, with their answers.
+        refused: addresses of workers that are not used.
+    """
+
+    def __init__(self, client: Any) -> None:
+        from distributed import as_completed
+
+        self.client, self.begun, self.here = client, f"steady-study-{uuid.uuid4().hex}", packages()
+        self.jobs, self.refused, self.kills = dict[Any, Job](), set[str](), Counter[str]()
+        self.running = as_completed(loop=client.loop, with_results=True, raise_errors=False)
+
+    def send(self, job: Job, **where: Any) -> None:
+        """Have it computed."""
+        future = self.client.submit(computed, job, self.here, self.begun, pure=False, **where)
+        self.jobs[future] = job
+        self.running.add(future)
+
+    def has_killed(self, job: Job) -> bool:
+        """Whether it has been begun so often that it is the one that kills; Dask also blames what only waited."""
+        self.kills[job.key] += 1
+        begun = sum(key == job.key for _, key in self.client.get_events(self.begun))
+        return max(begun, self.kills[job.key]) >= TRIES
+
+
+def computed(job: Job, here: Mapping[str, str], begun: str) -> Answer:
+    """On a worker: the row of a job, unless the worker is unlike the machine that asks.
+
+    Args:
+        job: what to compute.
+        here: versions of the packages there.
+        begun: topic of the events that say which jobs are begun.
+    """
+    from distributed import get_worker
+
+    worker = get_worker()
+    unlike = work.differing(here, packages())
+    if worker.state.nthreads > 1:
+        unlike = f"{worker.state.nthreads} threads, which would take turns"
+    if unlike:
+        return Answer(worker.address, unlike, {})
+    worker.log_event(begun, job.key)
+    return Answer(worker.address, "", work.run(job))
+
+
+def other_files(digests: Mapping[str, str]) -> list[str]:
+    """On a worker: the files that are not there, or are others."""
+    files = JobFiles()
+    return [file for file, digest in digests.items() if files.digest_or_none(file) != digest]
+
+
+def _hush(*owners: str) -> None:
+    """What they log of a connection that is lost is said in one line here."""
+    for name in list(logging.root.manager.loggerDict):
+        if name.partition(".")[0] in owners:
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
