@@ -22,7 +22,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +31,13 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from dask_cluster import Dask, wait_for  # noqa: E402
 
-from steady_ppl.studies.cluster import Cluster  # noqa: E402
+from steady_ppl.fit import packages  # noqa: E402
+from steady_ppl.studies.cluster import Cluster, computed  # noqa: E402
 from steady_ppl.studies.places import Local, Place  # noqa: E402
+from steady_ppl.studies.plan import Job  # noqa: E402
 from steady_ppl.studies.runner import run_study  # noqa: E402
 from steady_ppl.studies.study_file import read_plan  # noqa: E402
-from steady_ppl.studies.table import TABLE, read_results  # noqa: E402
+from steady_ppl.studies.table import TABLE, read_results, study_table  # noqa: E402
 
 RESULTS = Path(__file__).parent / "results" / "cluster.json"
 MUST = 0.9
@@ -145,8 +146,33 @@ def many(folder: Path, jobs: int) -> dict[str, Any]:
         "scheduler_ms_a_job": 1000 * scheduler / jobs,
         "client_mib": _resident(os.getpid()),
         "scheduler_mib": resident,
-        "bytes_a_job": len(json.dumps(asdict(plan.jobs[0]))),
-        "table_bytes": (folder / "out" / TABLE).stat().st_size,
+        "bytes_a_job": _sent_bytes(plan.jobs[0]),
+    }
+
+
+def _sent_bytes(job: Job) -> int:
+    """What goes to a worker with a job."""
+    from distributed.protocol import serialize
+
+    _, frames = serialize((computed, job, packages(), "steady-study-" + 32 * "0"))
+    return sum(memoryview(frame).nbytes for frame in frames)
+
+
+def kept(folder: Path, results: int) -> dict[str, Any]:
+    """As many results as those of a fit that is done, put into a table."""
+    plan = read_plan(fits(folder / "fit", 1, 2))
+    run_study(plan, folder / "one", Local(1))
+    (row,) = read_results(folder / "one").to_dict("records")
+    began = time.process_time()
+    with study_table(folder / "many") as table:
+        for place in range(results):
+            table.add(row | {"key": f"{place:016x}", "seconds": row["seconds"] + place / results})
+    spent = time.process_time() - began
+    return {
+        "results": results,
+        "columns": len(row),
+        "ms_a_result": 1000 * spent / results,
+        "bytes_a_result": (folder / "many" / TABLE).stat().st_size / results,
     }
 
 
@@ -174,16 +200,8 @@ def killed(folder: Path, jobs: int, steps: int, every: float) -> dict[str, Any]:
             over.set()
             killer.join()
         seconds = time.perf_counter() - began
-    found = read_results(folder / "out")
-    row = len(json.dumps(found.iloc[0].to_dict(), default=str))
-    return {
-        "jobs": jobs,
-        "kills": kills,
-        "seconds": seconds,
-        "lost": jobs - len(found),
-        "failed": failed,
-        "bytes_a_result": row,
-    }
+    lost = jobs - len(read_results(folder / "out"))
+    return {"jobs": jobs, "kills": kills, "seconds": seconds, "lost": lost, "failed": failed}
 
 
 def _resident(process: int) -> float:
@@ -207,6 +225,7 @@ def main() -> int:
         parts = {
             "efficiency": lambda at: efficiency(at, 1 if quick else 3, 4 if quick else 12, 5 if quick else 40),
             "many": lambda at: many(at, 200 if quick else 10_000),
+            "kept": lambda at: kept(at, 200 if quick else 10_000),
             "killed": lambda at: killed(at, 6 if quick else 24, 5 if quick else 40, 10.0 if quick else 15.0),
         }
         for part, measure in parts.items():
