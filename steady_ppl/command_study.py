@@ -44,7 +44,8 @@ def study(
     failed = run_study(read, out, place, again=again, say=say)
     tell(f"{out / 'results.parquet'}: {len(read.jobs) - failed} of {len(read.jobs)} jobs done")
     if failed:
-        say(f"{failed} {'job' if failed == 1 else 'jobs'} failed: column reason says why, --again tries them once more", always=True)
+        jobs = "job" if failed == 1 else "jobs"
+        say(f"{failed} {jobs} failed: column reason says why, --again tries them once more", always=True)
         raise typer.Exit(1)
 
 
