@@ -114,9 +114,11 @@ def observation_noise(rows: pd.DataFrame) -> tuple[str, Musts]:
         (1.25, "STEADY−", VISIBLY, "STEADY− worse than STEADY by 10 % and more at 1.25°"),
         (2.5, "STEADY−", VISIBLY, "STEADY− worse than STEADY by 10 % and more at 2.5°"),
     ):
-        error = _whole(best[best[SIGMA] == sigma], ERROR)
-        own, other = error.get("STEADY", math.nan), error.get(rival, math.nan)
-        musts.append((what, f"{own:.3f} and {other:.3f}", bool(other >= least * own)))
+        at = best[best[SIGMA] == sigma]
+        ours, theirs = at[at["method"] == "STEADY"], at[at["method"] == rival]
+        certain = len(ours) > 0 and len(theirs) > 0 and (ours["outcome"] == "done").all()
+        holds = certain and theirs[ERROR].mean() >= least * ours[ERROR].mean()
+        musts.append((what, f"{_cell(ours, ERROR, 3)} and {_cell(theirs, ERROR, 3)}", bool(holds)))
     return "\n\n".join(text), musts
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 from pathlib import Path
 
@@ -21,6 +22,13 @@ import studies  # noqa: E402
 def test_the_filed_tables_are_those_of_the_filed_results():
     page, _ = studies.tables(RESULTS)
     assert (RESULTS / "studies.md").read_text() == page
+
+
+def test_figures_of_the_page_are_those_of_the_tables():
+    page = (ROOT / "docs" / "studies.md").read_text().partition("## What they have found")[2]
+    quoted = re.findall(r"\d\.\d{3}(?: ± \d\.\d{3})?", page)
+    tables = (RESULTS / "studies.md").read_text()
+    assert len(quoted) >= 10 and [one for one in quoted if one not in tables] == []
 
 
 def test_fits_are_handed_to_the_worker_that_is_free_first():

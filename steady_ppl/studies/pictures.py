@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 from scipy import stats
 
 from steady_ppl.errors import UsageError
@@ -157,7 +157,7 @@ def _failed(axes: Axes, rows: pd.DataFrame, x: str, look: Mapping[str, Any], nam
 
 
 def _scale(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str, pd.DataFrame]]) -> None:
-    """Logarithmic, with a tick a value, where x goes over a factor of four or more; and y where it goes over ten."""
+    """Logarithmic, with a tick a value, where x goes over a factor of four or more; and y where it goes over five."""
     own = [rows[picture.x].dropna().to_numpy(float) for _, rows in lines]
     others = [point[0] for points in picture.published.get(column, {}).values() for point in points]
     values = np.unique(np.concatenate([*own, others]))
@@ -167,10 +167,12 @@ def _scale(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str,
             axes.set_xticks(values, [f"{value:g}" for value in values])
             axes.minorticks_off()
     heights = [height for _, rows in lines for _, height, *_ in points(rows, picture.x, column)]
-    if heights and 0 < 10 * min(heights) <= max(heights):
-        axes.set_yscale("log")
+    if heights and 0 < 5 * min(heights) <= max(heights):
+        axes.set_yscale("log", nonpositive="clip")
+        axes.set_ylim(bottom=min(heights) / 1.3)
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
+        axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def points(rows: pd.DataFrame, x: str, y: str) -> list[tuple[float, float, float, float]]:
