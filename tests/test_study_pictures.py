@@ -84,4 +84,5 @@ def test_a_power_curve_begins_with_drives_that_lack_nothing(tmp_path: Path):
     ]
     (axes,) = study_picture(plan, pd.DataFrame(rows)).axes
     (bars,) = axes.containers
+    assert axes.get_yscale() == "linear"
     assert bars.lines[0].get_xydata().tolist() == [[0.0, 0.5], [0.4, 0.0], [1.0, 1.0], [25.0, 1.0]]

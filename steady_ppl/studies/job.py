@@ -136,18 +136,24 @@ def _held_out(fitted: Fit, valid: Trajectories, seed: int) -> float:
 def _discover(job: Job) -> dict[str, Any]:
     """Whether what is missing is named, and how surely."""
     data = drives(job)
-    figures = discover(
+    searched = discover(
         told(load_program(job.program), job),
         data["train"],
         data["valid"],
         known_start=job.known_start,
         seed=job.seed,
         **job.settings,
-    ).figures
+    )
+    figures, first = searched.figures, searched.search.rounds[0].screening.tests.tested
     named = [one["effect"] for one in figures["effects"]]
     classes = [name for one in figures["effects"] for name in one["class"]]
     variant, value = planted(job)
-    limits = [one["detection_limit"] for one in figures["candidates"] if variant and one["effect"] == variant.name]
+    # of the program as its owner has it: beside what was found in its place, hardly any size can be told
+    limits = [
+        one.detection_limit.tolist()
+        for one in first
+        if variant and one.variant.name == variant.name and not one.untestable
+    ]
     return {
         "p_value": figures["p_value"],
         "verdict": figures["verdict"],
@@ -164,7 +170,7 @@ TASKS = {"fit": _fit, "discover": _discover}
 
 
 def in_limits(value: Sequence[float], limit: float | Sequence[float] | None) -> float:
-    """How large an effect is, in detection limits: 0 where none was planted, NaN where the search says no limit.
+    """How large an effect is, in detection limits: 0 where none was planted, NaN where the tests do not have it.
 
     Args:
         value: how far each component of the coefficient is from where the effect is absent.

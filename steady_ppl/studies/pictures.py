@@ -20,6 +20,7 @@ from steady_ppl.studies.plan import IN_LIMITS, LARGEST, Picture, Plan
 
 SIZES = (-1.0, 0.0, 0.25, 0.75, 1.25, 1.75, 2.5, 3.5, 5.0, 8.0, 12.0, math.inf)
 """Ends of ranges of what is missing, in detection limits; the first is of drives that lack nothing."""
+SHARES = ("found", "right", "in_class")
 Points = Sequence[Sequence[float]]
 
 
@@ -166,6 +167,9 @@ def _scale(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str,
         if len(values) <= 12:
             axes.set_xticks(values, [f"{value:g}" for value in values])
             axes.minorticks_off()
+    if column in SHARES:
+        axes.set_ylim(-0.05, 1.05)
+        return
     heights = [height for _, rows in lines for _, height, *_ in points(rows, picture.x, column)]
     if heights and 0 < 5 * min(heights) <= max(heights):
         axes.set_yscale("log", nonpositive="clip")
