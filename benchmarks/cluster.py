@@ -223,7 +223,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         folder, found = Path(name), {}
         parts = {
-            "efficiency": lambda at: efficiency(at, 1 if quick else 3, 4 if quick else 12, 5 if quick else 40),
+            "efficiency": lambda at: efficiency(at, 1 if quick else 3, 4 if quick else 8, 5 if quick else 20),
             "many": lambda at: many(at, 200 if quick else 10_000),
             "kept": lambda at: kept(at, 200 if quick else 10_000),
             "killed": lambda at: killed(at, 6 if quick else 24, 5 if quick else 40, 10.0 if quick else 15.0),
