@@ -174,7 +174,10 @@ def test_jobs_that_kill_every_worker_are_given_up_and_no_other(tmp_path: Path, d
     found = read_results(out).set_index("seed")
     assert found["outcome"].to_dict() == {seed: "failed" if seed in (1, 5) else "done" for seed in range(1, 7)}
     times = begun_times(tmp_path)
-    assert min(times[1], times[5]) >= 3 and max(times[seed] for seed in (2, 3, 4, 6)) == 1
+    deaths = times[1] + times[5]
+    assert min(times[1], times[5]) >= 3
+    # a worker may die before what it had just found has been fetched
+    assert 4 <= sum(times[seed] for seed in (2, 3, 4, 6)) <= 4 + deaths
 
 
 def test_a_worker_that_joins_late_and_is_unlike_this_machine_is_not_used(tmp_path: Path, dask: Dask):
