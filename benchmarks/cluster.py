@@ -166,7 +166,8 @@ def kept(folder: Path, results: int) -> dict[str, Any]:
     began = time.process_time()
     with study_table(folder / "many") as table:
         for place in range(results):
-            table.add(row | {"key": f"{place:016x}", "seconds": row["seconds"] + place / results})
+            figures = {name: value * (1 + place / results) for name, value in row.items() if isinstance(value, float)}
+            table.add(row | figures | {"key": f"{place:016x}"})
     spent = time.process_time() - began
     return {
         "results": results,
