@@ -19,13 +19,13 @@ from pathlib import Path
 import pandas as pd
 
 from steady_ppl.studies.pictures import chosen, points
-from steady_ppl.studies.plan import IN_LIMITS, Picture
+from steady_ppl.studies.plan import HELD_OUT, IN_LIMITS, Picture
 from steady_ppl.studies.table import TABLE
 
 RESULTS, STUDY_FILES = Path(__file__).parent / "results", Path(__file__).parents[1] / "studies"
 SIGMAS = (1.25, 2.5, 5.0, 10.0, 20.0)
 SIGMA, PARTICLES, DRIVES = "data.sigma_deg", "settings.particles", "data.train"
-ERROR, HELD_OUT = "forward.total", "valid_log_likelihood"
+ERROR = "forward.total"
 LEARNERS = ("FitHand", "FitTV", "SVI", "STEADY−", "STEADY−, bootstrap")  # without true states, besides STEADY
 MEASURES = {
     ERROR: "errs least in roll-outs",
@@ -95,9 +95,8 @@ def observation_noise(rows: pd.DataFrame) -> tuple[str, Musts]:
     """Errors against the noise of the bearings; STEADY's ramp is chosen at each by held-out drives."""
     best = chosen(Picture(SIGMA, [ERROR], chosen_by=HELD_OUT), rows)
     text = [
-        f"{len(rows)} fits, seeds {_listed(rows['seed'])}, {rows['seconds'].sum() / 3600:.1f} hours of one core. Of "
-        "STEADY's three ramps that with the largest log p(y) of valid drives is taken at each noise; no other method "
-        "has a choice.",
+        f"{_extent(rows)} Of STEADY's three ramps that with the largest log p(y) of valid drives is taken at each noise; "
+        "no other method has a choice.",
         table(best, SIGMA, ERROR, "error of 1 s roll-outs, root of all squares, at °"),
         table(best, SIGMA, "forward_mean.total", "of the means of the roll-outs"),
         table(best, SIGMA, "state_estimation.location", "error of estimated location, m"),
@@ -143,7 +142,7 @@ def _whole(rows: pd.DataFrame, column: str, of_seeds: str = "mean") -> dict[str,
 def particles(rows: pd.DataFrame) -> tuple[str, Musts]:
     """What more particles buy."""
     text = [
-        f"{len(rows)} fits, seeds {_listed(rows['seed'])}, {rows['seconds'].sum() / 3600:.1f} hours of one core.",
+        _extent(rows),
         table(rows, PARTICLES, ERROR, "error of 1 s roll-outs, root of all squares, by particles"),
         table(rows, PARTICLES, "state_estimation.location", "error of estimated location, m"),
         table(rows, PARTICLES, HELD_OUT, "log p(y) of a valid drive at 1 Hz, nats", 2),
@@ -171,7 +170,7 @@ def data_size(rows: pd.DataFrame) -> tuple[str, Musts]:
     """Errors against the number of drives."""
     return "\n\n".join(
         [
-            f"{len(rows)} fits, seeds {_listed(rows['seed'])}, {rows['seconds'].sum() / 3600:.1f} hours of one core.",
+            _extent(rows),
             table(rows, DRIVES, "forward.location", "location error of 1 s roll-outs, m, by drives", 4),
             table(rows, DRIVES, "state_estimation.location", "error of estimated location, m"),
             table(rows, DRIVES, "log_likelihood", "log p(y) of a test drive at 1 Hz, nats", 2),
@@ -184,8 +183,8 @@ def discovery(rows: pd.DataFrame) -> tuple[str, Musts]:
     """Shares against the size of what is missing, with exact 95 % intervals."""
     done = rows[rows["outcome"] == "done"]
     text = [
-        f"{len(rows)} searches, seeds {_listed(rows['seed'])}, {rows['seconds'].sum() / 3600:.1f} hours of one core. "
-        "Intervals are exact, at 95 %, for searches that are independent; those of one seed share their noise."
+        f"{_extent(rows, 'searches')} Intervals are exact, at 95 %, for searches that are independent; those of one seed "
+        "share their noise."
     ]
     columns = ("found", "in_class", "right")
     lines = [
@@ -200,8 +199,9 @@ def discovery(rows: pd.DataFrame) -> tuple[str, Musts]:
     return "\n\n".join([*text, "\n".join(lines)]), []
 
 
-def _listed(values: pd.Series) -> str:
-    return ", ".join(str(value) for value in sorted(values.unique()))
+def _extent(rows: pd.DataFrame, what: str = "fits") -> str:
+    seeds = ", ".join(str(seed) for seed in sorted(rows["seed"].unique()))
+    return f"{len(rows)} {what}, seeds {seeds}, {rows['seconds'].sum() / 3600:.1f} hours of one core."
 
 
 STUDIES: dict[str, Callable[[pd.DataFrame], tuple[str, Musts]]] = {

@@ -5,6 +5,9 @@ Programming errors stay ordinary Python errors.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from steady_ppl.harmless import harmless
 
 
@@ -101,3 +104,13 @@ def require(holds: bool, setting: str, value: object, wanted: str) -> None:
     """
     if not holds:
         raise UsageError(f"{setting} is {value}: it must be {wanted}")
+
+
+@contextmanager
+def labelled(what: str) -> Iterator[None]:
+    """Say before the message of a SteadyError of the block what it is about."""
+    try:
+        yield
+    except SteadyError as error:
+        error.args = (f"{what}: {error}",)
+        raise

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 
 from steady_ppl.data import Trajectories
-from steady_ppl.errors import SteadyError, UsageError
+from steady_ppl.errors import UsageError, labelled
 from steady_ppl.filtering import choose_filter, evidence
 from steady_ppl.fit import Fit
 from steady_ppl.long_drives import refuse_long
@@ -105,24 +104,15 @@ def evaluate_all(
         SteadyError: as `evaluate` does, the fit's label before the message.
     """
     for fit, label in zip(fits, labels, strict=True):
-        with _labelled(label):
+        with labelled(label):
             _checked(fit, table, surveyed)
     results = []
     with stages(*((f"evaluating {label}", 1) for label in labels)) as begin:
         for fit, label in zip(fits, labels, strict=True):
             begin()
-            with _labelled(label):
+            with labelled(label):
                 results.append(evaluate(fit, table, surveyed=surveyed, **settings))
     return results
-
-
-@contextmanager
-def _labelled(label: str) -> Iterator[None]:
-    try:
-        yield
-    except SteadyError as error:
-        error.args = (f"{label}: {error}",)
-        raise
 
 
 def _checked(fit: Fit, table: Trajectories, surveyed: Program | None) -> Trajectories:

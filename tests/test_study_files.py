@@ -277,7 +277,13 @@ def test_each_program_is_parsed_once_for_all_jobs(tmp_path: Path, monkeypatch: p
 
 @pytest.mark.parametrize(
     ("value", "limit", "expected"),
-    [([], None, 0.0), ([0.0], [0.3], 0.0), ([0.3, -0.6], 0.3, 2.0), ([-0.6], [0.1, 0.3], 2.0), ([0.5], None, math.nan)],
+    [
+        ([], None, 0.0),
+        ([0.0], [0.3], 0.0),
+        ([0.3, -0.6], [0.3, 0.3], 2.0),
+        ([-0.6], [0.1, 0.3], 2.0),
+        ([0.5], None, math.nan),
+    ],
 )
-def test_how_large_an_effect_is_in_detection_limits(value: list, limit: object, expected: float):
+def test_how_large_an_effect_is_in_detection_limits(value: list, limit: list | None, expected: float):
     assert in_limits(value, limit) == pytest.approx(expected, nan_ok=True)

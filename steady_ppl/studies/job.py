@@ -169,14 +169,14 @@ def _discover(job: Job) -> dict[str, Any]:
 TASKS = {"fit": _fit, "discover": _discover}
 
 
-def in_limits(value: Sequence[float], limit: float | Sequence[float] | None) -> float:
+def in_limits(value: Sequence[float], limit: Sequence[float] | None) -> float:
     """How large an effect is, in detection limits: 0 where none was planted, NaN where the tests do not have it.
 
     Args:
         value: how far each component of the coefficient is from where the effect is absent.
-        limit: of it, or of each of its components.
+        limit: of each of its components.
     """
     size = max(map(abs, value), default=0.0)
     if size == 0.0:
         return 0.0
-    return math.nan if limit is None else size / (max(limit) if isinstance(limit, Sequence) else limit)
+    return math.nan if limit is None else size / max(limit)

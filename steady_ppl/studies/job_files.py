@@ -6,7 +6,6 @@ import ast
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +47,7 @@ class JobFiles:
     def is_of(self, job: Job) -> bool:
         """Whether its files are there, and as they were when its key was made."""
         try:
-            return self.key(replace(job, key="")) == job.key
+            return self.key(job) == job.key
         except UsageError:
             return False
 

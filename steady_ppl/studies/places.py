@@ -75,7 +75,8 @@ class Local(Place):
     def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
         # of a single one joblib would make this process, which must not die of a job: it starts two, sent work in turn
         with joblib.parallel_config("loky", n_jobs=max(2, self.workers), inner_max_num_threads=1):
-            yield from _sent(_marked, [(job, self.marks) for job in jobs], at_once=self.workers)
+            parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch=self.workers)
+            yield from parallel(joblib.delayed(_marked)(job, self.marks) for job in jobs)
 
     def begun(self) -> set[str]:
         marks = list(self.marks.iterdir())
@@ -87,8 +88,3 @@ class Local(Place):
 def _marked(job: Job, marks: Path) -> Row:
     (marks / job.key).touch()
     return work.run(job)
-
-
-def _sent(function: Callable[..., Row], arguments: Sequence[tuple[Any, ...]], at_once: int) -> Generator[Row]:
-    parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch=at_once)
-    yield from parallel(joblib.delayed(function)(*given) for given in arguments)

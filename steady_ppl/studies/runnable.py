@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from steady_ppl.discovery import discover
-from steady_ppl.errors import SteadyError, UsageError
+from steady_ppl.errors import UsageError, labelled
 from steady_ppl.measurement_errors import OPEN_LOOP
 from steady_ppl.program import Program, error_groups
 from steady_ppl.program_file import load_program
@@ -27,7 +26,7 @@ def require_runnable(plan: Plan) -> None:
     """
     programs = []
     for job in {(job.method, repr(job.settings)): job for job in plan.jobs}.values():
-        with _named(f"method {job.method}"):
+        with labelled(f"method {job.method}"):
             programs.append(told(load_program(job.program), job))
             told_settings(job)
             if job.task == "fit":
@@ -35,22 +34,13 @@ def require_runnable(plan: Plan) -> None:
             else:
                 _require_search_settings(job.settings)
     for job in {repr(job.data): job for job in plan.jobs if "simulate" in job.data}.values():
-        with _named("data"):
+        with labelled("data"):
             truth(job)
     if "simulate" not in plan.jobs[0].data:
-        with _named("data"):
+        with labelled("data"):
             drives(plan.jobs[0])
     if plan.task == "fit" and plan.picture is not None:
         _require_figures(plan.picture.columns, programs)
-
-
-@contextmanager
-def _named(what: str) -> Iterator[None]:
-    try:
-        yield
-    except SteadyError as error:
-        error.args = (f"{what}: {error}",)
-        raise
 
 
 def _require_figures(columns: Sequence[str], programs: Sequence[Program]) -> None:

@@ -35,7 +35,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from steady_ppl.errors import UsageError
+from steady_ppl.errors import UsageError, labelled
 from steady_ppl.given_files import ANYTHING, LINES, TEXT, TRUTH, WHOLE, Absent, misfit, require_file
 from steady_ppl.studies.axes import Axes, count, grid, method_axes, source_axes
 from steady_ppl.studies.job_files import JobFiles
@@ -80,11 +80,8 @@ def read_plan(path: Path, data: Path | None = None) -> Plan:
         raise UsageError(f"there is no study {path}") from None
     except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"{path} cannot be read as TOML: {error}") from error
-    try:
+    with labelled(str(path)):
         return _plan(content, path.parent, data)
-    except UsageError as error:
-        error.args = (f"{path}: {error}",)
-        raise
 
 
 def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
@@ -136,11 +133,8 @@ def _jobs(content: Mapping[str, Any], task: str, source: Axes, methods: list[dic
 
 
 def _key(files: JobFiles, job: Job) -> str:
-    try:
+    with labelled(f"method {job.method}"):
         return files.key(job)
-    except UsageError as error:
-        error.args = (f"method {job.method}: {error}",)
-        raise
 
 
 def _without_doubles(jobs: tuple[Job, ...]) -> tuple[Job, ...]:
