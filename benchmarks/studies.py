@@ -95,8 +95,8 @@ def observation_noise(rows: pd.DataFrame) -> tuple[str, Musts]:
     """Errors against the noise of the bearings; STEADY's ramp is chosen at each by held-out drives."""
     best = chosen(Picture(SIGMA, [ERROR], chosen_by=HELD_OUT), rows)
     text = [
-        f"{_extent(rows)} Of STEADY's three ramps that with the largest log p(y) of valid drives is taken at each noise; "
-        "no other method has a choice.",
+        f"{_extent(rows)} Of STEADY's three ramps that with the largest log p(y) of valid drives is taken at each "
+        "noise; no other method has a choice.",
         table(best, SIGMA, ERROR, "error of 1 s roll-outs, root of all squares, at °"),
         table(best, SIGMA, "forward_mean.total", "of the means of the roll-outs"),
         table(best, SIGMA, "state_estimation.location", "error of estimated location, m"),
@@ -183,8 +183,8 @@ def discovery(rows: pd.DataFrame) -> tuple[str, Musts]:
     """Shares against the size of what is missing, with exact 95 % intervals."""
     done = rows[rows["outcome"] == "done"]
     text = [
-        f"{_extent(rows, 'searches')} Intervals are exact, at 95 %, for searches that are independent; those of one seed "
-        "share their noise."
+        f"{_extent(rows, 'searches')} Intervals are exact, at 95 %, for searches that are independent; those of one "
+        "seed share their noise."
     ]
     columns = ("found", "in_class", "right")
     lines = [
