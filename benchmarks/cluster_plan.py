@@ -84,8 +84,7 @@ def tables(cluster: dict[str, Any], fits: pd.DataFrame) -> str:
         ("a fit, one core", f"{seconds.mean():.0f} s ± {seconds.std(ddof=1):.0f}, at most {seconds.max():.0f} s"),
         ("memory of a worker", f"at most {fits['peak_mib'].max():.0f} MiB"),
         ("fits that fail by themselves", f"{failed} of {len(fits)}"),
-        ("efficiency of two workers", _spread(cluster["efficiency"]["cluster"])),
-        ("of two processes without a cluster", _spread(cluster["efficiency"]["processes"])),
+        *_efficiency(cluster["efficiency"]),
         ("a job, to the worker", f"{many['bytes_a_job']} bytes"),
         ("a result, in the table", f"{kept['bytes_a_result']:.0f} bytes"),
         ("planning", f"{many['planning_s']:.1f} s for {many['jobs']:,} jobs"),
@@ -120,8 +119,19 @@ def tables(cluster: dict[str, Any], fits: pd.DataFrame) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _spread(found: dict[str, Any]) -> str:
-    return f"{found['mean']:.2f} ± {found['sd']:.2f}"
+def _efficiency(found: dict[str, Any]) -> list[tuple[str, str]]:
+    """What two workers do of what one does twice, and what of the rest is the cluster's."""
+    seconds, own = np.array(found["seconds"]["cluster, 2"]), np.array(found["seconds_a_fit"]["cluster, 2"])
+    return [
+        ("efficiency of two workers", _spread(np.array(found["cluster"]["rounds"]))),
+        ("of two processes without a cluster", _spread(np.array(found["processes"]["rounds"]))),
+        ("share of two workers' time that is in fits", _spread(found["jobs"] * own / (2 * seconds))),
+        ("a fit beside another one takes, times", _spread(own / np.array(found["seconds_a_fit"]["cluster, 1"]))),
+    ]
+
+
+def _spread(found: np.ndarray) -> str:
+    return f"{found.mean():.2f} ± {found.std(ddof=1):.2f}"
 
 
 def main() -> int:

@@ -30,6 +30,19 @@ def test_what_failed_is_in_the_picture_and_names_are_no_formulas(tmp_path: Path)
     assert crosses.get_xdata().tolist() == [60.0]
 
 
+def test_crosses_of_methods_that_fail_at_the_same_place_are_all_seen(tmp_path: Path):
+    method = STUDY[STUDY.index('[[method]]\nname = "learned"') : STUDY.index("[picture]")]
+    plan = read_plan(written(tmp_path, STUDY.replace("[picture]", f"{method.replace('learned', 'again')}[picture]")))
+    rows = [job.columns | {"outcome": "done", "log_likelihood": 1.0} for job in plan.jobs]
+    for one in rows:
+        tried = one.get("settings.validation_particles")
+        if tried == 60 or (tried == 50 and one["method"] == "again"):
+            one |= {"outcome": "failed", "reason": "no", "log_likelihood": None}
+    (axes,) = study_picture(plan, pd.DataFrame(rows)).axes
+    first, second = [line.get_xydata().tolist() for line in axes.lines if line.get_marker() == "x"]
+    assert first == [[60.0, 0.98]] and second == [[50.0, 0.98], [60.0, 0.94]]
+
+
 def test_of_settings_that_were_tried_the_best_on_held_out_drives_is_drawn(tmp_path: Path):
     text = STUDY.replace("train = 2", "train = [2, 4]").replace("settings.validation_particles", "data.train", 1)
     text = text.replace("y = [", 'chosen_by = "valid_log_likelihood"\ny = [')

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -116,7 +117,7 @@ def _lines(picture: Picture, rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame
 
 
 def _panel(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str, pd.DataFrame]]) -> None:
-    published = dict(picture.published.get(column, {}))
+    published, crosses = dict(picture.published.get(column, {})), Counter[float]()
     for index, (name, rows) in enumerate(lines):
         look, said = _look(index), harmless(name, kept="")
         found = points(rows, picture.x, column)
@@ -126,7 +127,7 @@ def _panel(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str,
             x, middle, low, high = zip(*found, strict=True)
             axes.errorbar(x, middle, (low, high), ms=5, lw=1.5, capsize=3, label=said, **look)
         _published(axes, published.pop(name, []), look, "published")
-        _failed(axes, rows, picture.x, look, said)
+        _failed(axes, rows, picture.x, look, said, crosses)
     for index, (name, others) in enumerate(published.items(), len(lines)):
         _published(axes, others, _look(index), f"{harmless(name, kept='')}, published")
     _scale(axes, picture, column, lines)
@@ -147,14 +148,18 @@ def _published(axes: Axes, points: Points, look: Mapping[str, Any], name: str) -
         axes.plot(*zip(*points, strict=True), label=name, **style)
 
 
-def _failed(axes: Axes, rows: pd.DataFrame, x: str, look: Mapping[str, Any], name: str) -> None:
-    """A cross at the upper edge for each place where jobs have failed."""
+def _failed(
+    axes: Axes, rows: pd.DataFrame, x: str, look: Mapping[str, Any], name: str, crosses: Counter[float]
+) -> None:
+    """A cross at the upper edge for each place where jobs have failed, below those that are there already."""
     failed = rows[rows["outcome"] == "failed"]
     places = failed[x].dropna().unique()
     if len(places):
         said, edge = f"{name}: {len(failed)} of {len(rows)} failed", axes.get_xaxis_transform()
         style: dict[str, Any] = {"ls": "", "marker": "x", "ms": 8, "mew": 2, "color": look["color"]}
-        axes.plot(places, [0.98] * len(places), transform=edge, clip_on=False, label=said, **style)
+        heights = [0.98 - 0.04 * crosses[place] for place in places]
+        axes.plot(places, heights, transform=edge, clip_on=False, label=said, **style)
+        crosses.update(places)
 
 
 def _scale(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str, pd.DataFrame]]) -> None:
