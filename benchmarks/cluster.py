@@ -1,13 +1,14 @@
 """What a study costs on a Dask cluster: what one needs to know to plan ten thousand fits on a hundred machines.
 
-    python benchmarks/cluster.py [--quick]
+    python benchmarks/cluster.py [--quick] [PART …]
 
 A scheduler and workers are started as processes on loopback. Measured are: the same fits by one worker and by two in
 turn (efficiency: seconds of one over twice the seconds of two), beside them by one and two processes without a cluster,
 and how much longer a fit itself takes beside another one, which is the machine's part of what is lost;
-ten thousand jobs that end at once, for what scheduler, client and table can take (processor time, so that it matters
-little what else the machine does); bytes of a job and of a result; and workers that are killed in the middle, for what
-that costs. Written to results/cluster.json; exits with 1 where the efficiency is below 90 % or a job is lost.
+how long a worker takes that has just been started; ten thousand jobs that end at once, for what scheduler, client and
+table can take (processor time, so that it matters little what else the machine does); bytes of a job and of a result;
+and workers that are killed in the middle, for what that costs. Written to results/cluster.json, parts that are not
+named stay as they are there; exits with 1 where the efficiency is below 90 %, or no worker was killed, or a fit failed.
 """
 
 from __future__ import annotations
@@ -124,9 +125,29 @@ def _efficiency(alone: list[float], both: list[float]) -> dict[str, Any]:
     return {"rounds": found, "mean": statistics.mean(found), "sd": spread}
 
 
+def start(folder: Path, rounds: int) -> dict[str, Any]:
+    """Seconds of a short fit by a worker that has just been started, and by the same one when it has done others."""
+    new, used = list[float](), list[float]()
+    for turn in range(rounds):
+        at = folder / str(turn)
+        at.mkdir()
+        plan = read_plan(fits(at / "fits", 1, 2))
+        dask = Dask(at)
+        try:
+            dask.scheduler()
+            for name, seconds in (("first", new), ("again", used)):
+                began = time.perf_counter()
+                if name == "first":
+                    dask.worker()
+                run_study(plan, at / name, Cluster(dask.address))
+                seconds.append(time.perf_counter() - began)
+        finally:
+            dask.end()
+    return {"new": new, "used": used}
+
+
 def many(folder: Path, jobs: int) -> dict[str, Any]:
     """Jobs that end at once: what everything but the computing takes."""
-    folder.mkdir()
     (folder / "ends.py").write_text(ENDS_AT_ONCE)
     began = time.perf_counter()
     plan = read_plan(study(folder, jobs, CART, 1, f"program = '{CART}'\nrecipe = 'ends.py'"))
@@ -181,9 +202,12 @@ def kept(folder: Path, results: int) -> dict[str, Any]:
 
 
 def killed(folder: Path, jobs: int, steps: int, every: float) -> dict[str, Any]:
-    """The same fits while one of two workers is killed again and again, another one taking its place."""
-    plan, kills = read_plan(fits(folder, jobs, steps)), 0
-    with cluster(folder / "dask", 2) as dask, Cluster(dask.address) as place:
+    """Fits by two workers, and the same while one of them is killed again and again, another one taking its place."""
+    plan, kills = read_plan(fits(folder / "fits", jobs, steps)), 0
+    with cluster(folder / "dask", 2) as dask:
+        began = time.perf_counter()
+        assert not run_study(plan, folder / "undisturbed", Cluster(dask.address))
+        undisturbed, place = time.perf_counter() - began, Cluster(dask.address)
         over = threading.Event()
 
         def kill() -> None:
@@ -204,8 +228,7 @@ def killed(folder: Path, jobs: int, steps: int, every: float) -> dict[str, Any]:
             over.set()
             killer.join()
         seconds = time.perf_counter() - began
-    lost = jobs - len(read_results(folder / "out"))
-    return {"jobs": jobs, "kills": kills, "seconds": seconds, "lost": lost, "failed": failed}
+    return {"jobs": jobs, "kills": kills, "seconds": seconds, "undisturbed": undisturbed, "failed": failed}
 
 
 def _resident(process: int) -> float:
@@ -219,29 +242,33 @@ def _processor_seconds(process: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
+PARTS: dict[str, Callable[[Path, bool], dict[str, Any]]] = {
+    "efficiency": lambda at, quick: efficiency(at, *((1, 4, 5) if quick else (4, 8, 20))),
+    "start": lambda at, quick: start(at, 1 if quick else 3),
+    "many": lambda at, quick: many(at, 200 if quick else 10_000),
+    "kept": lambda at, quick: kept(at, 200 if quick else 10_000),
+    "killed": lambda at, quick: killed(at, *((6, 5, 40.0) if quick else (24, 20, 60.0))),
+}
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="few and short jobs; writes nothing")
-    quick = parser.parse_args().quick
+    parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}; all of them when none is named")
+    words = parser.parse_args()
+    if unknown := set(words.parts) - set(PARTS):
+        parser.error(f"no part {', '.join(unknown)}; there are {', '.join(PARTS)}")
+    found = {} if words.quick or not RESULTS.exists() else json.loads(RESULTS.read_text())
     signal.signal(signal.SIGTERM, lambda *received: sys.exit(1))  # so that what was started is ended
-    with tempfile.TemporaryDirectory() as name:
-        folder, found = Path(name), {}
-        parts = {
-            "efficiency": lambda at: efficiency(at, 1 if quick else 4, 4 if quick else 8, 5 if quick else 20),
-            "many": lambda at: many(at, 200 if quick else 10_000),
-            "kept": lambda at: kept(at, 200 if quick else 10_000),
-            "killed": lambda at: killed(at, 6 if quick else 24, 5 if quick else 20, 40.0 if quick else 60.0),
-        }
-        for part, measure in parts.items():
-            if part != "many":
-                (folder / part).mkdir()
-            found[part] = measure(folder / part)
-            print(part, json.dumps(found[part]), flush=True)
-    if not quick:
-        RESULTS.write_text(json.dumps(found, indent=1) + "\n")
-    return int(
-        found["efficiency"]["cluster"]["mean"] < MUST or found["killed"]["lost"] > 0 or found["killed"]["failed"] > 0
-    )
+    for part in words.parts or PARTS:
+        with tempfile.TemporaryDirectory() as name:
+            found[part] = PARTS[part](Path(name), words.quick)
+        print(part, json.dumps(found[part]), flush=True)
+        if not words.quick:
+            RESULTS.write_text(json.dumps(found, indent=1) + "\n")
+    efficient = "efficiency" not in found or found["efficiency"]["cluster"]["mean"] >= MUST
+    survived = "killed" not in found or (found["killed"]["kills"] > 0 and not found["killed"]["failed"])
+    return int(not (efficient and survived))
 
 
 if __name__ == "__main__":

@@ -182,21 +182,26 @@ def data_size(rows: pd.DataFrame) -> tuple[str, Musts]:
 def discovery(rows: pd.DataFrame) -> tuple[str, Musts]:
     """Shares against the size of what is missing, with exact 95 % intervals."""
     done = rows[rows["outcome"] == "done"]
+    failed, unlimited = len(rows) - len(done), int(done[IN_LIMITS].isna().sum())
     text = [
-        f"{_extent(rows, 'searches')} Intervals are exact, at 95 %, for searches that are independent; those of one "
-        "seed share their noise."
+        f"{_extent(rows, 'searches')} {failed} failed; {unlimited} are not in the table, for the tests could not have "
+        "what was planted, so that it has no limit. Intervals are exact, at 95 %, for searches that are independent; "
+        "those of one seed share their noise. The first row is of drives that lack nothing."
     ]
     columns = ("found", "in_class", "right")
     lines = [
         "| size in detection limits | says that something is missing | its class | names it |",
         "|---|---|---|---|",
     ]
-    found = {column: points(done, IN_LIMITS, column) for column in columns}
-    for place in range(len(found["found"])):
-        shares = (found[column][place] for column in columns)
-        cells = [f"{middle:.0%} ({middle - low:.0%}–{middle + high:.0%})" for _, middle, low, high in shares]
-        lines.append(f"| {found['found'][place][0]:.2f} | " + " | ".join(cells) + " |")
+    shares = {column: {place: of for place, *of in points(done, IN_LIMITS, column)} for column in columns}
+    for place in shares["found"]:
+        cells = [_share(*shares[column][place]) if place in shares[column] else "" for column in columns]
+        lines.append(f"| {place:.2f} | " + " | ".join(cells) + " |")
     return "\n\n".join([*text, "\n".join(lines)]), []
+
+
+def _share(middle: float, low: float, high: float) -> str:
+    return f"{middle:.0%} ({middle - low:.0%}–{middle + high:.0%})"
 
 
 def _extent(rows: pd.DataFrame, what: str = "fits") -> str:

@@ -29,9 +29,13 @@ def recipe_folder() -> Path:
     return workbench() / "inference"
 
 
-def _require_kind(recipe: Recipe, option: str, value: Any) -> None:
-    """A number where the recipe's annotation says so, and so on; what it does not annotate can be anything."""
-    annotation = inspect.formatannotation(inspect.signature(recipe).parameters[option].annotation)
+def require_kind(function: Callable[..., Any], option: str, value: Any) -> None:
+    """A number where the function's annotation says so, and so on; what it does not annotate can be anything.
+
+    Raises:
+        UsageError: it is of another kind.
+    """
+    annotation = inspect.formatannotation(inspect.signature(function).parameters[option].annotation)
     kinds = annotation.strip("'").split(" | ")  # by name: a recipe's annotations may not be there to be evaluated
     words = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a word", "None": "none"}
     if not all(kind in words for kind in kinds):
@@ -85,7 +89,7 @@ def require_settings(name: str, recipe: Recipe, options: Mapping[str, Any]) -> N
     for option, value in options.items():
         if option not in settings:
             raise UsageError(f"recipe {name} has no setting {option}; it has {', '.join(settings) or 'none'}")
-        _require_kind(recipe, option, value)
+        require_kind(recipe, option, value)
 
 
 def trains(recipe: Recipe) -> bool:

@@ -31,7 +31,7 @@ class Dask:
         command = [sys.executable, "-m", "distributed.cli.dask_" + words[0], *words[1:]]
         alone = {**os.environ, "OMP_NUM_THREADS": "1"}
         with (self.folder / "dask.log").open("a") as log:
-            process = subprocess.Popen(command, stdout=log, stderr=log, env=alone | environment)
+            process = subprocess.Popen(command, stdout=log, stderr=log, env=alone | environment, cwd=self.folder)
         self.processes.append(process)
         return process
 

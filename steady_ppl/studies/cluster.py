@@ -11,7 +11,7 @@ import logging
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from typing import Any, NamedTuple
 
@@ -23,7 +23,8 @@ from steady_ppl.studies.places import Place, Row, Say, given_up
 from steady_ppl.studies.plan import Job
 
 WORKER_WAIT = 30  # s for the first worker, and between looks at whether there still is one
-TRIES = 3  # of a job whose workers die
+TRIES = 3  # of a job whose workers die; the scheduler itself tries it so often as it is set, four times at first
+HOLD = 10  # s for which a worker that is not used keeps what it was given, so that it is not given everything
 
 
 class Cluster(Place):
@@ -37,7 +38,8 @@ class Cluster(Place):
         UsageError: dask.distributed is not installed, nobody answers there, there is no worker, one has several
             threads, or other versions than this machine; from `results`, one does not see the files of the jobs as
             they are here.
-        ComputationError: from `results`: no worker is left that is like this machine, or one cannot begin a job.
+        ComputationError: from `results`: no worker is left that is like this machine, or workers die before they
+            begin.
     """
 
     def __init__(self, address: str) -> None:
@@ -107,8 +109,10 @@ class Cluster(Place):
             for job in jobs:
                 sent.send(job)
             while sent.jobs:
-                for future, answer in self._batch(sent.running, say):
-                    job = sent.jobs.pop(future)
+                for future, answer in self._batch(sent, say):
+                    if future not in sent.jobs:
+                        continue  # it was sent again
+                    job, _ = sent.jobs.pop(future)
                     if isinstance(answer, Answer):
                         if row := self._usable(answer, job, sent, say):
                             yield row
@@ -124,16 +128,17 @@ class Cluster(Place):
         finally:
             self.client.cancel(list(sent.jobs))
 
-    def _batch(self, running: Any, say: Say) -> list[tuple[Any, Any]]:
+    def _batch(self, sent: _Sent, say: Say) -> list[tuple[Any, Any]]:
         """What has ended, with a line when there is no worker left to end anything."""
-        while not running.has_ready():
+        while not sent.running.has_ready():
             time.sleep(0.05)
             if time.monotonic() - self.looked > WORKER_WAIT:
-                alone = not self._workers()
-                if alone and not self.deserted:
+                workers = self._workers()
+                if not workers and not self.deserted:
                     say("the cluster has no worker left: start some, or stop this and go on later")
-                self.looked, self.deserted = time.monotonic(), alone
-        return running.next_batch(block=False)
+                self.looked, self.deserted = time.monotonic(), not workers
+                sent.send_again_what_waits_for_others_than(workers)
+        return sent.running.next_batch(block=False)
 
     def _usable(self, answer: Answer, job: Job, sent: _Sent, say: Say) -> Row | None:
         """Its row; None, and the job is sent to others, where the worker is unlike this machine."""
@@ -145,10 +150,10 @@ class Cluster(Place):
         if answer.worker not in sent.refused:
             say(f"the worker {answer.worker} is not used: it has {reason}")
             sent.refused.add(answer.worker)
-        others = [worker for worker in self._workers() if worker not in sent.refused]
+        others = self._workers().keys() - sent.refused
         if not others:
             raise ComputationError(f"no worker is left that is like this machine; the last had {reason}")
-        sent.send(job, workers=others, allow_other_workers=True)  # if these are gone when its turn comes
+        sent.send(job, others)
         return None
 
 
@@ -170,7 +175,7 @@ class _Sent:
     """What is on the cluster.
 
     Attributes:
-        jobs: by their futures.
+        jobs: by their futures; beside each the workers that alone may have it, none where all may.
         running: hands out futures as they end, with their answers.
         refused: addresses of workers that are not used.
     """
@@ -178,21 +183,32 @@ class _Sent:
     def __init__(self, client: Any) -> None:
         from distributed import as_completed
 
-        self.client, self.begun, self.here = client, f"steady-study-{uuid.uuid4().hex}", packages()
-        self.jobs, self.refused, self.kills = dict[Any, Job](), set[str](), Counter[str]()
+        self.client, self.topic, self.here = client, f"steady-study-{uuid.uuid4().hex}", packages()
+        self.jobs, self.refused = dict[Any, tuple[Job, set[str]]](), set[str]()
+        self.begun, self.kills = Counter[str](), Counter[str]()
         self.running = as_completed(loop=client.loop, with_results=True, raise_errors=False)
+        client.subscribe_topic(self.topic, lambda event: self.begun.update([event[1]]))
 
-    def send(self, job: Job, **where: Any) -> None:
-        """Have it computed."""
-        future = self.client.submit(computed, job, self.here, self.begun, pure=False, **where)
-        self.jobs[future] = job
+    def send(self, job: Job, only: Collection[str] = ()) -> None:
+        """Have it computed, by these workers alone where there are some."""
+        future = self.client.submit(computed, job, self.here, self.topic, pure=False, workers=list(only) or None)
+        self.jobs[future] = job, set(only)
         self.running.add(future)
+
+    def send_again_what_waits_for_others_than(self, workers: Collection[str]) -> None:
+        """Dask would keep for ever what no worker may have that is left."""
+        for future, (job, only) in list(self.jobs.items()):
+            if only and only.isdisjoint(workers):
+                del self.jobs[future]
+                self.client.cancel([future])
+                self.send(job, set(workers) - self.refused)
 
     def has_killed(self, job: Job) -> bool:
         """Whether it has been begun so often that it is the one that kills; Dask also blames what only waited."""
         self.kills[job.key] += 1
-        begun = sum(key == job.key for _, key in self.client.get_events(self.begun))
-        return max(begun, self.kills[job.key]) >= TRIES
+        if self.kills[job.key] >= TRIES and not self.begun[job.key]:
+            raise ComputationError("workers die before they begin")
+        return max(self.begun[job.key], self.kills[job.key]) >= TRIES
 
 
 def computed(job: Job, here: Mapping[str, str], begun: str) -> Answer:
@@ -210,6 +226,7 @@ def computed(job: Job, here: Mapping[str, str], begun: str) -> Answer:
     if worker.state.nthreads > 1:
         unlike = f"{worker.state.nthreads} threads, which would take turns"
     if unlike:
+        time.sleep(HOLD)
         return Answer(worker.address, unlike, {})
     worker.log_event(begun, job.key)
     return Answer(worker.address, "", work.run(job))

@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from steady_ppl.discovery import discover
 from steady_ppl.errors import RunError, one_line
 from steady_ppl.evaluation import evaluate
 from steady_ppl.filtering import choose_filter, log_likelihood
-from steady_ppl.fit import Fit
+from steady_ppl.fit import Fit, packages
 from steady_ppl.program import for_program
 from steady_ppl.program_file import load_program
 from steady_ppl.run_recipe import find_recipe, require_settings, trains
@@ -38,8 +37,8 @@ def run(job: Job) -> dict[str, Any]:
 
     Returns:
         Columns of the table: those of the job, `outcome` ("done" or "failed"), `reason`, `seconds`, `peak_mib` (the
-        most memory that this process took: on Linux during the job, else until its end), `version` of steady-ppl and
-        the figures.
+        most memory that this process took: on Linux during the job, else until its end), `packages` with their
+        versions and the figures.
     """
     with _one_at_a_time:
         torch.set_num_threads(1)
@@ -50,7 +49,7 @@ def run(job: Job) -> dict[str, Any]:
             found = _done(job) if JobFiles().is_of(job) else {"outcome": "failed", "reason": CHANGED}
         except (Exception, SystemExit) as error:  # a study goes on without this job
             found = {"outcome": "failed", "reason": one_line(error)}
-        spent = {"seconds": time.perf_counter() - began, "peak_mib": _peak_mib(), "version": version("steady-ppl")}
+        spent = {"seconds": time.perf_counter() - began, "peak_mib": _peak_mib(), "packages": in_words(packages())}
         return job.columns | spent | found
 
 
@@ -59,15 +58,16 @@ def _done(job: Job) -> dict[str, Any]:
 
 
 def _forget_peak() -> None:
-    """Count the most memory that this process takes from here on, where the system can do that (Linux)."""
+    """Count the most memory that this process takes from here on, where the system can do that (Linux, but for some
+    containers)."""
     if sys.platform == "linux":
-        with suppress(PermissionError):  # then it is counted from the process's beginning
+        with suppress(OSError):  # then it is counted from the process's beginning
             Path("/proc/self/clear_refs").write_text("5")
 
 
 def _peak_mib() -> float:
     """The most memory that this process has taken; NaN on Windows, which cannot be asked for it."""
-    if sys.platform == "linux":
+    with suppress(OSError, ValueError):  # not Linux, or a container that does not say it
         words = Path("/proc/self/status").read_text().split()
         return int(words[words.index("VmHWM:") + 1]) / 1024
     if sys.platform == "win32":
@@ -75,6 +75,11 @@ def _peak_mib() -> float:
     import resource
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 1024)
+
+
+def in_words(versions: Mapping[str, str]) -> str:
+    """Packages and their versions."""
+    return ", ".join(f"{name} {number}" for name, number in versions.items())
 
 
 def differing(here: Mapping[str, str], there: Mapping[str, str]) -> str:
@@ -160,8 +165,8 @@ def _discover(job: Job) -> dict[str, Any]:
         "named": ", ".join(named),
         "planted": variant.name if variant else "",
         "found": figures["verdict"] != "none",
-        "right": named == ([variant.name] if variant else []),
-        "in_class": variant.name in classes if variant else not named,
+        "right": named == [variant.name] if variant else None,
+        "in_class": variant.name in classes if variant else None,
         IN_LIMITS: in_limits(value, limits[0] if limits else None),
     }
 

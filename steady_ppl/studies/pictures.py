@@ -151,15 +151,20 @@ def _published(axes: Axes, points: Points, look: Mapping[str, Any], name: str) -
 def _failed(
     axes: Axes, rows: pd.DataFrame, x: str, look: Mapping[str, Any], name: str, crosses: Counter[float]
 ) -> None:
-    """A cross at the upper edge for each place where jobs have failed, below those that are there already."""
+    """A cross at the upper edge for each place where jobs have failed, below those that are there already; one in the
+    legend alone where it is a result that says the place."""
     failed = rows[rows["outcome"] == "failed"]
-    places = failed[x].dropna().unique()
-    if len(places):
-        said, edge = f"{name}: {len(failed)} of {len(rows)} failed", axes.get_xaxis_transform()
-        style: dict[str, Any] = {"ls": "", "marker": "x", "ms": 8, "mew": 2, "color": look["color"]}
-        heights = [0.98 - 0.04 * crosses[place] for place in places]
-        axes.plot(places, heights, transform=edge, clip_on=False, label=said, **style)
+    edge = axes.get_xaxis_transform()
+    style: dict[str, Any] = {"ls": "", "marker": "x", "ms": 8, "mew": 2, "color": look["color"]}
+    if len(failed):
+        places = failed[x].dropna().unique()
+        heights, said = [0.98 - 0.04 * crosses[place] for place in places], f"{len(failed)} of {len(rows)} failed"
+        axes.plot(places, heights, transform=edge, clip_on=False, label=f"{name}: {said}", **style)
         crosses.update(places)
+    nowhere = int((rows["outcome"].eq("done") & rows[x].isna()).sum()) if x == IN_LIMITS else 0
+    if nowhere:
+        said = f"{nowhere} of {len(rows)} without a detection limit"
+        axes.plot([], [], label=f"{name}: {said}", **style | {"marker": "+"})
 
 
 def _scale(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str, pd.DataFrame]]) -> None:

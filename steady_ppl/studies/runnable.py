@@ -11,7 +11,7 @@ from steady_ppl.errors import UsageError, labelled
 from steady_ppl.measurement_errors import OPEN_LOOP
 from steady_ppl.program import Program, error_groups
 from steady_ppl.program_file import load_program
-from steady_ppl.run_recipe import find_recipe, require_settings
+from steady_ppl.run_recipe import find_recipe, require_kind, require_settings
 from steady_ppl.studies.job import ERRORS
 from steady_ppl.studies.job_data import drives, told, told_settings, truth
 from steady_ppl.studies.plan import Plan
@@ -59,3 +59,5 @@ def _require_search_settings(settings: Mapping[str, Any]) -> None:
     unknown = [name for name in settings if name not in known]
     if unknown:
         raise UsageError(f"discover has no setting {unknown[0]}; there are {', '.join(known)}")
+    for name, value in settings.items():
+        require_kind(discover, name, value)

@@ -1,24 +1,26 @@
 """Send the jobs of a study out and keep what comes back.
 
-A result is kept when it comes; a worker that dies takes nothing with it but its job, which is tried again, and a job
-that kills one worker after the other is given up.
+A result is kept when it comes; what is lost with a worker that dies is tried again, and a job that kills one worker
+after the other is given up.
 """
 
 from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from steady_ppl.errors import ComputationError, RunError
-from steady_ppl.studies.job import CHANGED
+from steady_ppl.fit import packages
+from steady_ppl.studies.job import CHANGED, in_words
 from steady_ppl.studies.places import Place, Row, Say, given_up
 from steady_ppl.studies.plan import RECORD, Job, Plan, record_plan, recorded_plan
 from steady_ppl.studies.table import read_results, study_table
 
+Keep = Callable[[Row], None]
 IN_VAIN = 3  # rounds in which workers died and nothing had been begun
 
 
@@ -49,12 +51,15 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
         left = {key: job for key, job in wanted.items() if key not in kept}
         if kept:
             say(f"{len(kept)} of {len(wanted)} jobs are there already")
+        others = sorted({str(row.get("packages")) for row in rows if row["key"] in kept} - {in_words(packages())})
+        if others:
+            say(f"some of them were computed with {'; '.join(others)}: here is {in_words(packages())}")
         clock = _Clock(len(left))
 
         def keep(row: Row) -> None:
             table.add(row)
             kept[row["key"]] = row["outcome"]
-            say(f"{len(kept)}/{len(wanted)} {left.pop(row['key']).label}: {_in_words(row)}, {clock.tick()}")
+            say(f"{len(kept)}/{len(wanted)} {left.pop(row['key']).label}: {_result(row)}, {clock.tick()}")
 
         ended: tuple[type[BaseException], ...] = (ComputationError, KeyboardInterrupt, *place.lost)
         try:
@@ -71,25 +76,42 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
     return sum(outcome == "failed" for outcome in kept.values())
 
 
-def _compute(place: Place, left: dict[str, Job], keep: Callable[[Row], None], say: Say) -> None:
-    """Until nothing is left: what had been begun when a worker died twice is tried by itself."""
+def _compute(place: Place, left: dict[str, Job], keep: Keep, say: Say) -> None:
+    """Until nothing is left: what had been begun when a worker died twice is tried apart."""
     deaths, in_vain = Counter[str](), 0
     while left:
         before = len(left)
         try:
-            with closing(place.results(list(left.values()), say)) as results:
-                for row in results:
-                    keep(row)
+            _keep_all(place, list(left.values()), keep, say)
         except place.died as error:
             begun = place.begun() & left.keys()
             deaths.update(begun)
             suspects = [job for key, job in left.items() if deaths[key] > 1]
-            say(f"a worker died: {len(begun)} jobs are begun again, {len(suspects)} of them each by itself")
-            for job in suspects:
-                keep(_alone(place, job, say))
+            say(f"a worker died: {len(begun)} jobs are begun again, {len(suspects)} of them apart")
+            _sift(place, suspects, left, keep, say)
             in_vain = 0 if begun or len(left) < before else in_vain + 1
             if in_vain == IN_VAIN:
                 raise ComputationError("workers die before they begin") from error
+
+
+def _sift(place: Place, suspects: Sequence[Job], left: Mapping[str, Job], keep: Keep, say: Say) -> None:
+    """Jobs of which some kill, in halves, and halves of those in which a worker dies, down to a job that does so."""
+    middle = (len(suspects) + 1) // 2
+    for half in filter(None, (suspects[:middle], suspects[middle:])):
+        try:
+            _keep_all(place, half, keep, say)
+        except place.died:
+            rest = [job for job in half if job.key in left]
+            if len(rest) == 1 == len(half):
+                keep(given_up(rest[0]))
+            else:
+                _sift(place, rest, left, keep, say)
+
+
+def _keep_all(place: Place, jobs: Sequence[Job], keep: Keep, say: Say) -> None:
+    with closing(place.results(jobs, say)) as results:
+        for row in results:
+            keep(row)
 
 
 def _require_same_study(plan: Plan, folder: Path) -> None:
@@ -104,16 +126,7 @@ def _is_tried_again(row: Mapping[str, Any], again: bool) -> bool:
     return row["outcome"] == "failed" and (again or row.get("reason") == CHANGED)
 
 
-def _alone(place: Place, job: Job, say: Say) -> Row:
-    """The result of a job whose workers have died twice; what is to be kept if this one does so too."""
-    try:
-        (row,) = place.results([job], say)
-        return row
-    except place.died:
-        return given_up(job)
-
-
-def _in_words(row: Row) -> str:
+def _result(row: Row) -> str:
     return f"failed, {row['reason']}" if row["outcome"] == "failed" else f"{row['seconds']:.0f} s"
 
 
