@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator, Sequence
 from pathlib import Path
 
 import pytest
 from small import steady
 from small_studies import STUDY, written
 
-from steady_ppl.studies.places import Local
+from steady_ppl.studies.places import Local, Place, Row, Say
+from steady_ppl.studies.plan import Job
 from steady_ppl.studies.runner import run_study
 from steady_ppl.studies.study_file import read_plan
 from steady_ppl.studies.table import TABLE, read_results
@@ -75,3 +77,43 @@ def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(t
     assert (tmp_path / "marks" / "7").stat().st_size == 2
     assert run_study(plan, out, Local(workers), again=True) == 3
     assert (tmp_path / "marks" / "7").stat().st_size == 3
+
+
+class Died(Exception):
+    pass
+
+
+class Fragile(Place):
+    """Sixteen workers, all of which die of one job."""
+
+    died = (Died,)
+
+    def __init__(self, deadly: set[str]) -> None:
+        self.deadly, self.rounds, self.marks = deadly, list[int](), set[str]()
+
+    def __exit__(self, *raised: object) -> None:
+        pass
+
+    def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
+        self.rounds.append(len(jobs))
+        for place in range(0, len(jobs), 16):
+            under_way = jobs[place : place + 16]
+            self.marks |= {job.key for job in under_way}
+            if any(job.key in self.deadly for job in under_way):
+                raise Died
+            yield from (job.columns | {"outcome": "done", "seconds": 1.0} for job in under_way)
+
+    def begun(self) -> set[str]:
+        found, self.marks = self.marks, set()
+        return found
+
+
+def test_jobs_that_were_under_way_beside_a_deadly_one_are_tried_beside_each_other(tmp_path: Path):
+    plan = read_plan(written(tmp_path, STUDY.replace("[1, 2]", f"{list(range(1, 14))}")))
+    assert len(plan.jobs) == 39
+    deadly = {plan.jobs[3].key, plan.jobs[20].key}
+    place = Fragile(deadly)
+    assert run_study(plan, tmp_path / "out", place) == 2
+    found = read_results(tmp_path / "out").set_index("key")["outcome"]
+    assert len(found) == 39 and set(found[found == "failed"].index) == deadly
+    assert len(place.rounds) <= 2 * (2 + 2 * 5)  # of each two deaths, and sixteen halved until one is left
