@@ -95,7 +95,11 @@ def test_a_power_curve_begins_with_drives_that_lack_nothing(tmp_path: Path):
         job.columns | {"method": "it", "outcome": "done", IN_LIMITS: size, "found": one}
         for job, size, one in zip(plan.jobs, sizes, found, strict=True)
     ]
-    (axes,) = study_picture(plan, pd.DataFrame(rows)).axes
+    rows[3] |= {"outcome": "failed", IN_LIMITS: None, "found": None}
+    figure = study_picture(plan, pd.DataFrame(rows))
+    (axes,) = figure.axes
     (bars,) = axes.containers
+    said = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert said == {"it", "it: 1 of 6 failed", "it: 1 of 6 without a detection limit"}
     assert axes.get_yscale() == "linear"
-    assert bars.lines[0].get_xydata().tolist() == [[0.0, 0.5], [0.4, 0.0], [1.0, 1.0], [25.0, 1.0]]
+    assert bars.lines[0].get_xydata().tolist() == [[0.0, 0.5], [0.4, 0.0], [25.0, 1.0]]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -29,6 +31,13 @@ def test_figures_of_the_page_are_those_of_the_tables():
     quoted = re.findall(r"\d\.\d{3}(?: ± \d\.\d{3})?", page)
     tables = (RESULTS / "studies.md").read_text()
     assert len(quoted) >= 10 and [one for one in quoted if one not in tables] == []
+
+
+def test_the_plan_of_a_cluster_is_that_of_what_was_measured_and_the_pages():
+    fits = pd.read_parquet(RESULTS / "observation-noise.parquet")
+    plan = cluster_plan.tables(json.loads((RESULTS / "cluster.json").read_text()), fits)
+    assert (RESULTS / "cluster.md").read_text() == plan
+    assert plan.strip() in (ROOT / "docs" / "cluster.md").read_text()
 
 
 def test_fits_are_handed_to_the_worker_that_is_free_first():
