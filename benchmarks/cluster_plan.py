@@ -18,11 +18,18 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 
 RESULTS = Path(__file__).parent / "results"
 FITS, MACHINES, CORES = 10_000, 100, 16
 DRAWS = 20  # of fits, their order, and deaths
-LIVES = (math.inf, 1000.0, 100.0)  # hours until a machine dies, in the mean
+PLANS = (  # machines, hours until one dies in the mean, and whether the longest fits come first
+    (MACHINES, math.inf, False),
+    (MACHINES, math.inf, True),
+    (MACHINES, 100.0, True),
+    (MACHINES, 10.0, True),
+    (MACHINES // 10, math.inf, False),
+)
 BACK = 300.0  # s until it is there again
 
 
@@ -81,6 +88,7 @@ def tables(cluster: dict[str, Any], fits: pd.DataFrame) -> str:
     client = many["client_ms_a_job"] + kept["ms_a_result"]  # at most: the first with rows that say little
     start = np.array(cluster["start"]["new"]) - np.array(cluster["start"]["used"])
     failed = int((fits["outcome"] == "failed").sum())
+    least, most = stats.binomtest(failed, len(fits)).proportion_ci(0.95)
     measured = [
         ("a fit, one core", f"{seconds.mean():.0f} s ± {seconds.std(ddof=1):.0f}, at most {seconds.max():.0f} s"),
         ("memory of a worker", f"at most {fits['peak_mib'].max():.0f} MiB"),
@@ -112,18 +120,29 @@ def tables(cluster: dict[str, Any], fits: pd.DataFrame) -> str:
         ("sent to the workers", f"{FITS * many['bytes_a_job'] / 2**20:.1f} MiB"),
         ("table of results", f"{FITS * kept['bytes_a_result'] / 2**20:.1f} MiB"),
         ("memory of a machine", f"{CORES * fits['peak_mib'].max() / 1024:.0f} GiB"),
-        ("fits that will have failed", f"about {FITS * failed / len(fits):,.0f}"),
+        (
+            "fits that will have failed",
+            f"{FITS * failed / len(fits):,.0f}; 95 %: {FITS * least:,.0f} to {FITS * most:,.0f}",
+        ),
     ]
     lines += ["", f"| {FITS:,} such fits on {MACHINES} machines of {CORES} cores | |", "|---|---|"]
     lines += [f"| {name} | {value} |" for name, value in planned]
-    lines += ["", "| a machine dies every | minutes | of the workers' time is of use |", "|---|---|---|"]
-    for life in LIVES:
-        found = np.array(
-            [schedule(generator.choice(seconds, FITS), MACHINES, CORES, life, generator) for _ in range(DRAWS)]
-        )
-        minutes, used = found[:, 0] / 60, found[:, 1]
+    lines += [
+        "",
+        "| machines | one dies every | fits come | minutes | of the workers' time is of use |",
+        "|---|---|---|---|---|",
+    ]
+    for machines, life, longest_first in PLANS:
+        found = []
+        for _ in range(DRAWS):
+            drawn = generator.choice(seconds, FITS)
+            own = np.sort(drawn)[::-1] if longest_first else drawn
+            found.append(schedule(own, machines, CORES, life, generator))
+        minutes, used = np.array(found).T
         name = f"{life:,.0f} hours" if math.isfinite(life) else "never"
-        lines.append(f"| {name} | {minutes.mean():.1f} ± {minutes.std(ddof=1):.1f} | {used.mean():.0%} |")
+        order = "longest first" if longest_first else "as drawn"
+        spread = f"{minutes.mean() / 60:.1f} ± {minutes.std(ddof=1) / 60:.1f}"
+        lines.append(f"| {machines} | {name} | {order} | {spread} | {used.mean():.0%} |")
     return "\n".join(lines) + "\n"
 
 
