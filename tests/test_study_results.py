@@ -28,7 +28,7 @@ def test_the_filed_tables_are_those_of_the_filed_results():
 
 def test_figures_of_the_page_are_those_of_the_tables():
     page = (ROOT / "docs" / "studies.md").read_text().partition("## What they have found")[2]
-    quoted = re.findall(r"\d\.\d{3}(?: ± \d\.\d{3})?", page)
+    quoted = re.findall(r"\d\.\d{3}(?: ± \d\.\d{3})?|\d+% \(\d+%–\d+%\)", page)
     tables = (RESULTS / "studies.md").read_text()
     assert len(quoted) >= 10 and [one for one in quoted if one not in tables] == []
 
