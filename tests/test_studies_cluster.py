@@ -231,25 +231,39 @@ def test_a_worker_that_joins_late_without_steady_ppl_disturbs_nobody(tmp_path: P
     assert (read_results(out)["outcome"] == "done").sum() == 8
 
 
-def test_what_only_workers_may_have_that_have_left_is_given_to_others(tmp_path: Path, dask: Dask, monkeypatch):
-    """After an unlike worker a job is for the others that there are; these leave, and one more comes."""
-    monkeypatch.setattr(clusters, "WORKER_WAIT", 2)
-    said, out = list[str](), tmp_path / "out"
+NO_RECIPE = """
+import os
+known = os.stat
+
+def stat(path, *more, **others):
+    if str(path).endswith("slow.py"):
+        raise FileNotFoundError(2, "not there", path)
+    return known(path, *more, **others)
+
+os.stat = stat
+"""
+
+
+def test_a_worker_that_joins_late_and_sees_other_files_is_not_given_everything(tmp_path: Path, dask: Dask, monkeypatch):
+    said, sent, out = list[str](), list[str](), tmp_path / "out"
+    send = clusters._Sent.send
+    monkeypatch.setattr(clusters._Sent, "send", lambda of, job, **where: (sent.append(job.key), send(of, job, **where)))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "sitecustomize.py").write_text(NO_RECIPE)
 
     def hear(line: str) -> None:
         said.append(line)
         if line.startswith("1/"):
-            dask.worker(PYTHONPATH=str(other_version(tmp_path)))
-        elif "is not used" in line:
-            os.kill(first.pid, signal.SIGKILL)
-            dask.worker()
-            wait_for(lambda: (tmp_path / "dask.log").read_text().count("Register worker") >= 3)
+            dask.worker(PYTHONPATH=str(tmp_path / "other"))
+            wait_for(lambda: (tmp_path / "dask.log").read_text().count("Register worker") >= 2)
 
     dask.scheduler()
-    first = dask.worker()
+    dask.worker()
     with Cluster(dask.address) as place:
-        assert run_study(read_plan(study(tmp_path, seeds=8, seconds=2.0)), out, place, say=hear) == 0
-    assert (read_results(out)["outcome"] == "done").sum() == 8
+        assert run_study(read_plan(study(tmp_path, seeds=20, seconds=0.5)), out, place, say=hear) == 0
+    (line,) = [line for line in said if "is not used" in line]
+    assert "it has other files than there are here" in line and (read_results(out)["outcome"] == "done").sum() == 20
+    assert 1 <= len(sent) - 20 < 10  # it would be all of them if it did not hold what it is given
 
 
 def test_a_study_goes_on_when_its_scheduler_is_there_again(tmp_path: Path, dask: Dask):

@@ -47,6 +47,14 @@ def test_fits_are_handed_to_the_worker_that_is_free_first():
     assert unlike == (10.0, pytest.approx(12 / 20))
 
 
+def test_a_machine_that_is_down_is_given_nothing_until_it_is_back(monkeypatch):
+    """The first one is idle when it dies, and is to take what the second one loses."""
+    deaths = iter([[50.0], [349.0]])
+    monkeypatch.setattr(cluster_plan, "_deaths", lambda life, generator: next(deaths))
+    last, _ = cluster_plan.schedule(np.array([10.0, 400.0]), 2, 1, 1.0, np.random.default_rng(0))
+    assert last == 50 + cluster_plan.BACK + 400
+
+
 def test_machines_that_die_cost_what_they_compute_and_their_rest():
     """An hour in the mean, fits of 600 s: of 3900 s 300 are rest and 300 are a fit that is half done."""
     last, used = cluster_plan.schedule(np.full(2000, 600.0), 4, 2, 1.0, np.random.default_rng(0))

@@ -11,7 +11,7 @@ import logging
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable, Collection, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from typing import Any, NamedTuple
 
@@ -24,7 +24,8 @@ from steady_ppl.studies.plan import Job
 
 WORKER_WAIT = 30  # s for the first worker, and between looks at whether there still is one
 TRIES = 3  # of a job whose workers die; the scheduler itself tries it so often as it is set, four times at first
-HOLD = 10  # s for which a worker that is not used keeps what it was given, so that it is not given everything
+HOLD, LONGEST_HOLD = 10, 60  # s for which a worker that is not used holds what it is given, or it would get it all
+IN_VAIN = 10  # jobs that Dask gives up while nothing is begun
 
 
 class Cluster(Place):
@@ -38,8 +39,7 @@ class Cluster(Place):
         UsageError: dask.distributed is not installed, nobody answers there, there is no worker, one has several
             threads, or other versions than this machine; from `results`, one does not see the files of the jobs as
             they are here.
-        ComputationError: from `results`: no worker is left that is like this machine, or workers die before they
-            begin.
+        ComputationError: from `results`: workers die before they begin, or one cannot load what it is to do.
     """
 
     def __init__(self, address: str) -> None:
@@ -109,10 +109,10 @@ class Cluster(Place):
             for job in jobs:
                 sent.send(job)
             while sent.jobs:
-                for future, answer in self._batch(sent, say):
-                    if future not in sent.jobs:
-                        continue  # it was sent again
-                    job, _ = sent.jobs.pop(future)
+                batch = self._batch(sent, say)
+                batch.sort(key=lambda one: not isinstance(one[1], Answer))  # what has come is kept before anything ends
+                for future, answer in batch:
+                    job = sent.jobs.pop(future)
                     if isinstance(answer, Answer):
                         if row := self._usable(answer, job, sent, say):
                             yield row
@@ -133,15 +133,14 @@ class Cluster(Place):
         while not sent.running.has_ready():
             time.sleep(0.05)
             if time.monotonic() - self.looked > WORKER_WAIT:
-                workers = self._workers()
-                if not workers and not self.deserted:
+                alone = not self._workers().keys() - sent.refused
+                if alone and not self.deserted:
                     say("the cluster has no worker left: start some, or stop this and go on later")
-                self.looked, self.deserted = time.monotonic(), not workers
-                sent.send_again_what_waits_for_others_than(workers)
+                self.looked, self.deserted = time.monotonic(), alone
         return sent.running.next_batch(block=False)
 
     def _usable(self, answer: Answer, job: Job, sent: _Sent, say: Say) -> Row | None:
-        """Its row; None, and the job is sent to others, where the worker is unlike this machine."""
+        """Its row; None, and the job is sent again, where the worker is unlike this machine."""
         reason = answer.unlike
         if answer.row.get("reason") == work.CHANGED and JobFiles().is_of(job):
             reason = "other files than there are here"
@@ -150,10 +149,9 @@ class Cluster(Place):
         if answer.worker not in sent.refused:
             say(f"the worker {answer.worker} is not used: it has {reason}")
             sent.refused.add(answer.worker)
-        others = self._workers().keys() - sent.refused
-        if not others:
-            raise ComputationError(f"no worker is left that is like this machine; the last had {reason}")
-        sent.send(job, others)
+            self.client.run(hold, sent.topic, workers=[answer.worker], on_error="ignore")
+        others = list(self._workers().keys() - sent.refused)  # rather than these; others still may take it from them
+        sent.send(job, **({"workers": others, "allow_other_workers": True} if others else {}))
         return None
 
 
@@ -175,7 +173,7 @@ class _Sent:
     """What is on the cluster.
 
     Attributes:
-        jobs: by their futures; beside each the workers that alone may have it, none where all may.
+        jobs: by their futures.
         running: hands out futures as they end, with their answers.
         refused: addresses of workers that are not used.
     """
@@ -184,40 +182,48 @@ class _Sent:
         from distributed import as_completed
 
         self.client, self.topic, self.here = client, f"steady-study-{uuid.uuid4().hex}", packages()
-        self.jobs, self.refused = dict[Any, tuple[Job, set[str]]](), set[str]()
-        self.begun, self.kills = Counter[str](), Counter[str]()
+        self.jobs, self.refused = dict[Any, Job](), set[str]()
+        self.begun, self.in_vain = Counter[str](), 0
         self.running = as_completed(loop=client.loop, with_results=True, raise_errors=False)
-        client.subscribe_topic(self.topic, lambda event: self.begun.update([event[1]]))
+        client.subscribe_topic(self.topic, self._hear_of_begun)
 
-    def send(self, job: Job, only: Collection[str] = ()) -> None:
-        """Have it computed, by these workers alone where there are some."""
-        future = self.client.submit(computed, job, self.here, self.topic, pure=False, workers=list(only) or None)
-        self.jobs[future] = job, set(only)
+    def _hear_of_begun(self, event: tuple[float, str]) -> None:
+        self.begun[event[1]] += 1
+        self.in_vain = 0
+
+    def send(self, job: Job, **where: Any) -> None:
+        """Have it computed."""
+        future = self.client.submit(computed, job, self.here, self.topic, pure=False, **where)
+        self.jobs[future] = job
         self.running.add(future)
 
-    def send_again_what_waits_for_others_than(self, workers: Collection[str]) -> None:
-        """Dask would keep for ever what no worker may have that is left."""
-        for future, (job, only) in list(self.jobs.items()):
-            if only and only.isdisjoint(workers):
-                del self.jobs[future]
-                self.client.cancel([future])
-                self.send(job, set(workers) - self.refused)
-
     def has_killed(self, job: Job) -> bool:
-        """Whether it has been begun so often that it is the one that kills; Dask also blames what only waited."""
-        self.kills[job.key] += 1
-        if self.kills[job.key] >= TRIES and not self.begun[job.key]:
+        """Whether it has been begun so often that it is the one that kills; Dask also blames what only waited.
+
+        Raises:
+            ComputationError: again and again workers have died while nothing was begun.
+        """
+        self.in_vain += 1
+        if self.in_vain > IN_VAIN:
             raise ComputationError("workers die before they begin")
-        return max(self.begun[job.key], self.kills[job.key]) >= TRIES
+        return self.begun[job.key] >= TRIES
 
 
-def computed(job: Job, here: Mapping[str, str], begun: str) -> Answer:
+_held = Counter[str]()  # on a worker that is not used: how often it has held what it was given, by topic
+
+
+def hold(topic: str) -> None:
+    """On a worker: it is not used."""
+    _held[topic] += 1
+
+
+def computed(job: Job, here: Mapping[str, str], topic: str) -> Answer:
     """On a worker: the row of a job, unless the worker is unlike the machine that asks.
 
     Args:
         job: what to compute.
         here: versions of the packages there.
-        begun: topic of the events that say which jobs are begun.
+        topic: of the events that say which jobs are begun.
     """
     from distributed import get_worker
 
@@ -225,10 +231,11 @@ def computed(job: Job, here: Mapping[str, str], begun: str) -> Answer:
     unlike = work.differing(here, packages())
     if worker.state.nthreads > 1:
         unlike = f"{worker.state.nthreads} threads, which would take turns"
-    if unlike:
-        time.sleep(HOLD)
-        return Answer(worker.address, unlike, {})
-    worker.log_event(begun, job.key)
+    if unlike or topic in _held:
+        time.sleep(min(HOLD * 2.0 ** _held[topic], LONGEST_HOLD))
+        hold(topic)
+        return Answer(worker.address, unlike or "been refused", {})
+    worker.log_event(topic, job.key)
     return Answer(worker.address, "", work.run(job))
 
 

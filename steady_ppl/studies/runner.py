@@ -51,7 +51,7 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
         left = {key: job for key, job in wanted.items() if key not in kept}
         if kept:
             say(f"{len(kept)} of {len(wanted)} jobs are there already")
-        others = sorted({str(row.get("packages")) for row in rows if row["key"] in kept} - {in_words(packages())})
+        others = sorted({_packages(row) for row in rows if row["key"] in kept} - {in_words(packages())})
         if others:
             say(f"some of them were computed with {'; '.join(others)}: here is {in_words(packages())}")
         clock = _Clock(len(left))
@@ -120,6 +120,12 @@ def _require_same_study(plan: Plan, folder: Path) -> None:
         there = recorded_plan(folder)
         if there.title != plan.title and not {job.key for job in there.jobs} & {job.key for job in plan.jobs}:
             raise RunError(f"{folder} holds another study, {there.title!r}: choose another folder")
+
+
+def _packages(row: Row) -> str:
+    """What it was computed with; where nothing says so, as of a job that was given up, what is here."""
+    found = row.get("packages")
+    return found if isinstance(found, str) else in_words(packages())
 
 
 def _is_tried_again(row: Mapping[str, Any], again: bool) -> bool:

@@ -61,6 +61,7 @@ class StudyTable:
         self.merge()
         table, earlier = self.folder / TABLE, self.folder / EARLIER
         now = read_results(self.folder)
+        self.rows = len(now)
         before = _read(earlier) if os.path.lexists(earlier) else now[:0]
         everything = _joined([before, now])
         own = everything["key"].isin(keys)
@@ -162,7 +163,7 @@ def _write(frame: pd.DataFrame, file: Path) -> None:
             frame[name] = [None if _is_absent(value) else str(value) for value in frame[name]]
     with whole_file(file, RunError) as beside:
         frame.to_parquet(beside, index=False)
-        with beside.open("rb") as written:
+        with beside.open("r+b") as written:
             os.fsync(written.fileno())  # before it has its name: no power cut leaves half of it
 
 
