@@ -7,7 +7,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -195,15 +195,22 @@ def test_jobs_that_kill_every_worker_are_given_up_and_no_other(tmp_path: Path, d
     assert 4 <= sum(times[seed] for seed in (2, 3, 4, 6)) <= 4 + deaths
 
 
-def test_a_worker_that_joins_late_and_is_unlike_this_machine_is_not_used(tmp_path: Path, dask: Dask):
-    said, out = list[str](), tmp_path / "out"
+def joining(dask: Dask, path: Path, said: list[str]) -> Callable[[str], None]:
+    """Hears what a study says, and starts a worker with `path` before all packages when a first result is there."""
 
     def hear(line: str) -> None:
         said.append(line)
         if line.startswith("1/"):
-            dask.worker(PYTHONPATH=str(other_version(tmp_path)))
-            wait_for(lambda: (tmp_path / "dask.log").read_text().count("Register worker") >= 2)
+            dask.worker(PYTHONPATH=str(path))
+            wait_for(lambda: (dask.folder / "dask.log").read_text().count("Register worker") >= 2)
 
+    return hear
+
+
+def test_a_worker_that_joins_late_and_is_unlike_this_machine_is_not_used(tmp_path: Path, dask: Dask):
+    said, out = list[str](), tmp_path / "out"
+
+    hear = joining(dask, other_version(tmp_path), said)
     dask.scheduler()
     dask.worker()
     with Cluster(dask.address) as place:
@@ -214,15 +221,11 @@ def test_a_worker_that_joins_late_and_is_unlike_this_machine_is_not_used(tmp_pat
 
 def test_a_worker_that_joins_late_without_steady_ppl_disturbs_nobody(tmp_path: Path, dask: Dask):
     """Dask ends it with the first job that it cannot load."""
-    out, other = tmp_path / "out", tmp_path / "other" / "steady_ppl"
+    said, out, other = list[str](), tmp_path / "out", tmp_path / "other" / "steady_ppl"
     other.mkdir(parents=True)
     (other / "__init__.py").write_text("raise ModuleNotFoundError('there is no steady-ppl here')\n")
 
-    def hear(line: str) -> None:
-        if line.startswith("1/"):
-            dask.worker(PYTHONPATH=str(other.parent))
-            wait_for(lambda: (tmp_path / "dask.log").read_text().count("Register worker") >= 2)
-
+    hear = joining(dask, other.parent, said)
     dask.scheduler()
     dask.worker()
     with Cluster(dask.address) as place:
@@ -251,12 +254,7 @@ def test_a_worker_that_joins_late_and_sees_other_files_is_not_given_everything(t
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "sitecustomize.py").write_text(NO_RECIPE)
 
-    def hear(line: str) -> None:
-        said.append(line)
-        if line.startswith("1/"):
-            dask.worker(PYTHONPATH=str(tmp_path / "other"))
-            wait_for(lambda: (tmp_path / "dask.log").read_text().count("Register worker") >= 2)
-
+    hear = joining(dask, tmp_path / "other", said)
     dask.scheduler()
     dask.worker()
     with Cluster(dask.address) as place:
