@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from steady_ppl.studies.pictures import chosen, points
+from steady_ppl.studies.pictures import SIZES, chosen, points
 from steady_ppl.studies.plan import HELD_OUT, IN_LIMITS, Picture
 from steady_ppl.studies.table import TABLE
 
@@ -93,7 +93,7 @@ def _cell(rows: pd.DataFrame, column: str, digits: int) -> str:
 
 def observation_noise(rows: pd.DataFrame) -> tuple[str, Musts]:
     """Errors against the noise of the bearings; STEADY's ramp is chosen at each by held-out drives."""
-    best = chosen(Picture(SIGMA, [ERROR], chosen_by=HELD_OUT), rows)
+    best = of_best_settings(rows)
     text = [
         f"{_extent(rows)} Of STEADY's three ramps that with the largest log p(y) of valid drives is taken at each "
         "noise; no other method has a choice. The musts compare it with the other learners; STEADY with the bootstrap "
@@ -103,6 +103,7 @@ def observation_noise(rows: pd.DataFrame) -> tuple[str, Musts]:
         table(best, SIGMA, "state_estimation.location", "error of estimated location, m"),
         table(best, SIGMA, "log_likelihood", "log p(y) of a test drive at 1 Hz, nats", 2),
         table(best, SIGMA, "fit_seconds", "seconds of the fit", 0),
+        *_ramps(rows[rows["method"] == "STEADY"]),
     ]
     musts: Musts = []
     for measure, what in MEASURES.items():
@@ -120,6 +121,23 @@ def observation_noise(rows: pd.DataFrame) -> tuple[str, Musts]:
         holds = certain and theirs[ERROR].mean() >= least * ours[ERROR].mean()
         musts.append((what, f"{_cell(ours, ERROR, 3)} and {_cell(theirs, ERROR, 3)}", bool(holds)))
     return "\n\n".join(text), musts
+
+
+def of_best_settings(rows: pd.DataFrame) -> pd.DataFrame:
+    """Of each method's settings those with the largest log p(y) of valid drives, at each noise."""
+    return chosen(Picture(SIGMA, [ERROR], chosen_by=HELD_OUT), rows)
+
+
+def _ramps(tried: pd.DataFrame) -> list[str]:
+    """What STEADY's choice is of, and what it costs."""
+    each = tried.assign(method=[f"STEADY, ramp {ramp:g}" for ramp in tried["settings.ramp"]])
+    each = each.sort_values(["settings.ramp", "seed"])
+    spent = tried.groupby([SIGMA, "seed"], as_index=False)["fit_seconds"].sum()
+    return [
+        table(each, SIGMA, HELD_OUT, "log p(y) of a valid drive, by which the ramp is chosen", 2),
+        table(each, SIGMA, ERROR, "error of 1 s roll-outs"),
+        table(spent.assign(method="STEADY", outcome="done"), SIGMA, "fit_seconds", "seconds of all three fits", 0),
+    ]
 
 
 def _best_of_all(rows: pd.DataFrame, column: str, what: str, of_seeds: str = "mean") -> tuple[str, str, bool]:
@@ -200,17 +218,20 @@ def discovery(rows: pd.DataFrame) -> tuple[str, Musts]:
     text = [
         f"{_extent(rows, 'searches')} {failed} failed; {unlimited} are not in the table, for the tests could not have "
         "what was planted, so that it has no limit. Intervals are exact, at 95 %, for searches that are independent; "
-        "those of one seed share their noise. The first row is of drives that lack nothing."
+        "those of one seed share their noise. The first row is of drives that lack nothing. Ranges are a quarter wide, "
+        "one of them around a limit; they were narrowed when the results of wider ones had been seen."
     ]
     columns = ("found", "in_class", "right")
     lines = [
-        "| size in detection limits | says that something is missing | its class | names it |",
-        "|---|---|---|---|",
+        "| size in detection limits | mean | searches | says that something is missing | its class | names it |",
+        "|---|---|---|---|---|---|",
     ]
     shares = {column: {place: of for place, *of in points(done, IN_LIMITS, column)} for column in columns}
-    for place in shares["found"]:
+    ranges = done.groupby(pd.cut(done[IN_LIMITS], SIZES), observed=True).size()
+    for place, (ends, searches) in zip(shares["found"], ranges.items(), strict=True):
         cells = [_share(*shares[column][place]) if place in shares[column] else "" for column in columns]
-        lines.append(f"| {place:.2f} | " + " | ".join(cells) + " |")
+        size = "0" if ends.right == 0 else f"{ends.left:.2f} to {ends.right:.2f}"
+        lines.append(f"| {size} | {place:.2f} | {searches} | " + " | ".join(cells) + " |")
     return "\n\n".join([*text, "\n".join(lines)]), []
 
 

@@ -59,7 +59,7 @@ def plot_study(
     from steady_ppl.studies.plan import recorded_plan
     from steady_ppl.studies.table import read_results
 
-    place = out or folder / "study.png"
+    plan, place = recorded_plan(folder), out or folder / "study.png"
     require_picture(place)
-    write_picture(study_picture(recorded_plan(folder), read_results(folder)), place)
+    write_picture(study_picture(plan, read_results(folder)), place)
     tell(place)

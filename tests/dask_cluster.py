@@ -42,9 +42,9 @@ class Dask:
         wait_for(lambda: answers(self.port))
         return process
 
-    def worker(self, **environment: str) -> subprocess.Popen:
-        """Start one of a single thread, which lives as long as its scheduler."""
-        return self.start("worker", self.address, "--no-nanny", *self._words, **environment)
+    def worker(self, *more: str, **environment: str) -> subprocess.Popen:
+        """Start one of a single thread, unless more is said, which lives as long as its scheduler."""
+        return self.start("worker", self.address, "--no-nanny", *self._words, *more, **environment)
 
     def nanny(self) -> subprocess.Popen:
         """Start one whose process is replaced when it dies."""

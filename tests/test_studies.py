@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Generator, Sequence
 from pathlib import Path
 
 import pytest
+from dask_cluster import wait_for
 from small import steady
 from small_studies import STUDY, written
 
+from steady_ppl.errors import ComputationError
+from steady_ppl.studies.cluster import Deaths
 from steady_ppl.studies.places import Local, Place, Row, Say
 from steady_ppl.studies.plan import Job
 from steady_ppl.studies.runner import run_study
@@ -38,6 +42,8 @@ from steady_ppl import Fit
 
 def fit(program, table, valid=None, *, known_start=False, mark="", deadly=False, seed=0):
     times = Path(mark) / str(seed)
+    while seed == 13 and not (Path(mark) / "1").exists():
+        time.sleep(0.05)  # otherwise 1 may have been begun twice, for all anybody knows, before it dies by itself
     with times.open("a") as file:
         file.write("1")
     if deadly and (seed == 13 or times.stat().st_size == 1):
@@ -79,6 +85,32 @@ def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(t
     assert (tmp_path / "marks" / "7").stat().st_size == 3
 
 
+def test_what_had_ended_beside_a_job_that_dies_is_not_lost(tmp_path: Path):
+    (tmp_path / "mine.py").write_text(RECIPE.format())
+    (tmp_path / "marks").mkdir()
+    text = STUDY[: STUDY.index("[[method]]")].replace("[1, 2]", "[1, 2, 3, 5, 13]") + (
+        '[[method]]\nname = "mine"\nprogram = "{model}"\nrecipe = "mine.py"\n'
+        f'settings = {{{{mark = "{tmp_path / "marks"}", deadly = [false]}}}}\n'
+        '[[method]]\nname = "deadly"\nprogram = "{model}"\nrecipe = "mine.py"\n'
+        f'settings = {{{{mark = "{tmp_path / "marks"}", deadly = true}}}}\n'
+    )
+    jobs = [job for job in read_plan(written(tmp_path, text)).jobs if (job.method == "deadly") == (job.seed == 13)]
+    found = []
+
+    def fetch(place: Place) -> None:
+        for row in place.results(jobs, print):
+            found.append(row["key"])
+            if len(found) == 1:  # until 13 has died
+                wait_for((tmp_path / "marks" / "13").exists)
+                time.sleep(2)
+
+    with Local(2) as place:
+        with pytest.raises(place.died):
+            fetch(place)
+        ended = [mark.stem for mark in place.marks.glob("*.json")]
+    assert sorted(found) == sorted(ended) and len(found) >= 3  # the other worker may have died at the fourth
+
+
 class Died(Exception):
     pass
 
@@ -117,3 +149,38 @@ def test_jobs_that_were_under_way_beside_a_deadly_one_are_tried_beside_each_othe
     found = read_results(tmp_path / "out").set_index("key")["outcome"]
     assert len(found) == 39 and set(found[found == "failed"].index) == deadly
     assert len(place.rounds) <= 2 * (2 + 2 * 5)  # of each two deaths, and sixteen halved until one is left
+
+
+def test_workers_that_die_before_they_begin_end_a_study(tmp_path: Path):
+    plan = read_plan(written(tmp_path))
+    place = Fragile({plan.jobs[0].key})
+    place.begun = set  # type: ignore[method-assign]
+    with pytest.raises(ComputationError, match="workers die before they begin: 0 of 6 jobs are kept"):
+        run_study(plan, tmp_path / "out", place)
+    assert len(place.rounds) == 3
+
+
+def test_a_cluster_gives_up_every_job_that_kills_and_none_that_only_waited():
+    deaths, deadly = Deaths(), [f"deadly {place}" for place in range(16)]
+    for key in [*deadly, "waits"]:
+        deaths.sent(key)
+    for key in 4 * deadly:
+        deaths.hear(key)
+    assert all(deaths.killed(key) for key in deadly)  # all at once
+    assert not deaths.killed("waits")
+    assert not any(deaths.killed("waits") for _ in range(9))
+    with pytest.raises(ComputationError, match="workers die before they begin"):
+        deaths.killed("waits")
+
+
+def test_jobs_that_a_machine_takes_along_once_are_tried_again():
+    deaths = Deaths()
+    for key in map(str, range(40)):  # of a scheduler that tries once
+        deaths.sent(key)
+        deaths.hear(key)
+    assert not any(deaths.killed(str(place)) for place in range(40))
+
+
+def test_a_folder_that_is_no_study_is_said(tmp_path: Path, capsys):
+    assert steady("plot-study", tmp_path / "nowhere") == 2
+    assert "nowhere is not a study: it has no study.json" in capsys.readouterr().err

@@ -306,6 +306,12 @@ def test_workers_that_would_find_something_else_are_refused(tmp_path: Path, dask
     assert "has steady-ppl 0.0.1 (here " in capsys.readouterr().err and len(read_results(out)) == 0
     worker.kill()
     worker.wait()
+    worker = dask.worker("--nthreads", "2")
+    assert steady("study", file, "--cluster", dask.address, "--out", out) == 2
+    said = capsys.readouterr().err
+    assert "workers with several threads, which would take turns: tcp://127.0.0.1:" in said
+    worker.kill()
+    worker.wait()
     dask.worker()
     cluster = Cluster(dask.address)
     plan = read_plan(file)

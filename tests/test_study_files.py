@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,10 +14,13 @@ from small import MODELS, steady
 from small_studies import CART, STUDY, written
 
 from steady_ppl.errors import DataError, UsageError
+from steady_ppl.program_file import load_program
+from steady_ppl.simulation import simulate
 from steady_ppl.studies.job import CHANGED, in_limits, run
 from steady_ppl.studies.job_data import planted, told_settings
 from steady_ppl.studies.runnable import require_runnable
 from steady_ppl.studies.study_file import read_plan
+from steady_ppl.table import write_table
 
 
 def test_every_list_is_an_axis_and_seeds_are_outermost(tmp_path: Path):
@@ -52,7 +56,9 @@ def test_a_job_is_known_by_what_it_depends_on_and_not_by_where_it_is(tmp_path: P
         ("simulate", "simulation", "data has no source"),
         ('simulate = "{model}"', 'simulate = "{model}"\ntables = "."', "data has simulate and tables"),
         ("settings =", "setting =", "method.setting means nothing here"),
-        ("[50, 60]", "[50, 50]", "learned is there twice"),
+        ("[50, 60]", "[50, 50]", "learned with seed 1 is there twice: .* lists values that differ"),
+        ("seeds = [1, 2]", "seeds = [1, 1]", "as declared with seed 1 is there twice: .* seeds"),
+        ('"as declared"', '" "', "method.name is ' ', expected a name"),
         ("[50, 60]", "[]", "validation_particles is an axis without a value"),
         ("[50, 60]", "2020-01-01", "validation_particles is .*expected numbers"),
         ("train = 2", "train = []", "train is an axis without a value"),
@@ -73,7 +79,11 @@ def test_a_job_is_known_by_what_it_depends_on_and_not_by_where_it_is(tmp_path: P
         ('"settings.validation_particles"', '"settings.particles"', "there will be no column settings.particles"),
         ("y = [", 'chosen_by = "valid_log_likelihood"\ny = [', "x is settings.validation_particles, expected data"),
         ("published = {{log_likelihood", "published = {{likelihood", "likelihood is no panel; y has log_likelihood"),
-        ('["log_likelihood"]', '["log_likelyhood"]', "there will be no column log_likelyhood; .*data.train, .*steps"),
+        (
+            '["log_likelihood"]',
+            '["log_likelyhood"]',
+            "no column log_likelyhood; .*data.train, .*forward.…, .*steps",
+        ),
         ('["log_likelihood"]', "[]", "picture.y has 0 columns"),
         ("y = [", 'chosen_by = "forward.total"\ny = [', "chosen_by is forward.total, expected valid_log_likelihood"),
         ("x = ", 'leave_out = ["learnt"]\nx = ', "leave_out: learnt is no method; there are as declared, learned"),
@@ -105,6 +115,11 @@ def test_what_is_wrong_with_a_study_is_named(tmp_path: Path, old: str, new: str,
         ('simulate = "{model}"', 'simulate = "{model}:Nobody"', "data: linear_gaussian.py has no program Nobody"),
         ('simulate = "{model}"', 'simulate = "nowhere.py"', "nowhere.py cannot be read"),
         (
+            'program = "{model}"',
+            f'program = "{MODELS / "hovercraft.py"}"',
+            "as declared: the table has no column",
+        ),
+        (
             'simulate = "{model}"\ntrain = 2\nvalid = 2\ntest = 2',
             'tables = "."',
             "has no train.csv and no train.parquet",
@@ -115,6 +130,15 @@ def test_what_no_job_could_do_is_said_before_any_is_begun(tmp_path: Path, capsys
     file = written(tmp_path, STUDY.replace(old, new, 1))
     assert steady("study", file, "--out", tmp_path / "out") == 2
     assert says in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_a_start_that_tables_do_not_know_is_said_before_any_job_is_begun(tmp_path: Path):
+    measured = replace(simulate(load_program(CART), 2, seed=1), states=None)
+    for part in ("train", "valid", "test"):
+        write_table(measured, tmp_path / f"{part}.csv")
+    text = STUDY.replace('simulate = "{model}"\ntrain = 2\nvalid = 2\ntest = 2', 'tables = "."')
+    with pytest.raises(DataError, match="method as declared: a known start needs the true states"):
+        require_runnable(read_plan(written(tmp_path, text)))
 
 
 @pytest.mark.parametrize(
@@ -281,7 +305,7 @@ def test_each_program_is_parsed_once_for_all_jobs(tmp_path: Path, monkeypatch: p
         ([], None, 0.0),
         ([0.0], [0.3], 0.0),
         ([0.3, -0.6], [0.3, 0.3], 2.0),
-        ([-0.6], [0.1, 0.3], 2.0),
+        ([0.6, 0.0], [0.1, 0.3], 6.0),
         ([0.5], None, math.nan),
     ],
 )

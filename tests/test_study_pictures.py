@@ -92,7 +92,7 @@ def test_a_power_curve_begins_with_drives_that_lack_nothing(tmp_path: Path):
     plan = replace(read_plan(written(tmp_path)), picture=picture)
     sizes, found = (0.0, 0.0, 0.4, 1.0, 25.0, float("nan")), (False, True, False, True, True, True)
     rows = [
-        job.columns | {"method": "it", "outcome": "done", IN_LIMITS: size, "found": one}
+        {"key": job.key, "method": "it", "outcome": "done", IN_LIMITS: size, "found": one}
         for job, size, one in zip(plan.jobs, sizes, found, strict=True)
     ]
     rows[3] |= {"outcome": "failed", IN_LIMITS: None, "found": None}
@@ -103,3 +103,24 @@ def test_a_power_curve_begins_with_drives_that_lack_nothing(tmp_path: Path):
     assert said == {"it", "it: 1 of 6 failed", "it: 1 of 6 without a detection limit"}
     assert axes.get_yscale() == "linear"
     assert bars.lines[0].get_xydata().tolist() == [[0.0, 0.5], [0.4, 0.0], [25.0, 1.0]]
+
+
+def test_a_power_curve_is_of_one_way_of_searching(tmp_path: Path):
+    plan = replace(read_plan(written(tmp_path)), picture=Picture(x=IN_LIMITS, y=["found"]))
+    asked = {"outcome": "done", IN_LIMITS: 1.0}
+    searches = [(drives, effect) for effect in ("linear_drag=1", "wind=1") for drives in (2, 16)]
+    rows = [
+        {"key": job.key, "method": "it", "data.train": drives, "data.effect": effect, "found": drives == 16} | asked
+        for job, (drives, effect) in zip(plan.jobs, searches, strict=False)
+    ]
+    (axes,) = study_picture(plan, pd.DataFrame(rows)).axes
+    found = {str(bars.get_label()): bars.lines[0].get_ydata().tolist() for bars in axes.containers}
+    assert found == {"it, train 2": [0.0], "it, train 16": [1.0]}
+
+
+def test_a_method_may_have_another_name_in_the_picture(tmp_path: Path):
+    labels = 'labels = {{learned = "by its likelihood"}}\npublished'
+    plan = read_plan(written(tmp_path, STUDY.replace("published", labels, 1)))
+    rows = [job.columns | {"outcome": "done", "log_likelihood": 1.0} for job in plan.jobs]
+    (legend,) = study_picture(plan, pd.DataFrame(rows)).legends
+    assert [text.get_text() for text in legend.get_texts()] == ["as declared", "published", "by its likelihood"]

@@ -22,15 +22,50 @@ import studies  # noqa: E402
 
 
 def test_the_filed_tables_are_those_of_the_filed_results():
-    page, _ = studies.tables(RESULTS)
-    assert (RESULTS / "studies.md").read_text() == page
+    tables, _ = studies.tables(RESULTS)
+    assert (RESULTS / "studies.md").read_text() == tables
+
+
+def page() -> str:
+    return (ROOT / "docs" / "studies.md").read_text().partition("## What they have found")[2]
 
 
 def test_figures_of_the_page_are_those_of_the_tables():
-    page = (ROOT / "docs" / "studies.md").read_text().partition("## What they have found")[2]
-    quoted = re.findall(r"\d\.\d{3}(?: ± \d\.\d{3})?|\d+% \(\d+%–\d+%\)", page)
+    quoted = re.findall(r"\d\.\d{3}(?: ± \d\.\d{3})?|\d+% \(\d+%–\d+%\)", page())
     tables = (RESULTS / "studies.md").read_text()
     assert len(quoted) >= 10 and [one for one in quoted if one not in tables] == []
+
+
+@pytest.mark.parametrize(
+    ("study", "method", "place", "sentence"),
+    [
+        ("observation-noise", "STEADY", 1.25, "STEADY ends at {} at 1.25°"),
+        ("observation-noise", "FitTruth", 1.25, "above FitTruth ({})"),
+        ("observation-noise", "STEADY−", 1.25, "blows up there, and the others end at {}."),
+        ("observation-noise", "STEADY−", 2.5, "At 2.5° it is {} against"),
+        ("observation-noise", "STEADY", 2.5, "against {}, 9.7 % worse"),
+        ("observation-noise", "SVI", 5.0, "SVI ends at {}, STEADY"),
+        ("observation-noise", "STEADY", 5.0, ", STEADY at {}."),
+        ("observation-noise", "STEADY, bootstrap", 1.25, "errs more at 1.25° ({})"),
+        ("observation-noise", "STEADY, bootstrap", 5.0, "from 5° on ({}, "),
+        ("observation-noise", "STEADY, bootstrap", 10.0, ", {} and "),
+        ("observation-noise", "STEADY, bootstrap", 20.0, " and {})."),
+        ("particles", "lookahead", 100, "errs as much: {} and "),
+        ("particles", "bootstrap", 20_000, " and {} in roll-outs"),
+        ("particles", "bootstrap", 200, "200 of them end at {}, in"),
+    ],
+)
+def test_a_figure_of_the_page_is_that_of_the_method_that_it_names(study: str, method: str, place: float, sentence: str):
+    rows = pd.read_parquet(RESULTS / f"{study}.parquet")
+    x = studies.SIGMA if study == "observation-noise" else studies.PARTICLES
+    rows = studies.of_best_settings(rows) if study == "observation-noise" else rows
+    found = rows[(rows["method"] == method) & (rows[x] == place)][studies.ERROR].dropna()
+    assert sentence.format(f"{found.mean():.3f} ± {found.std():.3f}") in page()
+
+
+def test_two_workers_do_nine_tenths_of_what_one_does_twice():
+    found = json.loads((RESULTS / "cluster.json").read_text())["efficiency"]["cluster"]["rounds"]
+    assert len(found) >= 3 and np.mean(found) >= 0.9
 
 
 def test_the_plan_of_a_cluster_is_that_of_what_was_measured_and_the_pages():

@@ -66,6 +66,17 @@ def test_a_column_of_several_kinds_is_text(tmp_path: Path):
     assert found["settings.steps"].tolist()[:2] == [3.0, 3.5] and pd.isna(found.loc["c", "settings.steps"])
 
 
+def test_a_setting_of_several_kinds_is_the_same_text_before_and_after_a_stop(tmp_path: Path):
+    name = "settings.lag"
+    for words in ({"a": 3, "b": None, "c": "auto"}, {"d": 3, "e": "auto"}):
+        with study_table(tmp_path) as table:
+            for key, value in words.items():
+                table.add(row(key, **({} if value is None else {name: value})))
+                table.merge()
+    found = pd.read_parquet(tmp_path / TABLE).set_index("key")[name].dropna()
+    assert found.to_dict() == {"a": "3", "c": "auto", "d": "3", "e": "auto"}
+
+
 @pytest.mark.parametrize(
     "damage",
     [

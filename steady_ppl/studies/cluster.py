@@ -15,7 +15,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from typing import Any, NamedTuple
 
-from steady_ppl.errors import ComputationError, UsageError, one_line
+from steady_ppl.errors import ComputationError, UsageError, one_line, shown
 from steady_ppl.fit import packages
 from steady_ppl.studies import job as work
 from steady_ppl.studies.job_files import JobFiles
@@ -71,11 +71,11 @@ class Cluster(Place):
         self.client.close(timeout=2)
 
     def _require_alike(self, address: str) -> None:
-        several = sum(worker["nthreads"] > 1 for worker in self._workers().values())
+        several = [name for name, worker in self._workers().items() if worker["nthreads"] > 1]
         if several:
             raise UsageError(
-                f"{several} workers have several threads, which would take turns: start them by "
-                f"`dask worker {address} --nthreads 1 --nworkers N`"
+                f"workers with several threads, which would take turns: {shown(', '.join(several), 200)}; start them "
+                f"by `dask worker {address} --nthreads 1 --nworkers N`"
             )
         here = packages()
         for worker, there in self._ask(packages).items():
@@ -117,7 +117,7 @@ class Cluster(Place):
                         if row := self._usable(answer, job, sent, say):
                             yield row
                     elif isinstance(answer, tuple) and isinstance(answer[1], self.killed):
-                        if sent.has_killed(job):
+                        if sent.deaths.killed(job.key):
                             yield given_up(job)
                         else:
                             sent.send(job)
@@ -144,6 +144,7 @@ class Cluster(Place):
         reason = answer.unlike
         if answer.row.get("reason") == work.CHANGED and JobFiles().is_of(job):
             reason = "other files than there are here"
+            sent.deaths.begun[job.key] -= 1  # only its files were looked at
         if not reason:
             return answer.row
         if answer.worker not in sent.refused:
@@ -175,6 +176,7 @@ class _Sent:
     Attributes:
         jobs: by their futures.
         running: hands out futures as they end, with their answers.
+        deaths: which of them kill workers.
         refused: addresses of workers that are not used.
     """
 
@@ -182,31 +184,47 @@ class _Sent:
         from distributed import as_completed
 
         self.client, self.topic, self.here = client, f"steady-study-{uuid.uuid4().hex}", packages()
-        self.jobs, self.refused = dict[Any, Job](), set[str]()
-        self.begun, self.in_vain = Counter[str](), 0
+        self.jobs, self.deaths, self.refused = dict[Any, Job](), Deaths(), set[str]()
         self.running = as_completed(loop=client.loop, with_results=True, raise_errors=False)
-        client.subscribe_topic(self.topic, self._hear_of_begun)
-
-    def _hear_of_begun(self, event: tuple[float, str]) -> None:
-        self.begun[event[1]] += 1
-        self.in_vain = 0
+        client.subscribe_topic(self.topic, lambda event: self.deaths.hear(event[1]))
 
     def send(self, job: Job, **where: Any) -> None:
         """Have it computed."""
         future = self.client.submit(computed, job, self.here, self.topic, pure=False, **where)
         self.jobs[future] = job
+        self.deaths.sent(job.key)
         self.running.add(future)
 
-    def has_killed(self, job: Job) -> bool:
-        """Whether it has been begun so often that it is the one that kills; Dask also blames what only waited.
+
+class Deaths:
+    """Tells jobs that kill their workers from those that only waited at one that died, which Dask blames as well.
+
+    Attributes:
+        begun: how often each job was, by its key.
+    """
+
+    def __init__(self) -> None:
+        self.begun, self.before, self.in_vain = Counter[str](), dict[str, int](), 0
+
+    def sent(self, key: str) -> None:
+        """It is given to the scheduler."""
+        self.before[key] = self.begun[key]
+
+    def hear(self, key: str) -> None:
+        """It is begun."""
+        self.begun[key] += 1
+        self.in_vain = 0
+
+    def killed(self, key: str) -> bool:
+        """Dask has given it up: whether it has been begun so often that it is the one that kills.
 
         Raises:
-            ComputationError: again and again workers have died while nothing was begun.
+            ComputationError: Dask gives up one after the other, and nothing is begun.
         """
-        self.in_vain += 1
+        self.in_vain = 0 if self.begun[key] > self.before[key] else self.in_vain + 1
         if self.in_vain > IN_VAIN:
             raise ComputationError("workers die before they begin")
-        return self.begun[job.key] >= TRIES
+        return self.begun[key] >= TRIES
 
 
 _held = Counter[str]()  # on a worker that is not used: how often it has held what it was given, by topic

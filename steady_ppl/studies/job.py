@@ -175,13 +175,13 @@ TASKS = {"fit": _fit, "discover": _discover}
 
 
 def in_limits(value: Sequence[float], limit: Sequence[float] | None) -> float:
-    """How large an effect is, in detection limits: 0 where none was planted, NaN where the tests do not have it.
+    """How large an effect is, in detection limits, by the component that has the most of its own: 0 where none was
+    planted, NaN where the tests do not have it.
 
     Args:
         value: how far each component of the coefficient is from where the effect is absent.
         limit: of each of its components.
     """
-    size = max(map(abs, value), default=0.0)
-    if size == 0.0:
+    if not any(value):
         return 0.0
-    return math.nan if limit is None else size / max(limit)
+    return math.nan if limit is None else max(abs(one) / least for one, least in zip(value, limit, strict=True))

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 from scipy import stats
 
@@ -19,9 +20,11 @@ from steady_ppl.harmless import harmless
 from steady_ppl.proof_pictures import COLORS, MARKS
 from steady_ppl.studies.plan import IN_LIMITS, LARGEST, Picture, Plan
 
-SIZES = (-1.0, 0.0, 0.25, 0.75, 1.25, 1.75, 2.5, 3.5, 5.0, 8.0, 12.0, math.inf)
-"""Ends of ranges of what is missing, in detection limits; the first is of drives that lack nothing."""
+SIZES = (-1.0, 0.0, *(1.25 ** (place - 0.5) for place in range(-6, 12)), math.inf)
+"""Ends of ranges of what is missing, in detection limits: each a quarter wider than the one before, one of them around
+a limit; the first is of drives that lack nothing."""
 SHARES = ("found", "right", "in_class")
+PUBLISHED = "published"  # in the legend
 Points = Sequence[Sequence[float]]
 
 
@@ -56,9 +59,12 @@ def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
     figure = Figure(figsize=(5.4 * len(picture.y), 5.4), layout="constrained")
     figure.suptitle(harmless(plan.title), fontsize=11, parse_math=False)
     lines = _lines(picture, own)
-    for panel, column in zip(figure.subplots(1, len(picture.y), squeeze=False)[0], picture.y, strict=True):
+    panels = figure.subplots(1, len(picture.y), squeeze=False, sharex=picture.x == IN_LIMITS)[0]
+    for panel, column in zip(panels, picture.y, strict=True):
         _panel(panel, picture, column, lines)
     entries = {str(line.get_label()): line for panel in figure.axes for line in panel.get_legend_handles_labels()[0]}
+    if PUBLISHED in entries:  # of every method in its own colour
+        entries[PUBLISHED] = Line2D([], [], **_published_look("0.4"))
     if entries:
         legend = figure.legend(
             entries.values(), entries, loc="outside lower center", ncols=2 * len(picture.y), fontsize=8
@@ -104,20 +110,21 @@ def _merit(rows: pd.DataFrame, column: str) -> tuple[int, float]:
 
 def _lines(picture: Picture, rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     """Rows of a method, apart where a setting or what is said of the data was varied besides x."""
-    if picture.x == IN_LIMITS:
-        return [(str(method), part) for method, part in rows.groupby("method", sort=False)]
-    axes = [name for name in rows if str(name).startswith(("data.", "settings.")) and name != picture.x]
+    x = "data.effect" if picture.x == IN_LIMITS else picture.x
+    axes = [name for name in rows if str(name).startswith(("data.", "settings.")) and name != x]
     found = []
     for method, own in rows.groupby("method", sort=False):
         varied = [name for name in axes if own[name].nunique(dropna=False) > 1]
         for values, part in own.groupby(varied, sort=False, dropna=False) if varied else [((), own)]:
             said = [f"{name.partition('.')[2]} {value}" for name, value in zip(varied, values, strict=True)]
-            found.append((", ".join([str(method), *said]), part))
+            found.append((", ".join([picture.labels.get(str(method), str(method)), *said]), part))
     return found
 
 
 def _panel(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str, pd.DataFrame]]) -> None:
-    published, crosses = dict(picture.published.get(column, {})), Counter[float]()
+    given = picture.published.get(column, {})
+    published = {picture.labels.get(name, name): others for name, others in given.items()}
+    crosses = Counter[float]()
     for index, (name, rows) in enumerate(lines):
         look, said = _look(index), harmless(name, kept="")
         found = points(rows, picture.x, column)
@@ -126,10 +133,10 @@ def _panel(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str,
         elif found:
             x, middle, low, high = zip(*found, strict=True)
             axes.errorbar(x, middle, (low, high), ms=5, lw=1.5, capsize=3, label=said, **look)
-        _published(axes, published.pop(name, []), look, "published")
+        _published(axes, published.pop(name, []), look["color"], PUBLISHED)
         _failed(axes, rows, picture.x, look, said, crosses)
     for index, (name, others) in enumerate(published.items(), len(lines)):
-        _published(axes, others, _look(index), f"{harmless(name, kept='')}, published")
+        _published(axes, others, _look(index)["color"], f"{harmless(name, kept='')}, {PUBLISHED}")
     _scale(axes, picture, column, lines)
     axes.set_xlabel(harmless(picture.labels.get(picture.x, picture.x)), parse_math=False)
     axes.set_ylabel(harmless(picture.labels.get(column, column)), parse_math=False)
@@ -142,10 +149,13 @@ def _look(index: int) -> dict[str, Any]:
     return {"color": COLORS[place], "marker": MARKS[(place + turn) % len(MARKS)], "ls": ("-", "-.")[turn % 2]}
 
 
-def _published(axes: Axes, points: Points, look: Mapping[str, Any], name: str) -> None:
+def _published(axes: Axes, points: Points, color: str, name: str) -> None:
     if points:
-        style: dict[str, Any] = {"ls": "--", "marker": "*", "ms": 7, "lw": 0.9, "alpha": 0.6, "color": look["color"]}
-        axes.plot(*zip(*points, strict=True), label=name, **style)
+        axes.plot(*zip(*points, strict=True), label=name, **_published_look(color))
+
+
+def _published_look(color: str) -> dict[str, Any]:
+    return {"ls": "--", "marker": "*", "ms": 7, "lw": 0.9, "alpha": 0.6, "color": color}
 
 
 def _failed(

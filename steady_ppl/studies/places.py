@@ -1,24 +1,28 @@
 """Where the jobs of a study are computed: what a place has to do, and processes of this machine, by joblib.
 
 What is here is what joblib leaves open: that a worker dies is told apart from what a job raises, and which jobs had
-been begun is known afterwards.
+been begun, and which had ended, is known afterwards.
 """
 
 from __future__ import annotations
 
+import json
 import tempfile
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
+from steady_ppl.errors import RunError
 from steady_ppl.studies import job as work
 from steady_ppl.studies.plan import Job
+from steady_ppl.whole_file import whole_file
 
 Row = dict[str, Any]
 Say = Callable[[str], None]
+ENDED = ".json"  # of the name of a job's mark, with its row
 
 
 class Place:
@@ -66,20 +70,31 @@ class Local(Place):
 
     def __enter__(self) -> Local:
         self.folder = tempfile.TemporaryDirectory(prefix="steady-study-")
-        self.marks = Path(self.folder.name)  # a job that is begun leaves its mark there
+        self.marks = Path(self.folder.name)  # a job that is begun leaves its mark there, and its row when it has ended
         return self
 
     def __exit__(self, *raised: Any) -> None:
         self.folder.cleanup()
 
     def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
+        waiting = {job.key for job in jobs}
+        try:
+            for row in self._computed(jobs):
+                waiting.remove(row["key"])
+                yield row
+        except self.died:  # joblib drops what had ended beside it and was not fetched yet
+            ended = [key for key in waiting if (self.marks / f"{key}{ENDED}").exists()]
+            yield from (json.loads((self.marks / f"{key}{ENDED}").read_text()) for key in ended)
+            raise
+
+    def _computed(self, jobs: Sequence[Job]) -> Iterator[Row]:
         # of a single one joblib would make this process, which must not die of a job: it starts two, sent work in turn
         with joblib.parallel_config("loky", n_jobs=max(2, self.workers), inner_max_num_threads=1):
             parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch=self.workers)
             yield from parallel(joblib.delayed(_marked)(job, self.marks) for job in jobs)
 
     def begun(self) -> set[str]:
-        marks = list(self.marks.iterdir())
+        marks = [mark for mark in self.marks.iterdir() if not mark.suffix]
         for mark in marks:
             mark.unlink()
         return {mark.name for mark in marks}
@@ -87,4 +102,7 @@ class Local(Place):
 
 def _marked(job: Job, marks: Path) -> Row:
     (marks / job.key).touch()
-    return work.run(job)
+    row = work.run(job)
+    with whole_file(marks / f"{job.key}{ENDED}", RunError) as beside:
+        beside.write_text(json.dumps(row))
+    return row

@@ -79,7 +79,7 @@ class Job:
         settings: of the recipe or of `discover`.
         seed: of data and method.
         known_start: the first state is given.
-        key: a hash of all that the result depends on, but for the engine itself.
+        key: a hash of all that is said of it, its method's name too, and of the contents of the files that it reads.
         label: by which it differs from the others.
     """
 
@@ -136,7 +136,7 @@ class Picture:
     Attributes:
         x: a column.
         y: columns, a panel each.
-        labels: of axes, by their columns.
+        labels: of axes, by their columns, and of methods, by their names.
         published: of a panel, by the method's name: points that others have found, `(x, y)`.
         chosen_by: a column of held-out drives; of a method's settings only the one with its largest mean at each x is
             drawn. All of them when empty.

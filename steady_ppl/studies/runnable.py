@@ -9,25 +9,26 @@ from typing import Any
 from steady_ppl.discovery import discover
 from steady_ppl.errors import UsageError, labelled
 from steady_ppl.measurement_errors import OPEN_LOOP
-from steady_ppl.program import Program, error_groups
+from steady_ppl.program import Program, error_groups, for_program
 from steady_ppl.program_file import load_program
 from steady_ppl.run_recipe import find_recipe, require_kind, require_settings
+from steady_ppl.simulation import simulate
 from steady_ppl.studies.job import ERRORS
 from steady_ppl.studies.job_data import drives, told, told_settings, truth
 from steady_ppl.studies.plan import Plan
 
 
 def require_runnable(plan: Plan) -> None:
-    """Load every program, plant every effect, look at every method's settings, read every log or table once and look
-    for the columns of the picture.
+    """Load every program, plant every effect, look at every method's settings, read every log or table once, hand every
+    program a drive and look for the columns of the picture.
 
     Raises:
         SteadyError: naming the method.
     """
-    programs = []
+    programs: list[tuple[str, Program]] = []
     for job in {(job.method, repr(job.settings)): job for job in plan.jobs}.values():
         with labelled(f"method {job.method}"):
-            programs.append(told(load_program(job.program), job))
+            programs.append((job.method, told(load_program(job.program), job)))
             told_settings(job)
             if job.task == "fit":
                 require_settings(job.recipe, find_recipe(job.recipe), job.settings)
@@ -35,12 +36,17 @@ def require_runnable(plan: Plan) -> None:
                 _require_search_settings(job.settings)
     for job in {repr(job.data): job for job in plan.jobs if "simulate" in job.data}.values():
         with labelled("data"):
-            truth(job)
-    if "simulate" not in plan.jobs[0].data:
-        with labelled("data"):
-            drives(plan.jobs[0])
+            owner = truth(job)
+    first = plan.jobs[0]
+    with labelled("data"):
+        given = simulate(owner, 1, seed=first.seed) if "simulate" in first.data else drives(first)["train"]
+    for method, program in programs:
+        with labelled(f"method {method}"):
+            read = for_program(program, given)
+            if first.known_start:
+                _ = read.known_start
     if plan.task == "fit" and plan.picture is not None:
-        _require_figures(plan.picture.columns, programs)
+        _require_figures(plan.picture.columns, [program for _, program in programs])
 
 
 def _require_figures(columns: Sequence[str], programs: Sequence[Program]) -> None:

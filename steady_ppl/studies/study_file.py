@@ -98,6 +98,9 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
     source = source_axes(folder, content["data"], data, task)
     if not content["seeds"] or not content["method"]:
         raise UsageError("expected at least one seed and one method")
+    for one in content["method"]:
+        if not one["name"].strip():
+            raise UsageError(f"method.name is {one['name']!r}, expected a name")
     methods = [method_axes(folder, one, task) for one in content["method"]]
     cells = len(content["seeds"]) * count(source) * sum(count(one["settings"]) for one in methods)
     if cells > MOST_JOBS:
@@ -141,7 +144,10 @@ def _without_doubles(jobs: tuple[Job, ...]) -> tuple[Job, ...]:
     seen: set[str] = set()
     for job in jobs:
         if job.key in seen:
-            raise UsageError(f"{job.method} is there twice: methods need names of their own, and axes other values")
+            raise UsageError(
+                f"{job.method} with seed {job.seed} is there twice: methods need names of their own, and seeds and "
+                "other lists values that differ"
+            )
         seen.add(job.key)
     return jobs
 
@@ -177,7 +183,8 @@ def _require_columns(picture: Picture, task: str, jobs: tuple[Job, ...]) -> None
         if name in said and not all(isinstance(value, int | float) for value in said[name]):
             raise UsageError(f"picture: column {name} is no number")
         if name not in said and not known:
-            there = ", ".join([*(one for one in said if one.startswith(("data.", "settings."))), *FIGURES[task]])
+            figures = [f"{figure}…" if figure.endswith(".") else figure for figure in FIGURES[task]]
+            there = ", ".join([*(one for one in said if one.startswith(("data.", "settings."))), *figures])
             raise UsageError(f"picture: there will be no column {name}; there will be {there}")
     methods = {job.method: None for job in jobs}
     for name in picture.leave_out:

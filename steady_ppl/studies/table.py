@@ -160,7 +160,7 @@ def _write(frame: pd.DataFrame, file: Path) -> None:
     for name in frame:
         kinds = {_kind(value) for value in frame[name] if not _is_absent(value)}
         if len(kinds) > 1 or "other" in kinds:
-            frame[name] = [None if _is_absent(value) else str(value) for value in frame[name]]
+            frame[name] = [None if _is_absent(value) else _text(value) for value in frame[name]]
     with whole_file(file, RunError) as beside:
         frame.to_parquet(beside, index=False)
         with beside.open("r+b") as written:
@@ -170,6 +170,11 @@ def _write(frame: pd.DataFrame, file: Path) -> None:
 def _kind(value: object) -> str:
     names = {bool: "truth", np.bool_: "truth", str: "text"}
     return names.get(type(value), "number" if isinstance(value, int | float | np.number) else "other")
+
+
+def _text(value: object) -> str:
+    """A whole number without a fraction, however the column held it: it has one where others are absent."""
+    return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
 
 
 def _is_absent(value: object) -> bool:
