@@ -32,7 +32,7 @@ def page() -> str:
 
 def test_figures_of_the_page_are_those_of_the_tables():
     quoted = re.findall(r"\d\.\d{3}(?: ± \d\.\d{3})?|\d+% \(\d+%–\d+%\)", page())
-    tables = (RESULTS / "studies.md").read_text()
+    tables = (RESULTS / "studies.md").read_text() + (ROOT / "studies" / "data-size.toml").read_text()  # published
     assert len(quoted) >= 10 and [one for one in quoted if one not in tables] == []
 
 
@@ -53,14 +53,26 @@ def test_figures_of_the_page_are_those_of_the_tables():
         ("particles", "lookahead", 100, "errs as much: {} and "),
         ("particles", "bootstrap", 20_000, " and {} in roll-outs"),
         ("particles", "bootstrap", 200, "200 of them end at {}, in"),
+        ("data-size", "program with drag", 4, "four drives enough: {} m"),
+        ("data-size", "program with drag", 160, " m in roll-outs of a second, {} with 160"),
+        ("data-size", "program without drag", 4, "as good with four as with 160: {} and "),
+        ("data-size", "program without drag", 160, " and {} m, 4.7 nats"),
+        ("data-size", "network, STEADY", 8, "passes the program without drag at eight ({})"),
+        ("data-size", "network, STEADY", 160, "and ends at {} m"),
+        ("data-size", "network, SVI", 16, "as good with sixteen ({} m, "),
+        ("data-size", "network, STEADY", 16, ", STEADY {})"),
     ],
 )
 def test_a_figure_of_the_page_is_that_of_the_method_that_it_names(study: str, method: str, place: float, sentence: str):
     rows = pd.read_parquet(RESULTS / f"{study}.parquet")
-    x = studies.SIGMA if study == "observation-noise" else studies.PARTICLES
+    x, column, digits = {
+        "observation-noise": (studies.SIGMA, studies.ERROR, 3),
+        "particles": (studies.PARTICLES, studies.ERROR, 3),
+        "data-size": (studies.DRIVES, "forward.location", 4),
+    }[study]
     rows = studies.of_best_settings(rows) if study == "observation-noise" else rows
-    found = rows[(rows["method"] == method) & (rows[x] == place)][studies.ERROR].dropna()
-    assert sentence.format(f"{found.mean():.3f} ± {found.std():.3f}") in page()
+    found = rows[(rows["method"] == method) & (rows[x] == place)][column].dropna()
+    assert sentence.format(f"{found.mean():.{digits}f} ± {found.std():.{digits}f}") in page()
 
 
 def test_two_workers_do_nine_tenths_of_what_one_does_twice():
