@@ -87,6 +87,11 @@ def test_a_job_is_known_by_what_it_depends_on_and_not_by_where_it_is(tmp_path: P
         ('["log_likelihood"]', "[]", "picture.y has 0 columns"),
         ("y = [", 'chosen_by = "forward.total"\ny = [', "chosen_by is forward.total, expected valid_log_likelihood"),
         ("x = ", 'leave_out = ["learnt"]\nx = ', "leave_out: learnt is no method; there are as declared, learned"),
+        (
+            "x = ",
+            'labels = {{learnt = "a"}}\nx = ',
+            "labels: learnt is not in the picture; there are settings.*, learned",
+        ),
         ("[60, -4.0]", "[60]", r"learned: \[60\] is no point"),
         ("[60, -4.0]", "[60, 1e200]", "is no point"),
         ('title = "Small"', f'title = "{"x" * 1001}"', "more than 1000 characters"),

@@ -190,6 +190,11 @@ def _require_columns(picture: Picture, task: str, jobs: tuple[Job, ...]) -> None
     for name in picture.leave_out:
         if name not in methods:
             raise UsageError(f"picture.leave_out: {name} is no method; there are {', '.join(methods)}")
+    others = {name for lines in picture.published.values() for name in lines}
+    for name in picture.labels:
+        if name not in {*picture.columns, *methods, *others}:
+            there = ", ".join([*picture.columns, *methods])
+            raise UsageError(f"picture.labels: {name} is not in the picture; there are {there}")
     for column in picture.published:
         if column not in picture.y:
             raise UsageError(f"picture.published: {column} is no panel; y has {', '.join(picture.y)}")
