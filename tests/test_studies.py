@@ -42,10 +42,10 @@ from steady_ppl import Fit
 
 def fit(program, table, valid=None, *, known_start=False, mark="", deadly=False, seed=0):
     times = Path(mark) / str(seed)
-    while seed == 13 and not (Path(mark) / "1").exists():
-        time.sleep(0.05)  # otherwise 1 may have been begun twice, for all anybody knows, before it dies by itself
     with times.open("a") as file:
         file.write("1")
+    while seed == 13 and not (Path(mark) / "1").exists():
+        time.sleep(0.05)  # otherwise 1 may have been begun twice, for all anybody knows, before it dies by itself
     if deadly and (seed == 13 or times.stat().st_size == 1):
         os.kill(os.getpid(), signal.SIGKILL)
     if seed == 7:
@@ -73,11 +73,9 @@ def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(t
         found.loc[7, "reason"] == "ValueError: seven"
         and found.loc[13, "reason"] == "its worker died each time that it was tried"
     )
-    # with two workers the other one may have died of 13 while 1 was begun again
-    assert (
-        2 <= (tmp_path / "marks" / "1").stat().st_size <= 1 + workers
-        and (tmp_path / "marks" / "13").stat().st_size == 3
-    )
+    begun = {seed: (tmp_path / "marks" / str(seed)).stat().st_size for seed in (1, 13)}
+    # of two workers the other one may have died of 13 while 1 was begun again, or of 1 before 13 had left its mark
+    assert 2 <= begun[1] <= 1 + workers and 4 - workers <= begun[13] <= 3
     assert sorted(file.name for file in out.iterdir()) == [TABLE, "study.json"]
     assert run_study(plan, out, Local(workers)) == 3  # what has failed is left
     assert (tmp_path / "marks" / "7").stat().st_size == 2
@@ -104,11 +102,9 @@ def test_what_had_ended_beside_a_job_that_dies_is_not_lost(tmp_path: Path):
                 wait_for((tmp_path / "marks" / "13").exists)
                 time.sleep(2)
 
-    with Local(2) as place:
-        with pytest.raises(place.died):
-            fetch(place)
-        ended = [mark.stem for mark in place.marks.glob("*.json")]
-    assert sorted(found) == sorted(ended) and len(found) >= 3  # the other worker may have died at the fourth
+    with Local(2) as place, pytest.raises(place.died):
+        fetch(place)
+    assert len(found) == len(set(found)) >= 3  # the other worker may have died at the fourth
 
 
 class Died(Exception):

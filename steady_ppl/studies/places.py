@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -79,15 +80,18 @@ class Local(Place):
     def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
         waiting = {job.key for job in jobs}
         try:
-            for row in self._computed(jobs):
-                waiting.remove(row["key"])
-                yield row
+            with closing(self._computed(jobs)) as computed:
+                for row in computed:
+                    waiting.remove(row["key"])
+                    (self.marks / f"{row['key']}{ENDED}").unlink(missing_ok=True)
+                    yield row
         except self.died:  # joblib drops what had ended beside it and was not fetched yet
-            ended = [key for key in waiting if (self.marks / f"{key}{ENDED}").exists()]
-            yield from (json.loads((self.marks / f"{key}{ENDED}").read_text()) for key in ended)
+            for ended in self.marks.glob(f"*{ENDED}"):
+                if ended.stem in waiting:
+                    yield json.loads(ended.read_text())
             raise
 
-    def _computed(self, jobs: Sequence[Job]) -> Iterator[Row]:
+    def _computed(self, jobs: Sequence[Job]) -> Generator[Row]:
         # of a single one joblib would make this process, which must not die of a job: it starts two, sent work in turn
         with joblib.parallel_config("loky", n_jobs=max(2, self.workers), inner_max_num_threads=1):
             parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch=self.workers)
@@ -103,6 +107,6 @@ class Local(Place):
 def _marked(job: Job, marks: Path) -> Row:
     (marks / job.key).touch()
     row = work.run(job)
-    with whole_file(marks / f"{job.key}{ENDED}", RunError) as beside:
+    with suppress(RunError), whole_file(marks / f"{job.key}{ENDED}", RunError) as beside:  # no room: fetched, or again
         beside.write_text(json.dumps(row))
     return row

@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from steady_ppl.data import Trajectories
 from steady_ppl.discovery import discover
 from steady_ppl.errors import UsageError, labelled
 from steady_ppl.measurement_errors import OPEN_LOOP
@@ -15,7 +16,7 @@ from steady_ppl.run_recipe import find_recipe, require_kind, require_settings
 from steady_ppl.simulation import simulate
 from steady_ppl.studies.job import ERRORS
 from steady_ppl.studies.job_data import drives, told, told_settings, truth
-from steady_ppl.studies.plan import Plan
+from steady_ppl.studies.plan import Job, Plan
 
 
 def require_runnable(plan: Plan) -> None:
@@ -36,10 +37,10 @@ def require_runnable(plan: Plan) -> None:
                 _require_search_settings(job.settings)
     for job in {repr(job.data): job for job in plan.jobs if "simulate" in job.data}.values():
         with labelled("data"):
-            owner = truth(job)
+            truth(job)
     first = plan.jobs[0]
     with labelled("data"):
-        given = simulate(owner, 1, seed=first.seed) if "simulate" in first.data else drives(first)["train"]
+        given = _a_drive(first) if "simulate" in first.data else drives(first)["train"]
     for method, program in programs:
         with labelled(f"method {method}"):
             read = for_program(program, given)
@@ -47,6 +48,11 @@ def require_runnable(plan: Plan) -> None:
                 _ = read.known_start
     if plan.task == "fit" and plan.picture is not None:
         _require_figures(plan.picture.columns, [program for _, program in programs])
+
+
+def _a_drive(job: Job) -> Trajectories:
+    """Of what simulates the drives, without any effect: its columns are the same."""
+    return simulate(told(load_program(job.data["simulate"]), job), 1, seed=job.seed)
 
 
 def _require_figures(columns: Sequence[str], programs: Sequence[Program]) -> None:
