@@ -190,9 +190,9 @@ class _Sent:
 
     def send(self, job: Job, **where: Any) -> None:
         """Have it computed."""
+        self.deaths.sent(job.key)  # before it can be begun
         future = self.client.submit(computed, job, self.here, self.topic, pure=False, **where)
         self.jobs[future] = job
-        self.deaths.sent(job.key)
         self.running.add(future)
 
 

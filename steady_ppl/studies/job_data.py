@@ -35,14 +35,19 @@ def drives(job: Job) -> Split:
     if "alpha_truck" in said:
         folder, degrees = Path(said["alpha_truck"]), said["sigma_deg"]
         return {part: read_alpha_truck(folder / part, seed=job.seed, sigma_degrees=degrees) for part in PARTS}
-    owner = truth(job)
+    whole = truth(job)
     seeds = {part: 10 * job.seed + i for i, part in enumerate(PARTS, 1)}
-    return {part: simulate(owner, said[part], seed=seeds[part]) for part in PARTS if part in said}
+    return {part: simulate(whole, said[part], seed=seeds[part]) for part in PARTS if part in said}
+
+
+def without_effect(job: Job) -> Program:
+    """What simulates the drives, without the effect that its owner's program lacks."""
+    return told(load_program(job.data["simulate"]), job)
 
 
 def truth(job: Job) -> Program:
     """What simulates the drives, with the effect that its owner's program lacks."""
-    owner, effect = told(load_program(job.data["simulate"]), job), job.data["effect"]
+    owner, effect = without_effect(job), job.data["effect"]
     return with_effects(owner, [effect], say=lambda line: None) if effect else owner
 
 
@@ -52,7 +57,7 @@ def planted(job: Job) -> tuple[Variant | None, list[float]]:
     if not job.data["effect"]:
         return None, []
     name, at, options, value = parsed(job.data["effect"])
-    variant = chosen_variant(told(load_program(job.data["simulate"]), job), name, at, **options)
+    variant = chosen_variant(without_effect(job), name, at, **options)
     coefficient = variant.coefficient(value, torch.zeros(()))
     return variant, (coefficient - variant.effect.null).flatten().tolist()
 

@@ -6,7 +6,6 @@ import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from steady_ppl.data import Trajectories
 from steady_ppl.discovery import discover
 from steady_ppl.errors import UsageError, labelled
 from steady_ppl.measurement_errors import OPEN_LOOP
@@ -15,8 +14,8 @@ from steady_ppl.program_file import load_program
 from steady_ppl.run_recipe import find_recipe, require_kind, require_settings
 from steady_ppl.simulation import simulate
 from steady_ppl.studies.job import ERRORS
-from steady_ppl.studies.job_data import drives, told, told_settings, truth
-from steady_ppl.studies.plan import Job, Plan
+from steady_ppl.studies.job_data import drives, told, told_settings, truth, without_effect
+from steady_ppl.studies.plan import Plan
 
 
 def require_runnable(plan: Plan) -> None:
@@ -40,7 +39,10 @@ def require_runnable(plan: Plan) -> None:
             truth(job)
     first = plan.jobs[0]
     with labelled("data"):
-        given = _a_drive(first) if "simulate" in first.data else drives(first)["train"]
+        # an effect changes no column
+        given = (
+            simulate(without_effect(first), 1, seed=first.seed) if "simulate" in first.data else drives(first)["train"]
+        )
     for method, program in programs:
         with labelled(f"method {method}"):
             read = for_program(program, given)
@@ -48,11 +50,6 @@ def require_runnable(plan: Plan) -> None:
                 _ = read.known_start
     if plan.task == "fit" and plan.picture is not None:
         _require_figures(plan.picture.columns, [program for _, program in programs])
-
-
-def _a_drive(job: Job) -> Trajectories:
-    """Of what simulates the drives, without any effect: its columns are the same."""
-    return simulate(told(load_program(job.data["simulate"]), job), 1, seed=job.seed)
 
 
 def _require_figures(columns: Sequence[str], programs: Sequence[Program]) -> None:
