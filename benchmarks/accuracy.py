@@ -30,22 +30,26 @@ from experiments import CONDITIONS, LOGS, SIZES, STANDARD, STEADY_SETTINGS, Cond
 from foundation import Bound, report, run_jobs
 
 from inference import steady
-from models.hovercraft import HovercraftTruth
-from models.neural_vehicle import NeuralHovercraft, NeuralTruck
+from models.paper import PaperHovercraftTruth, PaperNeuralHovercraft, PaperNeuralTruck
 from steady_ppl import Fit, Program, Trajectories, for_program, neglected, run_filter, seeded
 from steady_ppl.evaluation import evaluate
 
 
 def unknown_drag() -> Program:
     """The structure of what simulates Hov, its values unknown: guesses that are off by up to a factor of seven."""
-    program = HovercraftTruth()
+    program = PaperHovercraftTruth()
     program.mass, program.inertia = torch.tensor(1.0), torch.tensor(2.2)
     program.drag = torch.tensor([0.1, 0.1, 0.1])
     program.noise = torch.tensor([0.2, 0.2, 0.1])
     return program
 
 
-PROGRAMS = {"hov": NeuralHovercraft, "hov-mechanistic": unknown_drag, "hov+": NeuralHovercraft, "truck": NeuralTruck}
+PROGRAMS = {
+    "hov": PaperNeuralHovercraft,
+    "hov-mechanistic": unknown_drag,
+    "hov+": PaperNeuralHovercraft,
+    "truck": PaperNeuralTruck,
+}
 MUSTS = {
     ("hov", "forward location"): Bound(0.039, published=".0428"),
     ("hov", "forward angle"): Bound(0.0125, published=".0140"),

@@ -1,4 +1,7 @@
-"""The paper's experiments in pieces: data, the four programs, what was published."""
+"""The paper's experiments in pieces: data, the four programs, what was published.
+
+The paper's world and its programs take its authors' explicit Euler step, by the names of `models/paper.py`.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +17,13 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from inference import fit_truth, hand, steady  # noqa: E402
-from models.hovercraft import Hovercraft, HovercraftTruth  # noqa: E402
-from models.neural_vehicle import NeuralHovercraft, NeuralTruck  # noqa: E402
-from models.truck import Truck  # noqa: E402
+from models.paper import (  # noqa: E402
+    PaperHovercraft,
+    PaperHovercraftTruth,
+    PaperNeuralHovercraft,
+    PaperNeuralTruck,
+    PaperTruck,
+)
 from steady_ppl import Fit, PlanarVehicle, Trajectories, seeded, simulate  # noqa: E402
 from steady_ppl.alpha_truck import read_alpha_truck  # noqa: E402
 from steady_ppl.evaluation import evaluate  # noqa: E402
@@ -76,19 +83,29 @@ CONDITIONS = {
 }
 
 
-def hov(seed: int, train: int = 16, valid: int = 16, test: int = 32, condition: Condition = STANDARD) -> Split:
+def hov(
+    seed: int,
+    train: int = 16,
+    valid: int = 16,
+    test: int = 32,
+    condition: Condition = STANDARD,
+    truth: type[PlanarVehicle] = PaperHovercraftTruth,
+) -> Split:
     """Hov (train 16) or Hov+ (train 160, valid 32): train, valid and test drives of one data seed."""
-    truth = condition.of(HovercraftTruth())
+    world = condition.of(truth())
     sizes = enumerate((train, valid, test), 1)
     return tuple(  # type: ignore
-        simulate(truth, size, seed=10 * seed + part).observed_every(condition.every) for part, size in sizes
+        simulate(world, size, seed=10 * seed + part).observed_every(condition.every) for part, size in sizes
     )
 
 
-def truck(folder: Path, seed: int, condition: Condition = STANDARD) -> Split:
-    """The AlphaTruck logs with one draw of the bearings."""
+def truck(folder: Path, seed: int, condition: Condition = STANDARD, *, centred: bool = False) -> Split:
+    """The AlphaTruck logs with one draw of the bearings; `centred` velocities are those of a row, the authors' those of
+    half a row later."""
     return tuple(  # type: ignore
-        read_alpha_truck(folder / split, seed=seed, sigma_degrees=condition.degrees).observed_every(condition.every)
+        read_alpha_truck(folder / split, seed=seed, sigma_degrees=condition.degrees, centred=centred).observed_every(
+            condition.every
+        )
         for split in ("train", "valid", "test")
     )
 
@@ -99,10 +116,10 @@ def learn(
     """Fit one method to the train and valid drives, known start, as the paper does."""
     torch.set_num_threads(1)
     train, valid, _ = data
-    network = NeuralHovercraft if vehicle == "hov" else NeuralTruck
-    own = Hovercraft if vehicle == "hov" else Truck
+    network = PaperNeuralHovercraft if vehicle == "hov" else PaperNeuralTruck
+    own = PaperHovercraft if vehicle == "hov" else PaperTruck
     with seeded(seed, "program"):
-        program = {"steady": network, "fit-truth": network, "hand": own, "truth": HovercraftTruth}[method]()
+        program = {"steady": network, "fit-truth": network, "hand": own, "truth": PaperHovercraftTruth}[method]()
     if method == "steady":
         bearings_only = tuple(part.without_truth(keep_start=True) for part in (train, valid))
         return steady.fit(

@@ -11,9 +11,13 @@ from experiments import ROOT, Split
 from resumable import digest
 
 from inference import fit_hand, fit_truth, fit_tv, hand, steady, steady_minus, svi
-from models.hovercraft import Hovercraft, HovercraftTruth
-from models.neural_vehicle import NeuralHovercraft, NeuralTruck
-from models.truck import Truck
+from models.paper import (
+    PaperHovercraft,
+    PaperHovercraftTruth,
+    PaperNeuralHovercraft,
+    PaperNeuralTruck,
+    PaperTruck,
+)
 from steady_ppl import Fit, Trajectories, for_program, log_likelihood, seeded
 from steady_ppl.errors import FilterError
 from steady_ppl.metrics import state_estimation
@@ -34,15 +38,16 @@ OF_ITS_OWN: dict[str, Settings] = {
     "steady": {"guide": "gaussian"},
     "steady-bootstrap": {"guide": "bootstrap"},
 }
+PROGRAMS = {"hov": (PaperHovercraft, PaperNeuralHovercraft), "truck": (PaperTruck, PaperNeuralTruck)}
 LINEAGES = {"hov": 8, "hov+": 1, "truck": 7}  # as the authors
 
 
 def learnt(method: str, experiment: str, data: Split, seed: int, settings: Settings) -> Fit:
     """One method's fit to the train and valid drives, known start."""
     train, valid, _ = data
-    own, network = (Truck, NeuralTruck) if experiment == "truck" else (Hovercraft, NeuralHovercraft)
+    own, network = PROGRAMS["truck" if experiment == "truck" else "hov"]
     with seeded(seed, "program"):
-        program = {"hand": own, "truth": HovercraftTruth}.get(method, network)()
+        program = {"hand": own, "truth": PaperHovercraftTruth}.get(method, network)()
     if method in ("hand", "truth"):
         return RECIPES[method](program, train, valid, known_start=True, seed=seed)
     if method != "fit-truth":

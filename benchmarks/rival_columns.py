@@ -17,8 +17,9 @@ from steady_ppl.discovery.columns import Column, columns_of
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.elements import elements, moved
 from steady_ppl.linearization import Path, linearize
-from steady_ppl.program import acting_controls, names
+from steady_ppl.program import names
 from steady_ppl.scores import channel_moments
+from steady_ppl.substeps import acting_controls
 
 REGRESSED = ("push", "command", "history")  # forms of effects that change an acceleration
 

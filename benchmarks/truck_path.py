@@ -31,7 +31,7 @@ def path(logs: Path, draw: int, *, judged: bool = True) -> dict[str, Any]:
         The steps, each with the verdict, what was added, and the errors.
     """
     torch.set_num_threads(1)
-    train, valid, test = truck(logs, draw)
+    train, valid, test = truck(logs, draw, centred=True)
     drives = joined(train=train, valid=valid).without_truth(keep_start=True)
     with seeded(0, "program"):
         now: Any = Truck()

@@ -24,8 +24,8 @@ from truck_programs import learnt
 
 from steady_ppl import Program, Trajectories, for_program, roll_out
 from steady_ppl.metrics import forward_mean
-from steady_ppl.program import acting_controls
 from steady_ppl.sites import AtMean
+from steady_ppl.substeps import acting_controls
 
 SHOWN = {
     "fitted": ("#d55e00", "as written, fitted"),
@@ -84,7 +84,7 @@ def horizons(axes: Axes, test: Trajectories, programs: dict[str, Program]) -> No
 
 
 def roll_out_picture(logs: Path, draw: int, file: Path) -> None:
-    data = truck(logs, draw)
+    data = truck(logs, draw, centred=True)
     programs: dict[str, Any] = {name: learnt(name, data, draw).program for name in SHOWN}
     figure, axes = plt.subplots(1, len(DRIVES) + 1, figsize=(14, 4), layout="constrained")
     labels = list(data[2].labels)

@@ -144,7 +144,7 @@ def calibrated(logs: Path) -> Program:
     """
     parts: dict[str, Trajectories] = {}
     for draw in CALIBRATION:
-        train, valid, _ = truck(logs, draw)
+        train, valid, _ = truck(logs, draw, centred=True)
         parts |= {f"train{draw}": train, f"valid{draw}": valid}
     program = DiscoveredTruck().with_effect("response_time:yaw", 0.0)
     drives = joined(**parts).without_truth(keep_start=True)
@@ -170,7 +170,7 @@ def planted(logs: Path, fault: str, share: float, draw: int) -> dict[str, Any]:
     """
     torch.set_num_threads(1)
     program = calibrated(logs)
-    train, valid, _ = (FAULTS[fault].plant(part, share) for part in truck(logs, draw))
+    train, valid, _ = (FAULTS[fault].plant(part, share) for part in truck(logs, draw, centred=True))
     drives = joined(train=train, valid=valid).without_truth(keep_start=True)
     began = time.perf_counter()
     figures = discover(frozen(program), drives, known_start=True, seed=draw).figures

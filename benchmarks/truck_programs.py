@@ -12,19 +12,21 @@ from experiments import STEADY_SETTINGS, Split, truck
 from inference import hand, steady
 from models.discovered_truck import DiscoveredTruck, HybridTruck
 from models.neural_vehicle import NeuralTruck
+from models.paper import PaperNeuralTruck, PaperTruck
 from models.truck import Truck
 from steady_ppl import Fit, Trajectories, for_program, seeded, smoothed_states
 from steady_ppl.evaluation import evaluate
-from steady_ppl.program import acting_controls
+from steady_ppl.substeps import acting_controls, row_controls
 
 # Chosen by held-out log p(y) of the valid split, draws 11 to 14 of the bearings: see docs/truck.md. Draws of the
 # Gaussian guide: 388.0, 393.0, 393.7, 392.5 nats a drive, of the lookahead guide 388.0, 393.4, 394.2, 392.9; with it a
 # ramp of 2: 387.8, 392.9, 394.0, 393.0.
 MECHANISTIC = {"guide": "lookahead", "steps": 200, "learning_rate": 0.03, "ramp": 3.0}
 PROGRAMS: dict[str, tuple[Any, dict[str, Any]]] = {
-    "hand": (Truck, {}),
+    "hand": (PaperTruck, {}),
     "fitted": (Truck, MECHANISTIC),
     "network": (NeuralTruck, STEADY_SETTINGS["lookahead", "truck"] | {"guide": "lookahead"}),
+    "network, Euler": (PaperNeuralTruck, STEADY_SETTINGS["lookahead", "truck"] | {"guide": "lookahead"}),
     "discovered": (DiscoveredTruck, MECHANISTIC),
     "hybrid": (HybridTruck, MECHANISTIC),
 }
@@ -44,11 +46,12 @@ def learnt(name: str, data: Split, draw: int) -> Fit:
 def judged(logs: Path, name: str, draw: int) -> dict[str, Any]:
     """Errors of one program on the test drives of one draw of the bearings."""
     torch.set_num_threads(1)
-    data = truck(logs, draw)
+    data = truck(logs, draw, centred=True)
     began = time.perf_counter()
     fit = learnt(name, data, draw)
     seconds = time.perf_counter() - began
     record = {"program": name, "draw": draw, "seconds": seconds} | evaluate(fit, data[2])
+    record["authors_starts"] = evaluate(fit, truck(logs, draw)[2])  # their velocities know the next row's place
     if not isinstance(fit.program, NeuralTruck):
         own = {key: value for key, value in fit.program.named_parameters() if "hidden" not in key and "." not in key}
         record["parameters"] = {key.removesuffix("_unconstrained"): None for key in own}
@@ -65,7 +68,7 @@ def left_to_do(program: Any, table: Trajectories) -> dict[str, list[float]]:
     smoothed states of drives."""
     data = for_program(program, table).without_truth(keep_start=True)
     states = smoothed_states(program, data, known_start=True)[:-1]
-    given = (states, acting_controls(program, data)[:-1])
+    given = (states, row_controls(program, acting_controls(program, data))[:-1])
     if isinstance(program, HybridTruck):
         whole, by_network = program.accelerations(*given, data.steps)[0], program.rest(*given)[0]
     else:

@@ -79,7 +79,7 @@ def learnt(name: str, seed: int) -> Record:
     """The fits with the known and with the wrong map, judged."""
     torch.set_num_threads(1)
     known, unknown, settings = PROGRAMS[name]
-    train, valid, test = hov(seed)
+    train, valid, test = hov(seed, truth=HovercraftTruth)
     train, valid = (part.without_truth(keep_start=True) for part in (train, valid))
     figures: Record = {"program": name, "seed": seed}
     for which, kind in (("known map", known), ("learned map", unknown)):

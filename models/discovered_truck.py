@@ -17,31 +17,38 @@ class DiscoveredTruck(Truck):
 
     speed, turn as commanded `delay` seconds before                     it acts later than it is told
     turned    = (1 − share) turn + share · turn / speed · v              it steers a curve, not a turn rate
-    a_forward = clip((speed_gain · speed − v) / step, ±limit) + bias₁    forwards and backwards differ
-    a_lateral = (lever · yaw_rate + slip · v · yaw_rate − w) / step + bias₂
+    a_forward = clip((speed_gain · speed − v) / speed_time, ±limit) + bias − w · yaw_rate
+                                                                         it follows its command with a lag
+    a_lateral = ((lever + slip · v) yaw_rate + crab · v − w) / grip_time + v · yaw_rate
                                                                          the tracked point is before the rear axle
-    a_yaw     = clip((turn_gain · turned − yaw_rate) / step, ±limit) − caster · v · yaw_rate
+    a_yaw     = clip((turn_gain · turned − yaw_rate) / turn_time, ±limit) − caster · v · yaw_rate
                                                                          curves open forwards, close backwards
     σ         = noise · (1 + erratic · |command − state|)                of forward and yaw
 
     v and w are the forward and lateral velocity.
     """
 
+    substeps = 4
+    settling = property(lambda self: self.grip_time)
     rates = {"noise": 3.0, "erratic": 3.0}
 
     def __init__(self):
         super().__init__()
-        self.speed_gain = PyroParam(tensor(0.89), constraints.positive)
-        self.turn_gain = PyroParam(tensor(0.8), constraints.positive)
-        self.limit = PyroParam(tensor(4.8), constraints.positive)
-        self.delay = PyroParam(tensor(0.05), constraints.positive)
-        self.share = PyroParam(tensor(0.7))
-        self.bias = PyroParam(tensor([-0.3, -0.05]))
-        self.lever = PyroParam(tensor(0.46))
-        self.slip = PyroParam(tensor(0.05))
-        self.caster = PyroParam(tensor(0.75))
-        self.erratic = PyroParam(tensor(0.5), constraints.positive)
-        self.noise = PyroParam(tensor([2.5, 1.2, 1.2]), constraints.positive)
+        self.speed_gain = PyroParam(tensor(0.92), constraints.positive)
+        self.turn_gain = PyroParam(tensor(0.82), constraints.positive)
+        self.speed_time = PyroParam(tensor(0.12), constraints.positive)
+        self.turn_time = PyroParam(tensor(0.07), constraints.positive)
+        self.grip_time = PyroParam(tensor(0.05), constraints.positive)
+        self.limit = PyroParam(tensor(6.0), constraints.positive)
+        self.delay = PyroParam(tensor(0.08), constraints.positive)
+        self.share = PyroParam(tensor(0.75))
+        self.bias = PyroParam(tensor(-0.3))
+        self.lever = PyroParam(tensor(0.36))
+        self.slip = PyroParam(tensor(-0.08))
+        self.crab = PyroParam(tensor(-0.01))
+        self.caster = PyroParam(tensor(1.0))
+        self.erratic = PyroParam(tensor([2.0, 1.2]), constraints.positive)
+        self.noise = PyroParam(tensor([0.9, 0.4, 1.2]), constraints.positive)
 
     def actuators(self, control, time):
         return delayed(control, time, self.delay)
@@ -50,18 +57,20 @@ class DiscoveredTruck(Truck):
         """Means and standard deviations, `(..., 3)` each."""
         speed, turn = control.unbind(-1)
         forward, lateral, yaw_rate = self.body_velocity(state)
-        along, across = self.bias.unbind(-1)
         by_curvature = turn * speed * forward / (speed**2 + 0.05**2)
         turned = turn + self.share * (by_curvature - turn)
-        sideways = (self.lever + self.slip * forward) * yaw_rate
+        sideways = (self.lever + self.slip * forward) * yaw_rate + self.crab * forward
         mean = stack(
-            ((self.speed_gain * speed - forward) / step).clamp(-self.limit, self.limit) + along,
-            (sideways - lateral) / step + across,
-            ((self.turn_gain * turned - yaw_rate) / step).clamp(-self.limit, self.limit)
+            ((self.speed_gain * speed - forward) / self.speed_time).clamp(-self.limit, self.limit)
+            + self.bias
+            - lateral * yaw_rate,
+            (sideways - lateral) / self.grip_time + forward * yaw_rate,
+            ((self.turn_gain * turned - yaw_rate) / self.turn_time).clamp(-self.limit, self.limit)
             - self.caster * forward * yaw_rate,
         )
         slow, askew = (speed - forward).abs(), (turn - yaw_rate).abs()
-        wider = stack(1 + self.erratic * slow, torch.ones_like(slow), 1 + self.erratic * askew)
+        by_speed, by_turn = self.erratic.unbind(-1)
+        wider = stack(1 + by_speed * slow, torch.ones_like(slow), 1 + by_turn * askew)
         return mean, self.noise * wider
 
     def transition(self, state, control, time, step):

@@ -55,3 +55,4 @@ class GpsBoatTruth(GpsBoat):
     """What its owner does not know: water brakes in three ways."""
 
     effects = ("yaw_linear_drag=0.6", "side_slip=1.0", "quadratic_drag=0.15")
+    substeps = 8

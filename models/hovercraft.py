@@ -62,7 +62,7 @@ class Hovercraft(PlanarVehicle):
 
 
 class HovercraftTruth(Hovercraft):
-    """Drag and less noise: what simulates Hov (0.015, 0.03 and 0.07 over the mass of 1.5).
+    """Drag and less noise, as in Hov (0.015, 0.03 and 0.07 over the mass of 1.5); drag acts as in the middle of a step.
 
     a_forward = (left + right − drag_forward · v|v|) / mass      v forward velocity
     a_lateral = −drag_lateral · w|w| / mass                      w lateral velocity
@@ -76,8 +76,9 @@ class HovercraftTruth(Hovercraft):
 
     def transition(self, state, control, time, step):
         left, right = control.unbind(-1)
-        forward, lateral, yaw_rate = self.body_velocity(state)
         drag_forward, drag_lateral, drag_yaw = self.drag
+        thrust = stack((left + right) / self.mass, torch.zeros_like(left), (right - left) / self.inertia)
+        forward, lateral, yaw_rate = self.body_velocity(self.halfway(state, thrust, step))
         mean = stack(
             (left + right - drag_forward * forward * forward.abs()) / self.mass,
             -drag_lateral * lateral * lateral.abs() / self.mass,

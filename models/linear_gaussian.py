@@ -12,7 +12,8 @@ from steady_ppl import Program, stack
 class LinearGaussian(Program):
     """A cart pushed along a rail; linear, with normal noise, so that a Kalman filter is exact.
 
-    a = gain · push − damping · velocity,   position' = position + velocity · step,   velocity' = velocity + a · step
+    a = gain · push − damping · velocity
+    velocity' = velocity + a · step,   position' = position + (velocity + velocity') / 2 · step
     """
 
     states = ("position [m]", "velocity [m/s]")
@@ -36,7 +37,8 @@ class LinearGaussian(Program):
         position, velocity = state.unbind(-1)
         mean = self.gain * control[..., 0] - self.damping * velocity
         acceleration = pyro.sample("acceleration", dist.Normal(mean, self.noise))
-        return stack(position + velocity * step, velocity + acceleration * step)
+        faster = velocity + acceleration * step
+        return stack(position + 0.5 * (velocity + faster) * step, faster)
 
     def observe(self, state):
         pyro.sample("position", dist.Normal(state[..., 0], self.measurement_sd))

@@ -7,7 +7,7 @@ import pyro.distributions as dist
 import torch
 from torch import nn, tensor
 
-from steady_ppl import DataError, PlanarVehicle, bearings_to, dense, smoothed_states, stack
+from steady_ppl import DataError, ExplicitEuler, PlanarVehicle, bearings_to, dense, smoothed_states, stack
 
 
 class NeuralVehicle(PlanarVehicle):
@@ -102,8 +102,8 @@ class NeuralTruck(NeuralVehicle):
     decays = {"hidden": 1.0, "skip": 0.1, "noise": 3.0}
 
 
-class AuthorsHovercraft(NeuralHovercraft):
-    """The variant of the authors' code: two layers, absolute heading, normalised by true states (a leak)."""
+class AuthorsHovercraft(ExplicitEuler, NeuralHovercraft):
+    """The authors' variant: two layers, absolute heading, normalised by true states (a leak); explicit Euler."""
 
     rates = {}
     decays = {}
@@ -112,7 +112,7 @@ class AuthorsHovercraft(NeuralHovercraft):
         super().__init__(layers=2, absolute_heading=True, normalise="truth")
 
 
-class AuthorsTruck(NeuralTruck):
+class AuthorsTruck(ExplicitEuler, NeuralTruck):
     """The same for the AlphaTruck."""
 
     rates = {}

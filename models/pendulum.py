@@ -15,7 +15,9 @@ class Pendulum(Program):
     """A point mass on a stiff rod; the rate is never measured.
 
     a = −stiffness · sin(angle) − damping · rate + gain · torque
-    rate' = rate + a · step,   angle' = angle + rate' · step        (semi-implicit Euler, keeps the energy bounded)
+    rate' = rate + a · step,   angle' = angle + (rate + rate') / 2 · step
+
+    The acceleration is that at the angle half a step on (leapfrog).
     """
 
     states = ("angle [rad]", "rate [rad/s]")
@@ -25,6 +27,7 @@ class Pendulum(Program):
     angles = ("angle",)
     motion = {"torque": ("angle", "rate")}
     step = 0.05
+    substeps = 2
 
     def __init__(self):
         super().__init__()
@@ -39,10 +42,11 @@ class Pendulum(Program):
 
     def transition(self, state, control, time, step):
         angle, rate = state.unbind(-1)
-        mean = -self.stiffness * angle.sin() - self.damping * rate + self.gain * control[..., 0]
+        middle = angle + 0.5 * rate * step
+        mean = -self.stiffness * middle.sin() - self.damping * rate + self.gain * control[..., 0]
         acceleration = pyro.sample("acceleration", dist.Normal(mean, self.noise))
-        rate = rate + acceleration * step
-        return stack(angle + rate * step, rate)
+        faster = rate + acceleration * step
+        return stack(middle + 0.5 * faster * step, faster)
 
     def observe(self, state):
         pyro.sample("angle", WrappedNormal(state[..., 0], math.radians(3)))

@@ -13,11 +13,13 @@ from steady_ppl import PlanarVehicle, bearings_to, stack
 
 
 class Truck(PlanarVehicle):
-    """Reaches its command within one step if the acceleration limit allows, and never slips.
+    """Reaches its command in about a tenth of a second if the acceleration limit allows, and never slips.
 
-    a_forward = clip((speed_gain · speed − v) / step, ±limit)      v forward velocity
-    a_lateral = −w / step                                          w lateral velocity
-    a_yaw     = clip((turn_gain · turn − yaw_rate) / step, ±limit)
+    a_forward = clip((speed_gain · speed − v) / settling, ±limit) − w · yaw_rate    v forward velocity
+    a_lateral = −w / settling + v · yaw_rate                                        w lateral velocity
+    a_yaw     = clip((turn_gain · turn − yaw_rate) / settling, ±limit)
+
+    The terms with the yaw rate turn the velocity along with the vehicle.
     """
 
     controls = ("speed [m/s]", "turn [rad/s]")
@@ -25,6 +27,8 @@ class Truck(PlanarVehicle):
     rates = {"noise": 3.0}
     guesses = ("noise",)  # wide enough for whatever the equations lack
     slips = False
+    substeps = 2
+    settling = 0.1  # s
 
     def __init__(self):
         super().__init__()
@@ -42,9 +46,9 @@ class Truck(PlanarVehicle):
         speed, turn = control.unbind(-1)
         forward, lateral, yaw_rate = self.body_velocity(state)
         mean = stack(
-            ((self.speed_gain * speed - forward) / step).clamp(-self.limit, self.limit),
-            -lateral / step,
-            ((self.turn_gain * turn - yaw_rate) / step).clamp(-self.limit, self.limit),
+            ((self.speed_gain * speed - forward) / self.settling).clamp(-self.limit, self.limit) - lateral * yaw_rate,
+            -lateral / self.settling + forward * yaw_rate,
+            ((self.turn_gain * turn - yaw_rate) / self.settling).clamp(-self.limit, self.limit),
         )
         acceleration = pyro.sample("acceleration", dist.Normal(mean, self.noise).to_event(1))
         return self.integrate(state, acceleration, step)

@@ -41,7 +41,16 @@ if TYPE_CHECKING:
     from steady_ppl.parameter_draws import ParameterPosterior, parameter_posterior
     from steady_ppl.particles import particle_filter, roll_out
     from steady_ppl.paths import Filtered, Paths
-    from steady_ppl.planar_vehicle import PlanarVehicle, UnknownMap, WrappedNormal, bearings_to, dense, stack, wrap
+    from steady_ppl.planar_vehicle import (
+        ExplicitEuler,
+        PlanarVehicle,
+        UnknownMap,
+        WrappedNormal,
+        bearings_to,
+        dense,
+        stack,
+        wrap,
+    )
     from steady_ppl.program import Program, for_program
     from steady_ppl.program_file import load_program
     from steady_ppl.proof_pictures import open_loop_picture
@@ -50,6 +59,7 @@ if TYPE_CHECKING:
     from steady_ppl.seeding import seeded
     from steady_ppl.simulation import simulate
     from steady_ppl.smoother_guide import SmootherGuide
+    from steady_ppl.substeps import with_substeps
     from steady_ppl.table import from_frame, read_table, to_frame, write_table
     from steady_ppl.tempering import Constant, LinearRamp
     from steady_ppl.training import Optimization, Trained, train
@@ -81,7 +91,16 @@ _HOMES = {
     "parameter_draws": ("ParameterPosterior", "parameter_posterior"),
     "particles": ("particle_filter", "roll_out"),
     "paths": ("Filtered", "Paths"),
-    "planar_vehicle": ("PlanarVehicle", "UnknownMap", "WrappedNormal", "bearings_to", "dense", "stack", "wrap"),
+    "planar_vehicle": (
+        "ExplicitEuler",
+        "PlanarVehicle",
+        "UnknownMap",
+        "WrappedNormal",
+        "bearings_to",
+        "dense",
+        "stack",
+        "wrap",
+    ),
     "program": ("Program", "for_program"),
     "program_file": ("load_program",),
     "proof_pictures": ("open_loop_picture",),
@@ -90,6 +109,7 @@ _HOMES = {
     "seeding": ("seeded",),
     "simulation": ("simulate",),
     "smoother_guide": ("SmootherGuide",),
+    "substeps": ("with_substeps",),
     "tempering": ("Constant", "LinearRamp"),
     "table": ("from_frame", "read_table", "to_frame", "write_table"),
     "training": ("Optimization", "Trained", "train"),

@@ -44,13 +44,16 @@ def read_alpha_truck(
     sigma_degrees: float = 5.0,
     seed: int = 0,
     landmarks: Sequence[Sequence[float]] = LANDMARKS,
+    centred: bool = False,
 ) -> Trajectories:
     """Read one split, resampled as the authors of STEADY do.
 
     The window in which both logs run is cut into n = ⌊window in s⌋ // 10 trajectories. Position, cos and sin of the
     heading and both commands are interpolated linearly at 100 n evenly spaced times over the whole window; velocities
-    are forward differences there, the last one repeated. Nothing is filtered. Times are the messages' header stamps;
-    a log whose stamps are out of order is sorted by them, equal stamps staying in the order of the file.
+    are forward differences there, the last one repeated: those of half a row later, which suit an explicit Euler step.
+    Centred ones, the displacement from half a row before to half a row after, are those of the row itself. Nothing is
+    filtered. Times are the messages' header stamps; a log whose stamps are out of order is sorted by them, equal stamps
+    staying in the order of the file.
 
     Args:
         folder: holds `vrpn-pose.csv` and `vesc_drive.csv`.
@@ -59,6 +62,7 @@ def read_alpha_truck(
         seed: of the bearings' noise, drawn once; with the folder's name it keys the draw, so that the splits of one
             seed share no noise. Torch's global random state is left alone.
         landmarks: `(K, 2)` m.
+        centred: take centred velocities.
 
     Returns:
         n trajectories of 100 rows, float64, each starting at time 0, with controls speed (m/s) and turn (rad/s),
@@ -87,18 +91,24 @@ def read_alpha_truck(
     grid = np.linspace(0.0, window, FRAMES * count)
     step = window / (FRAMES * count - 1)
 
-    def resample(stamps: np.ndarray, values: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.interp(grid, (stamps - begin) * 1e-9, values))
+    def resample(stamps: np.ndarray, values: np.ndarray, at: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.interp(at, (stamps - begin) * 1e-9, values))
 
-    x, y, qz, qw = pose.T
-    angle = 2 * np.arctan2(qz, qw)
-    x, y, cos, sin = (resample(pose_stamps, values) for values in (x, y, np.cos(angle), np.sin(angle)))
-    position_and_heading = torch.stack([x, y, torch.atan2(sin, cos)], -1)
-    change = position_and_heading.diff(dim=0)
+    def poses(at: np.ndarray) -> torch.Tensor:
+        x, y, qz, qw = pose.T
+        angle = 2 * np.arctan2(qz, qw)
+        x, y, cos, sin = (resample(pose_stamps, values, at) for values in (x, y, np.cos(angle), np.sin(angle)))
+        return torch.stack([x, y, torch.atan2(sin, cos)], -1)
+
+    if centred:
+        before, after = (grid - step / 2).clip(0.0, window), (grid + step / 2).clip(0.0, window)
+        change, spans = poses(after) - poses(before), torch.from_numpy(after - before).unsqueeze(-1)
+    else:
+        change, spans = poses(grid).diff(dim=0), torch.full((1, 1), step, dtype=torch.float64)
+        change = torch.cat([change, change[-1:]])
     change[:, 2] = wrap(change[:, 2])
-    velocity = torch.cat([change, change[-1:]]) / step
-    states = torch.cat([position_and_heading, velocity], -1)
-    controls = torch.stack([resample(command_stamps, values) for values in command.T], -1)
+    states = torch.cat([poses(grid), change / spans], -1)
+    controls = torch.stack([resample(command_stamps, values, grid) for values in command.T], -1)
     states, controls = (block.unflatten(0, (count, FRAMES)).transpose(0, 1) for block in (states, controls))
 
     with seeded(seed, "bearings", folder.resolve().name):

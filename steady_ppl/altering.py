@@ -17,7 +17,8 @@ from torch import Tensor
 
 from steady_ppl.planar_vehicle import WrappedNormal, WrappedStudentT
 from steady_ppl.program import Program, names
-from steady_ppl.sites import AtMean, Recording, as_vector, normal_moments
+from steady_ppl.sites import AtMean, Recording, as_vector, normal_moments, unwrapped
+from steady_ppl.substeps import row_ends
 
 Change = Callable[[Any, slice], Any]
 
@@ -84,7 +85,7 @@ def misread(program: Program, change: Callable[[Tensor], Tensor]) -> Altering:
 
     def at_site(fn: Any, columns: slice) -> Any:
         def moved(loc: Tensor) -> Tensor:
-            reading = -_base(fn).residual(torch.zeros_like(loc)) if hasattr(_base(fn), "residual") else loc
+            reading = -unwrapped(fn).residual(torch.zeros_like(loc)) if hasattr(unwrapped(fn), "residual") else loc
             reading = as_vector(reading, fn.event_dim)
             whole = reading.new_zeros((*reading.shape[:-1], len(program.measurements)))
             whole = torch.cat([whole[..., : columns.start], reading, whole[..., columns.stop :]], -1)
@@ -110,7 +111,7 @@ def heavy_tailed(share: Tensor) -> Altering:
     """Give the measurements' noise the tails of a Student t of 1/`share` degrees of freedom, its scale the normal's."""
 
     def change(fn: Any, columns: slice) -> Any:
-        base = _base(fn)
+        base = unwrapped(fn)
         kind = WrappedStudentT if isinstance(base, WrappedNormal) else dist.StudentT
         return kind((1 / share).expand(base.loc.shape), base.loc, base.scale).to_event(fn.event_dim)
 
@@ -129,7 +130,7 @@ class Coloured(Altering):
         order = names(program.channels)
         share = torch.stack(torch.broadcast_tensors(*(shares.get(name, last.new_zeros(())) for name in order)), -1)
         super().__init__(self._change)
-        self.pushes, self.factors = share * last, (1 - share.square()).sqrt()
+        self.last, self.pushes, self.factors = last, share * last, (1 - share.square()).sqrt()
         self.deviations: list[Tensor] = []
 
     def _change(self, fn: Any, columns: slice) -> Any:
@@ -139,8 +140,8 @@ class Coloured(Altering):
         return _moved(_rescaled(fn, factors), lambda loc: loc + pushes)
 
     def beside(self, state: Tensor) -> Tensor:
-        """A state and the new deviations side by side, `(..., D + C)`."""
-        deviations = torch.cat(self.deviations, -1)
+        """A state and the deviations side by side, `(..., D + C)`: the new ones where the row ends, else the last."""
+        deviations = torch.cat(self.deviations, -1) if row_ends() else self.last
         left = torch.broadcast_shapes(state.shape[:-1], deviations.shape[:-1])
         return torch.cat([state.expand(*left, -1), deviations.expand(*left, -1)], -1)
 
@@ -166,21 +167,15 @@ def by_channel(program: Program, values: Mapping[str, Tensor], missing: float, l
     return _columns(values, names(program.channels), missing, 1, like).expand_as(like)
 
 
-def _base(fn: Any) -> Any:
-    while isinstance(fn, dist.Independent | dist.MaskedDistribution | dist.ExpandedDistribution):
-        fn = fn.base_dist
-    return fn
-
-
 def _moved(fn: Any, change: Callable[[Tensor], Tensor]) -> Any:
-    base = _base(fn)
+    base = unwrapped(fn)
     if isinstance(base, dist.StudentT):
         return type(base)(base.df, change(base.loc), base.scale).to_event(fn.event_dim)
     return type(base)(change(base.loc), base.scale).to_event(fn.event_dim)
 
 
 def _rescaled(fn: Any, factor: Tensor) -> Any:
-    base = _base(fn)
+    base = unwrapped(fn)
     if isinstance(base, dist.StudentT):
         return type(base)(base.df, base.loc, base.scale * factor).to_event(fn.event_dim)
     return type(base)(base.loc, base.scale * factor).to_event(fn.event_dim)

@@ -80,6 +80,7 @@ def figures(found: Check) -> dict[str, Any]:
                 if math.isfinite(ratio)
             },
         },
+        "step": found.step.figures,
         "stuck": [
             {"trajectory": one.label, "seconds": list(one.seconds), "columns": list(one.columns), "text": str(one)}
             for one in found.stuck
@@ -139,7 +140,14 @@ def lost_horizons(found: Check) -> list[str]:
 
 
 def verdict(found: Check) -> str:
-    """One sentence, `steady check`'s first line."""
+    """The first line of `steady check`: one sentence, after a first one on the time step where that is too coarse."""
+    if found.step.sentence:
+        first = found.step.sentence
+        return f"{first[0].upper()}{first[1:]}: refit at that step before anything else is believed. {_verdict(found)}"
+    return _verdict(found)
+
+
+def _verdict(found: Check) -> str:
     blame = found.blame
     if blame.kind == "nothing found":
         drives, alone = len(found.data), len(found.misfit.significant)

@@ -32,6 +32,7 @@ from steady_ppl.progress import stages
 from steady_ppl.reference_motion import Reference, constant_velocity, last_measurement
 from steady_ppl.seeding import seeded
 from steady_ppl.simulated_sets import FEWEST, residuals, simulate_sets
+from steady_ppl.step_size import StepCheck, check_step
 from steady_ppl.stuck import Stretch, stuck
 from steady_ppl.tracking import track
 
@@ -51,6 +52,7 @@ class Check:
         floor: horizon → RMSE of each component in each simulated set, `(M, K)`: what the noise alone would leave.
         reference: the vehicle that keeps its velocity, or why there is none.
         held: horizon → measured less last measured, and where both exist.
+        step: the program beside itself at finer steps, refitted to these drives.
         misfit: the maps; every cell with its residual.
         blame: who is at fault.
         residuals: names of the measurement components and, after them, of the channels.
@@ -66,6 +68,7 @@ class Check:
     floor: dict[int, np.ndarray]
     reference: Reference | str
     held: dict[int, tuple[Tensor, Tensor]]
+    step: StepCheck
     misfit: Misfit
     blame: Blame
     residuals: list[str]
@@ -115,13 +118,16 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     run = for_program(program, data).without_truth(keep_start=fit.known_start)
     _require(program, run, fit.known_start, simulations)
     horizons = named_horizons(run, SECONDS)
-    with stages(("finding paths", 1), ("simulating drives", 2), ("judging", 2)) as begin:
+    parts = (("finding paths", 1), ("comparing time steps", 1), ("simulating drives", 2), ("judging", 2))
+    with stages(*parts) as begin:
         begin()
         with seeded(seed, "check"):
             ahead = find_and_smooth(program, run, known_start=fit.known_start)
             real = track(program, run, ahead.linearization.path, known_start=fit.known_start, passes=1)
             _, drawn, _ = ahead.draws(simulations)
             starts = run.known_start.expand(simulations, -1, -1) if fit.known_start else drawn[:, 0]
+            begin()
+            step = check_step(program, run, ahead.linearization.path, known_start=fit.known_start)
             begin()
             rows = list(horizons.values())
             channels = real.noise.shape[-1]
@@ -141,6 +147,8 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         )
     notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
     notes += run.uneven_steps + doubts_of_units(program, run)
+    if step.note:
+        notes.append(f"refitted to these drives, {step.note}")
     if not scores.parameter_names:
         notes.append("the program's own parameters were not looked at one by one: it has none, or a network's")
     return Check(
@@ -151,6 +159,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         floor=made.floor,
         reference=constant_velocity(program, run, real, rows, known_start=fit.known_start),
         held=last_measurement(program, run, real.smoothed, rows),
+        step=step,
         misfit=misfit,
         blame=blame(scores, _scatter(ours, theirs), misfit.p_value),
         residuals=list(ours.names),

@@ -18,6 +18,9 @@ def alpha_truck(
     folder: Annotated[Path, typer.Argument(help="One split: holds vrpn-pose.csv and vesc_drive.csv.")],
     out: Annotated[Path, typer.Option("--out", help="Table to write, .csv or .parquet.")],
     sigma_deg: Annotated[float, typer.Option(help="Standard deviation of the simulated bearings, degrees.")] = 5.0,
+    centred: Annotated[
+        bool, typer.Option("--centred", help="Velocities of each row itself, not the authors' of half a row later.")
+    ] = False,
     seed: Annotated[int, random_seed()] = 0,
 ) -> None:
     """One split of the AlphaTruck logs to a table, resampled as the authors do.
@@ -28,7 +31,7 @@ def alpha_truck(
     from steady_ppl.alpha_truck import read_alpha_truck
     from steady_ppl.table import write_table
 
-    write_table(read_alpha_truck(folder, sigma_degrees=sigma_deg, seed=seed), out)
+    write_table(read_alpha_truck(folder, sigma_degrees=sigma_deg, seed=seed, centred=centred), out)
 
 
 @app.command("cut", epilog="Example:  steady data cut log.csv --seconds 60 --out drives.csv")

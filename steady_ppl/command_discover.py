@@ -21,6 +21,9 @@ def discover(
         bool | None,
         typer.Option(help="Give the first row's x. columns as the exact start; a RUN's own setting when not given."),
     ] = None,
+    substeps: Annotated[
+        int | None, typer.Option(help="Steps of the program in each row; as its class says when not given.")
+    ] = None,
     mix: Annotated[
         bool, typer.Option("--mix", help="Put both tables together and keep every second drive to choose by.")
     ] = False,
@@ -41,8 +44,10 @@ def discover(
     from steady_ppl.discovery.kept_search import kept_search
     from steady_ppl.fit import Fit
     from steady_ppl.picture_files import require_picture, write_picture
+    from steady_ppl.probe import probe
     from steady_ppl.run_folder import DISCOVERY
     from steady_ppl.run_recipe import fingerprint
+    from steady_ppl.substeps import with_substeps
     from steady_ppl.table import read_table
     from steady_ppl.whole_file import require_place
 
@@ -55,7 +60,10 @@ def discover(
         raise RunError(f"{out} exists: choose another folder, or --force to overwrite, or --resume to go on")
     require_picture(picture)
     require_place(json_file)
-    given: Any = Fit.load(source, program) if is_run else program_from(source, seed)
+    given: Any = Fit.load(source, program) if is_run else program_from(source, seed, substeps)
+    if is_run and substeps is not None:
+        given.program = with_substeps(given.program, substeps)
+        probe(given.program)
     drives, judges = read_table(table), read_table(valid) if valid else None
     options: dict[str, Any] = {"known_start": known_start, "mix": mix, "simulations": simulations, "seed": seed}
     with kept_search(out, given, drives, judges, options, force=force, resume=resume):

@@ -53,6 +53,9 @@ def fit(
     ] = None,
     hand: Annotated[str | None, typer.Option(help="The program written by hand, for fit-hand.")] = None,
     known_start: Annotated[bool, typer.Option(help="Give the first row's x. columns as the exact start.")] = False,
+    substeps: Annotated[
+        int | None, typer.Option(help="Steps of the program in each row; as its class says when not given.")
+    ] = None,
     particles: Annotated[int | None, count("Particles for each drive.")] = None,
     draws: Annotated[int | None, count("Paths for each drive in the M step.")] = None,
     steps: Annotated[int | None, count("E steps.")] = None,
@@ -74,7 +77,7 @@ def fit(
     given["guide"] = guide and guide.value
     result = run_recipe(
         recipe,
-        program_from(model, seed),
+        program_from(model, seed, substeps),
         read_table(table),
         read_table(valid) if valid else None,
         out,

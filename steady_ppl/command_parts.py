@@ -16,14 +16,18 @@ from steady_ppl.whole_file import whole_file
 LONGEST = 1000  # characters of a line that is said; a file that somebody gives can put more into it
 
 
-def program_from(model: str, seed: int) -> Any:
-    """Load a program, its random initial weights keyed by the seed, and try it once on a probe."""
+def program_from(model: str, seed: int, substeps: int | None = None) -> Any:
+    """Load a program, its random initial weights keyed by the seed, and try it once on a probe; with as many substeps a
+    row as its class says when None."""
     from steady_ppl.probe import probe
     from steady_ppl.program_file import load_program
     from steady_ppl.seeding import seeded
+    from steady_ppl.substeps import with_substeps
 
     with seeded(seed, "program"):
         program = load_program(model)
+    if substeps is not None:
+        program = with_substeps(program, substeps)
     probe(program)
     return program
 

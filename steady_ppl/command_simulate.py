@@ -17,6 +17,10 @@ def simulate(
     trajectories: Annotated[int | None, count("How many drives, 16 when not given.")] = None,
     seed: Annotated[int, random_seed()] = 0,
     controls: Annotated[Path | None, typer.Option(help="Take time, controls and gaps from this table.")] = None,
+    substeps: Annotated[
+        int | None,
+        typer.Option(help="Steps of the program in each row; so many that they are 5 ms or less when not given."),
+    ] = None,
     effect: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME[=VALUE]", help="Add a physical effect, see `steady effects`; as often as needed."),
@@ -25,15 +29,21 @@ def simulate(
     """Simulate drives of a program, with measurements and true states."""
     from steady_ppl.command_effects import with_effects
     from steady_ppl.command_parts import program_from, say
+    from steady_ppl.probe import probe
     from steady_ppl.progress import stages
     from steady_ppl.simulation import simulate as run
+    from steady_ppl.simulation import simulated_in
+    from steady_ppl.substeps import with_substeps
     from steady_ppl.table import read_table, write_table
 
     if controls and trajectories:
         raise UsageError("--controls has as many drives as its table: leave --trajectories out")
     program = with_effects(program_from(model, seed), effect or [], say)
+    if substeps is not None:
+        probe(with_substeps(program, substeps))
     like = read_table(controls) if controls else None
     with stages(("simulating", 1)) as begin:
         begin()
-        drives = run(program, trajectories or 16, seed=seed, like=like)
+        drives = run(program, trajectories or 16, seed=seed, like=like, substeps=substeps)
     write_table(drives, out)
+    say(simulated_in(program, drives, substeps))

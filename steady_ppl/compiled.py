@@ -15,11 +15,12 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.kernel_writer import LANES
 from steady_ppl.method import Method, close, compiled, distrust
-from steady_ppl.program import Program, acting_controls
+from steady_ppl.program import Program
 from steady_ppl.resampling import by_component
 from steady_ppl.scalar_graph import NotCompilable
 from steady_ppl.sites import Observing, Recording, Standardised, running
 from steady_ppl.stepping import Stepping
+from steady_ppl.substeps import advance
 
 FILTER = "filter"  # the name of what is compiled for it
 
@@ -37,7 +38,7 @@ def stepping_for(
         return plain, f"{str(state.dtype).removeprefix('torch.')} on {state.device.type}"
     if state.shape[0] < LANES:
         return plain, f"fewer than {LANES} particles"
-    methods = compiled(program, FILTER, lambda: _Methods(program, data, state))
+    methods = compiled(program, FILTER, lambda: _Methods(program, data, plain.controls, state))
     if isinstance(methods, str):
         return plain, methods
     stepping = CompiledStepping(methods, plain)
@@ -49,26 +50,28 @@ def stepping_for(
 class _Methods:
     """`transition` and `observe` of a program."""
 
-    def __init__(self, program: Program, data: Trajectories, state: Tensor) -> None:
+    def __init__(self, program: Program, data: Trajectories, controls: Tensor, state: Tensor) -> None:
         one = (1, 1, 1)
         seen = Recording()
         first = state[:1, :1].unsqueeze(1)
         inputs = {
-            "control": data.controls[:1, :1].unsqueeze(0),
+            "control": controls[:1, :1].unsqueeze(0),
             "time": data.elapsed[:1, :1].unsqueeze(0),
             "step": data.steps[:1, :1].unsqueeze(0),
         }
         with torch.no_grad(), running(*one), seen:
-            program.transition(first, *inputs.values())
+            advance(program, first, *inputs.values())
         self.event_dims = {site: fn.event_dim for site, fn in seen.distributions.items()}
         self.sizes = {site: value.numel() for site, value in seen.values.items()}
         self.channels, self.width = sum(self.sizes.values()), state.shape[-1]
+        self.held = program.substeps > 1
+        self.values = 0 if self.held else self.channels
 
         def transition(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Any:
             recording = Recording()
             with running(*one), recording, Standardised(noise):
-                moved = program.transition(state, control, time, step)
-            return (moved, *recording.values.values())
+                moved = advance(program, state, control, time, step)
+            return (moved,) if self.held else (moved, *recording.values.values())
 
         def observe(state: Tensor, measurement: Tensor, observed: Tensor, weight: Tensor) -> Any:
             recording = Recording()
@@ -84,7 +87,7 @@ class _Methods:
             "weight": torch.ones(()),
         }
         self.observe = Method(observe, {"state": first}, measured)
-        if self.transition.values != self.width + self.channels or self.observe.values != 1:
+        if self.transition.values != self.width + self.values or self.observe.values != 1:
             raise NotCompilable("its results for one particle have other shapes: it mixes particles or trajectories")
 
 
@@ -97,7 +100,7 @@ class CompiledStepping(Stepping):
         data = plain.data
         self.moving = methods.transition.parameters()
         self.observing = methods.observe.parameters()
-        moved = (acting_controls(plain.program, data)[:-1], data.elapsed[:-1, :, None], data.steps[..., None])
+        moved = (plain.controls[:-1], data.elapsed[:-1, :, None], data.steps[..., None])
         self.moved = torch.cat(moved, -1).float().contiguous().numpy()
         weight = torch.as_tensor(self.observation_weight, dtype=torch.float32).expand(data.time.shape).unsqueeze(-1)
         self.measured = torch.cat((data.measurements, data.observed.to(weight), weight), -1).contiguous().numpy()
@@ -111,14 +114,15 @@ class CompiledStepping(Stepping):
             drawn = torch.randn(methods.channels, trajectories, particles)
         else:
             drawn = noise.permute(2, 1, 0).contiguous()
-        out = torch.empty(methods.width + methods.channels, trajectories, particles)
+        out = torch.empty(methods.width + methods.values, trajectories, particles)
         came_from = None if ancestors is None else ancestors.t().contiguous().numpy()
         inputs = [by_component(state).numpy(), drawn.numpy()]
         methods.transition.kernel(self.moving, self.moved[row], inputs, came_from, out.numpy())
-        moved, *values = out.split([methods.width, *methods.sizes.values()])
+        moved, values = out.split([methods.width, methods.values])
+        values = drawn if methods.held else values
         noises = {
             site: value.permute(2, 1, 0) if self.event_dims[site] else value[0].t()
-            for site, value in zip(methods.sizes, values, strict=True)
+            for site, value in zip(methods.sizes, values.split(list(methods.sizes.values())), strict=True)
         }
         return moved.permute(2, 1, 0), noises
 

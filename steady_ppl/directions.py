@@ -19,8 +19,9 @@ from steady_ppl.data import Trajectories
 from steady_ppl.linearization import Path
 from steady_ppl.planar_vehicle import wrap
 from steady_ppl.predictions import errors, on_a_circle
-from steady_ppl.program import Program, acting_controls, names, units
+from steady_ppl.program import Program, names, units
 from steady_ppl.sites import AtMean, running
+from steady_ppl.substeps import acting_controls, advance, row_controls
 from steady_ppl.tracking import Tracked
 
 LAG = 0.3  # s
@@ -141,7 +142,7 @@ def _actuator(program: Program, data: Trajectories, path: Path, scores: _Scores)
         answer = _answer(program, data, path, controls, index, scores.linear.angles)
         if answer is None:
             continue
-        command = controls[:-1, :, index].double()
+        command = row_controls(program, controls)[:-1, :, index].double()
         for word, shape in _miscarried(command, data, speed).items():
             push = answer * shape.unsqueeze(-1)
             together.setdefault(word, []).append(push)
@@ -204,12 +205,16 @@ def _couplings(program: Program, data: Trajectories, path: Path, scores: _Scores
     controls = acting_controls(program, data)
     along = scores.linear.noise / scores.linear.noise.norm(dim=-2, keepdim=True).clamp(min=1e-300)
     unmoved: dict[int, list[int]] = {channel: [] for channel in range(len(called))}
-    for index in range(controls.shape[-1]):
+    for index in range(len(program.controls)):
         answer = _answer(program, data, path, controls, index, scores.linear.angles)
         for channel, members in unmoved.items():
             if answer is None or float((answer * along[..., channel]).sum(-1).norm() / answer.norm()) < 1e-3:
                 members.append(index)
-    commands, name, unit = controls[:-1].double(), names(program.controls), units(program.controls)
+    commands, name, unit = (
+        row_controls(program, controls)[:-1].double(),
+        names(program.controls),
+        units(program.controls),
+    )
     for channel, members in unmoved.items():
         for one in members:
             word = f"{called[channel]} acceleration with {name[one]}"
@@ -224,9 +229,9 @@ def _answer(
     program: Program, data: Trajectories, path: Path, controls: Tensor, index: int, angles: tuple[int, ...]
 ) -> Tensor | None:
     """How the next state changes with a control, `(T, B, D)`; None where it does not."""
-    size = 0.05 * float(controls[..., index].abs().amax()) or 0.05
+    size = 0.05 * float(row_controls(program, controls)[..., index].abs().amax()) or 0.05
     change = torch.zeros_like(controls)
-    change[..., index] = size
+    change[..., index :: len(program.controls)] = size  # in every substep
     more, less = (_moved(program, data, path, controls + sign * change).double() for sign in (1, -1))
     answer = _on_circle(more - less, angles) / (2 * size)
     answer = torch.where(data.transitions[..., None], answer, 0.0)
@@ -237,7 +242,7 @@ def _moved(program: Program, data: Trajectories, path: Path, controls: Tensor) -
     """The program's mean step from every row, `(T, B, D)`."""
     states = path.states[:-1]
     with running(*states.shape[:-1]), AtMean():
-        return program.transition(states, controls[:-1], data.elapsed[:-1], data.steps)
+        return advance(program, states, controls[:-1], data.elapsed[:-1], data.steps)
 
 
 def _on_circle(difference: Tensor, angles: tuple[int, ...]) -> Tensor:

@@ -11,6 +11,7 @@ from steady_ppl.errors import UsageError
 from steady_ppl.predictions import errors
 from steady_ppl.program import Program, names
 from steady_ppl.sites import AtMean, running
+from steady_ppl.substeps import acting, advance
 
 PROBED, PUSHES = 200, (1e-3, 1.0, -1e3)  # rows and sizes of a command that is looked for in what acts later
 
@@ -101,12 +102,12 @@ class Dynamics(nn.Module):
         begun = len(past) * self.step if time is None else time
         rows = torch.arange(len(commands), dtype=controls.dtype, device=controls.device) - len(past)
         elapsed = (begun + self.step * rows)[:, None].expand(-1, shape.numel())
-        acting = self.program.actuators(commands.reshape(len(commands), -1, commands.shape[-1]), elapsed)[len(past) :]
+        act = acting(self.program, commands.reshape(len(commands), -1, commands.shape[-1]), elapsed)[len(past) :]
         steps = torch.full_like(elapsed[len(past) :], self.step)
         state, states = state.expand(*shape, -1).reshape(-1, state.shape[-1]), []
-        for given in zip(acting, elapsed[len(past) :], steps, strict=True):
+        for given in zip(act, elapsed[len(past) :], steps, strict=True):
             with running(len(state)), nullcontext() if noisy else AtMean():
-                state = self.program.transition(state, *given)
+                state = advance(self.program, state, *given)
             states.append(state)
         return torch.stack([*states, state])[:-1].reshape(len(controls), *shape, state.shape[-1])
 

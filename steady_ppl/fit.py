@@ -23,6 +23,7 @@ from steady_ppl.program import Program
 from steady_ppl.program_file import load_program
 from steady_ppl.run_folder import PARAMETERS, POSTERIOR, RECORD, read_record, run_folder, write_record
 from steady_ppl.run_forms import FINISHED
+from steady_ppl.substeps import is_count
 from steady_ppl.training import Trained
 from steady_ppl.whole_file import whole_file
 
@@ -138,6 +139,7 @@ class Fit:
         return {
             "program": program_source(self.program, folder),
             "effects": effects.record(self.program),
+            "substeps": self.program.substeps,
             "recipe": self.recipe,
             "status": "interrupted" if trained is not None and trained.interrupted else "finished",
             "known_start": self.known_start,
@@ -170,6 +172,10 @@ class Fit:
         if not isinstance(program, Program):
             program = _load_recorded(folder, record["program"], program)
         effects.restore(program, record.get("effects", []))
+        substeps = record.get("substeps", 1)
+        if not is_count(substeps):
+            raise RunError(f"{folder / RECORD} is damaged: {substeps} substeps a row")
+        program.substeps = substeps
         tensors, _ = read_tensors(folder / PARAMETERS)
         have = {name: tuple(value.shape) for name, value in program.state_dict().items()}
         found = {name: tuple(value.shape) for name, value in tensors.items()}

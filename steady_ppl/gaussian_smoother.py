@@ -19,7 +19,7 @@ from steady_ppl.linearization import Path, linearize
 from steady_ppl.lookahead import Lookahead, look_ahead
 from steady_ppl.particles import particle_filter
 from steady_ppl.paths import Paths
-from steady_ppl.program import Program, acting_controls
+from steady_ppl.program import Program
 from steady_ppl.sites import (
     KnownStart,
     Recording,
@@ -30,6 +30,8 @@ from steady_ppl.sites import (
     normal_moments,
     running,
 )
+from steady_ppl.stability import divergence
+from steady_ppl.substeps import acting_controls, sample_channels
 
 WORSE = 10.0  # nats
 
@@ -104,7 +106,7 @@ def find_and_smooth(
         FilterError: the bootstrap filter of the search or the linearised program broke down.
     """
     ahead = find_and_try(program, data, known_start=known_start, observation_weight=observation_weight)
-    require_found(ahead, data)
+    require_found(ahead, program, data)
     return ahead
 
 
@@ -120,16 +122,16 @@ def find_and_try(
     return smooth(program, data, path, known_start=known_start, observation_weight=observation_weight)
 
 
-def require_found(ahead: Lookahead, data: Trajectories) -> None:
+def require_found(ahead: Lookahead, program: Program, data: Trajectories) -> None:
     """Raise a `FilterError` where the linearised program's log p(y) is not finite."""
     broken = ~torch.isfinite(ahead.log_likelihood)
     if bool(broken.any()):
         label = data.labels[int(broken.nonzero()[0])]
-        raise FilterError(
-            f"trajectory {label}: the linearised program's log p(y) is not finite: its parameters or states have blown "
-            "up, or it cannot be linearised there (--recipe steady --guide bootstrap does not)",
-            trajectory=label,
+        why = divergence(program, data) or (
+            "the linearised program's log p(y) is not finite: its parameters or states have blown up, or it cannot be "
+            "linearised there (--recipe steady --guide bootstrap does not)"
         )
+        raise FilterError(f"trajectory {label}: {why}", trajectory=label)
 
 
 def means_as_path(ahead: Lookahead, data: Trajectories) -> Path:
@@ -191,7 +193,7 @@ def standard_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor
     """The channel noise of paths in its standard deviations, `(M, T, B, C)`."""
     seen, states = Recording(), paths.states[:, :-1]
     with running(*states.shape[:-1]), seen, Replaying(paths.noise):
-        program.transition(states, acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
+        sample_channels(program, states, acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
     parts = []
     for site, fn in seen.distributions.items():
         mean, sd = normal_moments(fn, site)
@@ -222,7 +224,7 @@ def smoother_paths(
         program.initial()
     few = slice(0, 1)  # one transition says which sites there are
     with running(1, 1, trajectories), moving, Standardised(noise[few, few]):
-        program.transition(states[few, few], data.controls[few], data.elapsed[few], data.steps[few])
+        sample_channels(program, states[few, few], data.controls[few], data.elapsed[few], data.steps[few])
     event_dims = {site: fn.event_dim for site, fn in (start.distributions | moving.distributions).items()}
     first = torch.Size((draws, 1, trajectories))
     values, reason = _noise_along(program, data, states, noise, moving, kernels)
@@ -244,7 +246,7 @@ def _noise_along(
     def drawn(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
         seen = Recording()
         with running(*state.shape[:-1]), seen, Standardised(noise):
-            program.transition(state, control, time, step)
+            sample_channels(program, state, control, time, step)
         values = [as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()]
         return torch.cat([value.expand(*state.shape[:-1], value.shape[-1]) for value in values], -1)
 

@@ -9,8 +9,9 @@ import pyro.distributions as dist
 from pyro.distributions import constraints
 
 from steady_ppl.data import Trajectories
-from steady_ppl.program import Program, acting_controls
+from steady_ppl.program import Program
 from steady_ppl.sites import KnownStart, Observing, masked
+from steady_ppl.substeps import acting_controls, sample_channels
 
 
 class Joint:
@@ -42,6 +43,6 @@ class Joint:
                 self.program.initial()
             with pyro.plate("interval", rows - 1, dim=-2), masked(data.transitions):
                 controls = acting_controls(self.program, data)[:-1]
-                self.program.transition(states[..., :-1, :, :], controls, data.elapsed[:-1], data.steps)
+                sample_channels(self.program, states[..., :-1, :, :], controls, data.elapsed[:-1], data.steps)
             with pyro.plate("observed_row", rows, dim=-2), Observing(data.measurements, data.observed):
                 self.program.observe(states)

@@ -20,7 +20,7 @@ from steady_ppl.data import Trajectories
 from steady_ppl.errors import ProgramError
 from steady_ppl.planar_vehicle import wrap
 from steady_ppl.probe import start_size, step_size
-from steady_ppl.program import Program, acting_controls, names
+from steady_ppl.program import Program, names
 from steady_ppl.sites import (
     AtMean,
     Observing,
@@ -32,6 +32,7 @@ from steady_ppl.sites import (
     running,
     tangent_normal,
 )
+from steady_ppl.substeps import acting_controls, advance
 
 
 @dataclass(frozen=True)
@@ -190,7 +191,7 @@ def _transition(
 ) -> _Jacobians:
     def step(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
         with running(*state.shape[:-1]), Standardised(noise):
-            return program.transition(state, control, time, step)
+            return advance(program, state, control, time, step)
 
     along = {"state": states[:-1], "noise": noise}
     given = {"control": acting_controls(program, data)[:-1], "time": data.elapsed[:-1], "step": data.steps}
@@ -252,7 +253,7 @@ def _on_a_circle(program: Program, data: Trajectories, state: Tensor) -> tuple[i
     if len(data.steps):
         given = (part[first, first] for part in (data.controls, data.elapsed, data.steps))
         with running(len(turns), 1), AtMean():
-            moved = program.transition(states, *given)
+            moved = advance(program, states, *given)
         change = moved - states
         apart = change - change[first]
         apart[..., angles] = wrap(apart[..., angles])

@@ -83,7 +83,7 @@ class LinearizedGuide(PathGuide):
         weight = self.tempering(progress)
         ahead = find_and_try(self.program, part, known_start=self.known_start, observation_weight=weight)
         if known is None:
-            require_found(ahead, part)
+            require_found(ahead, self.program, part)
         found = means_as_path(ahead, part)
         better = ahead.log_likelihood > (-torch.inf if known is None else known[trajectories])  # not where it is a nan
         kept = better.nonzero().flatten().tolist()
@@ -136,7 +136,7 @@ class GaussianGuide(LinearizedGuide):
         """
         weight = self.tempering(progress)
         ahead = self.look_ahead(data, progress)
-        require_found(ahead, data)
+        require_found(ahead, self.program, data)
         paths = smoother_paths(
             self.program,
             data,

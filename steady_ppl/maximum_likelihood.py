@@ -122,7 +122,7 @@ def _climb(
 ) -> Maximum:
     parts = elements(program)
     here = _look(program, data, path or find_path(program, data, known_start=known_start), known_start, parts)
-    require_found(here.ahead, data)
+    require_found(here.ahead, program, data)
     began, reach = here.objective, torch.tensor([REACH * part.step for part in parts], dtype=torch.float64)
     information = _firm(_of_drives(here) if information is None else information)
     taken, decrement, passes = 0, 0.0, PASSES

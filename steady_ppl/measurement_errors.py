@@ -10,9 +10,10 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.filtering import in_parts
 from steady_ppl.particles import particle_filter, roll_out
-from steady_ppl.program import Program, acting_controls
+from steady_ppl.program import Program
 from steady_ppl.resampling import systematic, take
 from steady_ppl.sites import AtMean, Recording, as_vector, residual, running
+from steady_ppl.substeps import acting_controls
 
 OPEN_LOOP = {"open_loop_1s": 1.0, "open_loop_3s": 3.0}
 OPEN_LOOP_DRAWS = 64

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
+from functools import partial
 from typing import Any
 
 import torch
@@ -24,7 +25,9 @@ from steady_ppl.program import Program
 from steady_ppl.proposals import Proposal
 from steady_ppl.resampling import effective_sample_size, normalise, systematic, take
 from steady_ppl.sites import KnownStart, Recording, Standardised, broadcast_event, running
+from steady_ppl.stability import divergence
 from steady_ppl.stepping import Stepping
+from steady_ppl.substeps import advance, channel_values
 
 STEPS_WORTH_COMPILING = 1_000_000  # steps of particles, which take the program's own lines a second
 OnFrame = Callable[[int, Tensor, Tensor, Tensor], None]
@@ -144,7 +147,7 @@ def particle_filter(
                 noises.setdefault(site, []).append(value)
 
     event_dims = {"states": 1} | {site: fn.event_dim for site, fn in start.distributions.items()} | stepping.event_dims
-    _raise_if_broken(log_likelihood, blown_up, data)
+    _raise_if_broken(program, log_likelihood, blown_up, data)
     survivors = torch.zeros_like(log_weights).scatter_(0, roots, 1.0).sum(0)
     return Filtered(
         log_likelihood=log_likelihood.sum(0),
@@ -158,14 +161,21 @@ def particle_filter(
         ancestors=all_ancestors,
         event_dims=event_dims,
         in_plain_torch=reason,
+        channels=None if program.substeps == 1 else partial(_channels, program, data),
     )
+
+
+@torch.no_grad()
+def _channels(program: Program, data: Trajectories, states: Tensor, noise: dict[str, Tensor]) -> dict[str, Tensor]:
+    with running(*noise[next(iter(noise))].shape[:3]):
+        return channel_values(program, data, states, noise)
 
 
 def _given(noise: Tensor) -> Standardised:
     return Standardised(noise.unsqueeze(1))
 
 
-def _raise_if_broken(log_likelihood: Tensor, blown_up: Tensor, data: Trajectories) -> None:
+def _raise_if_broken(program: Program, log_likelihood: Tensor, blown_up: Tensor, data: Trajectories) -> None:
     """Find the first row whose evidence is not finite."""
     broken = ~torch.isfinite(log_likelihood)
     if not bool(broken.any()):
@@ -173,7 +183,7 @@ def _raise_if_broken(log_likelihood: Tensor, blown_up: Tensor, data: Trajectorie
     row, trajectory = (int(i) for i in broken.nonzero()[0])
     label, time = data.labels[trajectory], float(data.elapsed[row, trajectory])
     impossible = bool(log_likelihood[row, trajectory] == -math.inf) and not bool(blown_up[: row + 1, trajectory].any())
-    what = (
+    what = divergence(program, data) or (
         "every particle's weight is zero: the measurement is impossible under the program"
         if impossible
         else "no particle is left that is a number: the program's parameters or states have blown up"
@@ -201,5 +211,5 @@ def roll_out(
     """
     for control, time, step in zip(controls, elapsed, steps, strict=True):
         with running(*state.shape[:-1]), handler or nullcontext():
-            state = program.transition(state, control, time, step)
+            state = advance(program, state, control, time, step)
         yield state

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -63,6 +63,8 @@ class Filtered:
         roots: `(B,)` how many of the first row's particles still have descendants at the end.
         blown_up: `(B,)` how many weights were not numbers, summed over rows; they count as zero.
         in_plain_torch: why no kernels served; None where they did or were not asked for.
+        channels: (states `(M, T + 1, B, D)`, standardised noise by site) → the sites' values, where `noise` is
+            standardised; None where `noise` has the values.
         states, start, noise, ancestors: the particles' history, a tensor a row; empty when it was not kept.
     """
 
@@ -77,6 +79,7 @@ class Filtered:
     ancestors: list[Tensor | None]
     event_dims: dict[str, int]
     in_plain_torch: str | None = None
+    channels: Callable[[Tensor, dict[str, Tensor]], dict[str, Tensor]] | None = None
 
     def scarce(self, data: Trajectories) -> Tensor:
         """Share of each trajectory's measured rows after which fewer than `FEW` particles were in effect, `(B,)`."""
@@ -94,10 +97,14 @@ class Filtered:
             if ancestors is not None:
                 index = take(ancestors, index)
             states.append(take(self.states[row], index))
+        path, along = (
+            torch.stack(states[::-1], 1),
+            {site: torch.stack(values[::-1], 1) for site, values in noise.items()},
+        )
         return Paths(
-            states=torch.stack(states[::-1], 1),
+            states=path,
             start={site: take(value, index).unsqueeze(1) for site, value in self.start.items()},
-            noise={site: torch.stack(values[::-1], 1) for site, values in noise.items()},
+            noise=along if self.channels is None else self.channels(path, along),
             event_dims=self.event_dims,
         )
 

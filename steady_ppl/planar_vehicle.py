@@ -25,7 +25,10 @@ class PlanarVehicle(Program):
     Attributes:
         landmarks: positions that bearings are measured to, m.
         bearing_sd: standard deviation of a bearing, rad; 5° unless a program says otherwise, or learns it.
-        slips: whether the lateral velocity is free; False where the program takes it back within a step.
+        slips: whether the lateral velocity is free; False where the program takes it back, with the centripetal term
+            that a turn needs: `a_lateral = −w / settling + v · yaw_rate`.
+        settling: time constant in which a program that does not slip takes its lateral velocity back, and wheels reach
+            what they are told, s; None where it is the step.
     """
 
     states = ("x [m]", "y [m]", "heading [rad]", "vx [m/s]", "vy [m/s]", "yaw_rate [rad/s]")
@@ -41,6 +44,7 @@ class PlanarVehicle(Program):
     axes: ClassVar = {"translation": ("forward", "lateral"), "yaw": ("yaw",)}
     landmarks: Sequence[Sequence[float]] = ()
     bearing_sd: float
+    settling: float | None = None
     slips: bool = True
 
     def __init__(self) -> None:
@@ -63,7 +67,10 @@ class PlanarVehicle(Program):
         return tuple(f"bearing_{i} [rad]" for i in range(len(self.landmarks)))
 
     def integrate(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
-        """Explicit Euler with the old pose and velocity.
+        """Move on under an acceleration that is held in the body frame, to second order in the step.
+
+        The acceleration acts at the heading in the middle of the step, averaged over the turn; the pose moves by the
+        mean of the old and the new velocity.
 
         Args:
             state: `(..., 6)`.
@@ -73,6 +80,29 @@ class PlanarVehicle(Program):
         Returns:
             The next state, `(..., 6)`.
         """
+        x, y, heading, vx, vy, yaw_rate = state.unbind(-1)
+        forward, lateral, yaw = acceleration.unbind(-1)
+        turn = (yaw_rate + 0.5 * yaw * step) * step
+        # a turning push adds up to sin(turn / 2) / (turn / 2) of a straight one: so for small turns, bounded for large
+        gained = step / (1 + turn * turn / 24)
+        cos, sin = (heading + 0.5 * turn).cos() * gained, (heading + 0.5 * turn).sin() * gained
+        more_vx, more_vy = cos * forward - sin * lateral, sin * forward + cos * lateral
+        return stack(
+            x + (vx + 0.5 * more_vx) * step,
+            y + (vy + 0.5 * more_vy) * step,
+            heading + turn,
+            vx + more_vx,
+            vy + more_vy,
+            yaw_rate + yaw * step,
+        )
+
+    def halfway(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
+        """Return the state in the middle of a step under an acceleration, `(..., 6)`: where forces that depend on the
+        state are taken, so that the step is of second order in them too."""
+        return self.integrate(state, acceleration, 0.5 * step)
+
+    def integrate_euler(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
+        """Move on by one explicit Euler step, with the old pose and velocity; see `ExplicitEuler`."""
         x, y, heading, vx, vy, yaw_rate = state.unbind(-1)
         forward, lateral, yaw = acceleration.unbind(-1)
         cos, sin = heading.cos(), heading.sin()
@@ -102,6 +132,18 @@ class PlanarVehicle(Program):
     def earlier(self, state: Tensor, ago: Tensor) -> Tensor:
         """The pose `ago` seconds before, at its velocity, and the velocity as it is, `(..., 6)`."""
         return torch.cat([state[..., :3] - ago * state[..., 3:6], state[..., 3:]], -1)
+
+    def settles_in(self, step: Tensor) -> Tensor | float:
+        """Time constant of what the program holds, s: `settling`, or the step."""
+        return step if self.settling is None else self.settling
+
+    def carried(self, state: Tensor) -> dict[str, Tensor]:
+        """Accelerations by channel that turn the velocity along with the vehicle, `(...)` m/s², as a program with a
+        `settling` has them besides what its wheels do; zero for others."""
+        forward, lateral, yaw_rate = self.body_velocity(state)
+        turns = 0.0 if self.settling is None else yaw_rate
+        parts = (-lateral * turns, forward * turns, torch.zeros_like(forward))
+        return dict(zip(names(self.channels), parts, strict=True))
 
     def ranges(self, state: Tensor) -> Tensor:
         """Distances from the landmarks, `(..., K)` m."""
@@ -203,6 +245,23 @@ def _on_device(landmarks: Sequence[Sequence[float]] | Tensor, state: Tensor) -> 
 @lru_cache(maxsize=16)
 def _kept_on_device(landmarks: tuple[tuple[float, float], ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.tensor(landmarks, dtype=dtype, device=device)
+
+
+class ExplicitEuler(PlanarVehicle):
+    """A vehicle that takes the explicit Euler step of STEADY's authors, in simulation as well.
+
+    For the paper's tables, whose simulated world takes this step; of no other vehicle is it the motion. To be put
+    before a vehicle: `class AuthorsVehicle(ExplicitEuler, Hovercraft)`.
+    """
+
+    substeps = 1
+    simulated_step = math.inf
+
+    def integrate(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
+        return self.integrate_euler(state, acceleration, step)
+
+    def halfway(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
+        return state
 
 
 class UnknownMap(PlanarVehicle):

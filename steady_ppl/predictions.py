@@ -11,10 +11,11 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.linearization import Path
-from steady_ppl.program import Program, acting_controls
+from steady_ppl.program import Program
 from steady_ppl.simulation import measure
 from steady_ppl.sites import AtMean, Observing, Recording, as_vector, residual, running
 from steady_ppl.stepping import Stepping
+from steady_ppl.substeps import acting_controls, advance
 from steady_ppl.tracking import Tracked
 
 
@@ -80,7 +81,7 @@ def states_ahead(program: Program, data: Trajectories, tracked: Tracked, most: i
         rows = slice(ahead - 1, len(steps))
         state = state[: len(steps) - ahead + 1]
         with running(*state.shape[:-1]), AtMean():
-            state = program.transition(state, controls[rows], elapsed[rows], steps[rows])
+            state = advance(program, state, controls[rows], elapsed[rows], steps[rows])
         yield ahead, state
 
 

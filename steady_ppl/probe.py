@@ -15,6 +15,8 @@ from torch import Tensor
 from steady_ppl.errors import ProgramError, SteadyError, one_line
 from steady_ppl.program import Program, names
 from steady_ppl.sites import Broadcasting, Observing, Recording, Replaying, broadcast_event, running
+from steady_ppl.stability import require_convergence
+from steady_ppl.substeps import MAX_SUBSTEPS, is_count
 
 DRAWS, ROWS, TRAJECTORIES = 7, 11, 13
 LEFT = (DRAWS, ROWS, TRAJECTORIES)
@@ -42,6 +44,8 @@ def probe(program: Program) -> None:
         after, noise = _call(name, "transition", lambda: program.transition(state, control, time, step), LEFT)
         _check_state("transition", after, size)
         _check_noise(name, noise)
+        if program.substeps > 1:
+            require_convergence(program, state, control, time, step)
 
         measurements = torch.zeros(ROWS, TRAJECTORIES, width).to(parameter)
         observing = Observing(measurements, torch.ones_like(measurements, dtype=torch.bool))
@@ -93,6 +97,10 @@ def _check_declarations(program: Program, name: str) -> None:
         for member in members:
             if member not in known:
                 raise ProgramError(f"program {name}: {what} names {member!r}, no state component ({', '.join(known)})")
+    if not is_count(program.substeps):
+        raise ProgramError(
+            f"program {name}: substeps is {program.substeps!r}; expected a whole number from 1 to {MAX_SUBSTEPS}"
+        )
     if not (program.step > 0 and program.duration >= program.step):
         raise ProgramError(
             f"program {name}: step is {program.step} s and duration {program.duration} s; expected 0 < step ≤ duration"

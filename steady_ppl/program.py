@@ -60,7 +60,9 @@ class Program(PyroModule, metaclass=_WithEffects):
         decays: weight decay relative to the recipe's, by the beginning of a parameter's name; only the matrices of
             `torch.nn.Linear` decay.
         resting: state components that start at zero in every drive; a table need not have them.
+        substeps: in how many steps of `transition` the program takes a row; see `steady_ppl.substeps`.
         duration, step: of a simulated trajectory, s.
+        simulated_step: the longest substep of a simulated trajectory, s.
     """
 
     states: Sequence[str] = ()
@@ -77,8 +79,10 @@ class Program(PyroModule, metaclass=_WithEffects):
     rates: ClassVar[Mapping[str, float]] = {}
     decays: ClassVar[Mapping[str, float]] = {}
     resting: Sequence[str] = ()
+    substeps: int = 1
     duration: float = 10.0
     step: float = 0.1
+    simulated_step: float = 0.005
 
     def __init__(self) -> None:
         # parameters belong to this object, not to Pyro's global store, where a second program would find them
@@ -206,11 +210,6 @@ def error_groups(program: Program) -> dict[str, tuple[int, ...]]:
     order = names(program.states)
     groups = program.error_groups or {name: (name,) for name in order}
     return {group: tuple(order.index(name) for name in members) for group, members in groups.items()}
-
-
-def acting_controls(program: Program, data: Trajectories) -> Tensor:
-    """The controls of drives as they act on the program, `(T + 1, B, U)`."""
-    return program.actuators(data.controls, data.elapsed)
 
 
 def for_program(program: Program, data: Trajectories) -> Trajectories:

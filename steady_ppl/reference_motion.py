@@ -16,8 +16,9 @@ from steady_ppl.data import Trajectories
 from steady_ppl.linearization import Path
 from steady_ppl.planar_vehicle import wrap
 from steady_ppl.predictions import Prediction, on_a_circle, predict
-from steady_ppl.program import Program, acting_controls
+from steady_ppl.program import Program
 from steady_ppl.sites import AtMean, Recording, Standardised, as_vector, normal_moments, running
+from steady_ppl.substeps import acting_controls, advance, sample_channels
 from steady_ppl.tracking import Tracked, track
 
 MULTIPLES = (0.5, 1.0, 2.0, 4.0, 8.0)
@@ -70,7 +71,7 @@ class ConstantVelocity(Program):
         super().__init__()
         self.scales = tuple(scales)
         self.states, self.controls, self.channels = program.states, program.controls, program.channels
-        self.measurements = program.measurements
+        self.measurements, self.substeps = program.measurements, program.substeps
         self.angles = program.angles  # type: ignore[misc]
         object.__setattr__(self, "of", program)  # not a part of this one: Pyro would rename it
 
@@ -120,7 +121,7 @@ def constant_velocity(
     inputs = acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps
     seen = Recording()
     with running(*path.noise.shape[:-1]), seen, Standardised(path.noise):
-        program.transition(path.states[:-1], *inputs)
+        sample_channels(program, path.states[:-1], *inputs)
     sites = seen.distributions
     values = torch.cat([as_vector(value, sites[site].event_dim) for site, value in seen.values.items()], -1)
     spreads = [as_vector(normal_moments(fn, site)[1], fn.event_dim) for site, fn in sites.items()]
@@ -129,8 +130,8 @@ def constant_velocity(
     if not bool((sizes > 0).all() and torch.isfinite(sizes).all()):
         return "a channel of the program never moves"
     with running(*path.noise.shape[:-1]), AtMean():
-        moved = program.transition(path.states[:-1], *inputs)
-        coasted = ConstantVelocity(program, sizes.tolist()).transition(path.states[:-1], *inputs)
+        moved = advance(program, path.states[:-1], *inputs)
+        coasted = advance(ConstantVelocity(program, sizes.tolist()), path.states[:-1], *inputs)
     if torch.allclose(moved, coasted, rtol=1e-6, atol=1e-7):
         return "the program's channels have no mean that could be taken away"
     best: tuple[float, ConstantVelocity, Tracked] | None = None

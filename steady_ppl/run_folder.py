@@ -174,9 +174,11 @@ def require_same(folder: Path, begun: Mapping[str, Any]) -> None:
         raise RunError(
             f"{folder}: --resume goes on with the same {' and '.join(begun['option_files'])}; a file has changed"
         )
-    for key in ("recipe", "known_start", "seed", "options"):
-        if before.get(key) != begun[key]:
-            raise RunError(f"{folder}: --resume needs the same {key}: {before.get(key)} then, {begun[key]} now")
+    for key in ("recipe", "known_start", "seed", "options", "begun_substeps"):
+        then = before.get(key, 1 if key == "begun_substeps" else None)
+        if then != begun[key]:
+            name = key.removeprefix("begun_")
+            raise RunError(f"{folder}: --resume needs the same {name}: {then} then, {begun[key]} now")
 
 
 def read_record(folder: Path) -> dict[str, Any]:

@@ -20,6 +20,7 @@ BEGUN_RECORD = {
 
 FINISHED_RECORD = {
     "effects": Absent(LINES),
+    "substeps": Absent(WHOLE),
     "known_start": TRUTH,
     "seed": WHOLE,
     "settings": {str: ANYTHING},

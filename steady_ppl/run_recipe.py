@@ -141,6 +141,7 @@ def run_recipe(
     declared = {key: value.clone() for key, value in program.state_dict().items()}
     begun = {
         "program": program_source(program, folder),
+        "begun_substeps": program.substeps,
         "recipe": name,
         "status": "training",
         "known_start": known_start,

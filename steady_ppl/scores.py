@@ -21,8 +21,9 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.elements import Element, moved
 from steady_ppl.lookahead import Lookahead
-from steady_ppl.program import Program, acting_controls
-from steady_ppl.sites import AtMean, Recording, as_vector, normal_moments, residual, running
+from steady_ppl.program import Program
+from steady_ppl.sites import AtMean, Recording, as_vector, normal_moments, residual, running, unwrapped
+from steady_ppl.substeps import acting_controls, sample_channels
 
 Moments = tuple[Tensor, Tensor]
 
@@ -140,11 +141,11 @@ def by_component(values: Tensor) -> Tensor:
 @torch.no_grad()
 def channel_moments(program: Program, data: Trajectories, states: Tensor, controls: Tensor | None = None) -> Moments:
     """Means and standard deviations of the channels at states `(P, T, B, D)`, each `(P, T, B, C)`; `controls` are the
-    acting ones, `(T + 1, B, U)` or `(P, T + 1, B, U)`."""
+    acting ones, `(T + 1, B, U)` or `(P, T + 1, B, U)`, or as `acting` gives them."""
     controls = acting_controls(program, data) if controls is None else controls
     seen = Recording()
     with running(*states.shape[:-1]), seen, AtMean():
-        program.transition(states, controls[..., :-1, :, :], data.elapsed[:-1], data.steps)
+        sample_channels(program, states, controls[..., :-1, :, :], data.elapsed[:-1], data.steps)
     means, spreads = [], []
     for site, fn in seen.distributions.items():
         mean, spread = normal_moments(fn, site)
@@ -186,9 +187,7 @@ class Measured:
         """Scales, `(..., K)`."""
         parts = []
         for fn in self.distributions.values():
-            base = fn
-            while hasattr(base, "base_dist"):
-                base = base.base_dist
+            base = unwrapped(fn)
             parts.append(as_vector(base.scale, fn.event_dim))  # type: ignore[attr-defined]
         return torch.cat(parts, -1)
 
@@ -197,10 +196,8 @@ class Measured:
         """Degrees of freedom, `(..., K)`, infinite where the noise is normal."""
         parts = []
         for fn in self.distributions.values():
-            base = fn
-            while hasattr(base, "base_dist"):
-                base = base.base_dist
-            scale = base.scale  # type: ignore[attr-defined]
+            base = unwrapped(fn)
+            scale = base.scale
             freedom = base.df if isinstance(base, dist.StudentT) else scale.new_tensor(torch.inf)
             parts.append(as_vector(freedom.expand(scale.shape), fn.event_dim))  # type: ignore[attr-defined]
         return torch.cat(parts, -1)

@@ -2,29 +2,42 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import ProgramError, SteadyError, one_line
 from steady_ppl.particles import roll_out
-from steady_ppl.program import Program, acting_controls, for_program, names
+from steady_ppl.program import Program, for_program, names
 from steady_ppl.progress import stages
 from steady_ppl.seeding import seeded
 from steady_ppl.sites import Recording, as_vector, broadcast_event, running
+from steady_ppl.stability import is_step
+from steady_ppl.substeps import MAX_SUBSTEPS, acting_controls, with_substeps
 
 
 @torch.no_grad()
 def simulate(
-    program: Program, trajectories: int | None = None, *, seed: int = 0, like: Trajectories | None = None
+    program: Program,
+    trajectories: int | None = None,
+    *,
+    seed: int = 0,
+    like: Trajectories | None = None,
+    substeps: int | None = None,
 ) -> Trajectories:
-    """Drives of a program, with measurements and the true states.
+    """Simulate drives of a program in fine steps, with measurements and the true states.
+
+    Controls and noise are held over a row. A row is cut into substeps that are no longer than the program's
+    `simulated_step`, 5 ms unless it says otherwise; where `transition` is no step in `step`, into the program's own.
 
     Args:
         program: what moves and what is measured.
         trajectories: how many; the program's `duration`, `step` and `example_controls` apply.
         seed: the same seed gives the same table.
         like: take time, controls and gaps in the measurements from these drives instead.
+        substeps: of a row, instead.
 
     Raises:
         ProgramError: a state is not finite.
@@ -48,6 +61,7 @@ def simulate(
         else:
             data = like
         run = for_program(program, data)
+        program = with_substeps(program, simulated_substeps(program, run) if substeps is None else substeps)
         rows, drives = run.time.shape
         with running(1, drives):
             start = broadcast_event(program.initial(), torch.Size((1, drives)), 1)
@@ -75,6 +89,34 @@ def simulate(
         measurement_names=run.measurement_names,
         state_names=names(program.states),
     )
+
+
+def simulated_substeps(program: Program, data: Trajectories) -> int:
+    """Return in how many substeps a row of drives is simulated.
+
+    Args:
+        program: what is simulated.
+        data: as returned by `for_program`.
+    """
+    longest = _usual_step(data)
+    wanted = min(MAX_SUBSTEPS, math.ceil(longest / program.simulated_step - 1e-6))
+    return max(program.substeps, wanted) if wanted > program.substeps and is_step(program, data) else program.substeps
+
+
+def simulated_in(program: Program, drives: Trajectories, substeps: int | None = None) -> str:
+    """Say in which steps drives were simulated."""
+    run = for_program(program, drives)
+    count = simulated_substeps(program, run) if substeps is None else substeps
+    if count == program.substeps and substeps is None and not math.isinf(program.simulated_step):
+        longest = _usual_step(run)
+        if longest / count > 1.001 * program.simulated_step:
+            return f"simulated row by row: transition is no step in `step`, so that rows cannot be cut ({count} a row)"
+    return f"simulated in steps of {1000 * run.median_step / count:.3g} ms, {count} a row"
+
+
+def _usual_step(data: Trajectories) -> float:
+    """The step that 95 % of rows do not exceed, s: a pause in a log must not make every row fine."""
+    return float(data.steps[data.transitions].double().quantile(0.95)) if bool(data.transitions.any()) else 0.0
 
 
 def measure(program: Program, states: Tensor) -> Tensor:

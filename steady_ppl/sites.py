@@ -241,11 +241,16 @@ def masked(mask: Tensor) -> MaskMessenger:
     return MaskMessenger(cast(torch.BoolTensor, mask))
 
 
+def unwrapped(fn: Any) -> Any:
+    """Return the distribution under `to_event`, `mask` and `expand`."""
+    while isinstance(fn, dist.Independent | dist.MaskedDistribution | dist.ExpandedDistribution):
+        fn = fn.base_dist
+    return fn
+
+
 def residual(fn: Any, value: Tensor) -> Tensor:
     """`value − mean` of a measurement site, on the circle where the site's distribution lives there."""
-    base = fn
-    while isinstance(base, dist.Independent | dist.MaskedDistribution | dist.ExpandedDistribution):
-        base = base.base_dist
+    base = unwrapped(fn)
     if hasattr(base, "residual"):
         return base.residual(value)
     return value - fn.mean
@@ -257,9 +262,7 @@ def normal_moments(fn: Any, site: str) -> tuple[Tensor, Tensor]:
     Raises:
         ProgramError: the site has another distribution.
     """
-    base = fn
-    while isinstance(base, dist.Independent | dist.MaskedDistribution | dist.ExpandedDistribution):
-        base = base.base_dist
+    base = unwrapped(fn)
     if not isinstance(base, dist.Normal) or fn.event_dim > 1:
         raise ProgramError(
             f"site {site!r} is {type(base).__name__} with event shape {tuple(fn.event_shape)}: looking ahead needs "
@@ -281,9 +284,7 @@ def tangent_normal(fn: Any, residual: Tensor, site: str) -> tuple[Tensor, Tensor
     Raises:
         ProgramError: the site is neither normal nor Student t.
     """
-    base = fn
-    while isinstance(base, dist.Independent | dist.MaskedDistribution | dist.ExpandedDistribution):
-        base = base.base_dist
+    base = unwrapped(fn)
     if not isinstance(base, dist.StudentT) or fn.event_dim > 1:
         _, sd = normal_moments(fn, site)
         return sd, -sd.log() - 0.5 * math.log(2 * math.pi)

@@ -7,9 +7,10 @@ from contextlib import nullcontext
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
-from steady_ppl.program import Program, acting_controls
+from steady_ppl.program import Program
 from steady_ppl.resampling import take
 from steady_ppl.sites import Observing, Recording, Standardised, running
+from steady_ppl.substeps import acting_controls, advance, standardised
 
 
 class Stepping:
@@ -41,7 +42,8 @@ class Stepping:
             noise: `(N, B, C)`, in standard deviations of the channels; None: drawn by the program.
 
         Returns:
-            The next states `(N, B, D)` and each site's values `(N, B, ...)`.
+            The next states `(N, B, D)` and each site's values `(N, B, ...)`; with several substeps these are in
+            standard deviations, see `substeps.channel_values`.
         """
         if ancestors is not None:
             state = take(state, ancestors)
@@ -49,9 +51,12 @@ class Stepping:
         given = nullcontext() if noise is None else Standardised(noise.unsqueeze(1))
         control, time, step = self.controls[row, None], self.elapsed[row, None], self.steps[row, None]
         with running(state.shape[0], 1, state.shape[1]), recording, given:
-            moved = self.program.transition(state.unsqueeze(1), control, time, step)
+            moved = advance(self.program, state.unsqueeze(1), control, time, step)
         self.event_dims = {site: fn.event_dim for site, fn in recording.distributions.items()}
-        return moved.squeeze(1), {site: value.squeeze(1) for site, value in recording.values.items()}
+        values = recording.values
+        if self.program.substeps > 1:
+            values = {site: standardised(fn, values[site], site) for site, fn in recording.distributions.items()}
+        return moved.squeeze(1), {site: value.squeeze(1) for site, value in values.items()}
 
     def log_density(self, row: int, state: Tensor) -> Tensor:
         """Tempered log-density of a row's measurements, `(N, B)`."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable, Sequence
+
 import torch
 from torch import Tensor
 
@@ -9,17 +12,23 @@ from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError, ProgramError
 from steady_ppl.paths import Paths
 from steady_ppl.planar_vehicle import wrap
-from steady_ppl.program import Program, acting_controls, names
+from steady_ppl.program import Program, names
 from steady_ppl.sites import Recording, Replaying, running
+from steady_ppl.substeps import acting_controls, sample_row
+
+PASSES = 30  # of Gauss and Newton's method
+AT_REST = 1e-8  # of a channel's size and unit, by which noise may still move when it is found
+Noise = dict[str, Tensor]
 
 
 @torch.no_grad()
 def true_paths(program: Program, data: Trajectories) -> Paths:
     """The true states with the channel noise that leads from one to the next.
 
-    The program is run at zero noise and at a unit of each channel; where the next state is affine in the noise, least
-    squares on these runs gives the noise exactly. What noise cannot explain (a position that does not follow from the
-    velocity) is left over. Angles are compared on the circle.
+    Gauss and Newton's method from zero noise: least squares on the differences that a unit of each channel makes; one
+    pass is exact where the next state is affine in the noise. What noise cannot explain (a position that does not
+    follow from the velocity) is left over, and the more of that, the more precise the derivatives must be: the program
+    runs in double precision. Angles are compared on the circle.
 
     Args:
         program: the state-space model.
@@ -27,52 +36,39 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
 
     Raises:
         DataError: a state is unknown.
-        ProgramError: the next state is not affine in the channel noise, or the start is not one site.
+        ProgramError: no noise is found within `PASSES`, or the start is not one site.
     """
     states = data.states
     if states is None or not bool(torch.isfinite(states[data.rows]).all()):
         raise DataError("supervised learning needs the true state of every row: the table's x. columns are incomplete")
     states = torch.where(data.rows[..., None], states, states[:1])
-    before, after = states[:-1], states[1:]
-
-    controls = acting_controls(program, data)[:-1]
+    exact, within = copy.deepcopy(program).double(), data.to(torch.float64)
+    before, after = states[:-1].double(), states[1:].double()
+    controls = acting_controls(exact, within)[:-1]
 
     def run(noise: dict[str, Tensor]) -> tuple[Tensor, Recording]:
         recording = Recording()
         with running(*before.shape[:-1]), recording, Replaying(noise):
-            after = program.transition(before, controls, data.elapsed[:-1], data.steps)
+            after = sample_row(exact, before, controls, within.elapsed[:-1], within.steps)
         return after, recording
 
     _, probe = run({})
-    zero = {site: value.new_zeros(value.shape) for site, value in probe.values.items()}
-    base, _ = run(zero)
-    columns, places = [], []
-    for site, value in zero.items():
-        for channel in range(value[0, 0].numel()):
-            unit = zero | {site: value.clone()}
-            unit[site].reshape(*value.shape[:2], -1)[..., channel] = 1.0
-            columns.append(run(unit)[0] - base)
-            places.append((site, channel))
-    effect = torch.stack(columns, -1).double()
-    difference = after - base
-    for index in (names(program.states).index(angle) for angle in program.angles):
-        difference[..., index] = wrap(difference[..., index])
-    solution = (torch.linalg.pinv(effect) @ difference.double().unsqueeze(-1)).squeeze(-1).to(states.dtype)
-    noise = {site: value.clone() for site, value in zero.items()}
-    for index, (site, channel) in enumerate(places):
-        noise[site].reshape(*noise[site].shape[:2], -1)[..., channel] = solution[..., index]
+    noise = {site: value.new_zeros(value.shape) for site, value in probe.values.items()}
+    angles = [names(program.states).index(angle) for angle in program.angles]
+    for _ in range(PASSES):
+        noise, moved = _improved(run, noise, after, angles)
+        if not moved:
+            break
+    else:
+        raise ProgramError(
+            f"program {type(program).__name__}: no channel noise was found that leads from one true state to the next "
+            "(transition bends too much in its noise): supervised learning cannot tell which it was",
+            site="transition",
+        )
 
     start = Recording()
     with running(1, before.shape[1]), start:
         program.initial()
-    replayed = run(noise)[0] - base
-    predicted = (effect @ solution.double().unsqueeze(-1)).squeeze(-1).to(states.dtype)
-    if bool(((replayed - predicted).norm(dim=-1) > 1e-2 * predicted.norm(dim=-1) + 1e-3).any()):
-        raise ProgramError(
-            f"program {type(program).__name__}: the next state is not affine in the channel noise: supervised learning "
-            "cannot tell which noise led from one true state to the next",
-            site="transition",
-        )
     if len(start.values) != 1:
         raise ProgramError("supervised learning needs initial() to sample the whole state as one site", site="initial")
     (site,) = start.values
@@ -81,6 +77,34 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
     return Paths(
         states=states[None],
         start={site: states[None, :1, :, :width]},
-        noise={s: value[None] for s, value in noise.items()},
+        noise={s: value[None].to(states.dtype) for s, value in noise.items()},
         event_dims=event_dims,
     )
+
+
+def _improved(
+    run: Callable[[Noise], tuple[Tensor, Recording]], noise: Noise, after: Tensor, angles: Sequence[int]
+) -> tuple[Noise, bool]:
+    """Noise after one pass towards the states `after`, and whether it moved."""
+    base, _ = run(noise)
+    columns, places = [], []
+    for site, value in noise.items():
+        for channel in range(value[0, 0].numel()):
+            unit = noise | {site: value.clone()}
+            _channel(unit[site], channel).add_(1.0)
+            columns.append(run(unit)[0] - base)
+            places.append((site, channel))
+    effect, difference = torch.stack(columns, -1).double(), after - base
+    for index in angles:
+        difference[..., index] = wrap(difference[..., index])
+    change = (torch.linalg.pinv(effect) @ difference.double().unsqueeze(-1)).squeeze(-1).to(after.dtype)
+    found = {site: value.clone() for site, value in noise.items()}
+    for index, (site, channel) in enumerate(places):
+        _channel(found[site], channel).add_(change[..., index])
+    reached = torch.stack([_channel(found[site], channel) for site, channel in places], -1)
+    return found, bool((change.abs() > AT_REST * (1 + reached.abs())).any())
+
+
+def _channel(value: Tensor, channel: int) -> Tensor:
+    """A view of one channel of a site's value, `(T, B)`."""
+    return value.reshape(*value.shape[:2], -1)[..., channel]

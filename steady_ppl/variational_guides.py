@@ -18,8 +18,9 @@ from steady_ppl.data import Trajectories
 from steady_ppl.errors import require
 from steady_ppl.guides import sample_known
 from steady_ppl.paths import Paths
-from steady_ppl.program import Program, acting_controls
+from steady_ppl.program import Program
 from steady_ppl.sites import KnownStart, Recording, Replaying, Standardised, broadcast_event, running
+from steady_ppl.substeps import acting_controls, sample_channels, sample_row
 from steady_ppl.tempering import Constant, Tempering
 
 
@@ -118,7 +119,7 @@ class VariationalGuide(nn.Module):
                 later = later + torch.where(inside, density, 0.0).sum(-1)
                 moving = Recording()
                 with moving, (Taking if self.centred else Standardised)(noise.unsqueeze(1)):
-                    moved = self.program.transition(state.unsqueeze(1), *given).squeeze(1)
+                    moved = sample_row(self.program, state.unsqueeze(1), *given).squeeze(1)
                 state = torch.where(inside[:, None], moved, state)
                 states.append(state)
                 for site, value in moving.values.items():
@@ -155,7 +156,7 @@ def _prior_of_noise(program: Program, data: Trajectories, paths: Paths) -> Tenso
     """Log-density of the channel noise under the program, as `Joint` scores it, `(M,)`."""
     states, seen = paths.states[:, :-1], Recording()
     with running(*states.shape[:-1]), seen, Replaying(paths.noise):
-        program.transition(states, acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
+        sample_channels(program, states, acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
     logs = [fn.log_prob(paths.noise[site]) for site, fn in seen.distributions.items()]
     return torch.where(data.transitions, torch.stack(logs).sum(0), 0.0).sum((1, 2))
 

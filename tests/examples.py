@@ -24,10 +24,11 @@ def example(name: str, dtype: torch.dtype = torch.float64) -> Program:
 
 
 def drives(program: Program, trajectories: int, rows: int, *, gaps: bool = False, seed: int = 0) -> Trajectories:
-    """Simulated drives for `program`, read by it: all cells measured on an even clock, or, with `gaps`, every other
-    trajectory two rows shorter, a fifth of the cells missing and every interval of another length."""
+    """Drives for `program`, simulated at its own time step, so that it is right about them, and read by it: all cells
+    measured on an even clock, or, with `gaps`, every other trajectory two rows shorter, a fifth of the cells missing
+    and every interval of another length."""
     program.duration = (rows - 1) * program.step
-    table = simulate(program, trajectories, seed=seed)
+    table = simulate(program, trajectories, seed=seed, substeps=program.substeps)
     if gaps:
         with seeded(seed, "gaps"):
             time = program.step * (0.5 + torch.rand(table.time.shape, dtype=torch.float64)).cumsum(0)
@@ -36,7 +37,7 @@ def drives(program: Program, trajectories: int, rows: int, *, gaps: bool = False
             observed = (torch.rand(table.observed.shape) < 0.8) & inside[..., None]
         controls = torch.where(inside[..., None], table.controls, 0.0)
         table = replace(table, time=time, controls=controls, lengths=lengths, observed=observed)
-        table = simulate(program, seed=seed, like=table)
+        table = simulate(program, seed=seed, like=table, substeps=program.substeps)
     return for_program(program, table)
 
 

@@ -54,12 +54,13 @@ def cart_system(data, parameters: Parameters, *, known_start: bool = False) -> L
     step, push = data.steps.double(), data.controls[:-1, :, 0].double()
     zero, one = torch.zeros_like(step), torch.ones_like(step)
     trajectories = step.shape[1]
-    row = torch.stack([torch.stack([one, step], -1), torch.stack([zero, 1 - parameters["damping"] * step], -1)], -2)
-    velocity = torch.stack([zero, one], -1)
+    coasting = torch.stack([torch.stack([one, step], -1), torch.stack([zero, one], -1)], -2)
+    by_acceleration = torch.stack([step.square() / 2, step], -1)
+    braking = torch.stack([zero, -parameters["damping"] * one], -1)
     return LinearSystem(
-        matrix=row,
-        offset=velocity * (parameters["gain"] * push * step)[..., None],
-        noise=torch.diag_embed(velocity) * (parameters["noise"] * step)[..., None, None].square(),
+        matrix=coasting + by_acceleration[..., :, None] * braking[..., None, :],
+        offset=by_acceleration * (parameters["gain"] * push)[..., None],
+        noise=by_acceleration[..., :, None] * by_acceleration[..., None, :] * parameters["noise"].square(),
         start_mean=data.states[0].double() if known_start else START_MEAN.expand(trajectories, 2),
         start_covariance=torch.diag(START_SD**2 * (not known_start)).expand(trajectories, 2, 2),
         measurement_variance=parameters["measurement_sd"].square(),
@@ -131,8 +132,10 @@ class CartPosterior:
             push = float(data.controls[row, trajectory, 0])
             accelerations.append(noise * unit[2 + row] - damping * state[1])
             centres.append(gain * push - damping * constant[1])
-            state = torch.stack([state[0] + step * state[1], state[1] + step * accelerations[-1]])
-            constant = torch.stack([constant[0] + step * constant[1], constant[1] + step * centres[-1]])
+            state, constant = (
+                torch.stack([x + step * v + step**2 / 2 * a, v + step * a])
+                for (x, v), a in ((state, accelerations[-1]), (constant, centres[-1]))
+            )
             maps.append(state)
             constants.append(constant)
         self._states, self._states_constant = torch.stack(maps), torch.stack(constants)

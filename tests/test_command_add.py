@@ -44,6 +44,7 @@ def test_simulate_with_effects_says_their_values(work: Path, capsys) -> None:
         "steady: linear_drag = 0.12 1/s (typical)",
         "steady: slope = 0.05, -0.03 m/s² (as given)",
         "steady: thrust_saturation (knee 0.6) = 0.3 (as given)",
+        "steady: simulated in steps of 5 ms, 20 a row",
     ]
     plain, other = read_table(work / "plain.csv"), read_table(work / "with.csv")
     assert torch.equal(plain.controls, other.controls) and not torch.allclose(plain.states, other.states)

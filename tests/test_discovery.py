@@ -142,7 +142,7 @@ def test_noise_that_is_not_the_declared_is_said_to_be():
 def test_a_sensor_whose_noise_is_learned_is_said_not_to_be_the_declared():
     truth, program = FreeSight(), FreeSight()
     truth.bearing_sd = torch.tensor(0.12)
-    found = st.discover(program, *tables(truth, drives=6, rows=61), known_start=True, simulations=SETS)
+    found = st.discover(program, *tables(truth), known_start=True, simulations=SETS)
     (finding,) = found.findings
     assert found.verdict == "noise" and finding.variant.name == "measurement_noise"
     low, high = finding.interval[0]

@@ -21,6 +21,7 @@ from steady_ppl.filtering import log_likelihood
 from steady_ppl.probe import probe
 from steady_ppl.program import names
 from steady_ppl.sites import Recording, Replaying
+from steady_ppl.substeps import acting_controls, sample_row
 from steady_ppl.true_paths import true_paths
 
 PROGRAMS = ("hovercraft", "truck", "pendulum")
@@ -166,16 +167,16 @@ def test_a_wind_carries_what_is_at_rest_and_stops_when_it_moves_along() -> None:
     [
         ("gain_error:turn", 0.2, (0, 0, 0.2 * 0.5 * 0.4 / 0.1)),
         ("gain_error:speed", -0.2, (-0.2 * 0.95 / 0.1, 0, 0)),
-        ("lever_arm", 0.2, (0, 0.2 * 0.3 / 0.1, 0)),  # v_y is c · yaw rate after one step
+        ("lever_arm", 0.2, (0, 0.2 * 0.5 * 0.4 / 0.1, 0)),  # v_y goes to c · yaw rate, which goes to what it is told
         ("curvature_steering", 0.5, (0, 0, 0.5 * 0.5 * 0.4 * (0.95 * FORWARD / (0.95**2 + 0.05**2) - 1) / 0.1)),
-        ("response_time", 0.3, (-0.75 * (0.95 - FORWARD) / 0.1, 0, 0)),  # a step in 0.1 + 0.3 s
+        ("response_time", 0.3, (-0.75 * (0.95 - FORWARD) / 0.1, 0, 0)),  # in 0.1 + 0.3 s
         ("response_time:yaw", 0.1, (0, 0, -0.5 * (0.5 * 0.4 - 0.3) / 0.1)),
         ("response_time:lateral", 0.1, (0, 0.5 * LATERAL / 0.1, 0)),
         ("steering_offset", 0.2, (0, 0, 0.5 * 0.2 * FORWARD / 0.1)),
         ("understeer", 0.2, (0, 0, -0.5 * 0.2 * FORWARD**2 * 0.4 / 0.1)),
         ("reverse_steering", 0.2, (0, 0, -0.5 * 0.2 * math.tanh(FORWARD / 0.1) * 0.4 / 0.1)),
-        ("crab_angle", 0.2, (0, 0.2 * FORWARD / 0.1, 0)),
-        ("slip_angle", 0.2, (0, -0.2 * FORWARD * 0.3 / 0.1, 0)),
+        ("crab_angle", 0.2, (0, 0.2 * 0.95 / 0.1, 0)),  # likewise
+        ("slip_angle", 0.2, (0, -0.2 * (FORWARD * 0.5 * 0.4 + (0.95 - FORWARD) * 0.3) / 0.1, 0)),
         ("caster", 0.2, (0, 0, -0.2 * FORWARD * 0.3)),
     ],
 )
@@ -287,12 +288,12 @@ def test_step_after_step_is_the_same_as_all_steps_at_once(name: str, effects: tu
     data = drives(program, 3, 8, gaps=True)
     noise = {site: value[0] for site, value in true_paths(program, data).noise.items()}
     states = torch.where(data.rows[..., None], data.states, data.states[:1])
-    acting = program.actuators(data.controls, data.elapsed)[:-1]
+    acting = acting_controls(program, data)[:-1]
 
     def move(rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
         recording = Recording()
         with recording, Replaying({site: value[rows] for site, value in noise.items()}):
-            after = program.transition(states[:-1][rows], acting[rows], data.elapsed[:-1][rows], data.steps[rows])
+            after = sample_row(program, states[:-1][rows], acting[rows], data.elapsed[:-1][rows], data.steps[rows])
         return after, sum(recording.distributions[site].log_prob(value[rows]) for site, value in noise.items())
 
     together, density = move(slice(None))

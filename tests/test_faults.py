@@ -173,7 +173,9 @@ def test_a_command_that_is_killed_goes_on_to_the_same_result(desk: Path, name: s
 
 
 @pytest.mark.parametrize(
-    ("room", "pieces"), [(20_000, {"000001.safetensors", "000002.safetensors"}), (4_000, set())], ids=["some", "none"]
+    ("room", "pieces"),
+    [(20_000, {f"00000{piece}.safetensors" for piece in (1, 2, 3)}), (4_000, set())],
+    ids=["some", "none"],
 )
 def test_a_search_on_a_disk_that_fills_up_goes_on_when_there_is_room(desk: Path, room: int, pieces: set) -> None:
     out = f"full_{room}"

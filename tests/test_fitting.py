@@ -42,10 +42,10 @@ def test_a_fit_never_ends_below_where_it_began() -> None:
 
 
 def test_a_program_whose_linearised_likelihood_is_off_is_fitted_by_draws(monkeypatch) -> None:
-    truth = example("truck", torch.float32).with_effect("lever_arm", 0.4)
+    truth = example("paper.py:PaperTruck", torch.float32).with_effect("lever_arm", 0.4)
     truth.noise = torch.tensor([2.0, 1.0, 1.0])
     train, valid = drives(truth, 6, 61, seed=1), drives(truth, 6, 61, seed=2)
-    program = example("truck", torch.float32)
+    program = example("paper.py:PaperTruck", torch.float32)
     assert is_doubtful(program, train, find_path(program, train, known_start=True), known_start=True)
     monkeypatch.setattr("steady_ppl.discovery.fitting.DOUBTFUL", 0.0)
     base = first_refit(program, train, valid, known_start=True, seed=0)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from steady_ppl import Joint, PathGuide, Paths, Program, Trajectories, particle_filter, seeded, stack
 from steady_ppl.sites import Observing, Replaying
+from steady_ppl.substeps import sample_row
 
 PROGRAMS = (
     "linear_gaussian",
@@ -58,7 +59,7 @@ def all_at_once(program: Program, data: Trajectories, paths: Paths, *, known_sta
 
 
 def step_by_step(program: Program, data: Trajectories, paths: Paths, *, known_start: bool = False) -> Tensor:
-    """The same sum with one call of each method a row, on plain tensors and with the lengths counted by hand."""
+    """The same sum with one call a row, on plain tensors and with the lengths counted by hand."""
     draws, rows, trajectories, _ = paths.states.shape
 
     def density(method, *handlers) -> tuple[Tensor, Tensor]:
@@ -85,7 +86,8 @@ def step_by_step(program: Program, data: Trajectories, paths: Paths, *, known_st
         if row < rows - 1:
             noise = {site: value[:, row, None] for site, value in paths.noise.items()}
             at = data.controls[row, None], data.elapsed[row, None], data.steps[row, None]
-            moved, state = density(lambda: program.transition(state, *at), Replaying(noise))  # noqa: B023
+            moved, state = density(lambda: sample_row(program, state, *at), Replaying(noise))  # noqa: B023
+            state = state.detach()  # a path is given: in substeps a row's end would follow the parameters a little
             total = total + torch.where(row + 1 < data.lengths, moved, 0.0)
     return total.sum()
 

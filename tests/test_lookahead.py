@@ -267,7 +267,8 @@ class TwoKicks(type(example("linear_gaussian"))):
         mean, half = self.gain * control[..., 0] - self.damping * velocity, self.noise / math.sqrt(2)
         first = pyro.sample("first", dist.Normal(mean, half))
         second = pyro.sample("second", dist.Normal(torch.zeros_like(mean).unsqueeze(-1), half).to_event(1))
-        return stack(position + velocity * step, velocity + (first + second[..., 0]) * step)
+        acceleration = first + second[..., 0]
+        return stack(position + velocity * step + acceleration * step**2 / 2, velocity + acceleration * step)
 
 
 @pytest.mark.parametrize("known_start", [False, True])

@@ -109,15 +109,15 @@ def test_fits_begin_at_the_declared_noise_as_well_where_the_program_alone_explai
     truth, program = example("hovercraft"), example("hovercraft")
     for one in (truth, program):
         one.noise = torch.tensor([0.08, 0.08, 0.05]).double()
-    truth = truth.with_effect("range_dependent_noise", 0.2)
-    train, valid = drives(truth, 4, 41, seed=1), drives(truth, 4, 41, seed=2)
+    truth = truth.with_effect("range_dependent_noise", 0.1)
+    train, valid = drives(truth, 6, 41, seed=1), drives(truth, 6, 41, seed=2)
     base = first_refit(program, train, valid, known_start=True, seed=0)
     assert base.rough is not None and float(base.program.noise.detach().max()) > 20 * 0.05
     variant = chosen_variant(program, "range_dependent_noise", "")
     found = refit_with(base, variant, 0.05, known_start=True)
     assert not isinstance(found, str)
-    assert float(found.coefficient(variant)) == pytest.approx(0.2, rel=0.3)
-    assert all(float(one.noise.detach().max()) < 0.2 for one in found.programs)
+    assert float(found.coefficient(variant)) == pytest.approx(0.1, rel=0.3)
+    assert all(one.noise.detach().max() < base.program.noise.detach().max() / 20 for one in found.programs)
 
 
 def test_a_fit_at_another_knee_is_the_one_from_nothing():
@@ -129,4 +129,5 @@ def test_a_fit_at_another_knee_is_the_one_from_nothing():
     direct = [refit_with(base, knee, 0.5, known_start=True) for knee in knees]
     near = refit_near(base, direct[0], [knees[1]], known_start=True)
     assert gain_of_fits(base, near) == pytest.approx(gain_of_fits(base, direct[1]), abs=0.2)
-    assert float((near.held_out - direct[1].held_out).sum()) == pytest.approx(0.0, abs=0.5)
+    # fits rest within .02 nats of their maxima, .2 standard deviations: of two fits on two folds .4 nats, three of them
+    assert float((near.held_out - direct[1].held_out).sum()) == pytest.approx(0.0, abs=1.2)

@@ -15,6 +15,7 @@ from steady_ppl import Fit, Trajectories
 from steady_ppl.posterior import posterior
 from steady_ppl.program import names
 from steady_ppl.sites import Replaying
+from steady_ppl.substeps import sample_row
 
 ROWS = 9
 
@@ -94,8 +95,8 @@ def test_the_noise_of_a_row_leads_from_its_state_to_the_next(name: str) -> None:
     states = torch.from_numpy(np.stack([result[n].values[0] for n in names(program.states)], -1)).transpose(1, 2)
     noise = torch.from_numpy(result["acceleration"].values[0]).transpose(1, 2)[:, :-1]
     noise = noise if len(program.channels) > 1 else noise[..., 0]
-    with Replaying({"acceleration": noise}):
-        after = program.transition(states[:, :-1].nan_to_num(), data.controls[:-1], data.elapsed[:-1], data.steps)
+    with Replaying({"acceleration": noise.nan_to_num()}):
+        after = sample_row(program, states[:, :-1].nan_to_num(), data.controls[:-1], data.elapsed[:-1], data.steps)
     inside = data.transitions.expand(4, -1, -1)
     torch.testing.assert_close(after[inside], states[:, 1:][inside], rtol=1e-12, atol=1e-12)
 

@@ -141,7 +141,8 @@ def test_an_error_is_that_of_kalmans_states_rolled_out_row_by_row(cart, carts, h
             for row in range(first, first + rows):
                 step, push = float(data.steps[row, drive]), float(data.controls[row, drive, 0])
                 acceleration = values["gain"] * push - values["damping"] * velocity
-                position, velocity = position + step * velocity, velocity + step * acceleration
+                position += step * velocity + step**2 / 2 * acceleration
+                velocity += step * acceleration
             if bool(data.observed[first + rows, drive, 0]):
                 measured.append(float(data.measurements[first + rows, drive, 0]) - position)
             estimated.append(float(data.states[first + rows, drive, 1]) - velocity)

@@ -28,7 +28,7 @@ FEW = {"steps": 2, "validate_every": 2}
 
 @pytest.fixture(autouse=True)
 def few_drives(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(unknown_map, "hov", lambda seed: hov(seed, 2, 2, 2))
+    monkeypatch.setattr(unknown_map, "hov", lambda seed, truth: hov(seed, 2, 2, 2, truth=truth))
 
 
 def test_the_bound_of_a_linear_program_is_kalmans() -> None:

@@ -13,8 +13,9 @@ from steady_ppl.altering import by_channel
 from steady_ppl.data import Trajectories
 from steady_ppl.discovery.curves import by_height, multiplier, over_reading, over_state, variables
 from steady_ppl.effects import Variant
-from steady_ppl.program import Program, acting_controls, names
+from steady_ppl.program import Program, names
 from steady_ppl.scores import Smoothed, channel_moments, measured
+from steady_ppl.substeps import acting_controls, row_controls
 
 PART = 400  # trajectories at a time
 
@@ -53,8 +54,9 @@ class Scoring:
 
     def __init__(self, program: Program, data: Trajectories, at: Smoothed) -> None:
         self.program, self.data, self.at = program, data, at
-        self.controls = acting_controls(program, data)
-        self.means, spread = channel_moments(program, data, at.channels.points, self.controls)
+        self.acting = acting_controls(program, data)
+        self.controls = row_controls(program, self.acting)
+        self.means, spread = channel_moments(program, data, at.channels.points, self.acting)
         self.spread = spread[0]
         self.here = measured(program, at.measurements.points)
         self._points: dict[int, Tensor] = {}
@@ -179,11 +181,12 @@ class Scoring:
     def by_control(self) -> Tensor:
         """Derivatives of the channels' means in the acting controls, `(U, P, T, B, C)`."""
         found = []
-        for index in range(self.controls.shape[-1]):
+        count = self.controls.shape[-1]
+        for index in range(count):
             step = 0.02 * float(self.controls[..., index].abs().max()) or 0.02
-            up, down = self.controls.clone(), self.controls.clone()
-            up[..., index] += step
-            down[..., index] -= step
+            up, down = self.acting.clone(), self.acting.clone()
+            up[..., index::count] += step
+            down[..., index::count] -= step
             means = [channel_moments(self.program, self.data, self.at.channels.points, u)[0] for u in (up, down)]
             found.append((means[0] - means[1]) / (2 * step))
         return torch.stack(found)

@@ -13,7 +13,8 @@ from steady_ppl.altering import channel_means
 from steady_ppl.discovery.curves import variables
 from steady_ppl.discovery.refits import Fold, Refit
 from steady_ppl.effects import Variant
-from steady_ppl.program import Program, acting_controls, names
+from steady_ppl.program import Program, names
+from steady_ppl.substeps import acting_controls, row_controls
 
 if TYPE_CHECKING:
     from steady_ppl.discovery.discovery import Discovery
@@ -70,7 +71,7 @@ def _visited(program: Program, variant: Variant, fold: Fold) -> np.ndarray:
         index = [names(program.measurements).index(name) for name in variant.options["chosen"]]
         return data.measurements[..., index][data.observed[..., index]].double().numpy(force=True)
     states = fold.path.states[..., : len(program.states)]
-    given = (states[:-1], acting_controls(program, data)[:-1], data.elapsed[:-1])
+    given = (states[:-1], row_controls(program, acting_controls(program, data))[:-1], data.elapsed[:-1])
     mean = channel_means(program, program.transition, *given, data.steps)
     values = variables(program, *given, mean)[variant.options["variable"]]
     return values.expand(data.transitions.shape)[data.transitions].double().numpy(force=True)

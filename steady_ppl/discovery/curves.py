@@ -19,7 +19,8 @@ from steady_ppl.altering import channel_means
 from steady_ppl.data import Trajectories
 from steady_ppl.effects import Effect, Variant
 from steady_ppl.predictions import on_a_circle
-from steady_ppl.program import Program, acting_controls, names, units
+from steady_ppl.program import Program, names, units
+from steady_ppl.substeps import acting_controls, row_controls
 
 KNOTS = 7
 REACH = 0.4  # of the variable's range over which heights are alike
@@ -41,7 +42,8 @@ def curves(program: Program, data: Trajectories, spread: Tensor, sharpness: Tens
         sharpness: of the measurements, `(K,)`.
     """
     assert data.states is not None
-    given = (data.states[:-1], acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
+    controls = row_controls(program, acting_controls(program, data))
+    given = (data.states[:-1], controls[:-1], data.elapsed[:-1], data.steps)
     mean = channel_means(program, program.transition, *given)
     found = []
     for variable, values in variables(program, *given[:3], mean).items():

@@ -206,7 +206,7 @@ def _unclear(found: Search, effects: Sequence[Finding]) -> Found | None:
 
 def _doubts(found: Search, is_fitted: bool) -> list[str]:
     doubts = [] if found.base.converged else [NOT_CONVERGED]
-    gained = found.base.maxima[0].gained
+    gained = found.gained
     if is_fitted and gained > FITTED_FURTHER:
         doubts.append(
             f"the run had not converged: fitting it further gained {gained:.0f} nats on these drives, before anything "
@@ -243,6 +243,9 @@ def _notes(found: Search) -> list[str]:
     constant = unexcited(found.base.program, found.base.folds[0].drives)
     if constant:
         notes.append(f"{', '.join(constant)} never changes: what it does cannot be told from what happens anyway")
+    for step in (found.step, found.with_found):
+        if step is not None and step.note:
+            notes.append(f"all fits are at a finer step: {step.note}")
     if found.curve is not None:
         notes.append(
             "a curve has no name and is not kept: 'after' is what it would bring, --out has the program as it stood, "

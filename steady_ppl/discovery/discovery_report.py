@@ -55,6 +55,7 @@ def figures(found: Discovery) -> dict[str, Any]:
             for one in found.search.rounds
         ],
         "known_start": found.before.known_start,
+        "step": (found.search.with_found or found.search.step).figures,
         "doubts": found.doubts,
         "notes": found.notes,
     }
@@ -158,7 +159,17 @@ def _side(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def sentence(found: Discovery) -> str:
-    """The verdict in one sentence."""
+    """The verdict in one sentence, after a first one on the time step where that is too coarse."""
+    said = [found.search.step.sentence] if found.search.step.sentence else []
+    if found.search.with_found is not None and found.search.with_found.sentence:
+        said.append(f"with what was found below, {found.search.with_found.sentence}")
+    if not said:
+        return _verdict(found)
+    first = "; ".join(said)
+    return f"{first[0].upper()}{first[1:]}. All that follows is at that step. {_verdict(found)}"
+
+
+def _verdict(found: Discovery) -> str:
     verdict, start = found.verdict, IN_WORDS[found.verdict]
     if verdict == "none":
         return f"{start} (p = {found.p_value:.2g}); the limits below say what could not have been seen."

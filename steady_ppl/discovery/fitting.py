@@ -166,5 +166,5 @@ def is_doubtful(program: Program, drives: Trajectories, path: Path, known_start:
 
 def _at_rest(program: Program, drives: Trajectories, path: Path, known_start: bool) -> Lookahead:
     ahead = smooth(program, drives, path, known_start=known_start, passes=15, tolerance=0.02, kernels=False)
-    require_found(ahead, drives)
+    require_found(ahead, program, drives)
     return ahead

@@ -45,6 +45,7 @@ def kept_search(
     program = given.program if isinstance(given, Fit) else given
     begun = {
         "program": program_source(program, folder),
+        "begun_substeps": program.substeps,
         "recipe": "discover",
         "status": "searching",
         "known_start": options["known_start"],

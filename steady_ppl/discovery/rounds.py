@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from steady_ppl.discovery.candidates import NATS, NO_DOUBT, Candidate, Screening
 from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.screening import LEVEL, Tested
+from steady_ppl.step_size import StepCheck
 
 MARGIN = 3.0  # nats by which a curve must be better than named effects
 
@@ -60,9 +61,13 @@ class Search:
     Attributes:
         known_start: the first states are certain.
         base: the program as it stands, fitted.
+        gained: nats that fitting the program as it stands gained on the training drives.
         rounds: in their order; the last tests the final program unless the search ended early.
         found: the effects that were added.
         final: the program with all of them, fitted.
+        step: the program as it stands beside itself at finer steps; all else is at the step that suits.
+        with_found: the program with what was found beside itself at finer steps, where these asked for a second search
+            at the step that suits; None where they did not.
         curves: fits of curves in place of the first effect, best first, where effects alone did not explain the drives.
         broke: effects that were taken back because the program with them blew up on drives of its own.
     """
@@ -70,6 +75,9 @@ class Search:
     known_start: bool
     base: Refit
     final: Refit
+    step: StepCheck
+    gained: float
+    with_found: StepCheck | None = None
     rounds: list[Round] = field(default_factory=list)
     found: list[Found] = field(default_factory=list)
     curves: list[Candidate] = field(default_factory=list)

@@ -26,11 +26,15 @@ from steady_ppl.discovery.look_again import RIVALS, labels, look_again
 from steady_ppl.discovery.places import at_its_best_place
 from steady_ppl.discovery.refits import Refit, Worth, first_refit
 from steady_ppl.discovery.rounds import MARGIN, Found, Round, Search
+from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
 from steady_ppl.program import Program
 from steady_ppl.progress import stages
+from steady_ppl.step_size import StepCheck, check_step
+from steady_ppl.substeps import with_substeps
 
 BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
+MAX_SHIFT_OF_SIZES = 0.08  # nats by which a finer step may move what is reported: 0.4 standard deviations
 MOST, CURVES = 5, 3  # effects in a program, and adding curves that are fitted
 
 
@@ -60,14 +64,49 @@ def search(
     """
     settings = Settings(known_start, withheld)
     declared = copy.deepcopy(declared or program)
-    with stages(("fitting the program as it stands", 1), ("", 7), ("looking again", 1)) as begin:
+
+    def first(program: Program) -> Refit:
+        return first_refit(program, train, valid, known_start=known_start, seed=seed)
+
+    with stages(("fitting the program as it stands", 1), ("comparing time steps", 1), ("", 8)) as begin:
         begin()
-        base = first_refit(program, train, valid, known_start=known_start, seed=seed)
-        found = Search(known_start, base, base)
+        base = first(program)
+        gained = base.maxima[0].gained
+        begin()
+        step = _step_of(base, known_start)
+        if step.too_coarse:  # the step is no effect: what follows is about the program at the step that suits
+            program, declared = (with_substeps(one, step.suited.substeps) for one in (program, declared))
+            base = first(program)
+        begin()
+        found = _rounds(Search(known_start, base, base, step, gained), declared, settings, sets, later_sets, seed)
+        with_found = _step_of(found.final, known_start, found.found) if found.found else step
+        if found.found and with_found.too_coarse:  # what was found asks for a finer step: sizes are those of that step
+            program, declared = (with_substeps(one, with_found.suited.substeps) for one in (program, declared))
+            base = first(program)
+            again = Search(known_start, base, base, step, gained, with_found)
+            found = _rounds(again, declared, settings, sets, later_sets, seed)
+    return found
+
+
+def _step_of(refit: Refit, known_start: bool, found: Sequence[Found] = ()) -> StepCheck:
+    """A program that was fitted to the first fold beside itself at finer steps, on these drives; sizes of what was
+    found must not go with the step."""
+    drives, maximum = refit.folds[0].drives, refit.maxima[0]
+    if not found:
+        return check_step(refit.program, drives, maximum, known_start=known_start)
+    sizes = [variant.parameter for variant in attached(refit.program)]
+    return check_step(
+        refit.program, drives, maximum, known_start=known_start, watched=sizes, max_shift=MAX_SHIFT_OF_SIZES
+    )
+
+
+def _rounds(found: Search, declared: Program, settings: Settings, sets: int, later_sets: int, seed: int) -> Search:
+    """Test, fit and add until nothing is left."""
+    with stages(("", 7), ("looking again", 1)) as begin:
         begin()
         rounds = range(MOST + 1)
-        parts = [part for index in rounds for part in (("testing every effect", 1 / 2**index), ("", 1 / 2**index))]
-        with stages(*parts) as begin_part:
+        shares = [part for index in rounds for part in (("testing every effect", 1 / 2**index), ("", 1 / 2**index))]
+        with stages(*shares) as begin_part:
             for index in rounds:
                 begin_part()
                 count = sets if index == 0 else later_sets

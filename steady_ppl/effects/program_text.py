@@ -65,6 +65,8 @@ def _class(
         lines += _indented(_entries(f"{what} = ", "()", [f"*{above}.{what}", *more]), 4)
     if base and base.effects:
         lines.append("    effects = ()  # written out here")
+    if base and program.substeps != base.substeps:
+        lines.append(f"    substeps = {program.substeps}")
     pairs = [f'"{layer.name}": "{layer.variant.written}"' for layer in layers]
     lines += _indented(broken("attached = ", ["{" + ", ".join(pairs) + "}"], 4), 4)
     priors = [f'"{layer.name}": {_prior(program.priors[layer.name])}' for layer in layers]

@@ -29,7 +29,8 @@ def _each_channel(program: Program, data: Trajectories | None) -> Sequence[Mappi
 
 
 def response_time(self, state, control, time, step, c, channels, mean):
-    return {channel: -mean[channel] * c / (c + step) for channel in channels}
+    slower, carried = c / (c + self.settles_in(step)), self.carried(state)
+    return {channel: (carried[channel] - mean[channel]) * slower for channel in channels}
 
 
 def curvature_steering(self, state, control, time, c):
@@ -57,19 +58,21 @@ def reverse_steering(self, state, control, time, c):
     return control * (1 - lost.unsqueeze(-1) * self.chosen_controls(("turn",), control))
 
 
-def lever_arm(self, state, control, time, step, c):
+def lever_arm(self, state, control, time, step, c, mean):
     yaw_rate = state[..., 5]
-    return {"lateral": c * yaw_rate / step}
+    return {"lateral": c * (yaw_rate / self.settles_in(step) + mean["yaw"])}
 
 
-def crab_angle(self, state, control, time, step, c):
-    forward, _, _ = self.body_velocity(state)
-    return {"lateral": c * forward / step}
+def crab_angle(self, state, control, time, step, c, mean):
+    forward, lateral, yaw_rate = self.body_velocity(state)
+    change = mean["forward"] + lateral * yaw_rate
+    return {"lateral": c * (forward / self.settles_in(step) + change)}
 
 
-def slip_angle(self, state, control, time, step, c):
-    forward, _, yaw_rate = self.body_velocity(state)
-    return {"lateral": -c * forward * yaw_rate / step}
+def slip_angle(self, state, control, time, step, c, mean):
+    forward, lateral, yaw_rate = self.body_velocity(state)
+    change = (mean["forward"] + lateral * yaw_rate) * yaw_rate + forward * mean["yaw"]
+    return {"lateral": -c * (forward * yaw_rate / self.settles_in(step) + change)}
 
 
 def caster(self, state, control, time, step, c):
@@ -81,8 +84,8 @@ WHEELS = [
     Effect(
         name="response_time",
         form="push",
-        equation=r"\dot v = (v_\mathrm{told} - v) / (c + \Delta t)",
-        text="dv/dt = (v_told - v) / (c + step)",
+        equation=r"\dot v = (v_\mathrm{told} - v) / (c + \tau)",
+        text="dv/dt = (v_told - v) / (c + τ), τ what the program has (its step where it says nothing)",
         unit="s",
         feels="gets to what it is told, or back to it when pushed off, little by little",
         occurs="speed controllers with little gain, hydraulic steering, heavy wheels",

@@ -1,0 +1,154 @@
+"""Check that `transition` is a consistent and a stable time step."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import ProgramError
+from steady_ppl.program import Program, names
+from steady_ppl.seeding import seeded
+from steady_ppl.sites import broadcast_event, running
+from steady_ppl.substeps import MAX_SUBSTEPS, Held, advance, with_substeps, within_row
+
+GROWTH = 1.1  # of a deviation over a row, from which it counts
+FINER = 16  # times as many substeps, at which it must not grow nearly as much
+SHORTER = 64  # times, by which a step is shortened to see whether its result follows
+STATES, ROWS = 64, 16  # at which a transition is looked at
+
+
+@torch.no_grad()
+def divergence(program: Program, data: Trajectories) -> str | None:
+    """Say that a program's step is unstable, or return None where it is not.
+
+    The eigenvalues of a row's derivative in the state are compared with those at `FINER` times as many substeps: where
+    a deviation grows at the program's own step alone, the step is what makes it grow.
+
+    Args:
+        program: any.
+        data: as returned by `for_program`.
+    """
+    if not bool(data.transitions.any()):
+        return None
+    drive = int(data.transitions.sum(0).argmax())
+    row = int(torch.where(data.transitions[:, drive], data.steps[:, drive], 0.0).argmax())  # the longest
+    at = slice(row, row + 1)
+    given = (data.controls[at, [drive]], data.elapsed[at, [drive]], data.steps[at, [drive]])
+    state = _starts(program, 1)
+    own = _eigenvalues(program, state, given)
+    fine = _eigenvalues(with_substeps(program, min(MAX_SUBSTEPS, FINER * program.substeps)), state, given)
+    if own is None or fine is None or not bool(own.abs().max() > GROWTH * max(1.0, float(fine.abs().max()))):
+        return None
+    control, time, step = given
+    once = _eigenvalues(with_substeps(program, 1), state, (control, time, step / program.substeps))
+    if once is None:
+        return None
+    fastest = once[(once - 1).abs().argmax()]
+    size = float((1 - fastest).abs()) * program.substeps
+    kind = "damping" if float(fastest.imag.abs()) < 0.1 * size else "frequency"
+    enough = min(MAX_SUBSTEPS, 2 ** math.ceil(math.log2(max(2.0, 2 * size))))
+    return (
+        f"the model itself diverges at this step: {kind} · step = {size:.3g}, with "
+        f"{program.substeps} substep{'s' if program.substeps > 1 else ''} a row; take more (--substeps {enough})"
+    )
+
+
+def _eigenvalues(program: Program, state: Tensor, given: tuple[Tensor, Tensor, Tensor]) -> Tensor | None:
+    """Of the row's derivative in the state, at several states, `(STATES · D,)`; None where one is no number."""
+    size = state.shape[-1]
+    columns = []
+    for index in range(size):
+        by = 1e-3 * (1 + state[..., index].abs())
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = state.clone()
+            moved[..., index] += sign * by
+            with running(*state.shape[:-1]), Held(0.0):
+                ends.append(advance(program, moved, *given).expand(*state.shape))
+        columns.append((ends[0] - ends[1]) / (2 * by.unsqueeze(-1)))
+    derivative = torch.stack(columns, -1).double()
+    if not bool(derivative.isfinite().all()):
+        return None
+    return torch.linalg.eigvals(derivative).flatten()
+
+
+@torch.no_grad()
+def is_step(program: Program, data: Trajectories) -> bool:
+    """Return whether `transition` is a step in `step`: it moves less and less as the step gets shorter.
+
+    A program that holds something within each step (`-w / step`) or that counts rows (`0.8 * state`) is none: in
+    substeps it is another program.
+
+    Args:
+        program: any.
+        data: as returned by `for_program`; rows to look at, whose states are drawn from the program's start.
+    """
+    if not len(data.steps):
+        return False
+    state, (control, time, step) = _some(program, data)
+    own = with_substeps(program, 1)
+    changes = []
+    for short in (step, step / SHORTER):
+        with within_row():
+            still, pushed = (_after(own, state, (control, time, short), noise) for noise in (0.0, 1.0))
+        changes.append((_largest(still - state), _largest(pushed - still)))
+    (far, pushed_far), (near, pushed_near) = changes
+    moves = near <= 0.5 * far + 1e-6 * (1 + _largest(state))
+    noise = pushed_near <= 0.1 * pushed_far + 1e-6
+    return bool(moves.all() and noise.all())
+
+
+@torch.no_grad()
+def require_convergence(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> None:
+    """Refuse substeps of a program whose rows go apart as they are cut more finely.
+
+    Args:
+        program: any.
+        state, control, time, step: of some rows, as `advance` takes them.
+
+    Raises:
+        ProgramError: its result at K and 2 K substeps differs more for large K than for small ones.
+    """
+
+    def ends(count: int) -> Tensor:
+        return _after(with_substeps(program, count), state, (control, time, step), 1.0)
+
+    coarse, fine = (_largest(ends(count) - ends(2 * count)) for count in (8, SHORTER))
+    beyond = fine - 0.7 * coarse - 1e-4 * (1 + _largest(ends(8)))
+    beyond = torch.where(fine.isfinite(), beyond, torch.inf)
+    if bool((beyond > 0).any()):
+        component = names(program.states)[int(beyond.argmax())]
+        raise ProgramError(
+            f"program {type(program).__name__}: transition is no step in `step`: at K and 2 K substeps {component} "
+            "goes apart as K grows; move the state in proportion to `step`, with noise that does not depend on it",
+            site="transition",
+        )
+
+
+def _some(program: Program, data: Trajectories) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+    """States from a program's start, `(STATES, R, 1, D)`, and control, time and step of some rows of a drive."""
+    rows = torch.linspace(0, len(data.steps) - 1, min(ROWS, len(data.steps)), device=data.time.device).long()
+    rows = rows[data.transitions[rows, 0]]
+    given = (data.controls[rows, :1], data.elapsed[rows, :1], data.steps[rows, :1])
+    return _starts(program, len(rows)), given
+
+
+def _starts(program: Program, rows: int) -> Tensor:
+    """States from a program's start, `(STATES, rows, 1, D)`."""
+    left = torch.Size((STATES, rows, 1))
+    with seeded("starts"), running(*left):
+        return broadcast_event(program.initial(), left, 1)
+
+
+def _after(program: Program, state: Tensor, given: tuple[Tensor, Tensor, Tensor], noise: float) -> Tensor:
+    """States after a row in which every channel is `noise` scales from its location."""
+    with running(*state.shape[:-1]), Held(noise):
+        return advance(program, state, *given)
+
+
+def _largest(change: Tensor) -> Tensor:
+    """The largest of every component, `(D,)`; infinite where it is no number."""
+    return change.abs().flatten(0, -2).nan_to_num(torch.inf).amax(0)

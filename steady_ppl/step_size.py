@@ -1,0 +1,248 @@
+"""Whether a program's own time step suits its drives: the first suspect where model and measurements differ.
+
+A program moves by steps, a vehicle in continuous time. What a coarse step gets wrong looks like physics: a delay, a
+lever arm, a drag. So a program is compared with itself at finer substeps before anything else is suspected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.elements import elements, values_of
+from steady_ppl.errors import FilterError, UsageError
+from steady_ppl.gaussian_smoother import find_path, means_as_path, require_found, smooth
+from steady_ppl.likelihood_fit import widens
+from steady_ppl.linearization import Path
+from steady_ppl.maximum_likelihood import Maximum, maximise
+from steady_ppl.program import Program
+from steady_ppl.stability import is_step
+from steady_ppl.substeps import MAX_SUBSTEPS, with_substeps
+
+MIN_GAIN = 3.0  # nats, of all drives together, from which a finer step counts
+MAX_SHIFT = 2.0  # nats that watched parameters of another step lie below the maximum: two standard deviations
+MAX_DECREMENT = 1.0  # nats that a scoring step at a finer step may promise; beyond it its refit may gain far more
+PRECISION = 0.005  # nats, of refits
+FINEST = 32  # times as many substeps as the program has, at most
+REFITS = 25  # scoring steps of a fit
+
+
+@dataclass(frozen=True)
+class StepTrial:
+    """A program with some number of substeps a row.
+
+    Attributes:
+        substeps: of a row.
+        log_likelihood: log p(y) of all drives, linearised.
+        decrement: what a scoring step would add, nats; zero where parameters are not refitted.
+        program: with the parameters of this trial.
+        path: of the drives, along which it was linearised.
+        names, values, covariance: of the learnable numbers that are watched, `(P,)`, `(P,)`, `(P, P)`.
+    """
+
+    substeps: int
+    log_likelihood: float
+    decrement: float
+    program: Program
+    path: Path
+    names: tuple[str, ...] = ()
+    values: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
+    covariance: Tensor = field(default_factory=lambda: torch.zeros(0, 0, dtype=torch.float64))
+
+    @property
+    def reachable(self) -> float:
+        """Log p(y) after another scoring step, as far as the score says."""
+        return self.log_likelihood + self.decrement
+
+    def shift(self, other: StepTrial) -> float:
+        """Nats that the other trial's watched parameters lie below this one's maximum, to second order."""
+        if not self.names:
+            return 0.0
+        change = other.values - self.values
+        return 0.5 * float(change @ torch.linalg.pinv(self.covariance) @ change)
+
+    def farthest(self, other: StepTrial) -> tuple[str, float]:
+        """The watched number that differs most from the other trial's, and by how many standard deviations."""
+        spread = self.covariance.diagonal().clamp(min=1e-300).sqrt()
+        apart = ((other.values - self.values) / spread).abs()
+        index = int(apart.argmax())
+        return self.names[index], float(apart[index])
+
+
+@dataclass(frozen=True)
+class StepCheck:
+    """A program beside itself at finer steps, on the same drives.
+
+    Attributes:
+        trials: the program's own number of substeps first, then twice as many each time, to the first that changes
+            neither log p(y) nor the watched parameters by what counts.
+        max_shift: nats by which the watched parameters may move.
+    """
+
+    trials: tuple[StepTrial, ...]
+    max_shift: float = MAX_SHIFT
+
+    @property
+    def suited(self) -> StepTrial:
+        """The trial with the fewest substeps, beyond which twice as many change nothing that counts."""
+        for trial, finer in zip(self.trials, self.trials[1:], strict=False):
+            if not _differs(trial, finer, self.max_shift):
+                return trial
+        return self.trials[-1]
+
+    @property
+    def gain(self) -> float:
+        """Nats that the suited step is ahead of the program's own."""
+        return self.suited.log_likelihood - self.trials[0].log_likelihood
+
+    @property
+    def too_coarse(self) -> bool:
+        """Whether finer steps make the drives likelier by more than `MIN_GAIN` nats, or move what is watched by more
+        than `max_shift`."""
+        return self.suited is not self.trials[0]
+
+    @property
+    def sentence(self) -> str:
+        """What is to be said first where a finer step makes the drives likelier or moves parameters far; empty
+        otherwise."""
+        if self.gain > MIN_GAIN:
+            said = f"{self._instead} gain {self.gain:.0f} nats"
+        elif self.too_coarse and self.suited.shift(self.trials[0]) > MAX_SHIFT:
+            said = f"{self._instead} move {self._farthest}"
+        else:
+            return ""
+        return f"the program's own time step is too coarse: {said} ({self._option})"
+
+    @property
+    def note(self) -> str:
+        """What is to be noted where a finer step moves parameters a little; empty otherwise."""
+        if not self.too_coarse or self.sentence:
+            return ""
+        return f"{self._instead} move {self._farthest} ({self._option})"
+
+    @property
+    def _farthest(self) -> str:
+        name, far = self.suited.farthest(self.trials[0])
+        return f"{name} by {far:.1f} standard deviations"
+
+    @property
+    def _instead(self) -> str:
+        return f"{self.suited.substeps} substeps a row instead of {self.trials[0].substeps}"
+
+    @property
+    def _option(self) -> str:
+        return f"--substeps {self.suited.substeps}"
+
+    @property
+    def figures(self) -> dict[str, object]:
+        """Everything as a plain dict, ready for JSON."""
+        return {
+            "substeps": self.suited.substeps,
+            "gain": self.gain,
+            "shift": self.suited.shift(self.trials[0]),
+            "trials": [{"substeps": t.substeps, "log_likelihood": t.log_likelihood} for t in self.trials],
+        }
+
+
+def _differs(trial: StepTrial, finer: StepTrial, max_shift: float) -> bool:
+    """Whether a finer step gains more than `MIN_GAIN` nats, or moves what is watched without losing as many."""
+    gain = finer.log_likelihood - trial.log_likelihood
+    return gain > MIN_GAIN or (gain > -MIN_GAIN and finer.shift(trial) > max_shift)
+
+
+@torch.no_grad()
+def check_step(
+    program: Program,
+    data: Trajectories,
+    at: Maximum | Path | None = None,
+    *,
+    known_start: bool = False,
+    watched: Sequence[str] | None = None,
+    max_shift: float = MAX_SHIFT,
+) -> StepCheck:
+    """Compare a program with itself at twice, four times … the substeps, refitted to the same drives.
+
+    Fits are made only where one look at a finer step does not exclude that it gains: its log p(y) with the parameters
+    as they are is no higher, and a scoring step would hardly move them. A network keeps its parameters.
+
+    Args:
+        program: with normal noise; see `linearize`.
+        data: as returned by `for_program`.
+        at: the program's maximum on these drives, or a path near their posterior means; found when None.
+        known_start: the first state is certain.
+        watched: names of the parameters whose values a finer step must not move either; all but those of noise when
+            None, of which a program that holds something within each substep needs more in shorter ones.
+        max_shift: nats by which it may move them.
+
+    Raises:
+        FilterError: the program cannot be smoothed as it is.
+    """
+
+    refits = can_refit(program)
+    if isinstance(at, Maximum) and not at.names:  # fitted by draws: nothing is known of its curvature
+        at = at.path
+    if not is_step(program, data):  # in substeps it is another model, whose parameters are others
+        watched = ()
+    elif refits and watched is None:
+        watched = [part.name.split("[")[0] for part in elements(program) if not widens(program, part, data)]
+    names = watched or ()
+
+    def trial(substeps: int, like: Program, path: Path, steps: int) -> StepTrial:
+        changed = with_substeps(like, substeps)
+        if not refits:
+            ahead = smooth(changed, data, path, known_start=known_start, kernels=False)
+            require_found(ahead, changed, data)
+            return StepTrial(substeps, float(ahead.log_likelihood.sum()), 0.0, changed, means_as_path(ahead, data))
+        maximum = maximise(changed, data, path, known_start=known_start, steps=steps, precision=PRECISION)
+        return _trial(changed, maximum, names)
+
+    own, most = program.substeps, min(MAX_SUBSTEPS, FINEST * program.substeps)
+    if isinstance(at, Maximum):
+        first = _trial(program, at, names)
+    else:
+        first = trial(own, program, at or find_path(program, data, known_start=known_start), 0)
+    if 2 * own > most:
+        return StepCheck((first,), max_shift)
+    try:
+        look = trial(2 * own, program, first.path, 0)
+        moves = look.decrement - first.decrement > min(max_shift, MAX_DECREMENT)
+        if look.reachable < first.reachable + 0.5 * MIN_GAIN and not moves:
+            return StepCheck((first,), max_shift)
+        if refits and not isinstance(at, Maximum):
+            first = trial(own, program, first.path, REFITS)
+        trials = [first, trial(2 * own, first.program, first.path, REFITS)]
+        while _differs(trials[-2], trials[-1], max_shift) and 2 * trials[-1].substeps <= most:
+            last = trials[-1]
+            trials.append(trial(2 * last.substeps, last.program, last.path, REFITS))
+    except FilterError:  # paths of the coarser step lead nowhere at the finer one: nothing speaks for it
+        return StepCheck((first,), max_shift)
+    return StepCheck(tuple(trials), max_shift)
+
+
+def can_refit(program: Program) -> bool:
+    """Whether a program has few enough learnable numbers to be refitted by scoring steps."""
+    try:
+        elements(program)
+    except UsageError:
+        return False
+    return True
+
+
+def _trial(program: Program, maximum: Maximum, watched: Sequence[str]) -> StepTrial:
+    parts = elements(program)
+    chosen = [index for index, part in enumerate(parts) if part.name.split("[")[0] in watched]
+    covariance = torch.linalg.pinv(maximum.information) if chosen else torch.zeros(0, 0, dtype=torch.float64)
+    return StepTrial(
+        program.substeps,
+        float(maximum.log_likelihood.sum()),
+        maximum.decrement or 0.0,
+        program,
+        maximum.path,
+        tuple(parts[index].name for index in chosen),
+        values_of([parts[index] for index in chosen]),
+        covariance[chosen][:, chosen],
+    )

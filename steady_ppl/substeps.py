@@ -1,0 +1,264 @@
+"""Move a program by one row of a table in several substeps, with one draw of noise a row and channel.
+
+A vehicle moves in continuous time, a program in steps of `transition`. With `substeps = K` a row takes K of them, each
+of a K-th of its time. The first one samples the channels; the others reuse its standardised noise, so that a row still
+has one latent draw a channel. Effects, actuators and user code act in every substep. K = 1 is the program itself.
+
+A row's channel is what it is on average over the substeps: its site is scored under the mean and the standard
+deviation of the row's substeps without noise. What a density counts therefore is the noise of the whole row, and its
+slope in a parameter that of the whole row's mean.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any
+
+import pyro
+import pyro.distributions as dist
+import torch
+from pyro import poutine
+from pyro.poutine.messenger import Messenger
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.errors import ProgramError, UsageError
+from steady_ppl.program import Program
+from steady_ppl.sites import Recording, unwrapped
+
+MAX_SUBSTEPS = 1000  # of a row
+_ROW_ENDS: ContextVar[bool] = ContextVar("row ends", default=True)
+
+
+def with_substeps(program: Program, count: int) -> Program:
+    """Return a copy of a program that takes `count` substeps a row.
+
+    Raises:
+        UsageError: the number is not whole, below 1 or above `MAX_SUBSTEPS`.
+    """
+    if not is_count(count):
+        raise UsageError(f"substeps must be a whole number from 1 to {MAX_SUBSTEPS}, got {count!r}")
+    changed = copy.deepcopy(program)
+    changed.substeps = count
+    return changed
+
+
+def is_count(value: object) -> bool:
+    """Whether a value can be a number of substeps."""
+    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MAX_SUBSTEPS
+
+
+def row_ends() -> bool:
+    """Whether the `transition` that runs now is the last one of its row."""
+    return _ROW_ENDS.get()
+
+
+def advance(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
+    """Move on by one row; handlers meet the channels' sites of the first substep.
+
+    Args:
+        state: `(..., D)`.
+        control: `(..., U)`, held over the row, or `(..., K U)` as `acting_controls` gives them.
+        time: `(...)` s since the trajectory's first row.
+        step: `(...)` s, of the row.
+
+    Returns:
+        The next state, `(..., D)`.
+
+    Raises:
+        ProgramError: with more than one substep, a channel's noise has no location and scale.
+    """
+    if program.substeps == 1:
+        return program.transition(state, control, time, step)
+    parts = list(_parts(program, control, time, step))
+    seen = Recording()
+    with seen, _at(parts[0]) as given:
+        state = program.transition(state, *given)
+    noise = {site: standardised(fn, seen.values[site], site) for site, fn in seen.distributions.items()}
+    for part in parts[1:]:
+        with poutine.block(), Held(noise), _at(part) as given:
+            state = program.transition(state, *given)
+    return state
+
+
+def sample_channels(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> None:
+    """Sample a row's channels at their sites, and move nowhere; arguments are those of `advance`."""
+    if program.substeps == 1:
+        program.transition(state, control, time, step)
+    else:
+        _sample(program, state, control, time, step)
+
+
+def sample_row(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
+    """Sample a row's channels at their sites and move on with them; arguments and result are those of `advance`."""
+    if program.substeps == 1:
+        return program.transition(state, control, time, step)
+    noise = _sample(program, state, control, time, step)
+    for part in _parts(program, control, time, step):
+        with poutine.block(), Held(noise), _at(part) as given:
+            state = program.transition(state, *given)
+    return state
+
+
+def channel_values(
+    program: Program, data: Trajectories, states: Tensor, noise: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """Return what channels are along given states with given standardised noise.
+
+    Args:
+        program: the state-space model.
+        data: as returned by `for_program`.
+        states: `(M, T + 1, B, D)`.
+        noise: site → `(M, T, B, ...)`, in standard deviations.
+
+    Returns:
+        Site → value, shaped as the noise.
+    """
+    given = (states[..., :-1, :, :], acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
+    found = {}
+    for site, fn in _on_average(program, *given).items():
+        loc, scale = location_and_scale(fn, site)
+        found[site] = loc + scale * noise[site]
+    return found
+
+
+def acting_controls(program: Program, data: Trajectories) -> Tensor:
+    """Return the controls of drives as they act on the program, `(T + 1, B, U)`; see `acting`."""
+    return acting(program, data.controls, data.elapsed)
+
+
+def acting(program: Program, commands: Tensor, elapsed: Tensor) -> Tensor:
+    """Return what actuators make of commands, for every substep.
+
+    Args:
+        program: the state-space model.
+        commands: `(rows, B, U)`, held over a row.
+        elapsed: `(rows, B)` s.
+
+    Returns:
+        `(rows, B, U)`, or where actuators change something within a row the substeps' controls side by side,
+        `(rows, B, K U)`.
+    """
+    count = program.substeps
+    if count == 1 or type(program).actuators is Program.actuators or len(elapsed) < 2:
+        return program.actuators(commands, elapsed)
+    rows, drives, controls = commands.shape
+    steps = torch.cat([elapsed[1:] - elapsed[:-1], elapsed[-1:] - elapsed[-2:-1]])
+    shares = torch.arange(count, dtype=elapsed.dtype, device=elapsed.device) / count
+    times = (elapsed.unsqueeze(1) + shares[:, None] * steps.unsqueeze(1)).flatten(0, 1)
+    act = program.actuators(commands.repeat_interleave(count, 0), times)
+    return act.unflatten(0, (rows, count)).movedim(1, 2).reshape(rows, drives, count * controls)
+
+
+def row_controls(program: Program, control: Tensor) -> Tensor:
+    """Return acting controls averaged over each row's substeps, `(..., U)` of `(..., U)` or `(..., K U)`."""
+    controls = len(program.controls)
+    if control.shape[-1] == controls:
+        return control
+    return control.unflatten(-1, (program.substeps, controls)).mean(-2)
+
+
+@contextmanager
+def within_row() -> Iterator[None]:
+    """Run a `transition` as one that no row ends with: what counts rows stays as it is."""
+    token = _ROW_ENDS.set(False)
+    try:
+        yield
+    finally:
+        _ROW_ENDS.reset(token)
+
+
+class Held(Messenger):
+    """Give channels the noise that a row already has.
+
+    Args:
+        noise: site → value in scales, or the same value for every site.
+    """
+
+    def __init__(self, noise: Mapping[str, Tensor] | float) -> None:
+        super().__init__()
+        self.noise = noise
+
+    def _pyro_sample(self, message: Any) -> None:
+        if message["is_observed"]:
+            return
+        loc, scale = location_and_scale(message["fn"], message["name"])
+        noise = self.noise if isinstance(self.noise, float) else self.noise[message["name"]]
+        message["value"] = loc + scale * noise
+
+
+def location_and_scale(fn: Any, site: str) -> tuple[Tensor, Tensor]:
+    """Return location and scale of a channel's distribution, each `(...)` or `(..., C)`.
+
+    Raises:
+        ProgramError: it has none.
+    """
+    base = unwrapped(fn)
+    if not isinstance(base, dist.Normal | dist.StudentT | dist.Laplace | dist.Cauchy):
+        raise ProgramError(
+            f"site {site!r} is {type(base).__name__}: substeps need channel noise with a location and a scale "
+            "(Normal, StudentT, Laplace, Cauchy), which can be held over a row",
+            site=site,
+        )
+    return base.loc, base.scale
+
+
+def standardised(fn: Any, value: Tensor, site: str) -> Tensor:
+    """Return a channel's value in scales from its location."""
+    loc, scale = location_and_scale(fn, site)
+    return (value - loc) / scale
+
+
+_Part = tuple[Tensor, Tensor, Tensor, bool]
+
+
+def _parts(program: Program, control: Tensor, time: Tensor, step: Tensor) -> Iterator[_Part]:
+    """Control, time, step and whether the row ends, for every substep."""
+    count, controls = program.substeps, len(program.controls)
+    short = step / count
+    held = [control] * count if control.shape[-1] == controls else control.split(controls, -1)
+    for index, acting_now in enumerate(held):
+        yield acting_now, time + index * short, short, index == count - 1
+
+
+@contextmanager
+def _at(part: _Part) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    *given, ends = part
+    token = _ROW_ENDS.set(ends)
+    try:
+        yield tuple(given)  # type: ignore[misc]
+    finally:
+        _ROW_ENDS.reset(token)
+
+
+def _sample(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> dict[str, Tensor]:
+    found = {}
+    for site, fn in _on_average(program, state, control, time, step).items():
+        found[site] = standardised(fn, pyro.sample(site, fn), site)
+    return found
+
+
+def _on_average(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> dict[str, Any]:
+    """Site → its distribution on average over a row that moves without noise."""
+    met: dict[str, list[Any]] = {}
+    for part in _parts(program, control, time, step):
+        seen = Recording()
+        with poutine.block(), seen, Held(0.0), _at(part) as given:
+            state = program.transition(state, *given)
+        for site, fn in seen.distributions.items():
+            met.setdefault(site, []).append(fn)
+    return {site: _average(fns, site) for site, fns in met.items()}
+
+
+def _average(fns: Sequence[Any], site: str) -> Any:
+    """The distribution with the mean location and the mean scale of several of one kind."""
+    if len(fns) == 1:
+        return fns[0]
+    moments = [location_and_scale(fn, site) for fn in fns]
+    loc, scale = (sum(parts[1:], parts[0]) / len(parts) for parts in zip(*moments, strict=True))
+    base = unwrapped(fns[0])
+    freedom = (base.df,) if isinstance(base, dist.StudentT) else ()
+    return type(base)(*freedom, loc, scale).to_event(fns[0].event_dim)

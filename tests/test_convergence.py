@@ -1,0 +1,98 @@
+"""Every program and every effect converges in its step: finer substeps change what the noise drowns.
+
+Roll-outs of a second without noise, from states at twice the speeds of a program's own drives, at K, 2 K and 4 K
+substeps a row: they differ by less than a tenth of what the process noise does meanwhile.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+import torch
+from examples import MODELS, example
+
+from steady_ppl import for_program, seeded, simulate, with_substeps
+from steady_ppl.effects import catalogue, chosen_variant
+from steady_ppl.particles import roll_out
+from steady_ppl.program import names
+from steady_ppl.sites import AtMean
+from steady_ppl.substeps import acting_controls
+
+PROGRAMS = (
+    "hovercraft",
+    "hovercraft:HovercraftTruth",
+    "gps_boat",
+    "gps_boat:GpsBoatTruth",
+    "truck",
+    "discovered_truck",
+    "discovered_truck:HybridTruck",
+    "pendulum",
+    "linear_gaussian",
+    "neural_vehicle:NeuralHovercraft",
+    "neural_vehicle:NeuralTruck",
+    "hovercraft_unknown_map",
+)
+FINEST = 64  # times as many substeps as a program has, that an effect of typical size may ask for
+EFFECTS = [(name, effect.name) for name in ("hovercraft", "truck", "pendulum") for effect in catalogue(example(name))]
+DRIVES, DRAWS, EVERY = 6, 64, 9
+
+
+def ends(program, state, data, rows, count, handler=None, draws=1):
+    """States a second on, `(draws, R, B, D)`."""
+    controls = acting_controls(program, data)
+    at = torch.stack([rows + index for index in range(count)])
+    started = state.expand(draws, *state.shape)
+    *_, last = roll_out(program, started, controls[at], data.elapsed[at], data.steps[at], handler=handler)
+    return last
+
+
+@torch.no_grad()
+def worst(program) -> float:
+    """The largest share of the noise's spread by which roll-outs at K, 2 K and 4 K substeps differ."""
+    data = for_program(program, simulate(program, DRIVES, seed=1))
+    if {"speed", "turn"} <= set(names(program.controls)):  # what is commanded in speeds drives twice as fast
+        data.controls.mul_(2)
+    count = round(1 / program.step)
+    rows = torch.arange(0, len(data.steps) - count + 1, EVERY)
+    state = data.states[rows].clone()
+    for index, name in enumerate(names(program.states)):
+        if name in program.derivatives.values():
+            state[..., index] *= 2
+    finer = [with_substeps(program, program.substeps * factor) for factor in (1, 2, 4)]
+    found = [ends(one, state, data, rows, count, AtMean())[0] for one in finer]
+    with seeded(3, "noise"):
+        noisy = ends(program, state, data, rows, count, draws=DRAWS)
+    spread = noisy.std(0).square().mean((0, 1)).sqrt()
+    shares = [(one - two).square().mean((0, 1)).sqrt() / spread for one, two in pairwise(found)]
+    moving = spread > 0
+    return max(float(share[moving].max()) for share in shares)
+
+
+def test_every_file_of_models_is_looked_at() -> None:
+    files = {path.stem for path in MODELS.glob("[!_]*.py")} - {"paper"}  # explicit Euler, by name
+    assert files == {name.partition(":")[0] for name in PROGRAMS}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_a_program_converges_at_its_own_substeps(name) -> None:
+    assert worst(example(name)) < 0.1
+
+
+def test_explicit_euler_does_not() -> None:
+    """The same test sees the step that discovered effects came from."""
+    assert worst(example("paper:PaperHovercraft")) > 0.3
+
+
+@pytest.mark.parametrize(("name", "effect"), EFFECTS, ids=["-".join(pair) for pair in EFFECTS])
+def test_an_effect_converges(name, effect) -> None:
+    """With as many substeps as it takes, at most `FINEST` times the program's own."""
+    program = example(name)
+    program = program.with_effect(chosen_variant(program, effect).effect.variants(program)[0])
+    own, factor, share = program.substeps, 1, worst(program)
+    while share >= 0.1 and factor < FINEST:
+        factor *= 4
+        finer = worst(with_substeps(program, own * factor))
+        assert finer < 0.5 * share  # of first order at least
+        share = finer
+    assert share < 0.1

@@ -1,0 +1,175 @@
+"""The time step is the first suspect: a program beside itself at finer steps, on drives in continuous time."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from examples import MODELS, example
+from pyro.distributions import constraints
+from pyro.nn import PyroParam
+from small import steady
+from torch import tensor
+
+from steady_ppl import (
+    Fit,
+    PlanarVehicle,
+    WrappedNormal,
+    check,
+    discover,
+    fit_by_likelihood,
+    for_program,
+    seeded,
+    simulate,
+    stack,
+    write_table,
+)
+from steady_ppl.step_size import check_step
+
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
+
+from continuous_worlds import Hovercraft, Unicycle
+from continuous_worlds import simulate as in_continuous_time
+
+CASE = Path(__file__).parents[2] / "shared" / "cases" / "exact_unicycle"
+
+
+class Turning(PlanarVehicle):
+    """A unicycle whose lateral velocity is taken back in each step, without the term that turns the velocity."""
+
+    controls = ("speed [m/s]", "turn [rad/s]")
+    measurements = ("x [m]", "y [m]", "heading [rad]")
+    guesses = ("noise",)
+    slips = False
+
+    def __init__(self):
+        super().__init__()
+        self.speed_time = PyroParam(tensor(0.3), constraints.positive)
+        self.turn_time = PyroParam(tensor(0.2), constraints.positive)
+        self.noise = PyroParam(tensor([0.1, 0.1, 0.1]), constraints.positive)
+
+    def initial(self):
+        sd = tensor([0.5, 0.5, 3.0, 2.0, 2.0, 1.0])
+        return pyro.sample("start", dist.Normal(torch.zeros_like(sd).to(self.noise), sd.to(self.noise)).to_event(1))
+
+    def transition(self, state, control, time, step):
+        speed, turn = control.unbind(-1)
+        forward, lateral, yaw_rate = self.body_velocity(state)
+        mean = stack((speed - forward) / self.speed_time, -lateral / step, (turn - yaw_rate) / self.turn_time)
+        acceleration = pyro.sample("acceleration", dist.Normal(mean, self.noise).to_event(1))
+        return self.integrate(state, acceleration, step)
+
+    def observe(self, state):
+        pyro.sample("position", dist.Normal(state[..., :2], 0.02).to_event(1))
+        pyro.sample("heading", WrappedNormal(state[..., 2:3], 0.01).to_event(1))
+
+
+@pytest.fixture(scope="module")
+def turning():
+    """Unicycles that move in steps of 1 ms."""
+    return in_continuous_time(Unicycle(), 8, seed=3)
+
+
+def checked(program, table, *, known_start=False):
+    data = for_program(program, table).without_truth(keep_start=known_start)
+    with seeded(0, "paths"):
+        maximum = fit_by_likelihood(program, data, known_start=known_start)
+        return check_step(program, data, maximum, known_start=known_start)
+
+
+@pytest.fixture(scope="module")
+def steps_of_turning(turning):
+    return checked(Turning(), turning)
+
+
+def test_a_step_that_is_too_coarse_is_told_by_its_gain(steps_of_turning) -> None:
+    found = steps_of_turning
+    assert found.too_coarse and found.suited.substeps >= 4 and found.gain > 20
+    assert found.sentence == (
+        f"the program's own time step is too coarse: {found.suited.substeps} substeps a row instead of 1 gain "
+        f"{found.gain:.0f} nats (--substeps {found.suited.substeps})"
+    )
+    for trial, finer in zip(found.trials[:-1], found.trials[1:], strict=True):
+        assert finer.substeps == 2 * trial.substeps
+
+
+def test_parameters_of_finer_steps_are_those_of_the_vehicle(steps_of_turning) -> None:
+    """Response times of .3 and .2 s; one explicit step a row makes them longer."""
+    own, finest = steps_of_turning.trials[0].program, steps_of_turning.trials[-1].program
+    for name, truth in (("speed_time", 0.3), ("turn_time", 0.2)):
+        off = [abs(getattr(program, name).item() - truth) for program in (own, finest)]
+        assert off[1] < 0.5 * off[0]
+
+
+def test_the_second_order_step_is_fine_enough_for_the_hovercraft_and_explicit_euler_is_not() -> None:
+    table = in_continuous_time(Hovercraft(thrust=2.0), 8, seed=1)
+    assert not checked(example("hovercraft", torch.float32), table, known_start=True).too_coarse
+    assert checked(example("paper:PaperHovercraft", torch.float32), table, known_start=True).gain > 3
+
+
+def test_check_says_the_step_first(turning) -> None:
+    program = Turning()
+    with seeded(0, "paths"):
+        fit_by_likelihood(program, for_program(program, turning))
+    found = check(Fit(program, "likelihood"), in_continuous_time(Unicycle(), 6, seed=4), simulations=40)
+    assert str(found).startswith("The program's own time step is too coarse: ")
+    assert found.figures["step"]["substeps"] == found.step.suited.substeps > 1
+
+
+@pytest.mark.slow
+def test_discover_goes_on_at_the_step_that_suits_and_names_no_effect(turning, tmp_path) -> None:
+    found = discover(Turning(), in_continuous_time(Unicycle(), 12, seed=5), in_continuous_time(Unicycle(), 12, seed=6))
+    assert str(found).startswith("The program's own time step is too coarse: ")
+    assert found.verdict == "none"
+    assert found.after.program.substeps == found.search.step.suited.substeps >= 4
+    assert found.figures["step"]["gain"] > 3
+    found.after.save(tmp_path / "run")
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert record["substeps"] == found.after.program.substeps
+
+
+@pytest.mark.slow
+def test_sizes_are_those_of_the_step_at_which_they_rest() -> None:
+    """A yaw drag of .6 1/s on a boat: one explicit step a row makes (1 − exp(−.06)) / .1 = .582 of it."""
+    boat = example("gps_boat", torch.float32)
+    truth = boat.with_effect("yaw_linear_drag", 0.6)
+    drives = [simulate(truth, 16, seed=seed).without_truth() for seed in (1, 2)]
+    found = discover(boat, *drives)
+    (effect,) = [one for one in found.findings if one.variant.name == "yaw_linear_drag"]
+    ((low, high),) = effect.interval
+    assert low < 0.6 < high
+    assert found.after.program.substeps > 1
+    assert any("substeps a row instead of 1 move yaw_linear_drag" in note for note in found.notes)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not CASE.is_dir(), reason="the case exact_unicycle is not beside the checkout")
+def test_the_exact_unicycle_lacks_nothing_but_a_finer_step(tmp_path, capsys) -> None:
+    run = tmp_path / "run"
+    train, valid = CASE / "train.csv", CASE / "valid.csv"
+    assert steady("fit", CASE / "unicycle.py", train, "--valid", valid, "--recipe", "likelihood", "--out", run) == 0
+    figures = tmp_path / "found.json"
+    assert steady("discover", run, train, "--valid", valid, "--json", figures) == 0
+    content = json.loads(figures.read_text())
+    assert content["sentence"].startswith("The program's own time step is too coarse: ")
+    assert content["verdict"] == "none"
+    trials = {trial["substeps"]: trial["log_likelihood"] for trial in content["step"]["trials"]}
+    assert trials[content["step"]["substeps"]] / 12 >= 785
+
+
+def test_an_unstable_step_is_told_by_every_command(tmp_path, capsys) -> None:
+    model = tmp_path / "stiff.py"
+    source = (MODELS / "linear_gaussian.py").read_text()
+    source = source.replace("PyroParam(tensor(0.8)", "PyroParam(tensor(60.0)").replace("LinearGaussian", "Stiff")
+    model.write_text(source)
+    write_table(simulate(example("linear_gaussian"), 4, seed=1), tmp_path / "drives.csv")
+    out = tmp_path / "run"
+    assert steady("fit", model, tmp_path / "drives.csv", "--recipe", "likelihood", "--out", out) != 0
+    said = capsys.readouterr().err
+    assert "the model itself diverges at this step: damping · step = 6" in said
+    assert "impossible" not in said
