@@ -106,7 +106,8 @@ def record_drives(tour: Tour, size: Size) -> None:
         write_table(read_table(f"{name}.csv").without_truth(keep_start=True), Path(f"{name}.csv"))
     tour.result(
         f"{size.train} drives to fit and {size.valid} to choose by: of both only controls, bearings and the first "
-        f"state are kept. {size.test} more are locked away for the proof, with their poses, to judge by."
+        f"state are kept. {size.test} more are locked away for the proof, with their poses, to judge by. The "
+        "hovercraft moves in steps of 5 ms, its programs in those of the rows."
     )
 
 
