@@ -26,6 +26,7 @@ from steady_ppl.substeps import MAX_SUBSTEPS, with_substeps
 MIN_GAIN = 3.0  # nats, of all drives together, from which a finer step counts
 MAX_SHIFT = 2.0  # nats that watched parameters of another step lie below the maximum: two standard deviations
 MAX_DECREMENT = 1.0  # nats that a scoring step at a finer step may promise; beyond it its refit may gain far more
+UNFITTED = 0.2  # share of what a scoring step promises at the program's own step, for parameters that are not fitted
 PRECISION = 0.005  # nats, of refits
 FINEST = 32  # times as many substeps as the program has, at most
 REFITS = 25  # scoring steps of a fit
@@ -209,7 +210,8 @@ def check_step(
         return StepCheck((first,), max_shift)
     try:
         look = trial(2 * own, program, first.path, 0)
-        moves = look.decrement - first.decrement > min(max_shift, MAX_DECREMENT)
+        allowed = max(min(max_shift, MAX_DECREMENT), UNFITTED * first.decrement)
+        moves = look.decrement - first.decrement > allowed
         if look.reachable < first.reachable + 0.5 * MIN_GAIN and not moves:
             return StepCheck((first,), max_shift)
         if refits and not isinstance(at, Maximum):
