@@ -28,7 +28,7 @@ class PlanarVehicle(Program):
         slips: whether the lateral velocity is free; False where the program takes it back, with the centripetal term
             that a turn needs: `a_lateral = −w / settling + v · yaw_rate`.
         settling: time constant in which a program that does not slip takes its lateral velocity back, and wheels reach
-            what they are told, s; None where it is the step.
+            their command, s; None where it is the step.
     """
 
     states = ("x [m]", "y [m]", "heading [rad]", "vx [m/s]", "vy [m/s]", "yaw_rate [rad/s]")

@@ -164,11 +164,8 @@ def row_controls(program: Program, control: Tensor) -> Tensor:
 @contextmanager
 def within_row() -> Iterator[None]:
     """Run a `transition` as one that no row ends with: what counts rows stays as it is."""
-    token = _ROW_ENDS.set(False)
-    try:
+    with _row_ending(False):
         yield
-    finally:
-        _ROW_ENDS.reset(token)
 
 
 class Held(Messenger):
@@ -227,9 +224,15 @@ def _parts(program: Program, control: Tensor, time: Tensor, step: Tensor) -> Ite
 @contextmanager
 def _at(part: _Part) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     *given, ends = part
+    with _row_ending(ends):
+        yield tuple(given)  # type: ignore[misc]
+
+
+@contextmanager
+def _row_ending(ends: bool) -> Iterator[None]:
     token = _ROW_ENDS.set(ends)
     try:
-        yield tuple(given)  # type: ignore[misc]
+        yield
     finally:
         _ROW_ENDS.reset(token)
 
