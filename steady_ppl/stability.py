@@ -16,6 +16,7 @@ from steady_ppl.substeps import MAX_SUBSTEPS, Held, advance, with_substeps, with
 
 GROWTH = 1.1  # of a deviation over a row, from which it counts
 FINER = 16  # times as many substeps, at which it must not grow nearly as much
+SLOWER = 1000.0  # times, by which rows are moved apart to see whether actuators look at time
 SHORTER = 64  # times, by which a step is shortened to see whether its result follows
 STATES, ROWS = 64, 16  # at which a transition is looked at
 
@@ -86,7 +87,7 @@ def is_step(program: Program, data: Trajectories) -> bool:
         program: any.
         data: as returned by `for_program`; rows to look at, whose states are drawn from the program's start.
     """
-    if not len(data.steps):
+    if not bool(data.transitions.any()) or counts_rows(program):
         return False
     state, (control, time, step) = _some(program, data)
     own = with_substeps(program, 1)
@@ -102,6 +103,25 @@ def is_step(program: Program, data: Trajectories) -> bool:
 
 
 @torch.no_grad()
+def counts_rows(program: Program) -> bool:
+    """Return whether `actuators` looks at other rows but not at the time between them.
+
+    A delay that is a number of rows (`control.roll(1, 0)`) is another delay in substeps.
+    """
+    if type(program).actuators is Program.actuators:
+        return False
+    like = next(program.parameters(), torch.zeros(()))
+    with seeded("commands"):
+        commands = torch.randn(ROWS, 1, len(program.controls)).to(like)
+    times = program.step * torch.arange(ROWS).to(like).unsqueeze(-1)
+    acting = program.actuators(commands, times)
+    if not torch.equal(acting, program.actuators(commands, SLOWER * times)):
+        return False
+    other = torch.cat([commands[:1] + 1.0, commands[1:]])
+    return not torch.equal(acting[1:], program.actuators(other, times)[1:])
+
+
+@torch.no_grad()
 def require_convergence(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> None:
     """Refuse substeps of a program whose rows go apart as they are cut more finely.
 
@@ -110,8 +130,15 @@ def require_convergence(program: Program, state: Tensor, control: Tensor, time: 
         state, control, time, step: of some rows, as `advance` takes them.
 
     Raises:
-        ProgramError: its result at K and 2 K substeps differs more for large K than for small ones.
+        ProgramError: its result at K and 2 K substeps differs more for large K than for small ones, or its actuators
+            count rows.
     """
+    if counts_rows(program):
+        raise ProgramError(
+            f"program {type(program).__name__}: actuators counts rows and not seconds, which is another delay in "
+            "substeps; shift commands by `time`, for example with steady_ppl.delayed",
+            site="actuators",
+        )
 
     def ends(count: int) -> Tensor:
         return _after(with_substeps(program, count), state, (control, time, step), 1.0)
@@ -129,10 +156,12 @@ def require_convergence(program: Program, state: Tensor, control: Tensor, time: 
 
 
 def _some(program: Program, data: Trajectories) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
-    """States from a program's start, `(STATES, R, 1, D)`, and control, time and step of some rows of a drive."""
-    rows = torch.linspace(0, len(data.steps) - 1, min(ROWS, len(data.steps)), device=data.time.device).long()
-    rows = rows[data.transitions[rows, 0]]
-    given = (data.controls[rows, :1], data.elapsed[rows, :1], data.steps[rows, :1])
+    """States from a program's start, `(STATES, R, 1, D)`, and control, time and step of some rows of the longest
+    drive."""
+    drive = int(data.transitions.sum(0).argmax())
+    rows = torch.where(data.transitions[:, drive])[0]
+    rows = rows[torch.linspace(0, len(rows) - 1, min(ROWS, len(rows)), device=rows.device).long()]
+    given = (data.controls[rows, :][:, [drive]], data.elapsed[rows, :][:, [drive]], data.steps[rows, :][:, [drive]])
     return _starts(program, len(rows)), given
 
 

@@ -20,7 +20,7 @@ from steady_ppl.likelihood_fit import widens
 from steady_ppl.linearization import Path
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.program import Program
-from steady_ppl.stability import is_step
+from steady_ppl.stability import counts_rows, is_step
 from steady_ppl.substeps import MAX_SUBSTEPS, with_substeps
 
 MIN_GAIN = 3.0  # nats, of all drives together, from which a finer step counts
@@ -28,7 +28,7 @@ MAX_SHIFT = 2.0  # nats that watched parameters of another step lie below the ma
 MAX_DECREMENT = 1.0  # nats that a scoring step at a finer step may promise; beyond it its refit may gain far more
 UNFITTED = 0.2  # share of what a scoring step promises at the program's own step, for parameters that are not fitted
 PRECISION = 0.005  # nats, of refits
-FINEST = 32  # times as many substeps as the program has, at most
+FINEST = 32  # substeps of a trial, at most; a program that has as many is compared with twice its own alone
 REFITS = 25  # scoring steps of a fit
 
 
@@ -168,7 +168,9 @@ def check_step(
     """Compare a program with itself at twice, four times … the substeps, refitted to the same drives.
 
     Fits are made only where one look at a finer step does not exclude that it gains: its log p(y) with the parameters
-    as they are is no higher, and a scoring step would hardly move them. A network keeps its parameters.
+    as they are is no higher, and a scoring step would hardly move them. Where two steps differ, the coarser one is
+    fitted from the finer one's parameters too, and judged there unless that is `MIN_GAIN` nats worse. A network keeps
+    its parameters.
 
     Args:
         program: with normal noise; see `linearize`.
@@ -201,12 +203,13 @@ def check_step(
         maximum = maximise(changed, data, path, known_start=known_start, steps=steps, precision=PRECISION)
         return _trial(changed, maximum, names)
 
-    own, most = program.substeps, min(MAX_SUBSTEPS, FINEST * program.substeps)
+    own = program.substeps
+    most = min(MAX_SUBSTEPS, max(FINEST, 2 * own))
     if isinstance(at, Maximum):
         first = _trial(program, at, names)
     else:
         first = trial(own, program, at or find_path(program, data, known_start=known_start), 0)
-    if 2 * own > most:
+    if 2 * own > most or counts_rows(program):  # in substeps its delay is another
         return StepCheck((first,), max_shift)
     try:
         look = trial(2 * own, program, first.path, 0)
@@ -217,9 +220,15 @@ def check_step(
         if refits and not isinstance(at, Maximum):
             first = trial(own, program, first.path, REFITS)
         trials = [first, trial(2 * own, first.program, first.path, REFITS)]
-        while _differs(trials[-2], trials[-1], max_shift) and 2 * trials[-1].substeps <= most:
-            last = trials[-1]
-            trials.append(trial(2 * last.substeps, last.program, last.path, REFITS))
+        while True:
+            coarse, fine = trials[-2:]
+            if refits and _differs(coarse, fine, max_shift):  # several maxima of one program are no matter of its step
+                again = trial(coarse.substeps, fine.program, fine.path, REFITS)
+                if again.log_likelihood > coarse.log_likelihood - MIN_GAIN:
+                    trials[-2] = again
+            if not _differs(trials[-2], fine, max_shift) or 2 * fine.substeps > most:
+                break
+            trials.append(trial(2 * fine.substeps, fine.program, fine.path, REFITS))
     except FilterError:  # paths of the coarser step lead nowhere at the finer one: nothing speaks for it
         return StepCheck((first,), max_shift)
     return StepCheck(tuple(trials), max_shift)

@@ -173,3 +173,15 @@ def test_an_unstable_step_is_told_by_every_command(tmp_path, capsys) -> None:
     said = capsys.readouterr().err
     assert "the model itself diverges at this step: damping · step = 6" in said
     assert "impossible" not in said
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_maxima_of_one_program_are_no_matter_of_its_step(seed) -> None:
+    """From a bias of 30 m/s² the coarser fit ends at a lower maximum than the finer one, which begins where it ends."""
+    cart = example("linear_gaussian", torch.float32)
+    data = for_program(cart, simulate(cart, 10, seed=seed)).without_truth()
+    with seeded(0, "paths"):
+        found = check_step(cart.with_effect("acceleration_bias", 30.0).double(), data)
+    assert len(found.trials) > 1  # one look did not do
+    assert not found.too_coarse
+    assert found.trials[0].log_likelihood == pytest.approx(found.trials[1].log_likelihood, abs=1.0)

@@ -39,7 +39,7 @@ from steady_ppl.particles import roll_out
 from steady_ppl.probe import probe
 from steady_ppl.simulation import simulated_substeps
 from steady_ppl.sites import AtMean, Recording, Standardised, running
-from steady_ppl.stability import divergence, is_step
+from steady_ppl.stability import counts_rows, divergence, is_step
 from steady_ppl.step_size import check_step
 from steady_ppl.stepping import Stepping
 from steady_ppl.substeps import acting_controls, advance, channel_values, row_controls, sample_channels
@@ -344,6 +344,34 @@ def test_what_cannot_be_cut_is_refused_in_one_line(kind, said) -> None:
 def test_a_step_is_told_from_what_is_none(program, expected) -> None:
     data = for_program(program, simulate(program, 2, seed=1, substeps=1))
     assert is_step(program, data) is expected
+
+
+class RowsLate(type(example("hovercraft"))):
+    """Its commands act a row late, however long the row."""
+
+    def actuators(self, control, time):
+        return torch.cat([control[:1], control[:-1]])
+
+
+class Halved(type(example("hovercraft"))):
+    """Its commands act by half, at once."""
+
+    def actuators(self, control, time):
+        return 0.5 * control
+
+
+@pytest.mark.parametrize(("kind", "expected"), [(RowsLate, True), (Delayed, False), (Halved, False)])
+def test_actuators_that_count_rows_are_told_from_others(kind, expected) -> None:
+    program = kind().double()
+    assert counts_rows(program) is expected
+    data = for_program(program, simulate(program, 2, seed=1, substeps=1))
+    assert is_step(program, data) is not expected
+    if expected:
+        with pytest.raises(ProgramError, match="program RowsLate: actuators counts rows and not seconds"):
+            probe(with_substeps(program, 2))
+        assert len(check_step(program, data, known_start=True).trials) == 1
+    else:
+        probe(with_substeps(program, 2))
 
 
 def test_what_is_no_step_is_simulated_row_by_row() -> None:

@@ -72,6 +72,6 @@ def _visited(program: Program, variant: Variant, fold: Fold) -> np.ndarray:
         return data.measurements[..., index][data.observed[..., index]].double().numpy(force=True)
     states = fold.path.states[..., : len(program.states)]
     given = (states[:-1], row_controls(program, acting_controls(program, data))[:-1], data.elapsed[:-1])
-    mean = channel_means(program, program.transition, *given, data.steps)
+    mean = channel_means(program, program.transition, *given, data.steps / program.substeps)
     values = variables(program, *given, mean)[variant.options["variable"]]
     return values.expand(data.transitions.shape)[data.transitions].double().numpy(force=True)

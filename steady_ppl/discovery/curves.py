@@ -43,7 +43,7 @@ def curves(program: Program, data: Trajectories, spread: Tensor, sharpness: Tens
     """
     assert data.states is not None
     controls = row_controls(program, acting_controls(program, data))
-    given = (data.states[:-1], controls[:-1], data.elapsed[:-1], data.steps)
+    given = (data.states[:-1], controls[:-1], data.elapsed[:-1], data.steps / program.substeps)
     mean = channel_means(program, program.transition, *given)
     found = []
     for variable, values in variables(program, *given[:3], mean).items():

@@ -55,7 +55,8 @@ def figures(found: Discovery) -> dict[str, Any]:
             for one in found.search.rounds
         ],
         "known_start": found.before.known_start,
-        "step": (found.search.with_found or found.search.step).figures,
+        "step": found.search.step.figures,
+        "step_with_found": found.search.with_found.figures if found.search.with_found else None,
         "doubts": found.doubts,
         "notes": found.notes,
     }
