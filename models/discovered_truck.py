@@ -23,7 +23,8 @@ class DiscoveredTruck(Truck):
                                                                          the tracked point is before the rear axle
     a_yaw     = clip((turn_gain · turned − yaw_rate) / turn_time, ±limit) − caster · v · yaw_rate
                                                                          curves open forwards, close backwards
-    σ         = noise · (1 + erratic · |command − state|)                of forward and yaw
+    σ         = noise · (1 + erratic · (|a_forward|, 0, |turn − yaw_rate|))
+                                                                         it pulls and turns in unevenly
 
     v and w are the forward and lateral velocity.
     """
@@ -42,12 +43,12 @@ class DiscoveredTruck(Truck):
         self.limit = PyroParam(tensor(6.0), constraints.positive)
         self.delay = PyroParam(tensor(0.08), constraints.positive)
         self.share = PyroParam(tensor(0.75))
-        self.bias = PyroParam(tensor(-0.3))
-        self.lever = PyroParam(tensor(0.36))
-        self.slip = PyroParam(tensor(-0.08))
-        self.crab = PyroParam(tensor(-0.01))
-        self.caster = PyroParam(tensor(1.0))
-        self.erratic = PyroParam(tensor([2.0, 1.2]), constraints.positive)
+        self.bias = PyroParam(tensor(0.0))
+        self.lever = PyroParam(tensor(0.25))
+        self.slip = PyroParam(tensor(0.0))
+        self.crab = PyroParam(tensor(0.0))
+        self.caster = PyroParam(tensor(0.7))
+        self.erratic = PyroParam(tensor([0.6, 1.0]), constraints.positive)
         self.noise = PyroParam(tensor([0.9, 0.4, 1.2]), constraints.positive)
 
     def actuators(self, control, time):
@@ -68,9 +69,9 @@ class DiscoveredTruck(Truck):
             ((self.turn_gain * turned - yaw_rate) / self.turn_time).clamp(-self.limit, self.limit)
             - self.caster * forward * yaw_rate,
         )
-        slow, askew = (speed - forward).abs(), (turn - yaw_rate).abs()
-        by_speed, by_turn = self.erratic.unbind(-1)
-        wider = stack(1 + by_speed * slow, torch.ones_like(slow), 1 + by_turn * askew)
+        pull, askew = mean[..., 0].abs(), (turn - yaw_rate).abs()
+        by_pull, by_turn = self.erratic.unbind(-1)
+        wider = stack(1 + by_pull * pull, torch.ones_like(pull), 1 + by_turn * askew)
         return mean, self.noise * wider
 
     def transition(self, state, control, time, step):

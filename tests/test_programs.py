@@ -551,7 +551,7 @@ def test_the_discovered_truck_is_what_its_docstring_says() -> None:
         ],
         -1,
     )
-    erratic = np.stack([value["erratic"][0] * abs(speed - v), 0 * v, value["erratic"][1] * abs(turn - turning)], -1)
+    erratic = np.stack([value["erratic"][0] * abs(mean[..., 0]), 0 * v, value["erratic"][1] * abs(turn - turning)], -1)
     found_mean, found_sd = found.accelerations(data.states[:-1], data.controls[:-1], data.steps)
     np.testing.assert_allclose(found_mean.detach().numpy(), mean, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found_sd.detach().numpy(), value["noise"] * (1 + erratic), rtol=1e-9, atol=1e-9)
