@@ -62,12 +62,13 @@ STATES = ("cart", *PROBLEMS)
 
 
 def problem(name: str, count: int, seed: int) -> tuple[Program, Trajectories]:
-    """A program and drives of it, as it reads them, with their true states."""
+    """A program and drives of it, as it reads them, with their true states; in its own steps, because ranks are uniform
+    only where the world is the program."""
     if name == "cart":
         program = example("linear_gaussian").requires_grad_(False)
         return program, drives(program, count, 31, seed=seed)
     known = reference(name)
-    made = simulate(known.program, seed=seed, like=runs(known.data, count))
+    made = simulate(known.program, seed=seed, like=runs(known.data, count), substeps=known.program.substeps)
     return known.program, for_program(known.program, made)
 
 

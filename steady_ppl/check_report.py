@@ -143,7 +143,8 @@ def verdict(found: Check) -> str:
     """The first line of `steady check`: one sentence, after a first one on the time step where that is too coarse."""
     if found.step.sentence:
         first = found.step.sentence
-        return f"{first[0].upper()}{first[1:]}: refit at that step before anything else is believed. {_verdict(found)}"
+        first = f"{first[0].upper()}{first[1:]}: refit at that step first; what follows is of the coarse one."
+        return f"{first} {_verdict(found)}"
     return _verdict(found)
 
 
@@ -162,7 +163,7 @@ def _verdict(found: Check) -> str:
         said = "The program does not explain these drives: "
         discover = "`steady discover` tests the physical effects by name"
         if blame.parameters_misfit:
-            said += f"{WHO['parameters']}{_parameters(found)}: fit it again before anything else is believed (more "
+            said += f"{WHO['parameters']}{_parameters(found)}: fit it again first (more "
             said += f"--steps, or --recipe likelihood){_beside_parameters(found)}; if that changes little, {discover}"
         else:
             said += f"{WHO[blame.kind]}{_most_clearly(found)}; "
