@@ -12,9 +12,7 @@ from pyro import poutine
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
-from steady_ppl.altering import channel_means
 from steady_ppl.errors import ProgramError, SteadyError, one_line
-from steady_ppl.planar_vehicle import PlanarVehicle
 from steady_ppl.program import Program, names
 from steady_ppl.sites import Broadcasting, Observing, Recording, Replaying, broadcast_event, running
 from steady_ppl.stability import require_convergence
@@ -22,7 +20,6 @@ from steady_ppl.substeps import MAX_SUBSTEPS, is_count
 
 DRAWS, ROWS, TRAJECTORIES = 7, 11, 13
 LEFT = (DRAWS, ROWS, TRAJECTORIES)
-ALIKE = 1.25  # times, by which a lateral velocity may be taken back faster or slower than declared
 
 
 def probe(program: Program) -> None:
@@ -49,8 +46,6 @@ def probe(program: Program) -> None:
         _check_noise(name, noise)
         if program.substeps > 1:
             require_convergence(program, state, control, time, step)
-        if isinstance(program, PlanarVehicle) and not program.slips:
-            _check_settling(program, name, state, control, time, step)
 
         measurements = torch.zeros(ROWS, TRAJECTORIES, width).to(parameter)
         observing = Observing(measurements, torch.ones_like(measurements, dtype=torch.bool))
@@ -109,33 +104,6 @@ def _check_declarations(program: Program, name: str) -> None:
     if not (program.step > 0 and program.duration >= program.step):
         raise ProgramError(
             f"program {name}: step is {program.step} s and duration {program.duration} s; expected 0 < step ≤ duration"
-        )
-
-
-def _check_settling(program: PlanarVehicle, name: str, state: Tensor, *given: Tensor) -> None:
-    """The effects of wheels pull at the lateral velocity as fast as the program takes it back."""
-    step, by = given[-1], 0.1  # m/s, sideways
-    sideways = torch.zeros_like(state)
-    sideways[..., 3], sideways[..., 4] = -by * state[..., 2].sin(), by * state[..., 2].cos()
-    with torch.no_grad(), running(*LEFT):
-        pulls = [
-            channel_means(program, program.transition, moved, *given)["lateral"]
-            for moved in (state - sideways, state + sideways)
-        ]
-    in_steps = float((step * (pulls[0] - pulls[1]) / (2 * by)).expand(LEFT).median())
-    expected = float((step / program.settles_in(step)).detach().expand(LEFT).median())
-    if not expected / ALIKE < in_steps < expected * ALIKE:
-        declared = "None (the step)" if program.settling is None else f"{float(program.settling):.2g} s"
-        if in_steps <= 0:
-            taken, mend = "never", "set slips to True"
-        elif 1 / ALIKE < in_steps < ALIKE:
-            taken, mend = "within each step", "set settling to None"
-        else:
-            taken, mend = f"in {float(step.median()) / in_steps:.2g} s", "set settling to that"
-        raise ProgramError(
-            f"program {name}: slips is False and settling {declared}, but transition takes the lateral velocity back "
-            f"{taken}; {mend}",
-            site="transition",
         )
 
 

@@ -263,33 +263,3 @@ def test_correlated_measurements_weigh_whole_rows_as_independent_ones_do(tmp_pat
         torch.manual_seed(1)
         values.append(log_likelihood(program, data, particles=50, known_start=False, every=1))
     torch.testing.assert_close(*values, rtol=1e-5, atol=1e-5)  # single precision
-
-
-@pytest.mark.parametrize(
-    ("declares", "takes", "said"),
-    [
-        ("settling = 0.1", "-w / 0.1", None),
-        ("settling = None", "-w / step", None),
-        ("settling = 0.1", "-w / 0.2", "settling 0.1 s, but transition takes the lateral velocity back in 0.2 s"),
-        ("settling = 0.5", "-w / step", "takes the lateral velocity back within each step; set settling to None"),
-        ("settling = None", "-w / 0.02", r"settling None \(the step\), but .* in 0.02 s; set settling to that"),
-        ("settling = 0.1", "0 * w", "takes the lateral velocity back never; set slips to True"),
-        ("slips = True", "-w / 0.2", None),
-    ],
-)
-def test_a_lateral_velocity_is_taken_back_as_declared(tmp_path: Path, declares, takes, said) -> None:
-    source = (Path(__file__).parents[1] / "models" / "truck.py").read_text()
-    for before, after in (
-        ("settling = 0.1  # s", declares),
-        ("-lateral / self.settling", takes.replace("w", "lateral")),
-    ):
-        assert before in source
-        source = source.replace(before, after)
-    file = tmp_path / "mine.py"
-    file.write_text(source.replace("/ self.settling", "/ 0.1"))
-    program = load_program(file)
-    if said is None:
-        probe(program)
-    else:
-        with pytest.raises(ProgramError, match=said):
-            probe(program)
