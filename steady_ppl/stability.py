@@ -161,7 +161,7 @@ def _some(program: Program, data: Trajectories) -> tuple[Tensor, tuple[Tensor, T
     drive = int(data.transitions.sum(0).argmax())
     rows = torch.where(data.transitions[:, drive])[0]
     rows = rows[torch.linspace(0, len(rows) - 1, min(ROWS, len(rows)), device=rows.device).long()]
-    given = (data.controls[rows, :][:, [drive]], data.elapsed[rows, :][:, [drive]], data.steps[rows, :][:, [drive]])
+    given = (data.controls[:, [drive]][rows], data.elapsed[:, [drive]][rows], data.steps[:, [drive]][rows])
     return _starts(program, len(rows)), given
 
 

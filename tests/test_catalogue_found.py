@@ -64,7 +64,7 @@ def test_it_is_found(effect: str) -> None:
 
 
 STUCK = "the fit with stiffness ends 71 nats behind the one with cubic_stiffness, alike to third order in the angle"
-FAILING = {("pendulum", "stiffness=6.9"): pytest.mark.xfail(reason=STUCK, strict=False)}  # passes on other drives
+FAILING = {("pendulum", "stiffness=6.9"): pytest.mark.xfail(reason=STUCK, strict=True)}
 
 
 @pytest.mark.parametrize(
