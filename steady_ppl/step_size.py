@@ -28,7 +28,7 @@ MAX_SHIFT = 2.0  # nats that watched parameters of another step lie below the ma
 MAX_DECREMENT = 1.0  # nats that a scoring step at a finer step may promise; beyond it its refit may gain far more
 UNFITTED = 0.2  # share of what a scoring step promises at the program's own step, for parameters that are not fitted
 PRECISION = 0.005  # nats, of refits
-FINEST = 32  # substeps of a trial, at most; a program that has as many is compared with twice its own alone
+FINEST = 32  # substeps of a trial, at most, unless more are asked for; a program may always be tried at twice its own
 REFITS = 25  # scoring steps of a fit
 
 
@@ -96,6 +96,11 @@ class StepCheck:
         return self.trials[-1]
 
     @property
+    def settled(self) -> bool:
+        """Whether twice as many substeps as the suited ones were tried and change nothing that counts."""
+        return len(self.trials) == 1 or self.suited is not self.trials[-1]
+
+    @property
     def gain(self) -> float:
         """Nats that the suited step is ahead of the program's own."""
         return self.suited.log_likelihood - self.trials[0].log_likelihood
@@ -112,6 +117,9 @@ class StepCheck:
         otherwise."""
         if self.gain > MIN_GAIN:
             said = f"{self._instead} gain {self.gain:.0f} nats"
+            if not self.settled:
+                last = self.trials[-1].log_likelihood - self.trials[-2].log_likelihood
+                said += f", the last doubling {last:.0f} of them: more substeps may gain more"
         elif self.too_coarse and self.suited.shift(self.trials[0]) > MAX_SHIFT:
             said = f"{self._instead} move {self._farthest}"
         else:
@@ -143,6 +151,7 @@ class StepCheck:
         """Everything as a plain dict, ready for JSON."""
         return {
             "substeps": self.suited.substeps,
+            "settled": self.settled,
             "gain": self.gain,
             "shift": self.suited.shift(self.trials[0]),
             "trials": [{"substeps": t.substeps, "log_likelihood": t.log_likelihood} for t in self.trials],
@@ -164,6 +173,7 @@ def check_step(
     known_start: bool = False,
     watched: Sequence[str] | None = None,
     max_shift: float = MAX_SHIFT,
+    finest: int = FINEST,
 ) -> StepCheck:
     """Compare a program with itself at twice, four times … the substeps, refitted to the same drives.
 
@@ -180,6 +190,7 @@ def check_step(
         watched: names of the parameters whose values a finer step must not move either; all but those of noise when
             None, of which a program that holds something within each substep needs more in shorter ones.
         max_shift: nats by which it may move them.
+        finest: substeps of a trial, at most; a program may always be tried at twice its own.
 
     Raises:
         FilterError: the program cannot be smoothed as it is.
@@ -204,7 +215,7 @@ def check_step(
         return _trial(changed, maximum, names)
 
     own = program.substeps
-    most = min(MAX_SUBSTEPS, max(FINEST, 2 * own))
+    most = min(MAX_SUBSTEPS, max(finest, 2 * own))
     if isinstance(at, Maximum):
         first = _trial(program, at, names)
     else:

@@ -63,18 +63,7 @@ def test_it_is_found(effect: str) -> None:
     assert_found(owner(known), owner(known), text_of_size(effect, SIZE))
 
 
-STUCK = "the fit with stiffness ends 71 nats behind the one with cubic_stiffness, alike to third order in the angle"
-FAILING = {("pendulum", "stiffness=6.9"): pytest.mark.xfail(reason=STUCK, strict=True)}
-
-
-@pytest.mark.parametrize(
-    ("program", "text"),
-    [
-        pytest.param(program, text, marks=FAILING.get((program, text), ()))
-        for program, texts in OTHERS.items()
-        for text in texts
-    ],
-)
+@pytest.mark.parametrize(("program", "text"), [(program, text) for program, texts in OTHERS.items() for text in texts])
 def test_it_is_found_in_other_programs(program: str, text: str) -> None:
     assert_found(program_called(program), program_called(program), text)
 

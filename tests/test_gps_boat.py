@@ -42,6 +42,5 @@ def test_all_that_brakes_a_boat_is_named_from_gps_and_compass(boat):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="in steps of 5 ms the last tests find more: p = .02, and .05 on other drives", strict=True)
 def test_nothing_else_is_left_of_the_boat(boat):
     assert boat.search.is_complete and "confidence" in boat.figures["sentence"]

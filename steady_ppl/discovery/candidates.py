@@ -14,7 +14,7 @@ from steady_ppl.discovery.bootstrap import Simulated, scores_along, simulate_sco
 from steady_ppl.discovery.columns import Column, columns_of
 from steady_ppl.discovery.curves import curves
 from steady_ppl.discovery.declared_noise import departures
-from steady_ppl.discovery.refits import ALWAYS, Refit, Worth, refit_with
+from steady_ppl.discovery.refits import ALWAYS, BY_LIKELIHOOD, Refit, Worth, refit_with
 from steady_ppl.discovery.screening import LEVEL, Screened, Tested, screen
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.elements import Element, elements
@@ -207,16 +207,17 @@ def fitted(now: Refit, tested: Tested, screening: Screening, settings: Settings,
     """
     effect = tested.variant.effect
     known = screening.information[_key(tested.column)] if effect.null == 0 and effect.form in LINEAR else None
-    start = _start(tested)
 
-    def fit(share: float) -> Candidate:
-        value = [share * one for one in start] if isinstance(start, list) else share * start
-        refit = refit_with(now, tested.variant, value, known_start=settings.known_start, information=known, worth=worth)
+    def fit(start: Any) -> Candidate:
+        refit = refit_with(now, tested.variant, start, known_start=settings.known_start, information=known, worth=worth)
         return judged(now, tested, refit)
 
-    candidate = fit(1.0)
+    absent = [0.0] * len(tested.coefficient)
+    if known is not None and tested.column.probe is None and now.fitting == BY_LIKELIHOOD:
+        return fit(absent)  # scoring steps go from there as far as the likelihood rises
+    candidate = fit(_start(tested))
     lost = isinstance(candidate.refit, str) or gain_of_first_fold(now, candidate.refit) < 0
-    return fit(0.1) if lost and known is not None and tested.statistic > PROMISING else candidate
+    return fit(absent) if lost and known is not None and tested.statistic > PROMISING else candidate
 
 
 def judged(now: Refit, tested: Tested, refit: Refit | str) -> Candidate:

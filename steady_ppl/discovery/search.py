@@ -35,6 +35,7 @@ from steady_ppl.substeps import with_substeps
 
 BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
 MAX_SHIFT_OF_SIZES = 0.08  # nats by which a finer step may move what is reported: 0.4 standard deviations
+FINEST = 128  # substeps at which a program is fitted, at most: what a coarser step leaves would be named as an effect
 MOST, CURVES = 5, 3  # effects in a program, and adding curves that are fitted
 
 
@@ -93,10 +94,15 @@ def _step_of(refit: Refit, known_start: bool, found: Sequence[Found] = ()) -> St
     found must not go with the step."""
     drives, maximum = refit.folds[0].drives, refit.maxima[0]
     if not found:
-        return check_step(refit.program, drives, maximum, known_start=known_start)
-    sizes = [variant.parameter for variant in attached(refit.program)]
+        return check_step(refit.program, drives, maximum, known_start=known_start, finest=FINEST)
     return check_step(
-        refit.program, drives, maximum, known_start=known_start, watched=sizes, max_shift=MAX_SHIFT_OF_SIZES
+        refit.program,
+        drives,
+        maximum,
+        known_start=known_start,
+        watched=[variant.parameter for variant in attached(refit.program)],
+        max_shift=MAX_SHIFT_OF_SIZES,
+        finest=FINEST,
     )
 
 
