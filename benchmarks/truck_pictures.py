@@ -2,7 +2,7 @@
 
     python benchmarks/truck_pictures.py --data FOLDER [--records benchmarks/results/truck.jsonl] [--out docs]
 
-Draws truck.png (fits four programs to the first draw of the bearings, two minutes) and truck-path.png.
+Draws truck.png (fits four programs to the first draw of the bearings, ten minutes) and truck-path.png.
 """
 
 from __future__ import annotations
@@ -133,6 +133,7 @@ def main() -> int:
         print("name the folder with the AlphaTruck logs: --data", file=sys.stderr)
         return 2
     torch.set_num_threads(1)
+    arguments.out.mkdir(parents=True, exist_ok=True)
     records = [json.loads(line) for line in arguments.records.read_text().splitlines()]
     path_picture(records, arguments.out / "truck-path.png")
     roll_out_picture(arguments.data, arguments.draw, arguments.out / "truck.png")
