@@ -408,6 +408,28 @@ def test_a_step_that_is_unstable_is_told_by_its_number() -> None:
     assert divergence(example("pendulum"), for_program(example("pendulum"), simulate(example("pendulum"), 2))) is None
 
 
+class Dragged(type(example("linear_gaussian"))):
+    """At rest to begin with; its drag is too stiff for a row at speed alone."""
+
+    def initial(self):
+        return pyro.sample("start", dist.Normal(torch.zeros(2).double(), 1e-3).to_event(1))
+
+    def transition(self, state, control, time, step):
+        position, velocity = state.unbind(-1)
+        mean = control[..., 0] - 400.0 * velocity * velocity.abs()
+        acceleration = pyro.sample("acceleration", dist.Normal(mean, self.noise))
+        return stack(position + velocity * step, velocity + acceleration * step)
+
+
+def test_a_step_that_is_unstable_at_speed_alone_is_told_too() -> None:
+    """Damping 2 · 400 · v at v = √(1 / 400) under a push of 1 N: 40 1/s, 4 in a row of .1 s."""
+    dragged = Dragged().double()
+    data = for_program(dragged, simulate(dragged, 2, seed=1, substeps=32))
+    said = divergence(dragged, data)
+    assert said is not None and 3 < float(said.partition("damping · step = ")[2].partition(",")[0]) < 5
+    assert divergence(with_substeps(dragged, 16), data) is None
+
+
 def test_a_run_remembers_its_substeps(tmp_path) -> None:
     table, run = written(tmp_path / "drives.csv"), tmp_path / "run"
     assert steady("fit", HOVERCRAFT, table, "--recipe", "likelihood", "--substeps", 3, "--out", run) == 0
