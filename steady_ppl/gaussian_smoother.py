@@ -126,8 +126,9 @@ def require_found(ahead: Lookahead, program: Program, data: Trajectories) -> Non
     """Raise a `FilterError` where the linearised program's log p(y) is not finite."""
     broken = ~torch.isfinite(ahead.log_likelihood)
     if bool(broken.any()):
-        label = data.labels[int(broken.nonzero()[0])]
-        why = divergence(program, data) or (
+        drive = int(broken.nonzero()[0])
+        label = data.labels[drive]
+        why = divergence(program, data.subset([drive])) or (
             "the linearised program's log p(y) is not finite: its parameters or states have blown up, or it cannot be "
             "linearised there (--recipe steady --guide bootstrap does not)"
         )

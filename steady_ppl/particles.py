@@ -183,7 +183,7 @@ def _raise_if_broken(program: Program, log_likelihood: Tensor, blown_up: Tensor,
     row, trajectory = (int(i) for i in broken.nonzero()[0])
     label, time = data.labels[trajectory], float(data.elapsed[row, trajectory])
     impossible = bool(log_likelihood[row, trajectory] == -math.inf) and not bool(blown_up[: row + 1, trajectory].any())
-    what = divergence(program, data) or (
+    what = divergence(program, data.subset([trajectory]), row) or (
         "every particle's weight is zero: the measurement is impossible under the program"
         if impossible
         else "no particle is left that is a number: the program's parameters or states have blown up"

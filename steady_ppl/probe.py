@@ -101,6 +101,10 @@ def _check_declarations(program: Program, name: str) -> None:
         raise ProgramError(
             f"program {name}: substeps is {program.substeps!r}; expected a whole number from 1 to {MAX_SUBSTEPS}"
         )
+    if not (isinstance(program.simulated_step, float | int) and program.simulated_step > 0):
+        raise ProgramError(
+            f"program {name}: simulated_step is {program.simulated_step!r}; expected seconds above 0, or infinity"
+        )
     if not (program.step > 0 and program.duration >= program.step):
         raise ProgramError(
             f"program {name}: step is {program.step} s and duration {program.duration} s; expected 0 < step ≤ duration"

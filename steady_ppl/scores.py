@@ -1,4 +1,4 @@
-"""How log p(y) changes with a parameter, exactly for the linearised program, by Fisher's identity.
+"""How log p(y) changes with a parameter, exactly for a linearised program with one substep a row, by Fisher's identity.
 
 The derivative of log p(y) is the posterior mean of the derivative of the joint log-density (Fisher; Louis 1982). The
 joint is a product of normals, of the channels and of the measurements. With z a standardised deviation, ψ the
@@ -8,6 +8,10 @@ derivative of its mean in standard deviations and χ that of the log standard de
 
 A regression of smoothed residuals on ψ leaves out v and divides by Σψ² instead of the information: it finds 5 to 20 %
 of a missing drag. Scores keep the posterior's dependence, and are divided by what they vary by under the program.
+
+With several substeps a row's mean is that without noise, its standard deviation the mean of the substeps': what a
+parameter does to the noise's way through the row is left out. On a cart with damping · row = 1 the slope in the damping
+is 9.1 where log p(y) has 2.8.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from steady_ppl.program import Program, for_program, names
 from steady_ppl.progress import stages
 from steady_ppl.seeding import seeded
 from steady_ppl.sites import Recording, as_vector, broadcast_event, running
-from steady_ppl.stability import is_step
+from steady_ppl.stability import counts_rows, is_step
 from steady_ppl.substeps import MAX_SUBSTEPS, acting_controls, with_substeps
 
 
@@ -110,7 +110,8 @@ def simulated_in(program: Program, drives: Trajectories, substeps: int | None = 
     if count == program.substeps and substeps is None and not math.isinf(program.simulated_step):
         longest = _usual_step(run)
         if longest / count > 1.001 * program.simulated_step:
-            return f"simulated row by row: transition is no step in `step`, so that rows cannot be cut ({count} a row)"
+            why = "actuators counts rows" if counts_rows(program) else "transition is no step in `step`"
+            return f"simulated row by row: {why}, so that rows cannot be cut ({count} a row)"
     return f"simulated in steps of {1000 * run.median_step / count:.3g} ms, {count} a row"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -17,13 +18,15 @@ from steady_ppl.substeps import MAX_SUBSTEPS, Held, advance, with_substeps, with
 GROWTH = 1.1  # of a deviation over a row, from which it counts
 FINER = 16  # times as many substeps, at which it must not grow nearly as much
 SLOWER = 1000.0  # times, by which rows are moved apart to see whether actuators look at time
+LONG = 1.5  # times the usual step, from which a row's length is told
 SHORTER = 64  # times, by which a step is shortened to see whether its result follows
 STATES, ROWS = 64, 16  # at which a transition is looked at
+COMMANDS = 256  # rows of commands, at which actuators are looked at
 AHEAD = 1600  # substeps that a program moves on to see where it comes: of 100 rows where it takes one
 
 
 @torch.no_grad()
-def divergence(program: Program, data: Trajectories) -> str | None:
+def divergence(program: Program, data: Trajectories, rows: int | None = None) -> str | None:
     """Say that a program's step is unstable, or return None where it is not.
 
     The eigenvalues of a row's derivative in the state are compared with those at `FINER` times as many substeps: where
@@ -33,11 +36,13 @@ def divergence(program: Program, data: Trajectories) -> str | None:
     Args:
         program: any.
         data: as returned by `for_program`.
+        rows: how many of each drive are looked at, from its first; all when None.
     """
-    if not bool(data.transitions.any()):
+    steps = torch.where(data.transitions, data.steps, 0.0)[:rows]
+    if not bool(steps.any()):
         return None
     finer = with_substeps(program, min(MAX_SUBSTEPS, FINER * program.substeps))
-    state, given = _visited(finer, data)
+    state, given = _visited(finer, data, steps)
     own, fine = _eigenvalues(program, state, given), _eigenvalues(finer, state, given)
     if own is None or fine is None:
         return None
@@ -49,12 +54,14 @@ def divergence(program: Program, data: Trajectories) -> str | None:
         return None
     there = once.flatten(0, -2)[worst]
     fastest = there[(there - 1).abs().argmax()]
+    length = float(step.expand(once.shape[:-1]).flatten()[worst])
+    long = f" in a row of {length:.3g} s" if length > LONG * data.median_step else ""
     size = float((1 - fastest).abs()) * program.substeps
     kind = "damping" if float(fastest.imag.abs()) < 0.1 * size else "frequency"
     enough = min(MAX_SUBSTEPS, 2 ** math.ceil(math.log2(max(2.0, 2 * size))))
     return (
-        f"the model itself diverges at this step: {kind} · step = {size:.3g}, with "
-        f"{program.substeps} substep{'s' if program.substeps > 1 else ''} a row; take more (--substeps {enough})"
+        f"the model itself diverges at this step{long}: {kind} · step = {size:.3g}, with {program.substeps} "
+        f"substep{'s' if program.substeps > 1 else ''} a row; take more (fit with --substeps {enough})"
     )
 
 
@@ -77,14 +84,13 @@ def _eigenvalues(program: Program, state: Tensor, given: tuple[Tensor, Tensor, T
     return torch.linalg.eigvals(derivative)
 
 
-def _visited(finer: Program, data: Trajectories) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+def _visited(finer: Program, data: Trajectories, steps: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
     """States that a program comes to, `(STATES, R, 1, D)`, and control, time and step of these rows.
 
     The longest row of all is looked at from the start; the others are of the drive that it belongs to.
     """
-    steps = torch.where(data.transitions, data.steps, 0.0)
     drive = int(steps.amax(0).argmax())
-    rows = torch.where(data.transitions[:, drive])[0][: max(1, AHEAD // finer.substeps)]
+    rows = torch.where(steps[:, drive] > 0)[0][: max(1, AHEAD // finer.substeps)]
     longest = steps[:, drive].argmax().reshape(1)
     states = [_starts(finer, 1)]
     for row in rows[:-1].tolist():
@@ -131,19 +137,44 @@ def is_step(program: Program, data: Trajectories) -> bool:
 def counts_rows(program: Program) -> bool:
     """Return whether `actuators` looks at other rows but not at the time between them.
 
-    A delay that is a number of rows (`control.roll(1, 0)`) is another delay in substeps.
+    A delay that is a number of rows (`control.roll(1, 0)`) is another delay in substeps. Each class that defines
+    `actuators` is looked at, so that a lag on top of such a delay does not hide it.
     """
-    if type(program).actuators is Program.actuators:
+    kinds = [kind for kind in type(program).__mro__ if kind is not Program]
+    methods = [vars(kind)["actuators"] for kind in kinds if "actuators" in vars(kind)]
+    if not methods:
         return False
     like = next(program.parameters(), torch.zeros(()))
     with seeded("commands"):
-        commands = torch.randn(ROWS, 1, len(program.controls)).to(like)
-    times = program.step * torch.arange(ROWS).to(like).unsqueeze(-1)
-    acting = program.actuators(commands, times)
-    if not torch.equal(acting, program.actuators(commands, SLOWER * times)):
-        return False
+        commands = torch.randn(COMMANDS, 1, len(program.controls)).to(like)
+    times = program.step * torch.arange(COMMANDS).to(like).unsqueeze(-1)
     other = torch.cat([commands[:1] + 1.0, commands[1:]])
-    return not torch.equal(acting[1:], program.actuators(other, times)[1:])
+
+    def counts(act: Callable[[Program, Tensor, Tensor], Tensor]) -> bool:
+        acting = act(program, commands, times)
+        if not torch.equal(acting, act(program, commands, SLOWER * times)):
+            return False
+        return not torch.equal(acting[1:], act(program, other, times)[1:])
+
+    return any(counts(method) for method in methods)
+
+
+@torch.no_grad()
+def can_be_cut(program: Program, data: Trajectories) -> bool:
+    """Return whether rows of drives can be taken in substeps; see `require_convergence`.
+
+    Args:
+        program: any.
+        data: as returned by `for_program`.
+    """
+    if not bool(data.transitions.any()):
+        return True
+    state, given = _some(program, data)
+    try:
+        require_convergence(program, state, *given)
+    except ProgramError:
+        return False
+    return True
 
 
 @torch.no_grad()

@@ -20,7 +20,7 @@ from steady_ppl.likelihood_fit import widens
 from steady_ppl.linearization import Path
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.program import Program
-from steady_ppl.stability import counts_rows, is_step
+from steady_ppl.stability import can_be_cut, counts_rows, is_step
 from steady_ppl.substeps import MAX_SUBSTEPS, with_substeps
 
 MIN_GAIN = 3.0  # nats, of all drives together, from which a finer step counts
@@ -144,7 +144,7 @@ class StepCheck:
 
     @property
     def _option(self) -> str:
-        return f"--substeps {self.suited.substeps}"
+        return f"fit with --substeps {self.suited.substeps}"
 
     @property
     def figures(self) -> dict[str, object]:
@@ -222,11 +222,12 @@ def check_step(
         first = trial(own, program, at or find_path(program, data, known_start=known_start), 0)
     if 2 * own > most or counts_rows(program):  # in substeps its delay is another
         return StepCheck((first,), max_shift)
+    trials = [first]
     try:
         look = trial(2 * own, program, first.path, 0)
         allowed = max(min(max_shift, MAX_DECREMENT), UNFITTED * first.decrement)
         moves = look.decrement - first.decrement > allowed
-        if look.reachable < first.reachable + 0.5 * MIN_GAIN and not moves:
+        if (look.reachable < first.reachable + 0.5 * MIN_GAIN and not moves) or not can_be_cut(program, data):
             return StepCheck((first,), max_shift)
         if refits and not isinstance(at, Maximum):
             first = trial(own, program, first.path, REFITS)
@@ -240,8 +241,8 @@ def check_step(
             if not _differs(trials[-2], fine, max_shift) or 2 * fine.substeps > most:
                 break
             trials.append(trial(2 * fine.substeps, fine.program, fine.path, REFITS))
-    except FilterError:  # paths of the coarser step lead nowhere at the finer one: nothing speaks for it
-        return StepCheck((first,), max_shift)
+    except FilterError:  # paths of the coarser step lead nowhere at the finer one: nothing speaks for that one
+        pass
     return StepCheck(tuple(trials), max_shift)
 
 

@@ -15,6 +15,7 @@ import copy
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from numbers import Integral
 from typing import Any
 
 import pyro
@@ -42,13 +43,13 @@ def with_substeps(program: Program, count: int) -> Program:
     if not is_count(count):
         raise UsageError(f"substeps must be a whole number from 1 to {MAX_SUBSTEPS}, got {count!r}")
     changed = copy.deepcopy(program)
-    changed.substeps = count
+    changed.substeps = int(count)
     return changed
 
 
 def is_count(value: object) -> bool:
     """Whether a value can be a number of substeps."""
-    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MAX_SUBSTEPS
+    return isinstance(value, Integral) and not isinstance(value, bool) and 1 <= int(value) <= MAX_SUBSTEPS
 
 
 def row_ends() -> bool:
@@ -204,9 +205,9 @@ def location_and_scale(fn: Any, site: str) -> tuple[Tensor, Tensor]:
 
 
 def standardised(fn: Any, value: Tensor, site: str) -> Tensor:
-    """Return a channel's value in scales from its location."""
+    """Return a channel's value in scales from its location; 0 where it has no noise."""
     loc, scale = location_and_scale(fn, site)
-    return (value - loc) / scale
+    return (value - loc) / torch.where(scale > 0, scale, torch.ones_like(scale))
 
 
 _Part = tuple[Tensor, Tensor, Tensor, bool]

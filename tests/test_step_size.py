@@ -17,6 +17,7 @@ from small import steady
 from torch import tensor
 
 from steady_ppl import (
+    FilterError,
     Fit,
     PlanarVehicle,
     WrappedNormal,
@@ -27,6 +28,7 @@ from steady_ppl import (
     seeded,
     simulate,
     stack,
+    step_size,
     write_table,
 )
 from steady_ppl.step_size import check_step
@@ -94,7 +96,7 @@ def test_a_step_that_is_too_coarse_is_told_by_its_gain(steps_of_turning) -> None
     assert last > 3 and not found.settled
     assert found.sentence == (
         f"the program's own time step is too coarse: 32 substeps a row instead of 1 gain {found.gain:.0f} nats, "
-        f"the last doubling {last:.0f} of them: more substeps may gain more (--substeps 32)"
+        f"the last doubling {last:.0f} of them: more substeps may gain more (fit with --substeps 32)"
     )
     for trial, finer in zip(found.trials[:-1], found.trials[1:], strict=True):
         assert finer.substeps == 2 * trial.substeps
@@ -114,8 +116,22 @@ def test_the_second_order_step_is_fine_enough_for_the_hovercraft_and_explicit_eu
     found = checked(example("paper:PaperHovercraft", torch.float32), table, known_start=True)
     assert found.settled and found.sentence == (
         f"the program's own time step is too coarse: {found.suited.substeps} substeps a row instead of 1 gain "
-        f"{found.gain:.0f} nats (--substeps {found.suited.substeps})"
+        f"{found.gain:.0f} nats (fit with --substeps {found.suited.substeps})"
     )
+
+
+def test_what_a_finer_step_has_gained_is_kept_where_the_next_one_fails(turning, monkeypatch) -> None:
+    maximise = step_size.maximise
+
+    def failing(program, *arguments, **settings):
+        if program.substeps >= 4:
+            raise FilterError("broken")
+        return maximise(program, *arguments, **settings)
+
+    monkeypatch.setattr(step_size, "maximise", failing)
+    found = checked(Turning(), turning)
+    assert [trial.substeps for trial in found.trials] == [1, 2] and not found.settled
+    assert found.gain > 3 and "(fit with --substeps 2)" in found.sentence
 
 
 def test_check_says_the_step_first(turning) -> None:

@@ -39,7 +39,7 @@ from steady_ppl.particles import roll_out
 from steady_ppl.probe import probe
 from steady_ppl.simulation import simulated_substeps
 from steady_ppl.sites import AtMean, Recording, Standardised, running
-from steady_ppl.stability import counts_rows, divergence, is_step
+from steady_ppl.stability import counts_rows, is_step
 from steady_ppl.step_size import check_step
 from steady_ppl.stepping import Stepping
 from steady_ppl.substeps import acting_controls, advance, channel_values, row_controls, sample_channels
@@ -386,48 +386,6 @@ def test_simulated_drives_do_not_depend_on_how_fine_their_steps_are() -> None:
     step = (fine.states - finer.states).abs().max()
     assert step < 1e-3
     assert step < 0.1 * (coarse.states - finer.states).abs().max()
-
-
-class Stiff(type(example("linear_gaussian"))):
-    """Damping of 30 1/s, explicit."""
-
-    def transition(self, state, control, time, step):
-        position, velocity = state.unbind(-1)
-        acceleration = pyro.sample("acceleration", dist.Normal(control[..., 0] - 30.0 * velocity, self.noise))
-        return stack(position + velocity * step, velocity + acceleration * step)
-
-
-def test_a_step_that_is_unstable_is_told_by_its_number() -> None:
-    stiff = Stiff().double()
-    data = for_program(stiff, simulate(stiff, 2, seed=1))
-    said = divergence(stiff, data)
-    assert said == (
-        "the model itself diverges at this step: damping · step = 3, with 1 substep a row; take more (--substeps 8)"
-    )
-    assert divergence(with_substeps(stiff, 8), data) is None
-    assert divergence(example("pendulum"), for_program(example("pendulum"), simulate(example("pendulum"), 2))) is None
-
-
-class Dragged(type(example("linear_gaussian"))):
-    """At rest to begin with; its drag is too stiff for a row at speed alone."""
-
-    def initial(self):
-        return pyro.sample("start", dist.Normal(torch.zeros(2).double(), 1e-3).to_event(1))
-
-    def transition(self, state, control, time, step):
-        position, velocity = state.unbind(-1)
-        mean = control[..., 0] - 400.0 * velocity * velocity.abs()
-        acceleration = pyro.sample("acceleration", dist.Normal(mean, self.noise))
-        return stack(position + velocity * step, velocity + acceleration * step)
-
-
-def test_a_step_that_is_unstable_at_speed_alone_is_told_too() -> None:
-    """Damping 2 · 400 · v at v = √(1 / 400) under a push of 1 N: 40 1/s, 4 in a row of .1 s."""
-    dragged = Dragged().double()
-    data = for_program(dragged, simulate(dragged, 2, seed=1, substeps=32))
-    said = divergence(dragged, data)
-    assert said is not None and 3 < float(said.partition("damping · step = ")[2].partition(",")[0]) < 5
-    assert divergence(with_substeps(dragged, 16), data) is None
 
 
 def test_a_run_remembers_its_substeps(tmp_path) -> None:
