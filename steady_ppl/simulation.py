@@ -112,7 +112,11 @@ def simulated_in(program: Program, drives: Trajectories, substeps: int | None = 
         if longest / count > 1.001 * program.simulated_step:
             why = "actuators counts rows" if counts_rows(program) else "transition is no step in `step`"
             return f"simulated row by row: {why}, so that rows cannot be cut ({count} a row)"
-    return f"simulated in steps of {1000 * run.median_step / count:.3g} ms, {count} a row"
+    said = f"simulated in steps of {1000 * run.median_step / count:.3g} ms, {count} a row"
+    pause = float(run.steps[run.transitions].max())
+    if pause > 2 * max(run.median_step, count * program.simulated_step):
+        said += f", but those of the longest row ({pause:.3g} s) of {1000 * pause / count:.3g} ms"
+    return said
 
 
 def _usual_step(data: Trajectories) -> float:

@@ -37,7 +37,7 @@ from steady_ppl.gaussian_smoother import find_path, smooth
 from steady_ppl.linearization import linearize
 from steady_ppl.particles import roll_out
 from steady_ppl.probe import probe
-from steady_ppl.simulation import simulated_substeps
+from steady_ppl.simulation import simulated_in, simulated_substeps
 from steady_ppl.sites import AtMean, Recording, Standardised, running
 from steady_ppl.stability import counts_rows, is_step
 from steady_ppl.step_size import check_step
@@ -438,6 +438,11 @@ def test_a_pause_in_a_log_does_not_make_every_row_fine(tmp_path) -> None:
     late[50:] += 5.0
     paused = for_program(program, replace(data, time=late))
     assert simulated_substeps(program, paused) == simulated_substeps(program, for_program(program, data)) == 20
+    said = "simulated in steps of 5 ms, 20 a row"
+    assert simulated_in(program, data) == said
+    assert simulated_in(program, replace(data, time=late)) == (
+        f"{said}, but those of the longest row (5.1 s) of 255 ms"
+    )
 
 
 @pytest.mark.parametrize("given", ["0", "-2", "1.5", "two"])
