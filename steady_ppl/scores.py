@@ -1,4 +1,4 @@
-"""How log p(y) changes with a parameter, exactly for a linearised program with one substep a row, by Fisher's identity.
+"""How log p(y) changes with a parameter, exactly for the linearised program, by Fisher's identity.
 
 The derivative of log p(y) is the posterior mean of the derivative of the joint log-density (Fisher; Louis 1982). The
 joint is a product of normals, of the channels and of the measurements. With z a standardised deviation, ψ the
@@ -9,13 +9,15 @@ derivative of its mean in standard deviations and χ that of the log standard de
 A regression of smoothed residuals on ψ leaves out v and divides by Σψ² instead of the information: it finds 5 to 20 %
 of a missing drag. Scores keep the posterior's dependence, and are divided by what they vary by under the program.
 
-With several substeps a row's mean is that without noise, its standard deviation the mean of the substeps': what a
-parameter does to the noise's way through the row is left out. On a cart with damping · row = 1 the slope in the damping
-is 9.1 where log p(y) has 2.8.
+With several substeps a parameter also changes the noise's way through a row, which no moment of the channels holds.
+There the joint is that of the noise alone, and a row's end x' moves with the parameter. With β(x') the likelihood of
+the measurements from x' on, the score is the sum of E[∇ log β(x') · ∂x'/∂θ], the noise held. Effects' columns in a
+search do not go so far: they are pushes on the channels, whose scores simulated sets calibrate.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import pyro.distributions as dist
@@ -25,9 +27,10 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.elements import Element, moved
 from steady_ppl.lookahead import Lookahead
+from steady_ppl.planar_vehicle import wrap
 from steady_ppl.program import Program
-from steady_ppl.sites import AtMean, Recording, as_vector, normal_moments, residual, running, unwrapped
-from steady_ppl.substeps import acting_controls, sample_channels
+from steady_ppl.sites import AtMean, Recording, Standardised, as_vector, normal_moments, residual, running, unwrapped
+from steady_ppl.substeps import acting_controls, advance, sample_channels
 
 Moments = tuple[Tensor, Tensor]
 
@@ -88,6 +91,7 @@ class Smoothed:
         measurements: deviations of `(T + 1, B, K)` measurements.
         sharpness: one over the standard deviations by which these are standardised, `(T + 1, B, K)`; those of the
             normal that touches a Student t.
+        ahead: of which these are the moments.
     """
 
     states: Tensor
@@ -95,6 +99,69 @@ class Smoothed:
     lag: Tensor
     measurements: Deviations
     sharpness: Tensor
+    ahead: Lookahead
+
+
+@dataclass(frozen=True)
+class Arrivals:
+    """The posterior of ∇ log β(x'), of the measurements from the end of each row on.
+
+    Attributes:
+        mean, scale: of each component, in standard deviations and their size, `(T, B, D)`.
+        states, noise: posterior means and these ± their covariance with each component in standard deviations,
+            `(1 + 2 D, T, B, D)` and `(1 + 2 D, T, B, C)`.
+        angles: components of the state that are angles.
+        present: `(T, B)` bool.
+    """
+
+    mean: Tensor
+    scale: Tensor
+    states: Tensor
+    noise: Tensor
+    angles: tuple[int, ...]
+    present: Tensor
+
+    def ends(self, program: Program, data: Trajectories) -> Tensor:
+        """Where rows end from these states with this noise, `(1 + 2 D, T, B, D)`."""
+        controls = acting_controls(program, data)[:-1]
+        with running(*self.states.shape[:-1]), Standardised(self.noise):
+            return advance(program, self.states, controls, data.elapsed[:-1], data.steps).double()
+
+    def score(self, change: Tensor) -> Tensor:
+        """Of a change of where rows end, `(1 + 2 D, T, B, D)`; `(B,)`."""
+        count = self.mean.shape[-1]
+        change = change.clone()
+        change[..., self.angles] = wrap(change[..., self.angles])
+        apart = (change[1 : 1 + count] - change[1 + count :]).diagonal(dim1=0, dim2=-1) / 2
+        by_row = (self.scale * (self.mean * change[0] + apart)).sum(-1)
+        return torch.where(self.present, by_row, 0.0).sum(0)
+
+
+def arrivals(ahead: Lookahead, data: Trajectories) -> Arrivals:
+    """What a push on the end of each row is worth."""
+    linear = ahead.linearization
+    states, noise = ahead.means()
+    covariance, every, sway = ahead.covariances()
+    weighted = linear.measurement * linear.precision.unsqueeze(-1)
+    precision = (ahead.precision + weighted.mT @ linear.measurement)[1:]
+    information = (ahead.information + (weighted.mT @ linear.residual.unsqueeze(-1)).squeeze(-1))[1:]
+    away = (states - linear.path.states)[1:].unsqueeze(-1)
+    with_state = linear.state @ covariance[:-1] + linear.noise @ sway.mT  # covariances of the end of a row
+    with_noise = linear.state @ sway + linear.noise @ every
+    of_end = linear.state @ with_state.mT + linear.noise @ with_noise.mT
+    scale = (precision @ of_end @ precision).diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+    per = torch.where(scale > 0, 1 / scale, 0.0)
+    by_state, by_noise = (-(per.unsqueeze(-1) * (precision @ part)).movedim(-2, 0) for part in (with_state, with_noise))
+    kind = data.controls.dtype
+    begin = torch.where(data.rows.unsqueeze(-1), states, states[:1])[:-1]
+    return Arrivals(
+        mean=per * (information - (precision @ away).squeeze(-1)),
+        scale=scale,
+        states=by_component(torch.cat([begin.unsqueeze(0), begin + by_state, begin - by_state]).to(kind)),
+        noise=by_component(torch.cat([noise.unsqueeze(0), noise + by_noise, noise - by_noise]).to(kind)),
+        angles=linear.angles,
+        present=data.transitions,
+    )
 
 
 def smoothed(ahead: Lookahead, data: Trajectories) -> Smoothed:
@@ -129,6 +196,7 @@ def smoothed(ahead: Lookahead, data: Trajectories) -> Smoothed:
             present=linear.precision > 0,
         ),
         sharpness=by_component(weight.to(kind)),
+        ahead=ahead,
     )
 
 
@@ -230,18 +298,15 @@ def parameter_scores(program: Program, data: Trajectories, at: Smoothed, parts: 
     """Scores of a program's own parameters, `(B, P)`."""
     if not parts:
         return at.states.new_zeros((len(data), 0)).double()
-    _, spread = channel_moments(program, data, at.channels.points[:1])
+    score_of_moves = _of_channels(program, data, at) if program.substeps == 1 else _of_ends(program, data, at)
     columns = []
     for part in parts:
         width = 2 * part.step
+        score = score_of_moves(part)
         with moved(part, part.step):
-            mean_up, spread_up = channel_moments(program, data, at.channels.points)
             a_few_up = measured(program, at.measurements.points[:1])
         with moved(part, -part.step):
-            mean_down, spread_down = channel_moments(program, data, at.channels.points)
             a_few_down = measured(program, at.measurements.points[:1])
-        score = at.channels.of_mean((mean_up - mean_down) / (width * spread))
-        score = score + at.channels.of_spread((spread_up[0] / spread_down[0]).log() / width)
         if not a_few_up.same(a_few_down):
             here = measured(program, at.measurements.points)
             with moved(part, part.step):
@@ -253,6 +318,35 @@ def parameter_scores(program: Program, data: Trajectories, at: Smoothed, parts: 
             score = score + (_of_tails(here, up, at) - _of_tails(here, down, at)) / width
         columns.append(score)
     return torch.stack(columns, -1).double()
+
+
+def _of_channels(program: Program, data: Trajectories, at: Smoothed) -> Callable[[Element], Tensor]:
+    """How a parameter's part in the channels' moments is scored, `(B,)`."""
+    _, spread = channel_moments(program, data, at.channels.points[:1])
+
+    def score(part: Element) -> Tensor:
+        with moved(part, part.step):
+            mean_up, spread_up = channel_moments(program, data, at.channels.points)
+        with moved(part, -part.step):
+            mean_down, spread_down = channel_moments(program, data, at.channels.points)
+        of_mean = at.channels.of_mean((mean_up - mean_down) / (2 * part.step * spread))
+        return of_mean + at.channels.of_spread((spread_up[0] / spread_down[0]).log() / (2 * part.step))
+
+    return score
+
+
+def _of_ends(program: Program, data: Trajectories, at: Smoothed) -> Callable[[Element], Tensor]:
+    """How a parameter's part in where rows end is scored, `(B,)`."""
+    arriving = arrivals(at.ahead, data)
+
+    def score(part: Element) -> Tensor:
+        with moved(part, part.step):
+            up = arriving.ends(program, data)
+        with moved(part, -part.step):
+            down = arriving.ends(program, data)
+        return arriving.score(up - down) / (2 * part.step)
+
+    return score
 
 
 def _of_tails(here: Measured, other: Measured, at: Smoothed) -> Tensor:

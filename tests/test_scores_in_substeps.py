@@ -1,0 +1,60 @@
+"""With several substeps the score is the slope of log p(y), where responses are fast beside a row too."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from examples import example
+
+from steady_ppl import fit_by_likelihood, for_program, seeded, simulate, with_substeps
+from steady_ppl.elements import elements, moved
+from steady_ppl.gaussian_smoother import find_path, means_as_path, smooth
+from steady_ppl.scores import parameter_scores, smoothed
+
+Cart = type(example("linear_gaussian"))
+
+
+def fast(damping, substeps, noise=3.0):
+    """A cart that follows its push within a row or less."""
+    cart = Cart().double()
+    for name, value in (("damping", damping), ("gain", damping), ("noise", noise)):
+        setattr(cart, name, torch.tensor(value).double())
+    return with_substeps(cart, substeps)
+
+
+def log_likelihood(program, data, path):
+    found = smooth(program, data, path, passes=20, tolerance=1e-7, kernels=False)
+    return float(found.log_likelihood.sum())
+
+
+@pytest.mark.parametrize(("damping", "substeps"), [(0.8, 1), (0.8, 4), (10.0, 16), (30.0, 32)])
+def test_scores_are_slopes(damping, substeps) -> None:
+    data = for_program(Cart().double(), simulate(fast(damping, substeps), 6, seed=1, substeps=substeps)).without_truth()
+    program = fast(1.2 * damping, substeps, noise=2.0)
+    with seeded(0, "path"):
+        path = find_path(program, data)
+    ahead = smooth(program, data, path, passes=20, tolerance=1e-7, kernels=False)
+    parts, path = elements(program), means_as_path(ahead, data)
+    scores = parameter_scores(program, data, smoothed(ahead, data), parts).sum(0)
+    assert [part.name for part in parts] == ["gain", "damping", "noise", "measurement_sd"]
+    for part, score in zip(parts, scores.tolist(), strict=True):
+        ends = []
+        for sign in (1, -1):
+            with moved(part, 0.1 * sign * part.step):
+                ends.append(log_likelihood(program, data, path))
+        assert score == pytest.approx((ends[0] - ends[1]) / (0.2 * part.step), rel=2e-3, abs=0.1)
+
+
+def test_a_fit_that_calls_itself_converged_is_at_the_maximum() -> None:
+    """Noise held 30 % too small: what the mean alone says of the damping leads elsewhere."""
+    data = for_program(Cart().double(), simulate(fast(30.0, 32), 12, seed=1, substeps=32)).without_truth()
+    program = fast(25.0, 32, noise=2.1)
+    program.noise_unconstrained.requires_grad_(False)
+    with seeded(0, "path"):
+        maximum = fit_by_likelihood(program, data)
+    assert maximum.converged
+    best = log_likelihood(program, data, maximum.path)
+    for part in elements(program):
+        for sign in (1, -1):
+            with moved(part, 4 * sign * part.step):
+                assert log_likelihood(program, data, maximum.path) < best + 0.1
