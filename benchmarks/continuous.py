@@ -366,7 +366,9 @@ def alarms_table(records: Sequence[Record]) -> list[str]:
     by_group = {name: [one for one in records if one["group"] == name] for name in GROUPS}
     rows = [(name, own) for name, own in by_group.items() if own]
     whole = [one for one in records if not one["group"].startswith("rough")]
-    for name, own in [*rows, *([("all", whole)] if whole else [])]:
+    hovercraft = [one for one in whole if one["group"].startswith("hovercraft")]
+    together = [("hovercraft together", hovercraft), ("all", whole)]
+    for name, own in [*rows, *(row for row in together if row[1])]:
         alarms = [one["verdict"] != "none" for one in own]
         low, high = exact_interval(sum(alarms), len(alarms))
         named = Counter(one["effect"] or one["verdict"] for one in own if one["verdict"] != "none")
