@@ -17,7 +17,7 @@ from torch import Tensor
 from steady_ppl.actuation import lagged
 from steady_ppl.data import Trajectories
 from steady_ppl.linearization import Path
-from steady_ppl.planar_vehicle import wrap
+from steady_ppl.planar_vehicle import wrap, wrap_angles
 from steady_ppl.predictions import errors, on_a_circle
 from steady_ppl.program import Program, names, units
 from steady_ppl.sites import AtMean, running
@@ -106,7 +106,7 @@ def _parameters(program: Program, data: Trajectories, path: Path, scores: _Score
             moved_less, measured_less = run()
         finally:
             flat[index] = before
-        push = _on_circle(moved.double() - moved_less.double(), scores.linear.angles) / (2 * size)
+        push = wrap_angles(moved.double() - moved_less.double(), scores.linear.angles) / (2 * size)
         shift = torch.where(data.observed, measured.double() - measured_less.double(), 0.0) / (2 * size)
         score = scores.push(push) + scores.shift(shift)
         if bool((score != 0).any()):
@@ -120,7 +120,7 @@ def _sensor(program: Program, data: Trajectories, path: Path, scores: _Scores) -
     predicted = torch.where(data.observed, data.measurements, 0.0).double() - scores.linear.residual
     predicted = torch.where(on_a_circle(program, data, path.states), wrap(predicted), predicted)
     step = data.steps.double().clamp(min=1e-9).unsqueeze(-1)
-    velocity = _on_circle((path.states[1:] - path.states[:-1]).double(), scores.linear.angles) / step
+    velocity = wrap_angles((path.states[1:] - path.states[:-1]).double(), scores.linear.angles) / step
     late = torch.cat([velocity[:1], velocity]).unsqueeze(-2)
     late = torch.where(data.rows[..., None], -(scores.linear.measurement * late).sum(-1), 0.0)
     for word, change in (("offset", unity), ("scale", predicted), ("delay", late)):
@@ -233,7 +233,7 @@ def _answer(
     change = torch.zeros_like(controls)
     change[..., index :: len(program.controls)] = size  # in every substep
     more, less = (_moved(program, data, path, controls + sign * change).double() for sign in (1, -1))
-    answer = _on_circle(more - less, angles) / (2 * size)
+    answer = wrap_angles(more - less, angles) / (2 * size)
     answer = torch.where(data.transitions[..., None], answer, 0.0)
     return answer if bool((answer.abs() > 1e-9).any()) else None
 
@@ -243,9 +243,3 @@ def _moved(program: Program, data: Trajectories, path: Path, controls: Tensor) -
     states = path.states[:-1]
     with running(*states.shape[:-1]), AtMean():
         return advance(program, states, controls[:-1], data.elapsed[:-1], data.steps)
-
-
-def _on_circle(difference: Tensor, angles: tuple[int, ...]) -> Tensor:
-    for angle in angles:
-        difference[..., angle] = wrap(difference[..., angle])
-    return difference

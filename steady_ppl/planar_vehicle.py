@@ -174,6 +174,14 @@ def wrap(angle: Tensor) -> Tensor:
     return angle - 2 * math.pi * (angle / (2 * math.pi)).round()
 
 
+def wrap_angles(difference: Tensor, angles: Sequence[int]) -> Tensor:
+    """A difference of states `(..., D)`, its angles, named by their index, in [−π, π]."""
+    difference = difference.clone()
+    for angle in angles:
+        difference[..., angle] = wrap(difference[..., angle])
+    return difference
+
+
 class WrappedNormal(dist.Normal):
     """Normal(0, scale) on the difference of two angles, wrapped to [−π, π].
 

@@ -27,7 +27,7 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.elements import Element, moved
 from steady_ppl.lookahead import Lookahead
-from steady_ppl.planar_vehicle import wrap
+from steady_ppl.planar_vehicle import wrap_angles
 from steady_ppl.program import Program
 from steady_ppl.sites import AtMean, Recording, Standardised, as_vector, normal_moments, residual, running, unwrapped
 from steady_ppl.substeps import acting_controls, advance, sample_channels
@@ -130,8 +130,7 @@ class Arrivals:
     def score(self, change: Tensor) -> Tensor:
         """Of a change of where rows end, `(1 + 2 D, T, B, D)`; `(B,)`."""
         count = self.mean.shape[-1]
-        change = change.clone()
-        change[..., self.angles] = wrap(change[..., self.angles])
+        change = wrap_angles(change, self.angles)
         apart = (change[1 : 1 + count] - change[1 + count :]).diagonal(dim1=0, dim2=-1) / 2
         by_row = (self.scale * (self.mean * change[0] + apart)).sum(-1)
         return torch.where(self.present, by_row, 0.0).sum(0)

@@ -18,7 +18,7 @@ from steady_ppl.substeps import MAX_SUBSTEPS, Held, advance, with_substeps, with
 GROWTH = 1.1  # of a deviation over a row, from which it counts
 FINER = 16  # times as many substeps, at which it must not grow nearly as much
 SLOWER = 1000.0  # times, by which rows are moved apart to see whether actuators look at time
-LONG = 1.5  # times the usual step, from which a row's length is told
+LONG = 1.5  # times the usual step, from which the message names a row's length
 SHORTER = 64  # times, by which a step is shortened to see whether its result follows
 STATES, ROWS = 64, 16  # at which a transition is looked at
 COMMANDS = 256  # rows of commands, at which actuators are looked at
