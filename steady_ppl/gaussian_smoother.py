@@ -33,7 +33,8 @@ from steady_ppl.sites import (
 from steady_ppl.stability import divergence
 from steady_ppl.substeps import acting_controls, sample_channels
 
-WORSE = 10.0  # nats
+WORSE = 10.0  # nats by which a step may leave a path less likely: steps that do sometimes lead out of a bad place
+RESTS = 0.05  # standard deviations of a channel by which no noise of a trajectory at rest moves
 
 
 @torch.no_grad()
@@ -50,7 +51,7 @@ def smooth(
 ) -> Lookahead:
     """Move a path to the mode of the posterior and look ahead along it.
 
-    A step after which the measurements are less likely by more than `WORSE` nats is halved.
+    Gauss and Newton's method. A step is halved as long as its end costs more by `WORSE` nats, see `_cost`.
 
     Args:
         program: with normal noise; see `linearize`.
@@ -73,22 +74,52 @@ def smooth(
             )
         )
 
-    accepted, likely = path, torch.full((len(data),), -torch.inf, dtype=torch.float64, device=path.states.device)
+    accepted, penalty = path, torch.zeros_like(path.states[1:], dtype=torch.float64)
+    cost = torch.full((len(data),), torch.inf, dtype=torch.float64, device=path.states.device)
     for index in range(passes):
         ahead = look(path)
-        worse = ~(ahead.log_likelihood >= likely - WORSE)  # or not a number
-        worse &= torch.isfinite(likely)
+        worse = ~(_cost(ahead, penalty) <= cost + WORSE)  # or not a number
+        worse &= torch.isfinite(cost)
         accepted = _either(worse, accepted, path)
         if index == passes - 1:
             break
         halfway = Path((accepted.states + path.states) / 2, (accepted.noise + path.noise) / 2)
         moved = _either(worse, halfway, means_as_path(ahead, data))
         change = torch.nan_to_num((moved.noise - path.noise).abs(), nan=0.0).max()  # of those that have not blown up
-        likely = torch.where(worse, likely - WORSE, ahead.log_likelihood)  # less each time: it may have been a fluke
+        penalty = torch.where(worse[:, None], penalty, _multipliers(ahead, moved))
+        cost = torch.where(worse, cost, _cost(ahead, penalty))
         path = moved
         if not bool(change > tolerance):
             break
     return look(accepted) if bool(worse.any()) else ahead
+
+
+def _cost(ahead: Lookahead, penalty: Tensor) -> Tensor:
+    """What a path costs, `(B,)` nats, less the linearised program's log p(y) along it.
+
+    The first is the path's own negative log-density. States that do not follow from its noise cost `penalty`,
+    `(T, B, D)` for each unit: above the multipliers of those constraints the penalty is exact (Nocedal and Wright 2006,
+    chapter 17). The second keeps paths off beacons: the likeliest one may lead through, where nothing is linear.
+    """
+    linear = ahead.linearization
+    noise = linear.path.noise.double()
+    defect = linear.offset + (linear.noise @ noise.unsqueeze(-1)).squeeze(-1)
+    gram = linear.start_noise.mT @ linear.start_noise
+    ridge = 1e-9 * torch.eye(gram.shape[-1]).to(gram)
+    start, _ = torch.linalg.solve_ex(gram + ridge, linear.start_noise.mT @ linear.start_offset.unsqueeze(-1))
+    seen = 0.5 * (linear.precision * linear.residual.square()).sum((0, 2)) - linear.log_scale.sum(0)
+    moved = 0.5 * noise.square().sum((0, 2)) + (penalty * defect.abs()).sum((0, 2))
+    return seen + moved + 0.5 * start.square().sum((1, 2)) - ahead.log_likelihood
+
+
+def _multipliers(ahead: Lookahead, moved: Path) -> Tensor:
+    """Twice the pull of a row's measurements and of the later ones at its state after a step, `(T, B, D)`."""
+    linear = ahead.linearization
+    away = (moved.states - linear.path.states)[1:].double().unsqueeze(-1)
+    apart = linear.residual[1:].unsqueeze(-1) - linear.measurement[1:] @ away
+    now = linear.measurement[1:].mT @ (linear.precision[1:].unsqueeze(-1) * apart)
+    later = ahead.information[1:].unsqueeze(-1) - ahead.precision[1:] @ away
+    return 2 * (now + later).squeeze(-1).abs()
 
 
 def _either(which: Tensor, one: Path, other: Path) -> Path:
@@ -143,6 +174,14 @@ def means_as_path(ahead: Lookahead, data: Trajectories) -> Path:
         states=torch.where(data.rows[..., None], states, states[:1]).to(kind),
         noise=torch.where(data.transitions[..., None], noise, 0.0).to(kind),
     )
+
+
+def resting_path(ahead: Lookahead, data: Trajectories) -> Path:
+    """`means_as_path` to go on from; what has not come to rest stays where it was linearised: how likely it is a step
+    further is not known."""
+    means, path = means_as_path(ahead, data), ahead.linearization.path
+    far = ~((means.noise - path.noise).abs().amax((0, 2)) <= RESTS)
+    return _either(far, path, means)
 
 
 @torch.no_grad()

@@ -13,7 +13,7 @@ import torch
 
 from steady_ppl.data import Trajectories
 from steady_ppl.elements import Element, elements, moved
-from steady_ppl.gaussian_smoother import find_path, means_as_path, smooth
+from steady_ppl.gaussian_smoother import find_path, resting_path, smooth
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.maximum_likelihood import Maximum, maximise
@@ -66,7 +66,7 @@ def led_back(program: Program, data: Trajectories, maximum: Maximum, known_start
         if not bool(better.any()):
             break
         states, noise = maximum.path.states.clone(), maximum.path.noise.clone()
-        found = means_as_path(there, part)
+        found = resting_path(there, part)
         states[:, strays[better]], noise[:, strays[better]] = found.states[:, better], found.noise[:, better]
         before = maximum.gained - maximum.objective
         maximum = maximise(program, data, Path(states, noise), known_start=known_start)

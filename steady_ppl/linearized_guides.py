@@ -9,7 +9,7 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import FilterError, require
-from steady_ppl.gaussian_smoother import find_and_try, means_as_path, require_found, smooth, smoother_paths
+from steady_ppl.gaussian_smoother import find_and_try, require_found, resting_path, smooth, smoother_paths
 from steady_ppl.guides import FilteringGuide, PathGuide
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
@@ -67,7 +67,7 @@ class LinearizedGuide(PathGuide):
             self.counts["searches_failed"] = 1
         if lost or due:
             ahead = self._smooth(data, progress)
-        self.remember(means_as_path(ahead, data), data)
+        self.remember(resting_path(ahead, data), data)
         self.in_plain_torch = ahead.linearization.in_plain_torch
         return ahead
 
@@ -84,7 +84,7 @@ class LinearizedGuide(PathGuide):
         ahead = find_and_try(self.program, part, known_start=self.known_start, observation_weight=weight)
         if known is None:
             require_found(ahead, self.program, part)
-        found = means_as_path(ahead, part)
+        found = resting_path(ahead, part)
         better = ahead.log_likelihood > (-torch.inf if known is None else known[trajectories])  # not where it is a nan
         kept = better.nonzero().flatten().tolist()
         if kept:

@@ -16,7 +16,7 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.elements import Element, elements, moved, set_values, values_of
 from steady_ppl.errors import FilterError
-from steady_ppl.gaussian_smoother import find_path, means_as_path, require_found, smooth
+from steady_ppl.gaussian_smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.journal import Piece, piece
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
@@ -200,7 +200,7 @@ def _look(
     prior, slope = _prior(program, parts)
     return _Here(
         ahead=ahead,
-        path=means_as_path(ahead, data),
+        path=resting_path(ahead, data),
         scores=scores,
         gradient=scores.sum(0) + slope,
         objective=float(ahead.log_likelihood.sum()) + prior,

@@ -15,7 +15,7 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.elements import elements, values_of
 from steady_ppl.errors import FilterError, UsageError
-from steady_ppl.gaussian_smoother import find_path, means_as_path, require_found, smooth
+from steady_ppl.gaussian_smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.likelihood_fit import widens
 from steady_ppl.linearization import Path
 from steady_ppl.maximum_likelihood import Maximum, maximise
@@ -210,7 +210,7 @@ def check_step(
         if not refits:
             ahead = smooth(changed, data, path, known_start=known_start, kernels=False)
             require_found(ahead, changed, data)
-            return StepTrial(substeps, float(ahead.log_likelihood.sum()), 0.0, changed, means_as_path(ahead, data))
+            return StepTrial(substeps, float(ahead.log_likelihood.sum()), 0.0, changed, resting_path(ahead, data))
         maximum = maximise(changed, data, path, known_start=known_start, steps=steps, precision=PRECISION)
         return _trial(changed, maximum, names)
 

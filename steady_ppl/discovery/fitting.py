@@ -19,7 +19,7 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.filtering import neglected
-from steady_ppl.gaussian_smoother import find_path, means_as_path, require_found, smooth
+from steady_ppl.gaussian_smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.linearization import Path
 from steady_ppl.linearized_guides import LookaheadGuide
 from steady_ppl.lookahead import Lookahead
@@ -90,7 +90,7 @@ class ByLikelihood:
 
     def judge(self, program: Program, drives: Trajectories, path: Path, *, known_start: bool) -> Judged:
         ahead = _at_rest(program, drives, path, known_start)
-        return Judged(ahead.log_likelihood, means_as_path(ahead, drives))
+        return Judged(ahead.log_likelihood, resting_path(ahead, drives))
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class ByDraws:
         ahead = _at_rest(program, drives, path, known_start)
         with seeded(0, "judge"):
             more = neglected(program, drives, known_start=known_start, particles=JUDGING, ahead=ahead)
-        return Judged(ahead.log_likelihood + more, means_as_path(ahead, drives))
+        return Judged(ahead.log_likelihood + more, resting_path(ahead, drives))
 
 
 def is_doubtful(program: Program, drives: Trajectories, path: Path, known_start: bool) -> bool:
