@@ -4,15 +4,16 @@ A vehicle moves in continuous time, a program in steps of `transition`. With `su
 of a K-th of its time. The first one samples the channels; the others reuse its standardised noise, so that a row still
 has one latent draw a channel. Effects, actuators and user code act in every substep. K = 1 is the program itself.
 
-A row's channel is what it is on average over the substeps: its site is scored under the mean and the standard
-deviation of the row's substeps without noise. What a density counts therefore is the noise of the whole row, and its
-slope in a parameter that of the whole row's mean.
+A row's channel is what it is on average over the substeps. Its site is scored under the mean of a row without noise,
+and under what one standard deviation of its own noise, held over the row, changes of that mean: a program that takes
+back what noise did leaves less of it at the end of the row. So a slope in a parameter is that of the row's end, exact
+where the channel's mean is linear in the noise and no other channel's noise moves it.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from numbers import Integral
@@ -28,7 +29,7 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import ProgramError, UsageError
 from steady_ppl.program import Program
-from steady_ppl.sites import Recording, unwrapped
+from steady_ppl.sites import Recording, as_vector, unwrapped
 
 MAX_SUBSTEPS = 1000  # of a row
 _ROW_ENDS: ContextVar[bool] = ContextVar("row ends", default=True)
@@ -124,6 +125,22 @@ def channel_values(
         loc, scale = location_and_scale(fn, site)
         found[site] = loc + scale * noise[site]
     return found
+
+
+def channel_scales(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
+    """Return what channels vary by within a substep, on average over a row without noise, `(..., C)`.
+
+    A push of this size, held over a row, moves its end as one standard deviation of noise does. Arguments are those of
+    `advance`.
+    """
+    found = []
+    for part in _parts(program, control, time, step):
+        seen = Recording()
+        with poutine.block(), seen, Held(0.0), _at(part) as given:
+            state = program.transition(state, *given)
+        scales = [as_vector(location_and_scale(fn, site)[1], fn.event_dim) for site, fn in seen.distributions.items()]
+        found.append(torch.cat([scale.expand(*state.shape[:-1], -1) for scale in scales], -1))
+    return sum(found[1:], found[0]) / len(found)
 
 
 def acting_controls(program: Program, data: Trajectories) -> Tensor:
@@ -246,23 +263,41 @@ def _sample(program: Program, state: Tensor, control: Tensor, time: Tensor, step
 
 
 def _on_average(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> dict[str, Any]:
-    """Site → its distribution on average over a row that moves without noise."""
-    met: dict[str, list[Any]] = {}
+    """Site → the distribution of its average over a row; with one substep its own."""
+    given = state, control, time, step
+    if program.substeps == 1:
+        seen = Recording()
+        with poutine.block(), seen, Held(0.0):
+            program.transition(*given)
+        return seen.distributions
+    still, kinds = _averages(program, *given, 0.0)
+    zero = {site: torch.zeros_like(value) for site, value in still.items()}
+    found = {}
+    for site, loc in still.items():
+        scales = []
+        for index in range(kinds[site].event_shape.numel()):
+            unit = zero[site].clone()
+            unit[..., index if kinds[site].event_dim else ...] = 1.0
+            pushed, _ = _averages(program, *given, zero | {site: unit})
+            scales.append((pushed[site] - loc)[..., index if kinds[site].event_dim else ...].abs())
+        scale = torch.stack(scales, -1) if kinds[site].event_dim else scales[0]
+        base = unwrapped(kinds[site])
+        freedom = (base.df,) if isinstance(base, dist.StudentT) else ()
+        found[site] = type(base)(*freedom, loc, scale).to_event(kinds[site].event_dim)
+    return found
+
+
+def _averages(
+    program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor, noise: Mapping[str, Tensor] | float
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """What channels are on average over a row with given noise in scales, and their distributions in its first part."""
+    kinds: dict[str, Any] = {}
+    met: dict[str, list[Tensor]] = {}
     for part in _parts(program, control, time, step):
         seen = Recording()
-        with poutine.block(), seen, Held(0.0), _at(part) as given:
+        with poutine.block(), seen, Held(noise), _at(part) as given:
             state = program.transition(state, *given)
-        for site, fn in seen.distributions.items():
-            met.setdefault(site, []).append(fn)
-    return {site: _average(fns, site) for site, fns in met.items()}
-
-
-def _average(fns: Sequence[Any], site: str) -> Any:
-    """The distribution with the mean location and the mean scale of several of one kind."""
-    if len(fns) == 1:
-        return fns[0]
-    moments = [location_and_scale(fn, site) for fn in fns]
-    loc, scale = (sum(parts[1:], parts[0]) / len(parts) for parts in zip(*moments, strict=True))
-    base = unwrapped(fns[0])
-    freedom = (base.df,) if isinstance(base, dist.StudentT) else ()
-    return type(base)(*freedom, loc, scale).to_event(fns[0].event_dim)
+        kinds = kinds or seen.distributions
+        for site, value in seen.values.items():
+            met.setdefault(site, []).append(value)
+    return {site: sum(values[1:], values[0]) / len(values) for site, values in met.items()}, kinds

@@ -5,10 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 from examples import example
+from test_substeps import joint_density
 
 from steady_ppl import fit_by_likelihood, for_program, seeded, simulate, with_substeps
 from steady_ppl.elements import elements, moved
-from steady_ppl.gaussian_smoother import find_path, means_as_path, smooth
+from steady_ppl.gaussian_smoother import find_path, means_as_path, smooth, smoother_paths
 from steady_ppl.scores import parameter_scores, smoothed
 
 Cart = type(example("linear_gaussian"))
@@ -58,3 +59,23 @@ def test_a_fit_that_calls_itself_converged_is_at_the_maximum() -> None:
         for sign in (1, -1):
             with moved(part, 4 * sign * part.step):
                 assert log_likelihood(program, data, maximum.path) < best + 0.1
+
+
+@pytest.mark.parametrize(("damping", "substeps"), [(0.8, 4), (3.0, 8), (10.0, 16)])
+def test_the_density_of_given_draws_has_the_same_slopes(damping, substeps) -> None:
+    """What an M step climbs, by 4,000 draws in ten lots."""
+    data = for_program(Cart().double(), simulate(fast(damping, substeps), 6, seed=1, substeps=substeps)).without_truth()
+    program = fast(1.2 * damping, substeps, noise=2.0)
+    with seeded(0, "path"):
+        path = find_path(program, data)
+    ahead = smooth(program, data, path, passes=20, tolerance=1e-7, kernels=False)
+    scores = parameter_scores(program, data, smoothed(ahead, data), elements(program)).sum(0)
+    lots = []
+    for seed in range(10):
+        with seeded(seed, "draws"):
+            paths = smoother_paths(program, data, ahead, 400)
+        program.zero_grad()
+        _, slopes = joint_density(program, paths, data)
+        lots.append(torch.stack([-slope / 400 for slope in slopes.values()]))
+    mean, sd = torch.stack(lots).mean(0), torch.stack(lots).std(0)
+    assert ((mean - scores).abs() < 4 * sd / 10**0.5 + 0.01 * scores.abs()).all(), (mean, scores, sd)

@@ -65,18 +65,20 @@ class Unrolled(Braked):
     """The same with `K` substeps a row in its own transition."""
 
     def transition(self, state, control, time, step):
-        means, sds, still = [], [], state
-        for _ in range(K):
-            mean, sd = self.moments(still, control)
-            still = self.integrate(still, mean, step / K)
-            means.append(mean)
-            sds.append(sd)
-        mean, sd = sum(means) / K, sum(sds) / K
+        mean, _ = self.row(state, control, step, torch.zeros(3, dtype=state.dtype))
+        units = torch.eye(3, dtype=state.dtype)
+        sd = stack(*(abs(self.row(state, control, step, units[i])[0] - mean)[..., i] for i in range(3)))
         noise = (pyro.sample("acceleration", dist.Normal(mean, sd).to_event(1)) - mean) / sd
+        return self.row(state, control, step, noise)[1]
+
+    def row(self, state, control, step, noise):
+        """The accelerations averaged over a row with held noise, and the state at its end."""
+        accelerations = []
         for _ in range(K):
             mean, sd = self.moments(state, control)
-            state = self.integrate(state, mean + sd * noise, step / K)
-        return state
+            accelerations.append(mean + sd * noise)
+            state = self.integrate(state, accelerations[-1], step / K)
+        return sum(accelerations) / K, state
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,8 @@ from steady_ppl.discovery.curves import by_height, multiplier, over_reading, ove
 from steady_ppl.effects import Variant
 from steady_ppl.program import Program, names
 from steady_ppl.scores import Smoothed, channel_moments, measured
-from steady_ppl.substeps import acting_controls, row_controls
+from steady_ppl.sites import running
+from steady_ppl.substeps import acting_controls, channel_scales, row_controls
 
 PART = 400  # trajectories at a time
 
@@ -57,7 +58,11 @@ class Scoring:
         self.acting = acting_controls(program, data)
         self.controls = row_controls(program, self.acting)
         self.means, spread = channel_moments(program, data, at.channels.points, self.acting)
-        self.spread = spread[0]
+        self.spread, self.own = spread[0], spread[0]
+        if program.substeps > 1:
+            given = self.acting[:-1], data.elapsed[:-1], data.steps
+            with running(*at.channels.points.shape[1:-1]):
+                self.own = channel_scales(program, at.channels.points[0], *given)
         self.here = measured(program, at.measurements.points)
         self._points: dict[int, Tensor] = {}
         self._values: dict[int, dict[str, Tensor]] = {}
@@ -100,7 +105,7 @@ class Scoring:
                 continue
             pushes = [self._pushed(variant, value, index)[channel] for value in values]
             change = pushes[0] if len(pushes) == 1 else pushes[0] - pushes[1]
-            slope = (change / (width * self.spread[..., index])).expand(3, *self.spread.shape[:2])
+            slope = (change / (width * self.own[..., index])).expand(3, *self.spread.shape[:2])
             total = total + self.at.channels.of_component(index, slope).sum(0)
         return total
 
@@ -120,7 +125,7 @@ class Scoring:
         index = names(self.program.channels).index(variant.options["channel"])
         variable, knots = variant.options["variable"], variant.options["knots"]
         times = multiplier(self._means_around(index), variant.options["channel"], variant.options["times"])
-        weights = self.at.channels.weights(index) / self.spread[..., index] * times
+        weights = self.at.channels.weights(index) / self.own[..., index] * times
         return by_height(self._variables(index)[variable], weights, knots, variable in self.program.angles)
 
     def _variables(self, index: int) -> dict[str, Tensor]:
