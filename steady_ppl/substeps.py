@@ -271,19 +271,20 @@ def _on_average(program: Program, state: Tensor, control: Tensor, time: Tensor, 
             program.transition(*given)
         return seen.distributions
     still, kinds = _averages(program, *given, 0.0)
-    zero = {site: torch.zeros_like(value) for site, value in still.items()}
-    found = {}
+    widths = {site: fn.event_shape.numel() for site, fn in kinds.items()}
+    units = torch.eye(sum(widths.values()), dtype=state.dtype, device=state.device)
+    units = units.reshape(len(units), *[1] * (state.dim() - 1), len(units))  # one channel's noise each, on the left
+    noise = dict(zip(widths, units.split(list(widths.values()), -1), strict=True))
+    noise = {site: part if kinds[site].event_dim else part[..., 0] for site, part in noise.items()}
+    pushed, _ = _averages(program, state.expand(len(units), *state.shape), *given[1:], noise)
+    found, begin = {}, 0
     for site, loc in still.items():
-        scales = []
-        for index in range(kinds[site].event_shape.numel()):
-            unit = zero[site].clone()
-            unit[..., index if kinds[site].event_dim else ...] = 1.0
-            pushed, _ = _averages(program, *given, zero | {site: unit})
-            scales.append((pushed[site] - loc)[..., index if kinds[site].event_dim else ...].abs())
-        scale = torch.stack(scales, -1) if kinds[site].event_dim else scales[0]
+        change = (pushed[site][begin : begin + widths[site]] - loc).abs()
+        scale = change.diagonal(dim1=0, dim2=-1) if kinds[site].event_dim else change[0]
         base = unwrapped(kinds[site])
         freedom = (base.df,) if isinstance(base, dist.StudentT) else ()
         found[site] = type(base)(*freedom, loc, scale).to_event(kinds[site].event_dim)
+        begin += widths[site]
     return found
 
 
