@@ -149,6 +149,8 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     notes += run.uneven_steps + doubts_of_units(program, run)
     if step.note:
         notes.append(f"refitted to these drives, {step.note}")
+    if step.uncompared:
+        notes.append(step.uncompared)
     if not scores.parameter_names:
         notes.append("the program's own parameters were not looked at one by one: it has none, or a network's")
     return Check(

@@ -82,10 +82,12 @@ class StepCheck:
         trials: the program's own number of substeps first, then twice as many each time, to the first that changes
             neither log p(y) nor the watched parameters by what counts.
         max_shift: nats by which the watched parameters may move.
+        uncompared: why the program was tried at no finer step, None where it could be.
     """
 
     trials: tuple[StepTrial, ...]
     max_shift: float = MAX_SHIFT
+    uncompared: str | None = None
 
     @property
     def suited(self) -> StepTrial:
@@ -220,8 +222,12 @@ def check_step(
         first = _trial(program, at, names)
     else:
         first = trial(own, program, at or find_path(program, data, known_start=known_start), 0)
-    if 2 * own > most or counts_rows(program):  # in substeps its delay is another
-        return StepCheck((first,), max_shift)
+    if counts_rows(program):  # in substeps its delay is another
+        reason = "whether the time step suits is not known: actuators counts rows, which substeps would make shorter"
+        return StepCheck((first,), max_shift, reason)
+    if 2 * own > most:
+        reason = f"whether the time step suits is not known: {own} substeps a row are not compared with twice as many"
+        return StepCheck((first,), max_shift, reason)
     trials = [first]
     try:
         look = trial(2 * own, program, first.path, 0)

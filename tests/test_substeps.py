@@ -371,7 +371,9 @@ def test_actuators_that_count_rows_are_told_from_others(kind, expected) -> None:
     if expected:
         with pytest.raises(ProgramError, match="program RowsLate: actuators counts rows and not seconds"):
             probe(with_substeps(program, 2))
-        assert len(check_step(program, data, known_start=True).trials) == 1
+        found = check_step(program, data, known_start=True)
+        assert len(found.trials) == 1
+        assert found.uncompared.startswith("whether the time step suits is not known: actuators counts rows")
     else:
         probe(with_substeps(program, 2))
 

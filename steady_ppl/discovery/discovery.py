@@ -246,6 +246,8 @@ def _notes(found: Search) -> list[str]:
     for step in (found.step, found.with_found):
         if step is not None and step.note:
             notes.append(f"all fits are at a finer step: {step.note}")
+    if found.step.uncompared:
+        notes.append(found.step.uncompared)
     if found.curve is not None:
         notes.append(
             "a curve has no name and is not kept: 'after' is what it would bring, --out has the program as it stood, "
