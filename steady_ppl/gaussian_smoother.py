@@ -8,6 +8,7 @@ Roweis 1999).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -19,6 +20,7 @@ from steady_ppl.linearization import Path, linearize
 from steady_ppl.lookahead import Lookahead, look_ahead
 from steady_ppl.particles import particle_filter
 from steady_ppl.paths import Paths
+from steady_ppl.planar_vehicle import wrap_angles
 from steady_ppl.program import Program
 from steady_ppl.sites import (
     KnownStart,
@@ -33,8 +35,8 @@ from steady_ppl.sites import (
 from steady_ppl.stability import divergence
 from steady_ppl.substeps import acting_controls, sample_channels
 
-WORSE = 10.0  # nats by which a step may leave a path less likely: steps that do sometimes lead out of a bad place
-RESTS = 0.05  # standard deviations of a channel by which no noise of a trajectory at rest moves
+WORSE = 10.0  # nats by which a step may leave a path worse off, see `_Merit`: some such steps lead out of a bad place
+RESTS = 0.05  # a trajectory is at rest where no noise moves by more, in standard deviations of its channel
 
 
 @torch.no_grad()
@@ -51,7 +53,7 @@ def smooth(
 ) -> Lookahead:
     """Move a path to the mode of the posterior and look ahead along it.
 
-    Gauss and Newton's method. A step is halved as long as its end costs more by `WORSE` nats, see `_cost`.
+    Gauss and Newton's method. A step is halved while its end is worse by more than `WORSE` nats, see `_Merit`.
 
     Args:
         program: with normal noise; see `linearize`.
@@ -74,51 +76,74 @@ def smooth(
             )
         )
 
-    accepted, penalty = path, torch.zeros_like(path.states[1:], dtype=torch.float64)
-    cost = torch.full((len(data),), torch.inf, dtype=torch.float64, device=path.states.device)
+    if passes == 1:
+        return look(path)
+    accepted = path = Path(path.states, torch.where(data.transitions[..., None], path.noise, 0.0))
+    penalty = torch.zeros_like(path.states, dtype=torch.float64)
+    most = torch.full((len(data),), torch.inf, dtype=torch.float64, device=path.states.device)
     for index in range(passes):
         ahead = look(path)
-        worse = ~(_cost(ahead, penalty) <= cost + WORSE)  # or not a number
-        worse &= torch.isfinite(cost)
+        merit = _merit(ahead)
+        worse = torch.isfinite(most) & ~(merit.cost(penalty) <= most)  # or not a number
         accepted = _either(worse, accepted, path)
         if index == passes - 1:
             break
         halfway = Path((accepted.states + path.states) / 2, (accepted.noise + path.noise) / 2)
         moved = _either(worse, halfway, means_as_path(ahead, data))
         change = torch.nan_to_num((moved.noise - path.noise).abs(), nan=0.0).max()  # of those that have not blown up
-        penalty = torch.where(worse[:, None], penalty, _multipliers(ahead, moved))
-        cost = torch.where(worse, cost, _cost(ahead, penalty))
+        penalty = torch.where(worse[:, None], penalty, _penalty(ahead, moved))
+        most = torch.where(worse, most, merit.cost(penalty) + WORSE)
         path = moved
         if not bool(change > tolerance):
             break
     return look(accepted) if bool(worse.any()) else ahead
 
 
-def _cost(ahead: Lookahead, penalty: Tensor) -> Tensor:
-    """What a path costs, `(B,)` nats, less the linearised program's log p(y) along it.
+@dataclass(frozen=True)
+class _Merit:
+    """What paths are compared by.
 
-    The first is the path's own negative log-density. States that do not follow from its noise cost `penalty`,
-    `(T, B, D)` for each unit: above the multipliers of those constraints the penalty is exact (Nocedal and Wright 2006,
-    chapter 17). The second keeps paths off beacons: the likeliest one may lead through, where nothing is linear.
+    The path's own negative log-density alone would lead through a beacon, where nothing is linear and what is drawn
+    from the linearised program is useless. The linearised log p(y) alone may be high far from the measurements. So the
+    merit is the one less the other: small where a path is likely and its surroundings are linear.
+
+    Attributes:
+        density: less the path's log-density given its own noise, less the linearised log p(y), `(B,)`.
+        defect: how far its states are from where its noise leads, `(T + 1, B, D)`.
     """
+
+    density: Tensor
+    defect: Tensor
+
+    def cost(self, penalty: Tensor) -> Tensor:
+        """Nats, `(B,)`, a unit of each defect counting `penalty`, `(T + 1, B, D)` (an l₁ penalty: Nocedal and Wright
+        2006, chapter 17)."""
+        return self.density + (penalty * self.defect).sum((0, 2))
+
+
+def _merit(ahead: Lookahead) -> _Merit:
     linear = ahead.linearization
     noise = linear.path.noise.double()
-    defect = linear.offset + (linear.noise @ noise.unsqueeze(-1)).squeeze(-1)
     gram = linear.start_noise.mT @ linear.start_noise
-    ridge = 1e-9 * torch.eye(gram.shape[-1]).to(gram)
-    start, _ = torch.linalg.solve_ex(gram + ridge, linear.start_noise.mT @ linear.start_offset.unsqueeze(-1))
+    ridge = 1e-12 * gram.diagonal(dim1=-2, dim2=-1) + 1e-24  # a known start has no noise
+    pull = linear.start_noise.mT @ linear.start_offset.unsqueeze(-1)
+    start, _ = torch.linalg.solve_ex(gram + torch.diag_embed(ridge), pull)
+    begins = linear.start_offset - (linear.start_noise @ start).squeeze(-1)
+    rows = linear.offset + (linear.noise @ noise.unsqueeze(-1)).squeeze(-1)
     seen = 0.5 * (linear.precision * linear.residual.square()).sum((0, 2)) - linear.log_scale.sum(0)
-    moved = 0.5 * noise.square().sum((0, 2)) + (penalty * defect.abs()).sum((0, 2))
-    return seen + moved + 0.5 * start.square().sum((1, 2)) - ahead.log_likelihood
+    drawn = 0.5 * (noise.square().sum((0, 2)) + start.square().sum((1, 2)))
+    defect = wrap_angles(torch.cat([begins.unsqueeze(0), rows]), linear.angles).abs()
+    return _Merit(seen + drawn - ahead.log_likelihood, defect)
 
 
-def _multipliers(ahead: Lookahead, moved: Path) -> Tensor:
-    """Twice the pull of a row's measurements and of the later ones at its state after a step, `(T, B, D)`."""
+def _penalty(ahead: Lookahead, moved: Path) -> Tensor:
+    """Twice the pull of a row's measurements and of the later ones at its state after a step, `(T + 1, B, D)`: what a
+    unit of a defect must cost for none to be worth it."""
     linear = ahead.linearization
-    away = (moved.states - linear.path.states)[1:].double().unsqueeze(-1)
-    apart = linear.residual[1:].unsqueeze(-1) - linear.measurement[1:] @ away
-    now = linear.measurement[1:].mT @ (linear.precision[1:].unsqueeze(-1) * apart)
-    later = ahead.information[1:].unsqueeze(-1) - ahead.precision[1:] @ away
+    away = (moved.states - linear.path.states).double().unsqueeze(-1)
+    apart = linear.residual.unsqueeze(-1) - linear.measurement @ away
+    now = linear.measurement.mT @ (linear.precision.unsqueeze(-1) * apart)
+    later = ahead.information.unsqueeze(-1) - ahead.precision @ away
     return 2 * (now + later).squeeze(-1).abs()
 
 
@@ -177,8 +202,10 @@ def means_as_path(ahead: Lookahead, data: Trajectories) -> Path:
 
 
 def resting_path(ahead: Lookahead, data: Trajectories) -> Path:
-    """`means_as_path` to go on from; what has not come to rest stays where it was linearised: how likely it is a step
-    further is not known."""
+    """`means_as_path` after several passes, to go on from. What has not come to rest stays where it was linearised.
+
+    How good a path is a step further is not known there. After a single pass it would never move.
+    """
     means, path = means_as_path(ahead, data), ahead.linearization.path
     far = ~((means.noise - path.noise).abs().amax((0, 2)) <= RESTS)
     return _either(far, path, means)

@@ -19,7 +19,7 @@ from steady_ppl.lookahead import Lookahead
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.program import Program
 from steady_ppl.progress import stages
-from steady_ppl.scores import channel_moments, smoothed
+from steady_ppl.scores import smoothed, substep_spreads
 
 ROUGH = 1.5  # mean square deviation, in the program's own, from which its noise is widened before anything is fitted
 FAR, SEARCHES = 6.0, 3  # standard deviations by which a drive strays from the others, and searches for its path
@@ -99,9 +99,9 @@ def roomy_path(program: Program, data: Trajectories, known_start: bool) -> Path:
 def widens(program: Program, part: Element, data: Trajectories) -> bool:
     """Whether a learnable number is the logarithm of the standard deviation of some channel."""
     states = data.controls.new_ones((1, *data.steps.shape, len(program.states)))
-    here = channel_moments(program, data, states)[1]
+    here = substep_spreads(program, data, states)
     with moved(part, 0.1):
-        there = channel_moments(program, data, states)[1]
+        there = substep_spreads(program, data, states)
     change = (there / here).log()[:, data.transitions]
     return bool(((change.abs() < 1e-6) | ((change - 0.1).abs() < 1e-3)).all()) and bool((change > 0.05).any())
 

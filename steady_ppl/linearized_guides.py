@@ -9,7 +9,14 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import FilterError, require
-from steady_ppl.gaussian_smoother import find_and_try, require_found, resting_path, smooth, smoother_paths
+from steady_ppl.gaussian_smoother import (
+    find_and_try,
+    means_as_path,
+    require_found,
+    resting_path,
+    smooth,
+    smoother_paths,
+)
 from steady_ppl.guides import FilteringGuide, PathGuide
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
@@ -67,7 +74,7 @@ class LinearizedGuide(PathGuide):
             self.counts["searches_failed"] = 1
         if lost or due:
             ahead = self._smooth(data, progress)
-        self.remember(resting_path(ahead, data), data)
+        self.remember(means_as_path(ahead, data), data)
         self.in_plain_torch = ahead.linearization.in_plain_torch
         return ahead
 

@@ -21,7 +21,7 @@ from steady_ppl.paired_bootstrap import Sums
 from steady_ppl.predictions import Prediction, named_horizons, predict, simulate_again, states_ahead
 from steady_ppl.program import Program, error_groups, for_program, units
 from steady_ppl.reference_motion import ConstantVelocity, constant_velocity
-from steady_ppl.scores import channel_moments, measured
+from steady_ppl.scores import measured, substep_spreads
 from steady_ppl.seeding import seeded
 from steady_ppl.tracking import Tracked, track
 
@@ -194,7 +194,7 @@ def _sums(values: Tensor, there: Tensor, *, root: bool = False) -> Sums:
 def noise_scales(program: Program, data: Trajectories, tracked: Tracked) -> Scales:
     """What `Row.scales` is."""
     states = tracked.path(data).states
-    _, channels = channel_moments(program, data, states[:-1].unsqueeze(0))
+    channels = substep_spreads(program, data, states[:-1].unsqueeze(0))
     declared = program.channels
     if len(declared) != channels.shape[-1]:
         declared = [f"channel {i + 1}" for i in range(channels.shape[-1])]

@@ -30,7 +30,7 @@ from steady_ppl.lookahead import Lookahead
 from steady_ppl.planar_vehicle import wrap_angles
 from steady_ppl.program import Program
 from steady_ppl.sites import AtMean, Recording, Standardised, as_vector, normal_moments, residual, running, unwrapped
-from steady_ppl.substeps import acting_controls, advance, sample_channels
+from steady_ppl.substeps import acting_controls, advance, channel_scales, sample_channels
 
 Moments = tuple[Tensor, Tensor]
 
@@ -211,7 +211,7 @@ def by_component(values: Tensor) -> Tensor:
 
 @torch.no_grad()
 def channel_moments(program: Program, data: Trajectories, states: Tensor, controls: Tensor | None = None) -> Moments:
-    """Means and standard deviations of the channels at states `(P, T, B, D)`, each `(P, T, B, C)`; `controls` are the
+    """Means and standard deviations of rows' channels at states `(P, T, B, D)`, each `(P, T, B, C)`; `controls` are the
     acting ones, `(T + 1, B, U)` or `(P, T + 1, B, U)`, or as `acting` gives them."""
     controls = acting_controls(program, data) if controls is None else controls
     seen = Recording()
@@ -224,6 +224,19 @@ def channel_moments(program: Program, data: Trajectories, states: Tensor, contro
         spreads.append(as_vector(spread, fn.event_dim))
     left = states.shape[:-1]
     return tuple(torch.cat([part.expand(*left, -1) for part in parts], -1) for parts in (means, spreads))  # type: ignore[return-value]
+
+
+@torch.no_grad()
+def substep_spreads(program: Program, data: Trajectories, states: Tensor, controls: Tensor | None = None) -> Tensor:
+    """What the channels' distributions have as standard deviations at states `(P, T, B, D)`, `(P, T, B, C)`.
+
+    With one substep they are those of `channel_moments`, which with more are of a row's average. `controls` as there.
+    """
+    if program.substeps == 1:
+        return channel_moments(program, data, states, controls)[1]
+    controls = acting_controls(program, data) if controls is None else controls
+    with running(*states.shape[:-1]):
+        return channel_scales(program, states, controls[..., :-1, :, :], data.elapsed[:-1], data.steps)
 
 
 @dataclass(frozen=True)
@@ -285,7 +298,7 @@ def measured(program: Program, states: Tensor) -> Measured:
 
 def typical_spreads(program: Program, data: Trajectories, at: Smoothed) -> Moments:
     """Root mean square standard deviations of the channels, `(C,)`, and of the measurements, `(K,)`."""
-    _, spread = channel_moments(program, data, at.channels.points[:1])
+    spread = substep_spreads(program, data, at.channels.points[:1])
     sharp = measured(program, at.measurements.points[:1]).spread
     return (
         spread[0][data.transitions].square().mean(0).sqrt(),

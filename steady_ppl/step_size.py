@@ -30,6 +30,7 @@ UNFITTED = 0.2  # share of what a scoring step promises at the program's own ste
 PRECISION = 0.005  # nats, of refits
 FINEST = 32  # substeps of a trial, at most, unless more are asked for; a program may always be tried at twice its own
 REFITS = 25  # scoring steps of a fit
+UNKNOWN = "whether the time step suits is not known"
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ class StepCheck:
         trials: the program's own number of substeps first, then twice as many each time, to the first that changes
             neither log p(y) nor the watched parameters by what counts.
         max_shift: nats by which the watched parameters may move.
-        uncompared: why the program was tried at no finer step, None where it could be.
+        uncompared: why the program was fitted at no finer step, None where it was or where one look excluded a gain.
     """
 
     trials: tuple[StepTrial, ...]
@@ -100,7 +101,7 @@ class StepCheck:
     @property
     def settled(self) -> bool:
         """Whether twice as many substeps as the suited ones were tried and change nothing that counts."""
-        return len(self.trials) == 1 or self.suited is not self.trials[-1]
+        return self.uncompared is None and (len(self.trials) == 1 or self.suited is not self.trials[-1])
 
     @property
     def gain(self) -> float:
@@ -154,6 +155,7 @@ class StepCheck:
         return {
             "substeps": self.suited.substeps,
             "settled": self.settled,
+            "uncompared": self.uncompared,
             "gain": self.gain,
             "shift": self.suited.shift(self.trials[0]),
             "trials": [{"substeps": t.substeps, "log_likelihood": t.log_likelihood} for t in self.trials],
@@ -223,21 +225,22 @@ def check_step(
     else:
         first = trial(own, program, at or find_path(program, data, known_start=known_start), 0)
     if counts_rows(program):  # in substeps its delay is another
-        reason = "whether the time step suits is not known: actuators counts rows, which substeps would make shorter"
-        return StepCheck((first,), max_shift, reason)
+        return StepCheck((first,), max_shift, f"{UNKNOWN}: `actuators` counts rows, which are shorter in substeps")
     if 2 * own > most:
-        reason = f"whether the time step suits is not known: {own} substeps a row are not compared with twice as many"
-        return StepCheck((first,), max_shift, reason)
-    trials = [first]
+        return StepCheck((first,), max_shift, f"{UNKNOWN}: {own} substeps a row are as many as are tried")
+    trials, reason = [first], None
     try:
         look = trial(2 * own, program, first.path, 0)
         allowed = max(min(max_shift, MAX_DECREMENT), UNFITTED * first.decrement)
         moves = look.decrement - first.decrement > allowed
-        if (look.reachable < first.reachable + 0.5 * MIN_GAIN and not moves) or not can_be_cut(program, data):
+        if look.reachable < first.reachable + 0.5 * MIN_GAIN and not moves:
             return StepCheck((first,), max_shift)
+        if not can_be_cut(program, data):
+            return StepCheck((first,), max_shift, f"{UNKNOWN}: `transition` is no step in `step`")
         if refits and not isinstance(at, Maximum):
             first = trial(own, program, first.path, REFITS)
-        trials = [first, trial(2 * own, first.program, first.path, REFITS)]
+        trials = [first]
+        trials.append(trial(2 * own, first.program, first.path, REFITS))
         while True:
             coarse, fine = trials[-2:]
             if refits and _differs(coarse, fine, max_shift):  # several maxima of one program are no matter of its step
@@ -247,9 +250,10 @@ def check_step(
             if not _differs(trials[-2], fine, max_shift) or 2 * fine.substeps > most:
                 break
             trials.append(trial(2 * fine.substeps, fine.program, fine.path, REFITS))
-    except FilterError:  # paths of the coarser step lead nowhere at the finer one: nothing speaks for that one
-        pass
-    return StepCheck(tuple(trials), max_shift)
+    except FilterError as error:  # paths of the coarser step lead nowhere at the finer one: nothing speaks for that one
+        if len(trials) == 1:
+            reason = f"{UNKNOWN}: with {2 * own} substeps a row {error}"
+    return StepCheck(tuple(trials), max_shift, reason)
 
 
 def can_refit(program: Program) -> bool:

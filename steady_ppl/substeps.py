@@ -4,18 +4,20 @@ A vehicle moves in continuous time, a program in steps of `transition`. With `su
 of a K-th of its time. The first one samples the channels; the others reuse its standardised noise, so that a row still
 has one latent draw a channel. Effects, actuators and user code act in every substep. K = 1 is the program itself.
 
-A row's channel is what it is on average over the substeps. Its site is scored under the mean of a row without noise,
-and under what one standard deviation of its own noise, held over the row, changes of that mean: a program that takes
-back what noise did leaves less of it at the end of the row. So a slope in a parameter is that of the row's end, exact
-where the channel's mean is linear in the noise and no other channel's noise moves it.
+A row's channel is what it is on average over the substeps. Its site has the mean of a row without noise. Its standard
+deviation is what one of its own noise, held over the row, changes of that mean: a program that takes noise back leaves
+less of it at the end of a row. A slope in a parameter is then that of a row's average. What is left out is when in the
+row the noise came, and what it does to other channels. Noise that is taken back to less than a tenth, or turned round,
+counts as a tenth.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from itertools import islice
 from numbers import Integral
 from typing import Any
 
@@ -32,6 +34,8 @@ from steady_ppl.program import Program
 from steady_ppl.sites import Recording, as_vector, unwrapped
 
 MAX_SUBSTEPS = 1000  # of a row
+LEAST = 0.1  # share of a channel's standard deviation in a substep that it has on average over a row, at least
+VISIBLE = 1e-3  # share of a channel's location that is pushed at least, for what it changes to be seen in 32 bits
 _ROW_ENDS: ContextVar[bool] = ContextVar("row ends", default=True)
 
 
@@ -134,13 +138,10 @@ def channel_scales(program: Program, state: Tensor, control: Tensor, time: Tenso
     `advance`.
     """
     found = []
-    for part in _parts(program, control, time, step):
-        seen = Recording()
-        with poutine.block(), seen, Held(0.0), _at(part) as given:
-            state = program.transition(state, *given)
-        scales = [as_vector(location_and_scale(fn, site)[1], fn.event_dim) for site, fn in seen.distributions.items()]
-        found.append(torch.cat([scale.expand(*state.shape[:-1], -1) for scale in scales], -1))
-    return sum(found[1:], found[0]) / len(found)
+    for seen in _recorded(program, state, control, time, step, 0.0):
+        scales = {site: location_and_scale(fn, site)[1] for site, fn in seen.distributions.items()}
+        found.append(_joined(scales, seen.distributions, state.shape[:-1]))
+    return _mean(found)
 
 
 def acting_controls(program: Program, data: Trajectories) -> Tensor:
@@ -264,41 +265,61 @@ def _sample(program: Program, state: Tensor, control: Tensor, time: Tensor, step
 
 def _on_average(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> dict[str, Any]:
     """Site → the distribution of its average over a row; with one substep its own."""
-    given = state, control, time, step
+    given, left = (control, time, step), state.shape[:-1]
+    kinds = _recorded(program, state, *given, 0.0, only=1)[0].distributions
     if program.substeps == 1:
-        seen = Recording()
-        with poutine.block(), seen, Held(0.0):
-            program.transition(*given)
-        return seen.distributions
-    still, kinds = _averages(program, *given, 0.0)
-    widths = {site: fn.event_shape.numel() for site, fn in kinds.items()}
-    units = torch.eye(sum(widths.values()), dtype=state.dtype, device=state.device)
-    units = units.reshape(len(units), *[1] * (state.dim() - 1), len(units))  # one channel's noise each, on the left
-    noise = dict(zip(widths, units.split(list(widths.values()), -1), strict=True))
-    noise = {site: part if kinds[site].event_dim else part[..., 0] for site, part in noise.items()}
-    pushed, _ = _averages(program, state.expand(len(units), *state.shape), *given[1:], noise)
-    found, begin = {}, 0
-    for site, loc in still.items():
-        change = (pushed[site][begin : begin + widths[site]] - loc).abs()
-        scale = change.diagonal(dim1=0, dim2=-1) if kinds[site].event_dim else change[0]
-        base = unwrapped(kinds[site])
-        freedom = (base.df,) if isinstance(base, dist.StudentT) else ()
-        found[site] = type(base)(*freedom, loc, scale).to_event(kinds[site].event_dim)
-        begin += widths[site]
-    return found
+        return kinds
+    moments = {site: location_and_scale(fn, site) for site, fn in kinds.items()}
+    loc, scale = (_joined({site: both[i] for site, both in moments.items()}, kinds, left) for i in range(2))
+    reach = 1 + VISIBLE * (loc / torch.where(scale > 0, scale, torch.ones_like(scale))).abs().detach()
+    count = scale.shape[-1]
+    units = torch.cat([scale.new_zeros(1, count), torch.eye(count).to(scale)]).view(1 + count, *[1] * len(left), count)
+    rows = _recorded(program, state.expand(1 + count, *state.shape), *given, _parted(units * reach, kinds))
+    still, *pushed = _mean([_joined(row.values, kinds, (1 + count, *left)) for row in rows])
+    change = torch.stack([one[..., index] - still[..., index] for index, one in enumerate(pushed)], -1) / reach
+    locs, scales = _parted(still, kinds), _parted(torch.maximum(change, LEAST * scale), kinds)
+    return {site: _like(fn, locs[site], scales[site]) for site, fn in kinds.items()}
 
 
-def _averages(
-    program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor, noise: Mapping[str, Tensor] | float
-) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """What channels are on average over a row with given noise in scales, and their distributions in its first part."""
-    kinds: dict[str, Any] = {}
-    met: dict[str, list[Tensor]] = {}
-    for part in _parts(program, control, time, step):
+def _recorded(
+    program: Program,
+    state: Tensor,
+    control: Tensor,
+    time: Tensor,
+    step: Tensor,
+    noise: Mapping[str, Tensor] | float,
+    only: int | None = None,
+) -> list[Recording]:
+    """What each substep of a row with given noise in scales samples; of the first `only` ones."""
+    found = []
+    for part in islice(_parts(program, control, time, step), only):
         seen = Recording()
         with poutine.block(), seen, Held(noise), _at(part) as given:
             state = program.transition(state, *given)
-        kinds = kinds or seen.distributions
-        for site, value in seen.values.items():
-            met.setdefault(site, []).append(value)
-    return {site: sum(values[1:], values[0]) / len(values) for site, values in met.items()}, kinds
+        found.append(seen)
+    return found
+
+
+def _mean(values: Sequence[Tensor]) -> Tensor:
+    return sum(values[1:], values[0]) / len(values)
+
+
+def _joined(values: Mapping[str, Tensor], kinds: Mapping[str, Any], left: Sequence[int]) -> Tensor:
+    """The sites' values side by side, `(*left, C)`."""
+    parts = [as_vector(value, kinds[site].event_dim) for site, value in values.items()]
+    return torch.cat([part.expand(*left, part.shape[-1]) for part in parts], -1)
+
+
+def _parted(values: Tensor, kinds: Mapping[str, Any]) -> dict[str, Tensor]:
+    """What `_joined` puts side by side, by site."""
+    parts = values.split([fn.event_shape.numel() for fn in kinds.values()], -1)
+    return {
+        site: part if fn.event_dim else part.squeeze(-1) for (site, fn), part in zip(kinds.items(), parts, strict=True)
+    }
+
+
+def _like(fn: Any, loc: Tensor, scale: Tensor) -> Any:
+    """A distribution of the same kind."""
+    base = unwrapped(fn)
+    freedom = (base.df,) if isinstance(base, dist.StudentT) else ()
+    return type(base)(*freedom, loc, scale).to_event(fn.event_dim)

@@ -31,7 +31,7 @@ from steady_ppl import (
 )
 from steady_ppl.checkpoint import read_tensors
 from steady_ppl.evaluation import evaluate
-from steady_ppl.gaussian_smoother import find_and_smooth, find_path, resting_path, smooth, smoother_paths
+from steady_ppl.gaussian_smoother import find_and_smooth, find_path, means_as_path, smooth, smoother_paths
 from steady_ppl.sites import AtMean, Recording, Replaying, Standardised, running
 
 GUIDES = (GaussianGuide, LookaheadGuide)
@@ -182,7 +182,7 @@ def test_gaussian_draws_agree_with_the_transition_to_first_order():
     program = example("hovercraft:HovercraftTruth").requires_grad_(False)
     data = drives(program, 2, 12)
     ahead = smooth(program, data, find_path(program, data, known_start=True), known_start=True, passes=40, tolerance=0)
-    mean = resting_path(ahead, data)
+    mean = means_as_path(ahead, data)
     _, states, noise = ahead.draws(50)
 
     def gap(share: float) -> Tensor:
@@ -232,7 +232,7 @@ def test_a_guide_leaves_a_wrong_place_for_a_likelier_path(guide, monkeypatch):
     right = {name: value.clone() for name, value in looking.memory.items()}
     wrong = right["states/2"] + torch.tensor([0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
     stays_put = lambda ahead, part: ahead.linearization.path  # noqa: E731
-    monkeypatch.setattr("steady_ppl.linearized_guides.resting_path", stays_put)
+    monkeypatch.setattr("steady_ppl.linearized_guides.means_as_path", stays_put)
     looking.memory["states/2"] = wrong
     looking.refresh(data, 0.4)
     assert torch.equal(looking.memory["states/2"], wrong)
@@ -277,7 +277,7 @@ def test_a_search_that_is_lost_for_one_drive_serves_the_others(monkeypatch):
 
     monkeypatch.setattr("steady_ppl.linearized_guides.find_and_try", one_is_lost)
     stays_put = lambda ahead, part: ahead.linearization.path  # noqa: E731
-    monkeypatch.setattr("steady_ppl.linearized_guides.resting_path", stays_put)
+    monkeypatch.setattr("steady_ppl.linearized_guides.means_as_path", stays_put)
     looking.refresh(data, 0.5)
     torch.testing.assert_close(looking.memory["states/2"], right["2"], rtol=0, atol=0.05)
     assert (looking.memory["states/1"] - right["1"]).abs().max() > 2

@@ -14,9 +14,8 @@ from steady_ppl.data import Trajectories
 from steady_ppl.discovery.curves import by_height, multiplier, over_reading, over_state, variables
 from steady_ppl.effects import Variant
 from steady_ppl.program import Program, names
-from steady_ppl.scores import Smoothed, channel_moments, measured
-from steady_ppl.sites import running
-from steady_ppl.substeps import acting_controls, channel_scales, row_controls
+from steady_ppl.scores import Smoothed, channel_moments, measured, substep_spreads
+from steady_ppl.substeps import acting_controls, row_controls
 
 PART = 400  # trajectories at a time
 
@@ -58,11 +57,8 @@ class Scoring:
         self.acting = acting_controls(program, data)
         self.controls = row_controls(program, self.acting)
         self.means, spread = channel_moments(program, data, at.channels.points, self.acting)
-        self.spread, self.own = spread[0], spread[0]
-        if program.substeps > 1:
-            given = self.acting[:-1], data.elapsed[:-1], data.steps
-            with running(*at.channels.points.shape[1:-1]):
-                self.own = channel_scales(program, at.channels.points[0], *given)
+        self.of_row = spread[0]
+        self.of_substep = substep_spreads(program, data, at.channels.points[:1], self.acting)[0]
         self.here = measured(program, at.measurements.points)
         self._points: dict[int, Tensor] = {}
         self._values: dict[int, dict[str, Tensor]] = {}
@@ -79,7 +75,7 @@ class Scoring:
 
     def _differences(self, column: Column) -> Iterator[tuple[tuple[Tensor, Tensor], float]]:
         """For each number of the coefficient two coefficients and how far they are apart."""
-        variant, like = column.variant, self.spread
+        variant, like = column.variant, self.of_substep
         absent = variant.absent(like)
         if column.probe is not None:
             reach = 1.0 if not torch.isfinite(absent) else abs(column.probe - float(absent))
@@ -105,7 +101,7 @@ class Scoring:
                 continue
             pushes = [self._pushed(variant, value, index)[channel] for value in values]
             change = pushes[0] if len(pushes) == 1 else pushes[0] - pushes[1]
-            slope = (change / (width * self.own[..., index])).expand(3, *self.spread.shape[:2])
+            slope = (change / (width * self.of_substep[..., index])).expand(3, *self.of_substep.shape[:2])
             total = total + self.at.channels.of_component(index, slope).sum(0)
         return total
 
@@ -125,7 +121,7 @@ class Scoring:
         index = names(self.program.channels).index(variant.options["channel"])
         variable, knots = variant.options["variable"], variant.options["knots"]
         times = multiplier(self._means_around(index), variant.options["channel"], variant.options["times"])
-        weights = self.at.channels.weights(index) / self.own[..., index] * times
+        weights = self.at.channels.weights(index) / self.of_substep[..., index] * times
         return by_height(self._variables(index)[variable], weights, knots, variable in self.program.angles)
 
     def _variables(self, index: int) -> dict[str, Tensor]:
@@ -133,7 +129,7 @@ class Scoring:
         if index not in self._values:
             given = (self._around(index), self.controls[:-1], self.data.elapsed[:-1])
             found = variables(self.program, *given, self._means_around(index))
-            self._values[index] = {name: value.expand(3, *self.spread.shape[:2]) for name, value in found.items()}
+            self._values[index] = {name: value.expand(3, *self.of_substep.shape[:2]) for name, value in found.items()}
         return self._values[index]
 
     def _means_around(self, index: int) -> dict[str, Tensor]:
@@ -175,12 +171,12 @@ class Scoring:
 
     def _of_control(self, change: Tensor, width: float) -> Tensor:
         slope = (self.by_control * change.movedim(-1, 0).unsqueeze(-1)).sum(0)
-        return self.at.channels.of_mean(slope / (width * self.spread))
+        return self.at.channels.of_mean(slope / (width * self.of_row))
 
     @cached_property
     def of_control(self) -> Tensor:
         """Scores of the acting controls, row by row, `(T, B, U)`."""
-        return torch.stack([self.at.channels.by_row(slope / self.spread) for slope in self.by_control], -1)
+        return torch.stack([self.at.channels.by_row(slope / self.of_row) for slope in self.by_control], -1)
 
     @cached_property
     def by_control(self) -> Tensor:
@@ -213,7 +209,9 @@ class Scoring:
 
     def _spread(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         given = (self.at.states[:-1], self.controls[:-1], self.data.elapsed[:-1], self.data.steps)
-        factors = [by_channel(self.program, variant(self.program, *given, c=value), 1.0, self.spread) for value in c]
+        factors = [
+            by_channel(self.program, variant(self.program, *given, c=value), 1.0, self.of_substep) for value in c
+        ]
         return self.at.channels.of_spread((factors[0] / factors[1]).log() / width)
 
     def _blur(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
@@ -232,8 +230,10 @@ class Scoring:
         """Of the share of the last deviation that stays, at zero: E[ε(t) ε(t − 1)], in the spreads' ratio."""
         at = self.at.channels
         product = at.mean[1:] * at.mean[:-1] + self.at.lag[1:]
-        ratio = self.spread[:-1] / self.spread[1:]
-        chosen = self.spread.new_tensor([float(n in variant.options["channels"]) for n in names(self.program.channels)])
+        ratio = self.of_substep[:-1] / self.of_substep[1:]
+        chosen = self.of_substep.new_tensor(
+            [float(n in variant.options["channels"]) for n in names(self.program.channels)]
+        )
         return torch.where(at.present[1:], product * ratio * chosen, 0.0).sum((0, -1))
 
 

@@ -14,7 +14,7 @@ from steady_ppl.discovery.refits import Fold, Refit, as_declared
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.elements import Element, moved
 from steady_ppl.program import Program, names
-from steady_ppl.scores import channel_moments, measured
+from steady_ppl.scores import measured, substep_spreads
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def _spread(spread: Spread, program: Program, fold: Fold) -> Tensor:
 
 
 def _of_channels(program: Program, data: Trajectories, states: Tensor) -> Tensor:
-    _, spread = channel_moments(program, data, states[:-1].unsqueeze(0))
+    spread = substep_spreads(program, data, states[:-1].unsqueeze(0))
     return spread[0][data.transitions].log().mean(0).double()
 
 
