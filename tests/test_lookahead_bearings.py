@@ -267,6 +267,36 @@ def test_a_drive_past_a_beacon_three_centimetres_off_comes_to_rest_where_a_filte
     assert (beyond.abs() < 5).all()
 
 
+def test_a_path_that_does_not_begin_at_a_known_start_is_led_there(cart, uneven):
+    path = find_path(cart, uneven)
+    path.states[0] += 0.3
+    found = smooth(cart, uneven, path, known_start=True, tolerance=1e-9)
+    torch.testing.assert_close(found.means()[0][0], uneven.known_start, rtol=0, atol=1e-9)
+    exact = smooth(cart, uneven, find_path(cart, uneven, known_start=True), known_start=True, tolerance=1e-9)
+    torch.testing.assert_close(found.log_likelihood, exact.log_likelihood, rtol=0, atol=1e-9)
+
+
+def test_a_path_smooths_alike_alone_and_padded_whatever_its_padding_holds(hovercraft, bearings):
+    path = find_path(hovercraft, bearings, known_start=True)
+    short = int(bearings.lengths.argmin())
+    rows = int(bearings.lengths[short])
+    assert rows < len(path.states)
+    path.noise[rows - 1 :, short] = 1e3
+    path = Path(path.states + 0.2, path.noise)
+    together = smooth(hovercraft, bearings, path, known_start=True, passes=3, tolerance=0)
+    path.noise[rows - 1 :, short] = 0.0
+    alone = smooth(hovercraft, bearings.subset([short]), of(path, [short]), known_start=True, passes=3, tolerance=0)
+    torch.testing.assert_close(together.log_likelihood[[short]], alone.log_likelihood, rtol=0, atol=1e-9)
+
+
+def test_steps_on_a_linear_program_never_cost_more(cart, uneven):
+    """Whole steps are taken there from any path: one pass more is the exact mean."""
+    path = find_path(cart, uneven)
+    far = Path(path.states + 5.0, path.noise - 3.0)
+    once, settled = (smooth(cart, uneven, far, passes=passes) for passes in (2, 20))
+    torch.testing.assert_close(once.means()[0], settled.means()[0], rtol=0, atol=1e-8)
+
+
 def test_a_found_path_on_the_cart_is_the_exact_mean(cart, uneven):
     path = find_path(cart, uneven, particles=50, tempering=(1.0, 0.1))
     for trajectory, rows in enumerate(uneven.lengths.tolist()):

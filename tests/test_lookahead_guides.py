@@ -198,6 +198,22 @@ def test_gaussian_draws_agree_with_the_transition_to_first_order():
     assert float(gap(0.1).max() / gap(1.0).max()) == pytest.approx(0.01, rel=0.2)
 
 
+def test_paths_follow_a_program_that_changes_from_one_refresh_to_the_next():
+    """A refresh linearises once. What it remembers is the mean, however far that is."""
+    program = example("hovercraft").requires_grad_(False)
+    data = drives(program, 3, 40)
+    guide = GaussianGuide(program, draws=4, known_start=True, tempering=Constant(), search_again=math.inf)
+    guide.refresh(data, 0.0)
+    for share in range(1, 11):
+        program.mass = torch.tensor(1.5 + 0.05 * share).double()
+        before = guide.memory["noise/1"].clone()
+        guide.refresh(data, share / 10)
+        assert not torch.equal(guide.memory["noise/1"], before)
+    exact = smooth(program, data, find_path(program, data, known_start=True), known_start=True, passes=20)
+    for i, label in enumerate(data.labels):
+        assert (guide.memory[f"noise/{label}"] - exact.means()[1][:, i]).abs().max() < 0.1
+
+
 def test_a_guide_remembers_its_paths_from_one_refresh_to_the_next(monkeypatch):
     program = example("hovercraft:HovercraftTruth").requires_grad_(False)
     data = drives(program, 3, 12, gaps=True)

@@ -13,12 +13,14 @@ import torch
 from examples import drives, example
 from oracles import cart_system, kalman_filter
 from pyro.infer import Trace_ELBO
+from pyro.nn import PyroParam
 from small import HOVERCRAFT, simulated, steady, written
 
 from steady_ppl import (
     Fit,
     Joint,
     PathGuide,
+    PlanarVehicle,
     Program,
     ProgramError,
     UsageError,
@@ -42,7 +44,14 @@ from steady_ppl.sites import AtMean, Recording, Standardised, running
 from steady_ppl.stability import counts_rows, is_step
 from steady_ppl.step_size import check_step
 from steady_ppl.stepping import Stepping
-from steady_ppl.substeps import acting_controls, advance, channel_values, row_controls, sample_channels
+from steady_ppl.substeps import (
+    acting_controls,
+    advance,
+    channel_scales,
+    channel_values,
+    row_controls,
+    sample_channels,
+)
 
 K = 3
 
@@ -468,3 +477,83 @@ def test_simulate_says_its_steps(tmp_path, capsys) -> None:
 
 def test_an_abstract_program_has_one_substep() -> None:
     assert Program.substeps == 1
+
+
+# --- what a channel is on average over a row --------------------------------------------------------------------------
+
+
+class TwoSites(PlanarVehicle):
+    """A vehicle with drag whose yaw has a site of its own, with the tails of a Student t."""
+
+    controls = ("push", "turn")
+    duration = 3.0
+
+    def __init__(self):
+        super().__init__()
+        self.drag = PyroParam(torch.tensor(2.0))
+
+    def initial(self):
+        return pyro.sample("start", dist.Normal(torch.zeros(6).to(self.drag), 0.1).to_event(1))
+
+    def transition(self, state, control, time, step):
+        push, turn = control.unbind(-1)
+        forward, lateral, yaw_rate = self.body_velocity(state)
+        yaw = pyro.sample("yaw", dist.StudentT(5.0, turn - 3.0 * yaw_rate, 0.2))
+        mean = stack(push - self.drag * forward, -self.drag * lateral)
+        moved = pyro.sample("moved", dist.Normal(mean, torch.tensor([0.3, 0.1]).to(mean)).to_event(1))
+        return self.integrate(state, stack(moved[..., 0], moved[..., 1], yaw), step)
+
+    def observe(self, state):
+        pyro.sample("pose", dist.Normal(state[..., :3], 0.05).to_event(1))
+
+    measurements = ("x", "y", "heading")
+
+
+def sampled(program, state, given):
+    seen = Recording()
+    with running(*state.shape[:-1]), seen:
+        sample_channels(program, state, *given)
+    return seen.distributions
+
+
+def test_a_row_keeps_as_much_of_each_sites_noise_as_is_left_at_its_end() -> None:
+    """A rate λ in K parts of a row of T leaves (1 − (1 − λ T / K)^K) / (λ T) of noise that is held."""
+    program = with_substeps(TwoSites().double(), 4)
+    state, step = torch.zeros(3, 5, 6).double(), torch.tensor(0.3).double().expand(5)
+    given = torch.zeros(5, 2).double(), torch.zeros(5).double(), step
+    found = sampled(program, state, given)
+    assert list(found) == ["yaw", "moved"] and isinstance(found["yaw"], dist.StudentT)
+
+    def left(rate):
+        return (1 - (1 - rate * 0.3 / 4) ** 4) / (rate * 0.3)
+
+    torch.testing.assert_close(found["yaw"].scale, torch.full((3, 5), 0.2 * left(3.0)).double())
+    expected = torch.tensor([0.3, 0.1]).double() * left(2.0)
+    torch.testing.assert_close(found["moved"].base_dist.scale, expected.expand(3, 5, 2))
+    own = channel_scales(program, state, *given)
+    torch.testing.assert_close(own, torch.tensor([0.2, 0.3, 0.1]).double().expand(3, 5, 3))
+
+
+@pytest.mark.parametrize("noise", [0.1, 1e-3, 1e-6, 2e-7])
+def test_a_rows_noise_is_seen_in_single_precision_however_small_it_is(noise) -> None:
+    cart = example("linear_gaussian", torch.float32)
+    cart.noise, cart.damping = torch.tensor(noise), torch.tensor(2.0)
+    cart = with_substeps(cart, 4)
+    given = torch.full((1, 1), 20.0), torch.zeros(1), torch.full((1,), 0.1)
+    (fn,) = sampled(cart, torch.zeros(1, 2), given).values()
+    share = (1 - (1 - 0.2 / 4) ** 4) / 0.2
+    assert float(fn.stddev.detach()) == pytest.approx(noise * share, rel=1e-3)
+
+
+def test_noise_that_is_turned_round_within_a_row_counts_as_a_tenth() -> None:
+    class Spring(type(example("linear_gaussian"))):
+        def transition(self, state, control, time, step):
+            position, velocity = state.unbind(-1)
+            mean = self.gain * control[..., 0] - 35.0**2 * position
+            velocity = velocity + pyro.sample("acceleration", dist.Normal(mean, self.noise)) * step
+            return stack(position + velocity * step, velocity)
+
+    cart = with_substeps(Spring().double(), 32)
+    given = torch.zeros(1, 1).double(), torch.zeros(1).double(), torch.full((1,), 0.1).double()
+    (fn,) = sampled(cart, torch.zeros(1, 2).double(), given).values()
+    torch.testing.assert_close(fn.stddev, 0.1 * cart.noise.expand(1).detach())
