@@ -21,7 +21,8 @@ from steady_ppl.substeps import acting_controls, row_controls
 # Chosen by held-out log p(y) of the valid split, draws 11 to 14 of the bearings: see docs/truck.md. With 200 steps and
 # one gradient step each, numbers that go together (lever, slip) may end far off: 389.5, 394.6, 392.3, 394.9 nats a
 # drive; three gradient steps: 389.0, 395.0, 394.8, 394.6; 400 steps with a rate of .02: 389.2, 394.9, 395.4, 395.3.
-# Both together were run on the draws 11 and 13 alone, from other starting values: 389.0, 394.9.
+# Both together were run on the draws 11 and 13 alone, from other starting values: 389.0, 394.9. By the M step that
+# scores what noise does to a whole row, 400 steps, draws 12 and 14: one gradient step 394.5, 395.3; three 394.8, 395.4.
 MECHANISTIC = {"guide": "lookahead", "steps": 400, "gradient_steps": 3, "learning_rate": 0.02, "ramp": 3.0}
 PROGRAMS: dict[str, tuple[Any, dict[str, Any]]] = {
     "hand": (PaperTruck, {}),
