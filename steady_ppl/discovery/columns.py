@@ -57,8 +57,8 @@ class Scoring:
         self.acting = acting_controls(program, data)
         self.controls = row_controls(program, self.acting)
         self.means, spread = channel_moments(program, data, at.channels.points, self.acting)
-        self.of_row = spread[0]
-        self.of_substep = substep_spreads(program, data, at.channels.points[:1], self.acting)[0]
+        self.row_spread = spread[0]
+        self.substep_spread = substep_spreads(program, data, at.channels.points[:1], self.acting)[0]
         self.here = measured(program, at.measurements.points)
         self._points: dict[int, Tensor] = {}
         self._values: dict[int, dict[str, Tensor]] = {}
@@ -75,7 +75,7 @@ class Scoring:
 
     def _differences(self, column: Column) -> Iterator[tuple[tuple[Tensor, Tensor], float]]:
         """For each number of the coefficient two coefficients and how far they are apart."""
-        variant, like = column.variant, self.of_substep
+        variant, like = column.variant, self.substep_spread
         absent = variant.absent(like)
         if column.probe is not None:
             reach = 1.0 if not torch.isfinite(absent) else abs(column.probe - float(absent))
@@ -101,7 +101,7 @@ class Scoring:
                 continue
             pushes = [self._pushed(variant, value, index)[channel] for value in values]
             change = pushes[0] if len(pushes) == 1 else pushes[0] - pushes[1]
-            slope = (change / (width * self.of_substep[..., index])).expand(3, *self.of_substep.shape[:2])
+            slope = (change / (width * self.substep_spread[..., index])).expand(3, *self.substep_spread.shape[:2])
             total = total + self.at.channels.of_component(index, slope).sum(0)
         return total
 
@@ -121,7 +121,7 @@ class Scoring:
         index = names(self.program.channels).index(variant.options["channel"])
         variable, knots = variant.options["variable"], variant.options["knots"]
         times = multiplier(self._means_around(index), variant.options["channel"], variant.options["times"])
-        weights = self.at.channels.weights(index) / self.of_substep[..., index] * times
+        weights = self.at.channels.weights(index) / self.substep_spread[..., index] * times
         return by_height(self._variables(index)[variable], weights, knots, variable in self.program.angles)
 
     def _variables(self, index: int) -> dict[str, Tensor]:
@@ -129,7 +129,9 @@ class Scoring:
         if index not in self._values:
             given = (self._around(index), self.controls[:-1], self.data.elapsed[:-1])
             found = variables(self.program, *given, self._means_around(index))
-            self._values[index] = {name: value.expand(3, *self.of_substep.shape[:2]) for name, value in found.items()}
+            self._values[index] = {
+                name: value.expand(3, *self.substep_spread.shape[:2]) for name, value in found.items()
+            }
         return self._values[index]
 
     def _means_around(self, index: int) -> dict[str, Tensor]:
@@ -171,12 +173,12 @@ class Scoring:
 
     def _of_control(self, change: Tensor, width: float) -> Tensor:
         slope = (self.by_control * change.movedim(-1, 0).unsqueeze(-1)).sum(0)
-        return self.at.channels.of_mean(slope / (width * self.of_row))
+        return self.at.channels.of_mean(slope / (width * self.row_spread))
 
     @cached_property
     def of_control(self) -> Tensor:
         """Scores of the acting controls, row by row, `(T, B, U)`."""
-        return torch.stack([self.at.channels.by_row(slope / self.of_row) for slope in self.by_control], -1)
+        return torch.stack([self.at.channels.by_row(slope / self.row_spread) for slope in self.by_control], -1)
 
     @cached_property
     def by_control(self) -> Tensor:
@@ -210,7 +212,7 @@ class Scoring:
     def _spread(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         given = (self.at.states[:-1], self.controls[:-1], self.data.elapsed[:-1], self.data.steps)
         factors = [
-            by_channel(self.program, variant(self.program, *given, c=value), 1.0, self.of_substep) for value in c
+            by_channel(self.program, variant(self.program, *given, c=value), 1.0, self.substep_spread) for value in c
         ]
         return self.at.channels.of_spread((factors[0] / factors[1]).log() / width)
 
@@ -230,8 +232,8 @@ class Scoring:
         """Of the share of the last deviation that stays, at zero: E[ε(t) ε(t − 1)], in the spreads' ratio."""
         at = self.at.channels
         product = at.mean[1:] * at.mean[:-1] + self.at.lag[1:]
-        ratio = self.of_substep[:-1] / self.of_substep[1:]
-        chosen = self.of_substep.new_tensor(
+        ratio = self.substep_spread[:-1] / self.substep_spread[1:]
+        chosen = self.substep_spread.new_tensor(
             [float(n in variant.options["channels"]) for n in names(self.program.channels)]
         )
         return torch.where(at.present[1:], product * ratio * chosen, 0.0).sum((0, -1))
