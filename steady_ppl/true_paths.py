@@ -17,7 +17,7 @@ from steady_ppl.sites import Recording, Replaying, running
 from steady_ppl.substeps import acting_controls, sample_row
 
 PASSES = 30  # of Gauss and Newton's method
-AT_REST = 1e-10  # of a channel's size and unit, by which noise may still move when it is found
+AT_REST = 1e-9  # of a channel's size and unit, by which noise may still move when it is found
 Noise = dict[str, Tensor]
 
 
