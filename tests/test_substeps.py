@@ -486,7 +486,7 @@ class TwoSites(PlanarVehicle):
     """A vehicle with drag whose yaw has a site of its own, with the tails of a Student t."""
 
     controls = ("push", "turn")
-    duration = 3.0
+    measurements = ("x", "y", "heading")
 
     def __init__(self):
         super().__init__()
@@ -505,8 +505,6 @@ class TwoSites(PlanarVehicle):
 
     def observe(self, state):
         pyro.sample("pose", dist.Normal(state[..., :3], 0.05).to_event(1))
-
-    measurements = ("x", "y", "heading")
 
 
 def sampled(program, state, given):
