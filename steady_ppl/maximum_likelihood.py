@@ -7,8 +7,8 @@ Hall, Hall and Hausman 1974) unless it is known, and learns on the way (Broyden,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -88,9 +88,14 @@ def maximise(
     Raises:
         FilterError: the program cannot be smoothed at its initial parameters.
     """
-    return kept_maximum(
-        program, lambda: _climb(program, data, path, known_start, information, steps, precision, hopeless)
-    )
+
+    def compute() -> Maximum:
+        parts = elements(program)
+        own = Term(program, data, path or find_path(program, data, known_start=known_start), parts, range(len(parts)))
+        (found,) = climb([own], known_start, information, steps, precision, hopeless)
+        return found
+
+    return kept_maximum(program, compute)
 
 
 def kept_maximum(program: Program, climb: Callable[[], Maximum]) -> Maximum:
@@ -110,20 +115,47 @@ def kept_maximum(program: Program, climb: Callable[[], Maximum]) -> Maximum:
     return Maximum(log_likelihood=tensors["log_likelihood"], information=tensors["information"], path=path, **values)
 
 
-def _climb(
-    program: Program,
-    data: Trajectories,
-    path: Path | None,
+@dataclass(frozen=True)
+class Term:
+    """What a program adds to an objective.
+
+    Attributes:
+        program: its parameters are moved in place.
+        data: its drives.
+        path: near their posterior means.
+        parts: its learnable numbers.
+        columns: of each of them among all numbers of the objective, of which several programs may share some.
+    """
+
+    program: Program
+    data: Trajectories
+    path: Path
+    parts: list[Element]
+    columns: Sequence[int]
+
+
+@torch.no_grad()
+def climb(
+    terms: Sequence[Term],
     known_start: bool,
     information: Tensor | None,
     steps: int,
     precision: float,
-    hopeless: float,
-) -> Maximum:
-    parts = elements(program)
-    here = _look(program, data, path or find_path(program, data, known_start=known_start), known_start, parts)
-    require_found(here.ahead, program, data)
-    began, reach = here.objective, torch.tensor([REACH * part.step for part in parts], dtype=torch.float64)
+    hopeless: float = -math.inf,
+) -> list[Maximum]:
+    """Move the numbers of programs, in place, to where the sum of their objectives is largest.
+
+    Returns:
+        Of each program where it ended, with its own part of the information; `decrement` and `steps` are of the sum.
+
+    Raises:
+        FilterError: the programs cannot be smoothed where they begin.
+    """
+    here = _look(terms, known_start)
+    for term, at in zip(terms, here.terms, strict=True):
+        require_found(at.ahead, term.program, term.data)
+    began = [at.objective for at in here.terms]
+    reach = _gathered(terms, [[REACH * part.step for part in term.parts] for term in terms])
     information = _firm(_of_drives(here) if information is None else information)
     taken, decrement, passes = 0, 0.0, PASSES
     with stages(*(("", FEWER**step) for step in range(steps + 1))) as begin:
@@ -135,11 +167,11 @@ def _climb(
                     "the likeliest parameters cannot be found: the drives do not tell them apart (singular)"
                 )
             decrement = 0.5 * float(here.gradient @ move)
-            behind = taken >= 6 and float(here.ahead.log_likelihood.sum()) < hopeless
+            behind = taken >= 6 and here.log_likelihood < hopeless
             if decrement < precision or taken == steps or behind:
                 break
             move = move * min(1.0, 1 / max(1e-9, float((move.abs() / reach).max())))
-            share, there = _searched(program, data, here, move, known_start, parts, passes)
+            share, there = _searched(terms, here, move, known_start, passes)
             if there is not None:
                 information = _updated(information, share * move, here.gradient - there.gradient)
                 here = there
@@ -147,29 +179,40 @@ def _climb(
                 break
             else:
                 passes = PATIENT
-                here = _look(program, data, here.path, known_start, parts, passes)
+                here = _look(_along(terms, here), known_start, passes)
                 information = _firm(_of_drives(here))
-    return _maximum(here, parts, information, taken, decrement, began)
+    return [
+        _maximum(term, at, information, taken, decrement, before)
+        for term, at, before in zip(terms, here.terms, began, strict=True)
+    ]
+
+
+def _count(terms: Sequence[Term]) -> int:
+    return len({column for term in terms for column in term.columns})
+
+
+def _gathered(terms: Sequence[Term], values: Sequence[Sequence[float]]) -> Tensor:
+    """Values of all numbers of an objective, `(P,)`, from those of each program."""
+    found = torch.zeros(_count(terms), dtype=torch.float64)
+    for term, own in zip(terms, values, strict=True):
+        found[list(term.columns)] = torch.as_tensor(own, dtype=torch.float64)
+    return found
 
 
 def _searched(
-    program: Program,
-    data: Trajectories,
-    here: _Here,
-    move: Tensor,
-    known_start: bool,
-    parts: list[Element],
-    passes: int,
+    terms: Sequence[Term], here: _Here, move: Tensor, known_start: bool, passes: int
 ) -> tuple[float, _Here | None]:
     """The share of a move that does not fall, and where it leads; None where none does and nothing is moved."""
-    share, before = 1.0 if bool(torch.isfinite(move).all()) else 0.0, values_of(parts)
+    share, before = 1.0 if bool(torch.isfinite(move).all()) else 0.0, [values_of(term.parts) for term in terms]
     while share > 0.01:
-        set_values(parts, before + share * move)
-        there = _try(program, data, here.path, known_start, parts, passes)
+        for term, values in zip(terms, before, strict=True):
+            set_values(term.parts, values + share * move[list(term.columns)])
+        there = _try(_along(terms, here), known_start, passes)
         if there is not None and there.objective >= here.objective - GIVES_WAY:
             return share, there
         share /= 3
-    set_values(parts, before)
+    for term, values in zip(terms, before, strict=True):
+        set_values(term.parts, values)
     return 0.0, None
 
 
@@ -184,27 +227,52 @@ def _firm(information: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class _Here:
+class _TermHere:
     ahead: Lookahead
     path: Path
-    scores: Tensor
-    gradient: Tensor
     objective: float
 
 
-def _look(
-    program: Program, data: Trajectories, path: Path, known_start: bool, parts: list[Element], passes: int = PASSES
-) -> _Here:
-    ahead = smooth(program, data, path, known_start=known_start, passes=passes, tolerance=TOLERANCE, kernels=False)
-    scores = parameter_scores(program, data, smoothed(ahead, data), parts)
-    prior, slope = _prior(program, parts)
-    return _Here(
-        ahead=ahead,
-        path=resting_path(ahead, data),
-        scores=scores,
-        gradient=scores.sum(0) + slope,
-        objective=float(ahead.log_likelihood.sum()) + prior,
-    )
+@dataclass(frozen=True)
+class _Here:
+    terms: list[_TermHere]
+    scores: Tensor
+    gradient: Tensor
+
+    @property
+    def objective(self) -> float:
+        return sum(term.objective for term in self.terms)
+
+    @property
+    def log_likelihood(self) -> float:
+        return sum(float(term.ahead.log_likelihood.sum()) for term in self.terms)
+
+
+def _along(terms: Sequence[Term], here: _Here) -> list[Term]:
+    return [replace(term, path=there.path) for term, there in zip(terms, here.terms, strict=True)]
+
+
+def _look(terms: Sequence[Term], known_start: bool, passes: int = PASSES) -> _Here:
+    found, scores, slopes = [], [], []
+    for term in terms:
+        program, data = term.program, term.data
+        ahead = smooth(
+            program, data, term.path, known_start=known_start, passes=passes, tolerance=TOLERANCE, kernels=False
+        )
+        scores.append(parameter_scores(program, data, smoothed(ahead, data), term.parts))
+        prior, slope = _prior(program, term.parts)
+        slopes.append(scores[-1].sum(0) + slope)
+        found.append(_TermHere(ahead, resting_path(ahead, data), float(ahead.log_likelihood.sum()) + prior))
+    count = _count(terms)
+    gradient = torch.zeros(count, dtype=torch.float64)
+    by_drive = []
+    for term, own, slope in zip(terms, scores, slopes, strict=True):
+        columns = list(term.columns)
+        gradient[columns] += slope
+        wide = own.new_zeros((len(own), count))
+        wide[:, columns] = own
+        by_drive.append(wide)
+    return _Here(found, torch.cat(by_drive), gradient)
 
 
 def posterior_score(program: Program, data: Trajectories, path: Path, known_start: bool) -> Tensor:
@@ -213,19 +281,18 @@ def posterior_score(program: Program, data: Trajectories, path: Path, known_star
     Raises:
         FilterError: the program blows up there.
     """
-    return _look(program, data, path, known_start, elements(program), PATIENT).gradient
+    parts = elements(program)
+    return _look([Term(program, data, path, parts, range(len(parts)))], known_start, PATIENT).gradient
 
 
-def _try(
-    program: Program, data: Trajectories, path: Path, known_start: bool, parts: list[Element], passes: int
-) -> _Here | None:
-    """None where the step went too far: the program blows up there."""
+def _try(terms: Sequence[Term], known_start: bool, passes: int) -> _Here | None:
+    """None where the step went too far: a program blows up there."""
     try:
-        here = _look(program, data, path, known_start, parts, passes)
+        here = _look(terms, known_start, passes)
     except FilterError:
         return None
-    finite = bool(torch.isfinite(here.ahead.log_likelihood).all()) and bool(torch.isfinite(here.gradient).all())
-    return here if finite else None
+    finite = all(bool(torch.isfinite(term.ahead.log_likelihood).all()) for term in here.terms)
+    return here if finite and bool(torch.isfinite(here.gradient).all()) else None
 
 
 def _prior(program: Program, parts: list[Element]) -> tuple[float, Tensor]:
@@ -260,15 +327,14 @@ def _updated(information: Tensor, step: Tensor, fall: Tensor) -> Tensor:
     return information - torch.outer(through, through) / expected + torch.outer(fall, fall) / seen
 
 
-def _maximum(
-    here: _Here, parts: list[Element], information: Tensor, taken: int, decrement: float, began: float
-) -> Maximum:
+def _maximum(term: Term, here: _TermHere, information: Tensor, taken: int, decrement: float, began: float) -> Maximum:
+    columns = list(term.columns)
     return Maximum(
         log_likelihood=here.ahead.log_likelihood,
         objective=here.objective,
         path=here.path,
-        names=tuple(part.name for part in parts),
-        information=information,
+        names=tuple(part.name for part in term.parts),
+        information=information[columns][:, columns],
         steps=taken,
         decrement=decrement,
         gained=here.objective - began,

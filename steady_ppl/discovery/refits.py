@@ -13,16 +13,17 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, Fitting, is_doubtful
 from steady_ppl.effects import Variant, attach, attached, coefficient
-from steady_ppl.elements import elements
+from steady_ppl.elements import elements, set_values, values_of
 from steady_ppl.errors import FilterError, SteadyError
 from steady_ppl.gaussian_smoother import find_path
 from steady_ppl.likelihood_fit import fit_by_likelihood, led_back, widens
 from steady_ppl.linearization import Path
-from steady_ppl.maximum_likelihood import Maximum, maximise
+from steady_ppl.maximum_likelihood import Maximum, Term, climb, maximise
 from steady_ppl.program import Program
 from steady_ppl.seeding import seeded
 
 WIDER = math.log(20.0)  # log ratio of a channel's noise after a fit and before, from which it explains next to nothing
+COMMON_STEPS, COMMON_PRECISION = 10, 0.1  # scoring steps of folds together, and nats that another would gain
 NOTHING = 2.0  # nats below the program without, after which a fit is given up: a candidate at zero is that program
 
 
@@ -56,8 +57,9 @@ class Refit:
         programs: one a fold.
         maxima: one a fold.
         folds: with the paths of these programs.
-        held_out: log p(y) of each drive under the program fitted without it, `(B,)`, the folds one after another; those
-            of the first only where the rest was not worth fitting.
+        held_out: log p(y) of each drive under the program fitted without it but for its process noise, which all folds
+            have in common, `(B,)`, the folds one after another; those of the first only where the rest was not worth
+            fitting.
         rough: the program before its fit made its noise many times wider, from whose parameters fits with an effect
             begin as well; None where it did not.
         fitting: how it was fitted, and how fits with an effect are.
@@ -206,7 +208,7 @@ def _refit(
     rough: Program | None = None,
     fitting: Fitting = BY_LIKELIHOOD,
 ) -> Refit:
-    fitted, found, held_out, judged_folds = list[Program](), [], [], []
+    fitted, found, held_out, judged_folds = list[Program](), list[Maximum](), list[Tensor](), list[Fold]()
     for program, fold, known, floor in zip(programs, folds, maxima, least, strict=True):
         drives, unseen = wide_drives(fold.drives, program), wide_drives(fold.held_out, program)
         share, path = len(fold.drives) / len(folds[0].drives), wide(fold.held_out_path, program)
@@ -227,7 +229,66 @@ def _refit(
         judged_folds.append(Fold(drives, maximum.path, unseen, judged.path))
         if float(maximum.log_likelihood.sum()) < worth.drives and float(judged.log_likelihood.sum()) < worth.held_out:
             break
+    if len(fitted) == len(folds) and fitting == BY_LIKELIHOOD:
+        copies = with_common_noise(fitted, found, judged_folds, known_start)
+        held_out = [
+            fitting.judge(program, fold.held_out, fold.held_out_path, known_start=known_start).log_likelihood
+            for program, fold in zip(copies, judged_folds, strict=True)
+        ]
     return Refit(fitted, found, judged_folds, torch.cat(held_out), fitting=fitting)
+
+
+def with_common_noise(
+    programs: Sequence[Program], maxima: Sequence[Maximum], folds: Sequence[Fold], known_start: bool
+) -> list[Program]:
+    """Copies of programs, each fitted to its fold, that have the standard deviations of their process noise in common.
+
+    A few drives tell little of the noise. Fitted to them alone it may vanish, and then the drives that judge the
+    program punish it by tens of nats, whatever its physics. The sum of all folds' log p(y) is maximised in these
+    numbers and in each program's others. Coefficients of effects, those of noise included, stay each fold's own.
+
+    Args:
+        programs: one a fold, of the same parameters.
+        maxima: where their fits ended.
+        folds: their drives.
+        known_start: the first states are certain.
+    """
+    copies = [copy.deepcopy(program) for program in programs]
+    columns = _columns(copies, folds)
+    size = len({column for own in columns for column in own})
+    if size == sum(len(own) for own in columns):
+        return copies
+    information, pull = torch.zeros(size, size).double(), torch.zeros(size).double()
+    terms = [
+        Term(program, fold.drives, maximum.path, elements(program), own)
+        for program, maximum, fold, own in zip(copies, maxima, folds, columns, strict=True)
+    ]
+    for term, maximum in zip(terms, maxima, strict=True):
+        index = torch.tensor(term.columns)
+        information[index[:, None], index] += maximum.information
+        pull[index] += maximum.information @ values_of(term.parts)
+    begin = torch.linalg.solve(information, pull)  # the maximum of the sum, were every log p(y) a parabola
+    for term in terms:
+        set_values(term.parts, begin[list(term.columns)])
+    climb(terms, known_start, information, steps=COMMON_STEPS, precision=COMMON_PRECISION)
+    return copies
+
+
+def _columns(programs: Sequence[Program], folds: Sequence[Fold]) -> list[list[int]]:
+    """Of each program's learnable numbers among those of all, where the process noise is the same in all."""
+    effects = {known.parameter for known in attached(programs[0])}
+    parts = elements(programs[0])
+    common = [
+        index
+        for index, part in enumerate(parts)
+        if part.name.split("[")[0] not in effects and widens(programs[0], part, folds[0].drives)
+    ]
+    own = [index for index in range(len(parts)) if index not in common]
+    first = {index: place for place, index in enumerate([*common, *own])}
+    return [
+        [first[index] if index in common else first[index] + order * len(own) for index in range(len(parts))]
+        for order, _ in enumerate(programs)
+    ]
 
 
 def _afresh(program: Program, drives: Trajectories, known_start: bool, floor: float) -> tuple[Program, Maximum] | None:
