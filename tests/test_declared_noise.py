@@ -22,7 +22,7 @@ def fitted(*programs) -> Refit:
         data = drives(program, count, 9)
         path = Path(data.states, torch.zeros(8, count, 3).double())
         folds.append(Fold(data, path, data, path))
-    return Refit(list(programs), [], folds, torch.zeros(6))
+    return Refit(list(programs), list(programs), [], folds, torch.zeros(6))
 
 
 @pytest.mark.parametrize("effect", ["range_dependent_noise", "coloured_noise:yaw"])

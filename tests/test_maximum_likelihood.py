@@ -10,7 +10,7 @@ import torch
 from examples import drives, example
 
 from steady_ppl.discovery.candidates import gain_of_fits
-from steady_ppl.discovery.refits import first_refit, refit_near, refit_with, with_common_noise
+from steady_ppl.discovery.refits import first_refit, refit_near, refit_with
 from steady_ppl.effects import chosen_variant
 from steady_ppl.elements import elements
 from steady_ppl.gaussian_smoother import smooth
@@ -97,8 +97,7 @@ def test_drives_are_judged_by_fits_that_have_not_seen_them():
     variant = chosen_variant(program, "yaw_bias", "")
     first, second = (float(value) for value in found.coefficients(variant))
     assert float(found.coefficient(variant)) == pytest.approx((6 * first + 8 * second) / 14)
-    judges = with_common_noise(found.programs, found.maxima, found.folds, known_start=True)
-    judged = smooth(judges[0], valid, found.folds[0].held_out_path, known_start=True, passes=4)
+    judged = smooth(found.judges[0], valid, found.folds[0].held_out_path, known_start=True, passes=4)
     torch.testing.assert_close(found.held_out[:8], judged.log_likelihood, atol=0.05, rtol=0)
     again = maximise(copy.deepcopy(found.programs[0]), train, found.folds[0].path, known_start=True)
     assert again.objective == pytest.approx(found.maxima[0].objective, abs=0.1)
@@ -118,10 +117,9 @@ def test_drives_are_judged_with_noise_that_all_of_them_tell(carts):
     """Fitted to one half alone it vanishes, and the other half punishes the program for that."""
     alone = [float(program.noise.detach()) for program in carts.programs]
     assert min(alone) < 0.15 / 10 and max(alone) < 0.15
-    judges = with_common_noise(carts.programs, carts.maxima, carts.folds, known_start=True)
-    common = [float(program.noise.detach()) for program in judges]
+    common = [float(program.noise.detach()) for program in carts.judges]
     assert common[0] == common[1] and min(alone) < common[0] < max(alone)
-    assert [float(program.noise.detach()) for program in carts.programs] == alone
+    assert float(carts.mean_program().noise.detach()) == pytest.approx(common[0])
     by_own = sum(
         float(smooth(program, fold.held_out, fold.held_out_path, known_start=True).log_likelihood.sum())
         for program, fold in zip(carts.programs, carts.folds, strict=True)
@@ -130,22 +128,20 @@ def test_drives_are_judged_with_noise_that_all_of_them_tell(carts):
 
 
 def test_no_noise_in_common_is_likelier(carts):
-    judges = with_common_noise(carts.programs, carts.maxima, carts.folds, known_start=True)
-
     def likelihood(programs) -> float:
         return sum(
             likelihood_of_cart(program, fold.drives) for program, fold in zip(programs, carts.folds, strict=True)
         )
 
-    best = likelihood(judges)
+    best = likelihood(carts.judges)
     for by in (-0.2, 0.2):
-        neighbours = copy.deepcopy(judges)
+        neighbours = copy.deepcopy(carts.judges)
         for program in neighbours:
             next(part for part in elements(program) if part.name == "noise").move(by)
         assert likelihood(neighbours) < best
     for name in ("gain", "damping", "measurement_sd"):
         for by in (-0.1, 0.1):
-            neighbours = copy.deepcopy(judges)
+            neighbours = copy.deepcopy(carts.judges)
             next(part for part in elements(neighbours[1]) if part.name == name).move(by)
             assert likelihood(neighbours) < best
 

@@ -24,7 +24,7 @@ class Departure:
     Attributes:
         variant: `process_noise` of these channels, or `measurement_noise`.
         away: log ratio of fitted to declared, their mean, on the drives that are tested.
-        on_all: the same on the drives of all folds.
+        on_all: the same of the judges, on the drives of all folds.
         share: of the drives that are tested among all.
         slope: derivative of `away` in the fitted parameters, `(P,)`.
     """
@@ -57,19 +57,15 @@ def departures(declared: Program, now: Refit, parts: Sequence[Element]) -> list[
     found = []
     for name, spread in SPREADS.items():
         slope = _slope(spread, now.program, now.folds[0], parts) * torch.tensor(own).unsqueeze(-1)
-        away = torch.stack(
-            [
-                _spread(spread, program, fold) - _spread(spread, as_declared(declared, program), fold)
-                for program, fold in zip(now.programs, now.folds, strict=True)
-            ]
-        )
-        mean = (torch.tensor(counts).unsqueeze(-1) * away).sum(0) / sum(counts)
+        away = _away(spread, declared, now.program, now.folds[0])
+        of_folds = torch.stack([_away(spread, declared, *one) for one in zip(now.judges, now.folds, strict=True)])
+        mean = (torch.tensor(counts).unsqueeze(-1) * of_folds).sum(0) / sum(counts)
         variants = [v for effect in catalogue(now.program) if effect.name == name for v in effect.variants(now.program)]
         for variant in variants if parts else []:
             index = _columns(now.program, variant)
             index = [i for i in index if bool(slope[:, i].any()) and not _guessed(now.program, parts, slope[:, i])]
             if index:
-                away_of, mean_of = float(away[0, index].mean()), float(mean[index].mean())
+                away_of, mean_of = float(away[index].mean()), float(mean[index].mean())
                 found.append(Departure(variant, away_of, mean_of, counts[0] / sum(counts), slope[:, index].mean(1)))
     return found
 
@@ -83,6 +79,11 @@ def _slope(spread: Spread, program: Program, fold: Fold, parts: Sequence[Element
         with moved(part, -part.step):
             slopes.append((up - _spread(spread, program, fold)) / (2 * part.step))
     return torch.stack(slopes) if slopes else torch.zeros(0)
+
+
+def _away(spread: Spread, declared: Program, program: Program, fold: Fold) -> Tensor:
+    """Log ratios of standard deviations to the declared, `(C,)` or `(K,)`."""
+    return _spread(spread, program, fold) - _spread(spread, as_declared(declared, program), fold)
 
 
 def _spread(spread: Spread, program: Program, fold: Fold) -> Tensor:

@@ -54,18 +54,19 @@ class Refit:
     """A program fitted on each fold.
 
     Attributes:
-        programs: one a fold.
+        programs: one a fold, fitted to its drives alone.
+        judges: the same with their process noise in common, by which the other drives are judged.
         maxima: one a fold.
         folds: with the paths of these programs.
-        held_out: log p(y) of each drive under the program fitted without it but for its process noise, which all folds
-            have in common, `(B,)`, the folds one after another; those of the first only where the rest was not worth
-            fitting.
+        held_out: log p(y) of each drive under the judge fitted without it but for its process noise, `(B,)`, the folds
+            one after another; those of the first only where the rest was not worth fitting.
         rough: the program before its fit made its noise many times wider, from whose parameters fits with an effect
             begin as well; None where it did not.
         fitting: how it was fitted, and how fits with an effect are.
     """
 
     programs: list[Program]
+    judges: list[Program]
     maxima: list[Maximum]
     folds: list[Fold]
     held_out: Tensor
@@ -79,19 +80,19 @@ class Refit:
 
     def coefficients(self, variant: Variant) -> list[Tensor]:
         """An effect's coefficient on each fold."""
-        return [coefficient(program, _there(program, variant)).detach().clone() for program in self.programs]
+        return [coefficient(program, _there(program, variant)).detach().clone() for program in self.judges]
 
     def coefficient(self, variant: Variant) -> Tensor:
         """Its mean over the folds, weighted by their drives: nearly that of a fit to all drives together."""
-        weights = [len(fold.drives) for fold, _ in zip(self.folds, self.programs, strict=False)]
+        weights = [len(fold.drives) for fold in self.folds]
         parts = [w * value for w, value in zip(weights, self.coefficients(variant), strict=True)]
         return torch.stack(parts).sum(0) / sum(weights)
 
     def mean_program(self) -> Program:
         """The folds' parameters averaged where they are learned: nearly what a fit to all drives together gives."""
-        mean = copy.deepcopy(self.programs[0])
-        weights = [len(fold.drives) for fold, _ in zip(self.folds, self.programs, strict=False)]
-        learned = [dict(program.named_parameters()) for program in self.programs]
+        mean = copy.deepcopy(self.judges[0])
+        weights = [len(fold.drives) for fold in self.folds]
+        learned = [dict(program.named_parameters()) for program in self.judges]
         for name, parameter in mean.named_parameters():
             if parameter.requires_grad:
                 parts = [weight * values[name].data for weight, values in zip(weights, learned, strict=True)]
@@ -229,13 +230,14 @@ def _refit(
         judged_folds.append(Fold(drives, maximum.path, unseen, judged.path))
         if float(maximum.log_likelihood.sum()) < worth.drives and float(judged.log_likelihood.sum()) < worth.held_out:
             break
+    judges = fitted
     if len(fitted) == len(folds) and fitting == BY_LIKELIHOOD:
-        copies = with_common_noise(fitted, found, judged_folds, known_start)
+        judges = with_common_noise(fitted, found, judged_folds, known_start)
         held_out = [
             fitting.judge(program, fold.held_out, fold.held_out_path, known_start=known_start).log_likelihood
-            for program, fold in zip(copies, judged_folds, strict=True)
+            for program, fold in zip(judges, judged_folds, strict=True)
         ]
-    return Refit(fitted, found, judged_folds, torch.cat(held_out), fitting=fitting)
+    return Refit(fitted, judges, found, judged_folds, torch.cat(held_out), fitting=fitting)
 
 
 def with_common_noise(
