@@ -7,7 +7,8 @@ Hall, Hall and Hausman 1974) unless it is known, and learns on the way (Broyden,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -92,17 +93,24 @@ def maximise(
     def compute() -> Maximum:
         parts = elements(program)
         own = Term(program, data, path or find_path(program, data, known_start=known_start), parts, range(len(parts)))
-        (found,) = climb([own], known_start, information, steps, precision, hopeless)
+        (found,) = climb(
+            [own],
+            known_start=known_start,
+            information=information,
+            steps=steps,
+            precision=precision,
+            hopeless=hopeless,
+        )
         return found
 
     return kept_maximum(program, compute)
 
 
-def kept_maximum(program: Program, climb: Callable[[], Maximum]) -> Maximum:
-    """A maximum as a piece of a journal: what `climb` returns, with the program moved there."""
+def kept_maximum(program: Program, find: Callable[[], Maximum]) -> Maximum:
+    """A maximum as a piece of a journal: what `find` returns, with the program moved there."""
 
     def compute() -> Piece:
-        found = climb()
+        found = find()
         tensors = {name: getattr(found, name) for name in ("log_likelihood", "information")}
         tensors |= {"states": found.path.states, "noise": found.path.noise}
         tensors |= {f"program/{name}": value for name, value in program.state_dict().items()}
@@ -124,7 +132,8 @@ class Term:
         data: its drives.
         path: near their posterior means.
         parts: its learnable numbers.
-        columns: of each of them among all numbers of the objective, of which several programs may share some.
+        columns: the place of each of them among all numbers of the objective, which are counted from 0 without gaps.
+            Programs that name the same place have this number in common.
     """
 
     program: Program
@@ -137,19 +146,24 @@ class Term:
 @torch.no_grad()
 def climb(
     terms: Sequence[Term],
+    *,
     known_start: bool,
-    information: Tensor | None,
-    steps: int,
-    precision: float,
+    information: Tensor | None = None,
+    steps: int = 25,
+    precision: float = 0.02,
     hopeless: float = -math.inf,
 ) -> list[Maximum]:
-    """Move the numbers of programs, in place, to where the sum of their objectives is largest.
+    """Move the numbers of programs, in place, towards where the sum of their objectives is largest.
+
+    Args:
+        terms: what is added. A number that several have in common has its log prior once.
+        known_start, information, steps, precision, hopeless: those of `maximise`, of the sum.
 
     Returns:
         Of each program where it ended, with its own part of the information; `decrement` and `steps` are of the sum.
 
     Raises:
-        FilterError: the programs cannot be smoothed where they begin.
+        FilterError: the programs cannot be smoothed where they begin, or the drives do not tell their numbers apart.
     """
     here = _look(terms, known_start)
     for term, at in zip(terms, here.terms, strict=True):
@@ -162,6 +176,9 @@ def climb(
         for taken in range(steps + 1):
             begin()
             move, singular = torch.linalg.solve_ex(information, here.gradient)
+            if not singular and not float(here.gradient @ move) >= 0:  # it has ceased to be positive
+                information = _firm(_of_drives(here))
+                move, singular = torch.linalg.solve_ex(information, here.gradient)
             if singular:
                 raise FilterError(
                     "the likeliest parameters cannot be found: the drives do not tell them apart (singular)"
@@ -187,13 +204,14 @@ def climb(
     ]
 
 
-def _count(terms: Sequence[Term]) -> int:
-    return len({column for term in terms for column in term.columns})
+def _owners(terms: Sequence[Term]) -> Counter[int]:
+    """How many programs have each number."""
+    return Counter(column for term in terms for column in term.columns)
 
 
 def _gathered(terms: Sequence[Term], values: Sequence[Sequence[float]]) -> Tensor:
     """Values of all numbers of an objective, `(P,)`, from those of each program."""
-    found = torch.zeros(_count(terms), dtype=torch.float64)
+    found = torch.zeros(len(_owners(terms)), dtype=torch.float64)
     for term, own in zip(terms, values, strict=True):
         found[list(term.columns)] = torch.as_tensor(own, dtype=torch.float64)
     return found
@@ -253,17 +271,17 @@ def _along(terms: Sequence[Term], here: _Here) -> list[Term]:
 
 
 def _look(terms: Sequence[Term], known_start: bool, passes: int = PASSES) -> _Here:
-    found, scores, slopes = [], [], []
+    found, scores, slopes, owners = [], [], [], _owners(terms)
     for term in terms:
         program, data = term.program, term.data
         ahead = smooth(
             program, data, term.path, known_start=known_start, passes=passes, tolerance=TOLERANCE, kernels=False
         )
         scores.append(parameter_scores(program, data, smoothed(ahead, data), term.parts))
-        prior, slope = _prior(program, term.parts)
+        prior, slope = _prior(program, term.parts, [owners[column] for column in term.columns])
         slopes.append(scores[-1].sum(0) + slope)
         found.append(_TermHere(ahead, resting_path(ahead, data), float(ahead.log_likelihood.sum()) + prior))
-    count = _count(terms)
+    count = len(owners)
     gradient = torch.zeros(count, dtype=torch.float64)
     by_drive = []
     for term, own, slope in zip(terms, scores, slopes, strict=True):
@@ -295,24 +313,30 @@ def _try(terms: Sequence[Term], known_start: bool, passes: int) -> _Here | None:
     return here if finite and bool(torch.isfinite(here.gradient).all()) else None
 
 
-def _prior(program: Program, parts: list[Element]) -> tuple[float, Tensor]:
-    """The log prior and its slope in the unconstrained space, without the Jacobian: for the parameter's own mode."""
+def _prior(program: Program, parts: list[Element], owners: Sequence[int]) -> tuple[float, Tensor]:
+    """The log prior and its slope in the unconstrained space, without the Jacobian: for the parameter's own mode. Of a
+    number that several programs have in common each has its share."""
 
     slope = torch.zeros(len(parts), dtype=torch.float64)
     if not program.priors:
         return 0.0, slope
+    shares = {part.name.split("[")[0]: 1 / count for part, count in zip(parts, owners, strict=True)}
     for index, part in enumerate(parts):
         if part.name.split("[")[0] in program.priors:
             with moved(part, part.step):
-                up = log_prior(program)
+                up = log_prior(program, shares)
             with moved(part, -part.step):
-                slope[index] = (up - log_prior(program)) / (2 * part.step)
-    return log_prior(program), slope
+                slope[index] = (up - log_prior(program, shares)) / (2 * part.step)
+    return log_prior(program, shares), slope
 
 
-def log_prior(program: Program) -> float:
-    """Of the parameters that have one, of their own values."""
-    return sum(float(prior.log_prob(getattr(program, name)).sum()) for name, prior in program.priors.items())
+def log_prior(program: Program, shares: Mapping[str, float] | None = None) -> float:
+    """Of the parameters that have one, of their own values; of some only a share."""
+    shares = shares or {}
+    return sum(
+        shares.get(name, 1.0) * float(prior.log_prob(getattr(program, name)).sum())
+        for name, prior in program.priors.items()
+    )
 
 
 def _updated(information: Tensor, step: Tensor, fall: Tensor) -> Tensor:

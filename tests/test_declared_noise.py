@@ -8,6 +8,7 @@ import pytest
 import torch
 from examples import drives, example
 
+from steady_ppl.discovery.common_noise import Judges
 from steady_ppl.discovery.declared_noise import departures
 from steady_ppl.discovery.refits import Fold, Refit
 from steady_ppl.discovery.rounds import Found
@@ -22,7 +23,7 @@ def fitted(*programs) -> Refit:
         data = drives(program, count, 9)
         path = Path(data.states, torch.zeros(8, count, 3).double())
         folds.append(Fold(data, path, data, path))
-    return Refit(list(programs), list(programs), [], folds, torch.zeros(6))
+    return Refit(list(programs), Judges(list(programs), []), [], folds, torch.zeros(6), torch.zeros(6))
 
 
 @pytest.mark.parametrize("effect", ["range_dependent_noise", "coloured_noise:yaw"])

@@ -70,12 +70,14 @@ class Candidate:
         tested: its score test.
         refit: the program with it, or why there is none.
         gain: held-out log p(y) above that of the program without, nats, `(B,)`.
+        alone: the same of the programs that were fitted to one fold alone, which is all there is of those given up.
         behind: the best in its round, where one fold was enough to see that this one is behind.
     """
 
     tested: Tested
     refit: Refit | str
     gain: Tensor
+    alone: Tensor
     behind: Candidate | None = None
 
     @property
@@ -90,12 +92,21 @@ class Candidate:
 
     @property
     def total(self) -> float:
-        """Held-out gain of all drives, nats, less one for each knee or place, which the training drives chose;
-        extrapolated where one fold was enough to see that it is behind."""
+        """Held-out gain of all drives, nats, less `charge`; extrapolated where one fold was enough to see that it is
+        behind."""
         if self.is_judged or not isinstance(self.refit, Refit):
-            return float(self.gain.sum()) - len(self.variant.profiled)
-        ahead = 0.0 if self.behind is None else self.behind.total - 2 * float(self.behind.gain[: len(self.gain)].sum())
-        return ahead + 2 * float(self.gain.sum()) - len(self.variant.profiled)
+            return float(self.gain.sum()) - self.charge
+        ahead = 0.0
+        if self.behind is not None:
+            ahead = self.behind.total - 2 * float(self.behind.alone[: len(self.alone)].sum())
+        return ahead + 2 * float(self.alone.sum()) - self.charge
+
+    @property
+    def charge(self) -> int:
+        """Nats for what the drives that judge it have told as well: one for each knee and place, and for each number of
+        the coefficient of a noise that all folds have in common."""
+        common = self.refit.in_common(self.variant) if isinstance(self.refit, Refit) else 0
+        return len(self.variant.profiled) + common
 
     def significant(self, critical: float) -> bool:
         """Whether its own test reaches the family's level, or nearly does and its gain leaves no doubt.
@@ -223,8 +234,11 @@ def fitted(now: Refit, tested: Tested, screening: Screening, settings: Settings,
 def judged(now: Refit, tested: Tested, refit: Refit | str) -> Candidate:
     """A fit and what it gains over the program without."""
     if isinstance(refit, str):
-        return Candidate(tested, refit, torch.full_like(now.held_out, -math.inf))
-    return Candidate(tested, refit, refit.held_out - now.held_out[: len(refit.held_out)])
+        none = torch.full_like(now.held_out, -math.inf)
+        return Candidate(tested, refit, none, none)
+    alone = refit.held_out_alone - now.held_out_alone[: len(refit.held_out_alone)]
+    given_up = len(refit.programs) < len(now.programs)
+    return Candidate(tested, refit, alone if given_up else refit.held_out - now.held_out, alone)
 
 
 def gain_of_first_fold(now: Refit, refit: Refit) -> float:

@@ -58,7 +58,9 @@ def departures(declared: Program, now: Refit, parts: Sequence[Element]) -> list[
     for name, spread in SPREADS.items():
         slope = _slope(spread, now.program, now.folds[0], parts) * torch.tensor(own).unsqueeze(-1)
         away = _away(spread, declared, now.program, now.folds[0])
-        of_folds = torch.stack([_away(spread, declared, *one) for one in zip(now.judges, now.folds, strict=True)])
+        of_folds = torch.stack(
+            [_away(spread, declared, *one) for one in zip(now.judges.programs, now.folds, strict=True)]
+        )
         mean = (torch.tensor(counts).unsqueeze(-1) * of_folds).sum(0) / sum(counts)
         variants = [v for effect in catalogue(now.program) if effect.name == name for v in effect.variants(now.program)]
         for variant in variants if parts else []:

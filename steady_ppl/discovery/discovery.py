@@ -229,7 +229,7 @@ def _as_written(program: Program) -> Program:
 
 def _proof(found: Search, is_curve: bool, valid: Trajectories, known_start: bool, seed: int) -> Proof:
     after: Any = found.curve.refit if is_curve and found.curve else found.final
-    rows = {"before": found.base.program, "after": after.program}
+    rows = {"before": found.base.judges.programs[0], "after": after.judges.programs[0]}
     return prove(rows, valid, known_start=known_start, with_constant_velocity=False, seed=seed)
 
 

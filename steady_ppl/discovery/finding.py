@@ -174,7 +174,7 @@ def gain_interval(candidate: Candidate, seed: int) -> tuple[float, float] | None
     """95 % bootstrap interval, over drives, of a candidate's held-out gain; None where it was fitted on one fold."""
     if isinstance(candidate.refit, str) or len(candidate.refit.programs) == 1:
         return None
-    gain = candidate.gain.double().numpy() - len(candidate.variant.profiled) / len(candidate.gain)
+    gain = candidate.gain.double().numpy() - candidate.charge / len(candidate.gain)
     random = np.random.default_rng(seed)
     totals = random.choice(gain, (RESAMPLES, len(gain))).sum(1)
     low, high = np.quantile(totals, [0.025, 0.975])

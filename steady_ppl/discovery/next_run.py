@@ -84,15 +84,15 @@ def _separation(members: list[Candidate], controls: Tensor, data: Trajectories, 
     drives = replace(data.subset(range(count)), controls=controls[:, :count].contiguous())
     first = members[0].refit
     assert isinstance(first, Refit)
-    path = first.folds[0].path
+    program, path = first.judges.programs[0], first.folds[0].path
     starts = path.states[0, :count].unsqueeze(0)
     with seeded(seed, "next run"):
-        again, truth = simulate_again(first.program, drives, starts, len(first.program.channels))
-    own = _log_likelihood(first.program, again, truth, known_start)
+        again, truth = simulate_again(program, drives, starts, len(program.channels))
+    own = _log_likelihood(program, again, truth, known_start)
     apart = []
     for member in members[1:]:
         assert isinstance(member.refit, Refit)
-        apart.append(float((own - _log_likelihood(member.refit.program, again, truth, known_start)).mean()))
+        apart.append(float((own - _log_likelihood(member.refit.judges.programs[0], again, truth, known_start)).mean()))
     return min(apart) if all(map(math.isfinite, apart)) else math.nan
 
 

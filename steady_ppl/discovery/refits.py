@@ -11,19 +11,19 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
+from steady_ppl.discovery.common_noise import Judges, with_common_noise
 from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, Fitting, is_doubtful
 from steady_ppl.effects import Variant, attach, attached, coefficient
-from steady_ppl.elements import elements, set_values, values_of
+from steady_ppl.elements import elements
 from steady_ppl.errors import FilterError, SteadyError
 from steady_ppl.gaussian_smoother import find_path
 from steady_ppl.likelihood_fit import fit_by_likelihood, led_back, widens
 from steady_ppl.linearization import Path
-from steady_ppl.maximum_likelihood import Maximum, Term, climb, maximise
+from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.program import Program
 from steady_ppl.seeding import seeded
 
 WIDER = math.log(20.0)  # log ratio of a channel's noise after a fit and before, from which it explains next to nothing
-COMMON_STEPS, COMMON_PRECISION = 10, 0.1  # scoring steps of folds together, and nats that another would gain
 NOTHING = 2.0  # nats below the program without, after which a fit is given up: a candidate at zero is that program
 
 
@@ -55,21 +55,23 @@ class Refit:
 
     Attributes:
         programs: one a fold, fitted to its drives alone.
-        judges: the same with their process noise in common, by which the other drives are judged.
+        judges: the same with their process noise in common, if fits by likelihood ended on every fold.
         maxima: one a fold.
         folds: with the paths of these programs.
-        held_out: log p(y) of each drive under the judge fitted without it but for its process noise, `(B,)`, the folds
-            one after another; those of the first only where the rest was not worth fitting.
+        held_out: log p(y) of each drive under the judge fitted without it, but for the noise in common, `(B,)`.
+            The folds come one after another; those of the first only where the rest was not worth fitting.
+        held_out_alone: the same under the programs that were fitted to one fold alone.
         rough: the program before its fit made its noise many times wider, from whose parameters fits with an effect
             begin as well; None where it did not.
         fitting: how it was fitted, and how fits with an effect are.
     """
 
     programs: list[Program]
-    judges: list[Program]
+    judges: Judges
     maxima: list[Maximum]
     folds: list[Fold]
     held_out: Tensor
+    held_out_alone: Tensor
     rough: Program | None = None
     fitting: Fitting = BY_LIKELIHOOD
 
@@ -80,7 +82,7 @@ class Refit:
 
     def coefficients(self, variant: Variant) -> list[Tensor]:
         """An effect's coefficient on each fold."""
-        return [coefficient(program, _there(program, variant)).detach().clone() for program in self.judges]
+        return [coefficient(program, _there(program, variant)).detach().clone() for program in self.judges.programs]
 
     def coefficient(self, variant: Variant) -> Tensor:
         """Its mean over the folds, weighted by their drives: nearly that of a fit to all drives together."""
@@ -90,9 +92,9 @@ class Refit:
 
     def mean_program(self) -> Program:
         """The folds' parameters averaged where they are learned: nearly what a fit to all drives together gives."""
-        mean = copy.deepcopy(self.judges[0])
+        mean = copy.deepcopy(self.judges.programs[0])
         weights = [len(fold.drives) for fold in self.folds]
-        learned = [dict(program.named_parameters()) for program in self.judges]
+        learned = [dict(program.named_parameters()) for program in self.judges.programs]
         for name, parameter in mean.named_parameters():
             if parameter.requires_grad:
                 parts = [weight * values[name].data for weight, values in zip(weights, learned, strict=True)]
@@ -101,8 +103,13 @@ class Refit:
 
     @property
     def converged(self) -> bool:
-        """Whether both fits did."""
-        return all(maximum.converged for maximum in self.maxima)
+        """Whether all fits did."""
+        return all(maximum.converged for maximum in (*self.maxima, *self.judges.maxima))
+
+    def in_common(self, variant: Variant) -> int:
+        """How many numbers of an effect's coefficient all drives told, those that judge it as well."""
+        name = _there(self.program, variant).parameter
+        return sum(common.split("[")[0] == name for common in self.judges.common)
 
 
 def first_refit(program: Program, train: Trajectories, valid: Trajectories, *, known_start: bool, seed: int) -> Refit:
@@ -118,13 +125,11 @@ def first_refit(program: Program, train: Trajectories, valid: Trajectories, *, k
         second = maximise(other, valid, find_path(other, valid, known_start=known_start), known_start=known_start)
         second = led_back(other, valid, second, known_start)
     folds = [Fold(train, one.path, valid, second.path), Fold(valid, second.path, train, one.path)]
-    refit = _refit([own, other], folds, known_start, [one, second])
-    if _far_wider(own, program, train):
-        return replace(refit, rough=copy.deepcopy(program))
-    if is_doubtful(own, train, one.path, known_start):
+    rough = copy.deepcopy(program) if _far_wider(own, program, train) else None
+    if rough is None and is_doubtful(own, train, one.path, known_start):
         refit = _refit([own, other], folds, known_start, [None, None], fitting=FIRST_BY_DRAWS)
         return replace(refit, fitting=BY_DRAWS)
-    return refit
+    return replace(_refit([own, other], folds, known_start, [one, second]), rough=rough)
 
 
 def _far_wider(fitted: Program, program: Program, data: Trajectories) -> bool:
@@ -230,67 +235,15 @@ def _refit(
         judged_folds.append(Fold(drives, maximum.path, unseen, judged.path))
         if float(maximum.log_likelihood.sum()) < worth.drives and float(judged.log_likelihood.sum()) < worth.held_out:
             break
-    judges = fitted
+    judges, alone = Judges(fitted, found), torch.cat(held_out)
     if len(fitted) == len(folds) and fitting == BY_LIKELIHOOD:
-        judges = with_common_noise(fitted, found, judged_folds, known_start)
+        judges = with_common_noise(fitted, found, [fold.drives for fold in judged_folds], known_start=known_start)
+    if judges.common:
         held_out = [
             fitting.judge(program, fold.held_out, fold.held_out_path, known_start=known_start).log_likelihood
-            for program, fold in zip(judges, judged_folds, strict=True)
+            for program, fold in zip(judges.programs, judged_folds, strict=True)
         ]
-    return Refit(fitted, judges, found, judged_folds, torch.cat(held_out), fitting=fitting)
-
-
-def with_common_noise(
-    programs: Sequence[Program], maxima: Sequence[Maximum], folds: Sequence[Fold], known_start: bool
-) -> list[Program]:
-    """Copies of programs, each fitted to its fold, that have the standard deviations of their process noise in common.
-
-    A few drives tell little of the noise. Fitted to them alone it may vanish, and then the drives that judge the
-    program punish it by tens of nats, whatever its physics. The sum of all folds' log p(y) is maximised in these
-    numbers and in each program's others. Coefficients of effects, those of noise included, stay each fold's own.
-
-    Args:
-        programs: one a fold, of the same parameters.
-        maxima: where their fits ended.
-        folds: their drives.
-        known_start: the first states are certain.
-    """
-    copies = [copy.deepcopy(program) for program in programs]
-    columns = _columns(copies, folds)
-    size = len({column for own in columns for column in own})
-    if size == sum(len(own) for own in columns):
-        return copies
-    information, pull = torch.zeros(size, size).double(), torch.zeros(size).double()
-    terms = [
-        Term(program, fold.drives, maximum.path, elements(program), own)
-        for program, maximum, fold, own in zip(copies, maxima, folds, columns, strict=True)
-    ]
-    for term, maximum in zip(terms, maxima, strict=True):
-        index = torch.tensor(term.columns)
-        information[index[:, None], index] += maximum.information
-        pull[index] += maximum.information @ values_of(term.parts)
-    begin = torch.linalg.solve(information, pull)  # the maximum of the sum, were every log p(y) a parabola
-    for term in terms:
-        set_values(term.parts, begin[list(term.columns)])
-    climb(terms, known_start, information, steps=COMMON_STEPS, precision=COMMON_PRECISION)
-    return copies
-
-
-def _columns(programs: Sequence[Program], folds: Sequence[Fold]) -> list[list[int]]:
-    """Of each program's learnable numbers among those of all, where the process noise is the same in all."""
-    effects = {known.parameter for known in attached(programs[0])}
-    parts = elements(programs[0])
-    common = [
-        index
-        for index, part in enumerate(parts)
-        if part.name.split("[")[0] not in effects and widens(programs[0], part, folds[0].drives)
-    ]
-    own = [index for index in range(len(parts)) if index not in common]
-    first = {index: place for place, index in enumerate([*common, *own])}
-    return [
-        [first[index] if index in common else first[index] + order * len(own) for index in range(len(parts))]
-        for order, _ in enumerate(programs)
-    ]
+    return Refit(fitted, judges, found, judged_folds, torch.cat(held_out), alone, fitting=fitting)
 
 
 def _afresh(program: Program, drives: Trajectories, known_start: bool, floor: float) -> tuple[Program, Maximum] | None:

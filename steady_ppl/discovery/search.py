@@ -1,7 +1,7 @@
 """Which effect is missing: screen, refit the leaders, choose on held-out drives, go on until nothing is left.
 
 The steps are those of score-test model building (Klein and Morelli 2006 do them by stepwise regression); what decides
-is held-out log p(y), each drive judged by a program that was fitted without it.
+is held-out log p(y), each drive judged by a program that was fitted without it, but for its process noise.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ def _worth(candidates: Sequence[Candidate]) -> Worth:
     """What the next candidate must reach on the first fold, given those that were fitted."""
     fits = [c.refit for c in candidates if isinstance(c.refit, Refit)]
     drives = [float(fit.maxima[0].log_likelihood.sum()) for fit in fits]
-    held_out = [float(fit.held_out[: len(fit.folds[0].held_out)].sum()) for fit in fits]
+    held_out = [float(fit.held_out_alone[: len(fit.folds[0].held_out)].sum()) for fit in fits]
     return Worth(max(drives, default=-math.inf) - BEHIND, max(held_out, default=-math.inf) - NATS)
 
 

@@ -1,0 +1,140 @@
+"""Programs fitted to different drives, with the size of their process noise in common.
+
+A few drives tell little of a noise that the sensors nearly hide. Fitted to them alone it may vanish, and then other
+drives punish the program by tens of nats, whatever its physics.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from steady_ppl.data import Trajectories
+from steady_ppl.effects import attached
+from steady_ppl.elements import Element, elements, moved, set_values, values_of
+from steady_ppl.errors import FilterError
+from steady_ppl.linearization import Path
+from steady_ppl.maximum_likelihood import Maximum, Term, climb
+from steady_ppl.program import Program
+from steady_ppl.scores import channel_moments, substep_spreads
+
+FORMS = ("spread", "colour")  # of effects that are process noise
+MOVED, LIKE = 0.1, 1e-3  # by how much a number is moved, and what its effect on log spreads may vary by from row to row
+STEPS, PRECISION = 25, 0.01  # scoring steps of the sum at most, and nats that another would gain
+
+
+@dataclass(frozen=True)
+class Judges:
+    """Programs, one a fold, that judge the drives they were not fitted to.
+
+    Attributes:
+        programs: with some learnable numbers in common.
+        maxima: where each ended.
+        common: names of the numbers that are the same in all.
+    """
+
+    programs: list[Program]
+    maxima: list[Maximum]
+    common: tuple[str, ...] = ()
+
+
+def with_common_noise(
+    programs: Sequence[Program], maxima: Sequence[Maximum], drives: Sequence[Trajectories], *, known_start: bool
+) -> Judges:
+    """Return copies of programs with their process noise in common.
+
+    The sum of the folds' log p(y) is maximised in the noise of all and in every program's other numbers. Programs
+    without such noise are returned as they are.
+
+    Args:
+        programs: one a fold, with the same learnable numbers, fitted.
+        maxima: where their fits ended.
+        drives: to which each was fitted.
+        known_start: the first states are certain.
+
+    Raises:
+        FilterError: the programs cannot follow their drives with one noise.
+    """
+    names = [part.name for part in elements(programs[0])]
+    common = [
+        index
+        for index in range(len(names))
+        if any(is_noise(*one, index) for one in zip(programs, drives, [m.path for m in maxima], strict=True))
+    ]
+    if not common:
+        return Judges(list(programs), list(maxima))
+    copies = [copy.deepcopy(program) for program in programs]
+    places = _places(len(names), common, len(copies))
+    terms = [
+        Term(program, data, maximum.path, elements(program), own)
+        for program, data, maximum, own in zip(copies, drives, maxima, places, strict=True)
+    ]
+    starts = _starts(terms, maxima)
+    for last, start in enumerate(starts, 1):
+        for term in terms:
+            set_values(term.parts, start[list(term.columns)])
+        try:
+            found = climb(terms, known_start=known_start, steps=STEPS, precision=PRECISION)
+        except FilterError:
+            if last == len(starts):
+                raise
+        else:
+            break
+    return Judges(copies, found, tuple(names[index] for index in common))
+
+
+@torch.no_grad()
+def is_noise(program: Program, data: Trajectories, path: Path, index: int) -> bool:
+    """Whether a learnable number says how large the process noise is, or how it goes on, and nothing else."""
+    part = elements(program)[index]
+    for variant in attached(program):
+        if variant.parameter == part.name.split("[")[0]:
+            return variant.effect.form in FORMS
+    return _scales_noise(program, part, data, path)
+
+
+def _scales_noise(program: Program, part: Element, data: Trajectories, path: Path) -> bool:
+    """Whether a number multiplies standard deviations of channels, in all rows alike, and leaves their means."""
+    states = path.states[:-1].unsqueeze(0)
+
+    def moments() -> tuple[Tensor, Tensor]:
+        mean, _ = channel_moments(program, data, states)
+        return mean[:, data.transitions], substep_spreads(program, data, states)[:, data.transitions]
+
+    mean, spread = moments()
+    with moved(part, MOVED):
+        mean_there, spread_there = moments()
+    change = (spread_there / spread).log().nan_to_num(0.0, 0.0, 0.0)
+    alike = bool(((change - change.mean(1, keepdim=True)).abs() < LIKE).all())
+    return alike and bool((change.abs() > LIKE).any()) and bool(((mean_there - mean).abs() <= LIKE * spread).all())
+
+
+def _places(count: int, common: Sequence[int], programs: int) -> list[list[int]]:
+    """Where each program's numbers are among those of all: first the common ones, then the own ones of each."""
+    own = [index for index in range(count) if index not in common]
+    first = {index: place for place, index in enumerate([*common, *own])}
+    return [
+        [first[index] if index in common else first[index] + order * len(own) for index in range(count)]
+        for order in range(programs)
+    ]
+
+
+def _starts(terms: Sequence[Term], maxima: Sequence[Maximum]) -> list[Tensor]:
+    """Where to begin: at the maximum of the sum were every log p(y) a parabola, and where each program's own numbers
+    are, with the mean of the noise."""
+    count = 1 + max(max(term.columns) for term in terms)
+    information, pull = torch.zeros(count, count).double(), torch.zeros(count).double()
+    sums, weights = torch.zeros(count).double(), torch.zeros(count).double()
+    for term, maximum in zip(terms, maxima, strict=True):
+        index, values = torch.tensor(term.columns), values_of(term.parts)
+        information[index[:, None], index] += maximum.information
+        pull[index] += maximum.information @ values
+        sums[index] += maximum.information.diagonal() * values
+        weights[index] += maximum.information.diagonal()
+    parabola, singular = torch.linalg.solve_ex(information, pull)
+    means = sums / weights
+    return [means] if singular or not bool(torch.isfinite(parabola).all()) else [parabola, means]
