@@ -73,14 +73,15 @@ def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(t
         found.loc[7, "reason"] == "ValueError: seven"
         and found.loc[13, "reason"] == "its worker died each time that it was tried"
     )
-    begun = {seed: (tmp_path / "marks" / str(seed)).stat().st_size for seed in (1, 13)}
+    begun = {seed: (tmp_path / "marks" / str(seed)).stat().st_size for seed in (1, 7, 13)}
     # of two workers the other one may have died of 13 while 1 was begun again, or of 1 before 13 had left its mark
     assert 2 <= begun[1] <= 1 + workers and 4 - workers <= begun[13] <= 3
+    assert 2 <= begun[7] <= 1 + workers
     assert sorted(file.name for file in out.iterdir()) == [TABLE, "study.json"]
     assert run_study(plan, out, Local(workers)) == 3  # what has failed is left
-    assert (tmp_path / "marks" / "7").stat().st_size == 2
+    assert (tmp_path / "marks" / "7").stat().st_size == begun[7]
     assert run_study(plan, out, Local(workers), again=True) == 3
-    assert (tmp_path / "marks" / "7").stat().st_size == 3
+    assert (tmp_path / "marks" / "7").stat().st_size > begun[7]
 
 
 def test_what_had_ended_beside_a_job_that_dies_is_not_lost(tmp_path: Path):
