@@ -297,14 +297,14 @@ def posterior_score(program: Program, data: Trajectories, path: Path, known_star
     """The slope of log p(y) and the log prior where the program is, `(P,)`, along the best path near `path`.
 
     Raises:
-        FilterError: the program blows up there.
+        FilterError: the program diverges there.
     """
     parts = elements(program)
     return _look([Term(program, data, path, parts, range(len(parts)))], known_start, PATIENT).gradient
 
 
 def _try(terms: Sequence[Term], known_start: bool, passes: int) -> _Here | None:
-    """None where the step went too far: a program blows up there."""
+    """None where the step went too far: a program diverges there."""
     try:
         here = _look(terms, known_start, passes)
     except FilterError:

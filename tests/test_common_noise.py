@@ -16,7 +16,7 @@ from models.linear_gaussian import LinearGaussian
 from steady_ppl import stack
 from steady_ppl.discovery import common_noise
 from steady_ppl.discovery.candidates import judged
-from steady_ppl.discovery.common_noise import is_noise, with_common_noise
+from steady_ppl.discovery.common_noise import noise_numbers, with_common_noise
 from steady_ppl.discovery.refits import Worth, first_refit, refit_with
 from steady_ppl.effects import chosen_variant
 from steady_ppl.elements import elements, values_of
@@ -147,9 +147,12 @@ def test_what_moves_the_motion_or_only_some_rows_is_no_noise():
     program = example("hovercraft").with_effect("range_dependent_noise", 0.1).with_effect("yaw_bias", 0.1)
     data = drives(program, 3, 21)
     path = find_path(program, data, known_start=True)
-    noise = [is_noise(program, data, path, index) for index in range(len(elements(program)))]
-    names = [part.name for part, is_one in zip(elements(program), noise, strict=True) if is_one]
-    assert names == ["noise[0]", "noise[1]", "noise[2]"]
+    found = noise_numbers(program, data, path)
+    assert [part.name for index, part in enumerate(elements(program)) if index in found] == [
+        "noise[0]",
+        "noise[1]",
+        "noise[2]",
+    ]
 
 
 def test_a_program_without_learnable_noise_is_its_own_judge():

@@ -86,6 +86,17 @@ def test_numbers_beside_motion_capture_are_of_five_draws(name: str, motion_captu
         assert max(found) < 0
 
 
+def test_what_the_page_says_of_the_mended_m_step_is_of_five_draws() -> None:
+    file = ROOT / "benchmarks" / "results" / "truck-mended-m-step.jsonl"
+    runs = [run for run in map(json.loads, file.read_text().splitlines()) if run["program"] == "discovered"]
+    assert sorted(run["draw"] for run in runs) == [1, 2, 3, 4, 5]
+    figures = [([run["parameters"][name] for run in runs], 3) for name in ("lever", "slip", "crab")]
+    figures += [([run[group]["location"] for run in runs], 4) for group in ("forward", "forward_mean")]
+    figures.append(([run["log_likelihood"] for run in runs], 2))
+    for values, places in figures:
+        assert f"{short(statistics.fmean(values), places)} ± {short(statistics.stdev(values), places)}" in PAGE
+
+
 def test_the_page_says_which_musts_are_missed(benchmark) -> None:
     lines, good = benchmark.table_of([record for record in RECORDS if record["part"] == "table"])
     missed = [line for line in lines if "MISSED" in line]

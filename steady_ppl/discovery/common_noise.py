@@ -15,7 +15,7 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.effects import attached
-from steady_ppl.elements import Element, elements, moved, set_values, values_of
+from steady_ppl.elements import elements, moved, set_values, values_of
 from steady_ppl.errors import FilterError
 from steady_ppl.linearization import Path
 from steady_ppl.maximum_likelihood import Maximum, Term, climb
@@ -60,11 +60,8 @@ def with_common_noise(
         FilterError: the programs cannot follow their drives with one noise.
     """
     names = [part.name for part in elements(programs[0])]
-    common = [
-        index
-        for index in range(len(names))
-        if any(is_noise(*one, index) for one in zip(programs, drives, [m.path for m in maxima], strict=True))
-    ]
+    found = [noise_numbers(*one) for one in zip(programs, drives, (m.path for m in maxima), strict=True)]
+    common = sorted(set().union(*found))
     if not common:
         return Judges(list(programs), list(maxima))
     copies = [copy.deepcopy(program) for program in programs]
@@ -78,39 +75,47 @@ def with_common_noise(
         for term in terms:
             set_values(term.parts, start[list(term.columns)])
         try:
-            found = climb(terms, known_start=known_start, steps=STEPS, precision=PRECISION)
+            ended = climb(terms, known_start=known_start, steps=STEPS, precision=PRECISION)
         except FilterError:
             if last == len(starts):
                 raise
         else:
             break
-    return Judges(copies, found, tuple(names[index] for index in common))
+    return Judges(copies, ended, tuple(names[index] for index in common))
 
 
 @torch.no_grad()
-def is_noise(program: Program, data: Trajectories, path: Path, index: int) -> bool:
-    """Whether a learnable number says how large the process noise is, or how it goes on, and nothing else."""
-    part = elements(program)[index]
-    for variant in attached(program):
-        if variant.parameter == part.name.split("[")[0]:
-            return variant.effect.form in FORMS
-    return _scales_noise(program, part, data, path)
+def noise_numbers(program: Program, data: Trajectories, path: Path) -> set[int]:
+    """Return which learnable numbers say how large the process noise is, or how it goes on, and nothing else.
+
+    Those of the program itself multiply standard deviations of channels, in all rows alike, and leave their means.
+    """
+    forms = {variant.parameter: variant.effect.form for variant in attached(program)}
+    mean, spread = _moments(program, data, path)
+    found = set()
+    for index, part in enumerate(elements(program)):
+        name = part.name.split("[")[0]
+        if name in forms:
+            is_noise = forms[name] in FORMS
+        else:
+            with moved(part, MOVED):
+                mean_there, spread_there = _moments(program, data, path)
+            change = (spread_there / spread).log().nan_to_num(0.0, 0.0, 0.0)
+            alike = bool(((change - change.mean(1, keepdim=True)).abs() < LIKE).all())
+            still = bool(((mean_there - mean).abs() <= LIKE * spread).all())
+            is_noise = alike and still and bool((change.abs() > LIKE).any())
+        if is_noise:
+            found.add(index)
+    return found
 
 
-def _scales_noise(program: Program, part: Element, data: Trajectories, path: Path) -> bool:
-    """Whether a number multiplies standard deviations of channels, in all rows alike, and leaves their means."""
+def _moments(program: Program, data: Trajectories, path: Path) -> tuple[Tensor, Tensor]:
+    """Return means of rows' channels and standard deviations of substeps' along a path, `(1, rows, C)` each."""
     states = path.states[:-1].unsqueeze(0)
-
-    def moments() -> tuple[Tensor, Tensor]:
-        mean, _ = channel_moments(program, data, states)
-        return mean[:, data.transitions], substep_spreads(program, data, states)[:, data.transitions]
-
-    mean, spread = moments()
-    with moved(part, MOVED):
-        mean_there, spread_there = moments()
-    change = (spread_there / spread).log().nan_to_num(0.0, 0.0, 0.0)
-    alike = bool(((change - change.mean(1, keepdim=True)).abs() < LIKE).all())
-    return alike and bool((change.abs() > LIKE).any()) and bool(((mean_there - mean).abs() <= LIKE * spread).all())
+    mean, spread = channel_moments(program, data, states)
+    if program.substeps > 1:
+        spread = substep_spreads(program, data, states)
+    return mean[:, data.transitions], spread[:, data.transitions]
 
 
 def _places(count: int, common: Sequence[int], programs: int) -> list[list[int]]:
