@@ -254,7 +254,10 @@ def computed(job: Job, here: Mapping[str, str], topic: str) -> Answer:
         hold(topic)
         return Answer(worker.address, unlike or "been refused", {})
     worker.log_event(topic, job.key)
-    return Answer(worker.address, "", work.run(job))
+    row = work.run(job)
+    if row.get("reason") == work.CHANGED:
+        time.sleep(HOLD)  # until it is refused, where its files alone are others: it would get everything meanwhile
+    return Answer(worker.address, "", row)
 
 
 def other_files(digests: Mapping[str, str]) -> list[str]:
