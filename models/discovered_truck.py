@@ -19,17 +19,18 @@ class DiscoveredTruck(Truck):
     turned    = (1 − share) turn + share · turn / speed · v              it steers a curve, not a turn rate
     a_forward = clip((speed_gain · speed − v) / speed_time, ±limit) + bias − w · yaw_rate
                                                                          it follows its command with a lag
-    a_lateral = ((lever + slip · v) yaw_rate + crab · v − w) / grip_time + v · yaw_rate
+    a_lateral = ((lever + slip · (v − 1.3)) yaw_rate + crab · v − w) / grip_time + v · yaw_rate
                                                                          the tracked point is before the rear axle
     a_yaw     = clip((turn_gain · turned − yaw_rate) / turn_time, ±limit) − caster · v · yaw_rate
                                                                          curves open forwards, close backwards
     σ         = noise · (1 + erratic · (|a_forward|, 0, |turn − yaw_rate|))
                                                                          it pulls and turns in unevenly
 
-    v and w are the forward and lateral velocity.
+    v and w are the forward and lateral velocity; the lever is that at 1.3 m/s, where these drives turn.
     """
 
     substeps = 4
+    turning_speed = 1.3  # m/s
     settling = property(lambda self: self.grip_time)
     rates = {"noise": 3.0, "erratic": 3.0}
 
@@ -60,7 +61,7 @@ class DiscoveredTruck(Truck):
         forward, lateral, yaw_rate = self.body_velocity(state)
         by_curvature = turn * speed * forward / (speed**2 + 0.05**2)
         turned = turn + self.share * (by_curvature - turn)
-        sideways = (self.lever + self.slip * forward) * yaw_rate + self.crab * forward
+        sideways = (self.lever + self.slip * (forward - self.turning_speed)) * yaw_rate + self.crab * forward
         mean = stack(
             ((self.speed_gain * speed - forward) / self.speed_time).clamp(-self.limit, self.limit)
             + self.bias
