@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
-from steady_ppl.errors import FilterError
+from steady_ppl.errors import FilterError, TrainingError
 from steady_ppl.filtering import neglected
 from steady_ppl.gaussian_smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.linearization import Path
@@ -31,6 +31,7 @@ from steady_ppl.training import Optimization, train
 from steady_ppl.validation import Validation
 
 DOUBTFUL = 0.5  # nats a drive by which the linearised log p(y) may be off
+SHARES = (1.0, 0.3, 0.1)  # of the learning rate: a fit that breaks down begins again
 PARTICLES, JUDGING = 100, 400  # of the guide and of the judge: see docs/discovery.md, step 4
 
 
@@ -102,7 +103,7 @@ class ByDraws:
 
     Attributes:
         steps: E steps, each with a gradient step.
-        learning_rate: Adam's at the first step.
+        learning_rate: Adam's at the first step; less where that leads nowhere.
     """
 
     steps: int = 60
@@ -123,15 +124,16 @@ class ByDraws:
     def _climb(self, program: Program, drives: Trajectories, path: Path | None, known_start: bool) -> Maximum:
         path = path or find_path(program, drives, known_start=known_start)
         before = self.judge(program, drives, path, known_start=known_start)
-        guide = LookaheadGuide(
-            program, particles=PARTICLES, tempering=Constant(), known_start=known_start, search_again=math.inf
-        )
-        guide.remember(before.path, drives)
-        optimization = Optimization(self.steps, learning_rate=self.learning_rate, averaging=0.95)
         began = copy.deepcopy(program.state_dict())
-        with torch.enable_grad():
-            train(program, guide, drives, Validation(), optimization, known_start=known_start, progress=False)
-        after = self.judge(program, drives, before.path, known_start=known_start)
+        for share in SHARES:
+            try:
+                self._train(program, drives, before.path, known_start, share * self.learning_rate)
+                after = self.judge(program, drives, before.path, known_start=known_start)
+                break
+            except (FilterError, TrainingError):
+                program.load_state_dict(began)
+                if share == SHARES[-1]:
+                    raise
         if not float(after.log_likelihood.sum()) > float(before.log_likelihood.sum()):
             program.load_state_dict(began)
             after = before
@@ -145,6 +147,15 @@ class ByDraws:
             decrement=None,
             gained=float((after.log_likelihood - before.log_likelihood).sum()),
         )
+
+    def _train(self, program: Program, drives: Trajectories, path: Path, known_start: bool, rate: float) -> None:
+        guide = LookaheadGuide(
+            program, particles=PARTICLES, tempering=Constant(), known_start=known_start, search_again=math.inf
+        )
+        guide.remember(path, drives)
+        optimization = Optimization(self.steps, learning_rate=rate, averaging=0.95)
+        with torch.enable_grad():
+            train(program, guide, drives, Validation(), optimization, known_start=known_start, progress=False)
 
     def judge(self, program: Program, drives: Trajectories, path: Path, *, known_start: bool) -> Judged:
         ahead = _at_rest(program, drives, path, known_start)
