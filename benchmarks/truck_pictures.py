@@ -85,7 +85,7 @@ def horizons(axes: Axes, test: Trajectories, programs: dict[str, Program]) -> No
 
 def roll_out_picture(logs: Path, draw: int, file: Path) -> None:
     data = truck(logs, draw, centred=True)
-    programs: dict[str, Any] = {name: learnt(name, data, draw).program for name in SHOWN}
+    programs: dict[str, Any] = {name: learnt(name, data, draw)[0].program for name in SHOWN}
     figure, axes = plt.subplots(1, len(DRIVES) + 1, figsize=(14, 4), layout="constrained")
     labels = list(data[2].labels)
     for label, one in zip(DRIVES, axes, strict=False):

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import torch
 from experiments import truck
-from truck_programs import MECHANISTIC
+from response_surface import move_to_likeliest
+from truck_programs import MECHANISTIC, SPACINGS
 
 from inference import steady
 from models.discovered_truck import DiscoveredTruck
-from steady_ppl import Program, Trajectories, bearings_to, discover, wrap
+from steady_ppl import Program, Trajectories, bearings_to, discover, for_program, wrap
 from steady_ppl.joining import joined
 
 CALIBRATION = (101, 102, 103, 104)  # draws of the bearings
@@ -140,7 +141,8 @@ def calibrated(logs: Path) -> Program:
 
     Several draws, since a program that is taken as known must be known better than the drives that test it can tell. A
     response time of the yaw, negative as it comes out, stands for what is left of the yaw's dynamics; it has no
-    physical meaning. Without it one draw's drives without a fault are not quiet.
+    physical meaning. Without it one draw's drives without a fault are not quiet. Lever and slip are moved to their
+    likeliest values.
     """
     parts: dict[str, Trajectories] = {}
     for draw in CALIBRATION:
@@ -149,7 +151,9 @@ def calibrated(logs: Path) -> Program:
     program = DiscoveredTruck().with_effect("response_time:yaw", 0.0)
     drives = joined(**parts).without_truth(keep_start=True)
     settings = MECHANISTIC | {"first_weight": 1.0}
-    return steady.fit(program, drives, known_start=True, seed=0, progress=False, **settings).program
+    steady.fit(program, drives, known_start=True, seed=0, progress=False, **settings)
+    move_to_likeliest(program, for_program(program, drives), SPACINGS, known_start=True)
+    return program
 
 
 def is_right(record: dict[str, Any]) -> bool:

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 from experiments import STEADY_SETTINGS, Split, truck
-from response_surface import move_to_likeliest
+from response_surface import Likeliest, move_to_likeliest
 
 from inference import hand, steady
 from models.discovered_truck import DiscoveredTruck, HybridTruck
@@ -20,12 +20,12 @@ from steady_ppl import Fit, Trajectories, for_program, seeded, smoothed_states
 from steady_ppl.evaluation import evaluate
 from steady_ppl.substeps import acting_controls, row_controls
 
-# Chosen by held-out log p(y) of the valid split, draws 11 to 14 of the bearings: see docs/truck.md. With 200 steps and
-# one gradient step each, numbers that go together (lever, slip) may end far off: 389.5, 394.6, 392.3, 394.9 nats a
-# drive; three gradient steps: 389.0, 395.0, 394.8, 394.6; 400 steps with a rate of .02: 389.2, 394.9, 395.4, 395.3.
-# Both together were run on the draws 11 and 13 alone, from other starting values: 389.0, 394.9. By the M step that
-# scores what noise does to a whole row, 400 steps, draws 12 and 14: one gradient step 394.5, 395.3; three 394.8, 395.4.
-# With the lever counted from 1.3 m/s and 16 paths a drive, three gradient steps: 388.1, 394.7, 394.9, 395.4; 64 paths,
+# Steps, rate and ramp were chosen by held-out log p(y) of the valid split, draws 11 to 14 of the bearings, with 64
+# paths a drive and an M step whose slopes were too small (docs/truck.md). Nats a drive: 200 steps of one gradient step
+# 389.5, 394.6, 392.3, 394.9; of three 389.0, 395.0, 394.8, 394.6; 400 steps with a rate of .02 389.2, 394.9, 395.4,
+# 395.3; both together on draws 11 and 13 alone, from other starting values, 389.0, 394.9. By the mended M step, 400
+# steps, draws 12 and 14: one gradient step 394.5, 395.3; three 394.8, 395.4. 16 paths are taken for their cost, 215 to
+# 254 s a fit where 64 took 374 to 546 s, with the lever counted from 1.3 m/s: 388.1, 394.7, 394.9, 395.4; 64 paths,
 # draw 14: 395.0.
 MECHANISTIC = {
     "guide": "lookahead",
@@ -35,9 +35,9 @@ MECHANISTIC = {
     "learning_rate": 0.02,
     "ramp": 3.0,
 }
-# Where lever and slip end goes by where they begin: on draw 14 at .254 m and -.036 s or at .274 m and -.083 s. Moved to
-# their likeliest values both end within a standard deviation of each other, .261 m and -.053 s, .264 m and -.060 s;
-# held-out log p(y) goes from 395.1 to 395.1 and from 395.0 to 395.4.
+# EM leaves lever and slip near where they begin: on draw 14 at .254 m and -.036 s or at .274 m and -.083 s. Moved to
+# the likeliest values given the other numbers, both end near each other: .261 m and -.053 s, .264 m and -.060 s.
+# Held-out log p(y) by 400 particles is 395.1 and 395.0 before, 395.1 and 395.4 after.
 SPACINGS = {"lever": 0.015, "slip": 0.025}  # m and s
 PROGRAMS: dict[str, tuple[Any, dict[str, Any]]] = {
     "hand": (PaperTruck, {}),
@@ -49,15 +49,21 @@ PROGRAMS: dict[str, tuple[Any, dict[str, Any]]] = {
 }
 
 
-def learnt(name: str, data: Split, draw: int) -> Fit:
-    """A program fitted to the train drives' bearings, the valid drives' deciding when to stop; known starts."""
+def learnt(name: str, data: Split, draw: int) -> tuple[Fit, Likeliest | None]:
+    """A program fitted to the train drives' bearings, the valid drives' deciding when to stop; known starts.
+
+    Where it has a lever and a slip, these are then moved to their likeliest values, by the train drives.
+    """
     kind, settings = PROGRAMS[name]
     train, valid = (part.without_truth(keep_start=True) for part in data[:2])
     with seeded(draw, "program"):
         program = kind()
     if not settings:
-        return hand.fit(program, train, valid, known_start=True, seed=draw)
-    return steady.fit(program, train, valid, known_start=True, seed=draw, progress=False, **settings)
+        return hand.fit(program, train, valid, known_start=True, seed=draw), None
+    fit = steady.fit(program, train, valid, known_start=True, seed=draw, progress=False, **settings)
+    if not isinstance(program, DiscoveredTruck):
+        return fit, None
+    return fit, move_to_likeliest(program, for_program(program, train), SPACINGS, known_start=True, seed=draw)
 
 
 def judged(logs: Path, name: str, draw: int) -> dict[str, Any]:
@@ -65,14 +71,11 @@ def judged(logs: Path, name: str, draw: int) -> dict[str, Any]:
     torch.set_num_threads(1)
     data = truck(logs, draw, centred=True)
     began = time.perf_counter()
-    fit = learnt(name, data, draw)
-    likeliest = {}
-    if isinstance(fit.program, DiscoveredTruck):
-        drives = for_program(fit.program, data[0].without_truth(keep_start=True))
-        moved = move_to_likeliest(fit.program, drives, SPACINGS, known_start=True, seed=draw)
-        likeliest = {"likeliest": asdict(moved)}
+    fit, moved = learnt(name, data, draw)
     seconds = time.perf_counter() - began
-    record = {"program": name, "draw": draw, "seconds": seconds} | likeliest | evaluate(fit, data[2])
+    record = {"program": name, "draw": draw, "seconds": seconds} | evaluate(fit, data[2])
+    if moved:
+        record["likeliest"] = asdict(moved)
     record["authors_starts"] = evaluate(fit, truck(logs, draw)[2])  # their velocities know the next row's place
     if not isinstance(fit.program, NeuralTruck):
         own = {key: value for key, value in fit.program.named_parameters() if "hidden" not in key and "." not in key}

@@ -42,17 +42,16 @@ def test_a_fit_never_ends_below_where_it_began() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:Encountered NaN")
-def test_a_fit_that_breaks_down_begins_again_with_a_smaller_rate(monkeypatch) -> None:
+def test_a_fit_that_breaks_down_begins_again_with_a_smaller_rate() -> None:
     program = example("linear_gaussian", torch.float32)
     data = drives(program, 4, 41, seed=1)
     wrong = {name: 2 * value.clone() for name, value in program.state_dict().items()}
     program.load_state_dict(wrong)
-    monkeypatch.setattr("steady_ppl.discovery.fitting.SHARES", (1.0,))
     with pytest.raises((st.FilterError, st.TrainingError)):
         ByDraws(steps=60, learning_rate=20.0).fit(program, data, known_start=True)
     assert all(torch.equal(value, wrong[name]) for name, value in program.state_dict().items())
-    monkeypatch.setattr("steady_ppl.discovery.fitting.SHARES", (1.0, 0.01))
-    assert ByDraws(steps=60, learning_rate=20.0).fit(program, data, known_start=True).gained > 5
+    again = ByDraws(steps=60, learning_rate=20.0, smaller=(0.5, 0.01))
+    assert again.fit(program, data, known_start=True).gained > 5
 
 
 def test_a_program_whose_linearised_likelihood_is_off_is_fitted_by_draws(monkeypatch) -> None:

@@ -31,7 +31,6 @@ from steady_ppl.training import Optimization, train
 from steady_ppl.validation import Validation
 
 DOUBTFUL = 0.5  # nats a drive by which the linearised log p(y) may be off
-SHARES = (1.0, 0.3, 0.1)  # of the learning rate: a fit that breaks down begins again
 PARTICLES, JUDGING = 100, 400  # of the guide and of the judge: see docs/discovery.md, step 4
 
 
@@ -103,11 +102,13 @@ class ByDraws:
 
     Attributes:
         steps: E steps, each with a gradient step.
-        learning_rate: Adam's at the first step; less where that leads nowhere.
+        learning_rate: Adam's at the first step.
+        smaller: shares of it with which a fit that breaks down begins again, one after the other.
     """
 
     steps: int = 60
     learning_rate: float = 0.1
+    smaller: tuple[float, ...] = ()
 
     def fit(
         self,
@@ -125,14 +126,14 @@ class ByDraws:
         path = path or find_path(program, drives, known_start=known_start)
         before = self.judge(program, drives, path, known_start=known_start)
         began = copy.deepcopy(program.state_dict())
-        for share in SHARES:
+        for left, share in enumerate((1.0, *self.smaller), -len(self.smaller)):
             try:
                 self._train(program, drives, before.path, known_start, share * self.learning_rate)
                 after = self.judge(program, drives, before.path, known_start=known_start)
                 break
             except (FilterError, TrainingError):
                 program.load_state_dict(began)
-                if share == SHARES[-1]:
+                if not left:
                     raise
         if not float(after.log_likelihood.sum()) > float(before.log_likelihood.sum()):
             program.load_state_dict(began)

@@ -25,6 +25,7 @@ from steady_ppl.studies.plan import Job
 WORKER_WAIT = 30  # s for the first worker, and between looks at whether there still is one
 TRIES = 3  # of a job whose workers die; the scheduler itself tries it so often as it is set, four times at first
 HOLD, LONGEST_HOLD = 10, 60  # s for which a worker that is not used holds what it is given, or it would get it all
+LATE = 4  # jobs whose files are others, at which a worker has been refused if its files alone are
 IN_VAIN = 10  # jobs that Dask gives up while nothing is begun
 
 
@@ -227,6 +228,7 @@ class Deaths:
         return self.begun[key] >= TRIES
 
 
+_changed = Counter[str]()  # on a worker: jobs whose files were others there, by topic
 _held = Counter[str]()  # on a worker that is not used: how often it has held what it was given, by topic
 
 
@@ -256,7 +258,9 @@ def computed(job: Job, here: Mapping[str, str], topic: str) -> Answer:
     worker.log_event(topic, job.key)
     row = work.run(job)
     if row.get("reason") == work.CHANGED:
-        time.sleep(HOLD)  # until it is refused, where its files alone are others: it would get everything meanwhile
+        _changed[topic] += 1
+        if 1 < _changed[topic] <= LATE:  # it would get everything before it is refused
+            time.sleep(HOLD)
     return Answer(worker.address, "", row)
 
 
