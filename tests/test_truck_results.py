@@ -74,27 +74,34 @@ def test_what_is_left_to_the_networks_is_the_mean_of_five_draws() -> None:
         assert f"{short(left[2], 2)} rad/s²" in PAGE
 
 
-@pytest.mark.parametrize(("name", "motion_capture"), [("lever", 0.372), ("slip", -0.082), ("crab", -0.013)])
-def test_numbers_beside_motion_capture_are_of_five_draws(name: str, motion_capture: float) -> None:
-    found = [run["parameters"][name] for run in of("discovered")]
+NAMES = ("lever", "slip")
+NUMBERS = {
+    "lever at 1.3 m/s": (lambda numbers: numbers["lever"], 0.265),
+    "lever at standstill": (lambda numbers: numbers["lever"] - 1.3 * numbers["slip"], 0.372),
+    "slip": (lambda numbers: numbers["slip"], -0.082),
+    "crab": (lambda numbers: numbers["crab"], -0.013),
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_numbers_beside_motion_capture_are_of_five_draws(name: str) -> None:
+    number, motion_capture = NUMBERS[name]
+    found = [number(run["parameters"]) for run in of("discovered")]
     (row,) = (line for line in PAGE.splitlines() if line.startswith(f"| {name} |"))
     assert f"{short(statistics.fmean(found), 3)} ± {short(statistics.stdev(found), 3)}" in row
     assert short(motion_capture, 3) in row
-    if name == "lever":
+    if name.startswith("lever"):
         assert all(abs(value - motion_capture) < 0.05 for value in found)
     if name == "slip":
         assert max(found) < 0
 
 
-def test_what_the_page_says_of_the_mended_m_step_is_of_five_draws() -> None:
-    file = ROOT / "benchmarks" / "results" / "truck-mended-m-step.jsonl"
-    runs = [run for run in map(json.loads, file.read_text().splitlines()) if run["program"] == "discovered"]
-    assert sorted(run["draw"] for run in runs) == [1, 2, 3, 4, 5]
-    figures = [([run["parameters"][name] for run in runs], 3) for name in ("lever", "slip", "crab")]
-    figures += [([run[group]["location"] for run in runs], 4) for group in ("forward", "forward_mean")]
-    figures.append(([run["log_likelihood"] for run in runs], 2))
-    for values, places in figures:
-        assert f"{short(statistics.fmean(values), places)} ± {short(statistics.stdev(values), places)}" in PAGE
+def test_lever_and_slip_were_moved_to_their_likeliest_values() -> None:
+    for run in of("discovered"):
+        moved = run["likeliest"]
+        assert moved["settled"] and all(run["parameters"][name] == pytest.approx(moved["values"][name]) for name in NAMES)
+    slips = [run["likeliest"]["sds"]["slip"] for run in of("discovered")]
+    assert f"to {short(min(slips), 3)} to {short(max(slips), 3)} s a draw" in PAGE
 
 
 def test_the_page_says_which_musts_are_missed(benchmark) -> None:
