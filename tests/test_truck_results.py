@@ -99,7 +99,7 @@ def test_numbers_beside_motion_capture_are_of_five_draws(name: str) -> None:
 def test_lever_and_slip_were_moved_to_their_likeliest_values() -> None:
     for run in of("discovered"):
         moved = run["likeliest"]
-        assert moved["settled"] and all(run["parameters"][name] == pytest.approx(moved["values"][name]) for name in NAMES)
+        assert moved["settled"] and {name: run["parameters"][name] for name in NAMES} == pytest.approx(moved["values"])
     slips = [run["likeliest"]["sds"]["slip"] for run in of("discovered")]
     assert f"to {short(min(slips), 3)} to {short(max(slips), 3)} s a draw" in PAGE
 
