@@ -25,7 +25,7 @@ from steady_ppl.substeps import acting_controls, row_controls
 # 389.5, 394.6, 392.3, 394.9; of three 389.0, 395.0, 394.8, 394.6; 400 steps with a rate of .02 389.2, 394.9, 395.4,
 # 395.3; both together on draws 11 and 13 alone, from other starting values, 389.0, 394.9. By the mended M step, 400
 # steps, draws 12 and 14: one gradient step 394.5, 395.3; three 394.8, 395.4. 16 paths are taken for their cost, 215 to
-# 254 s a fit where 64 took 374 to 546 s, with the lever counted from 1.3 m/s: 388.1, 394.7, 394.9, 395.4; 64 paths,
+# 310 s a fit where 64 took 374 to 546 s, with the lever counted from 1.3 m/s: 388.1, 394.7, 394.9, 395.4; 64 paths,
 # draw 14: 395.0.
 MECHANISTIC = {
     "guide": "lookahead",

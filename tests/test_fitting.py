@@ -41,19 +41,6 @@ def test_a_fit_never_ends_below_where_it_began() -> None:
     assert all(torch.equal(value, before[name]) for name, value in program.named_parameters())
 
 
-@pytest.mark.filterwarnings("ignore:Encountered NaN")
-def test_a_fit_that_breaks_down_begins_again_with_a_smaller_rate() -> None:
-    program = example("linear_gaussian", torch.float32)
-    data = drives(program, 4, 41, seed=1)
-    wrong = {name: 2 * value.clone() for name, value in program.state_dict().items()}
-    program.load_state_dict(wrong)
-    with pytest.raises((st.FilterError, st.TrainingError)):
-        ByDraws(steps=60, learning_rate=20.0).fit(program, data, known_start=True)
-    assert all(torch.equal(value, wrong[name]) for name, value in program.state_dict().items())
-    again = ByDraws(steps=60, learning_rate=20.0, smaller=(0.5, 0.01))
-    assert again.fit(program, data, known_start=True).gained > 5
-
-
 def test_a_program_whose_linearised_likelihood_is_off_is_fitted_by_draws(monkeypatch) -> None:
     truth = example("paper.py:PaperTruck", torch.float32).with_effect("lever_arm", 0.4)
     truth.noise = torch.tensor([2.0, 1.0, 1.0])

@@ -46,7 +46,7 @@ def test_numbers_end_where_exact_log_p_is_largest_whatever_they_begin_with():
     assert float((ends[0] - ends[1]).abs().max()) < 0.15
 
 
-def test_a_surface_that_opens_upwards_leads_to_its_highest_point_():
+def test_a_surface_that_opens_upwards_leads_to_its_highest_point():
     grid = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0]).double()] * 2)
     saddle = _surface(grid, grid[:, 0] - grid[:, 1].square() + 0.5 * grid[:, 0].square())
     assert saddle.lead.tolist() == [1.5, 0.0] and not saddle.has_top and saddle.scatter < 1e-9

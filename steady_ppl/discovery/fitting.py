@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories
-from steady_ppl.errors import FilterError, TrainingError
+from steady_ppl.errors import FilterError
 from steady_ppl.filtering import neglected
 from steady_ppl.gaussian_smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.linearization import Path
@@ -103,12 +103,10 @@ class ByDraws:
     Attributes:
         steps: E steps, each with a gradient step.
         learning_rate: Adam's at the first step.
-        smaller: shares of it with which a fit that breaks down begins again, one after the other.
     """
 
     steps: int = 60
     learning_rate: float = 0.1
-    smaller: tuple[float, ...] = ()
 
     def fit(
         self,
@@ -125,16 +123,15 @@ class ByDraws:
     def _climb(self, program: Program, drives: Trajectories, path: Path | None, known_start: bool) -> Maximum:
         path = path or find_path(program, drives, known_start=known_start)
         before = self.judge(program, drives, path, known_start=known_start)
+        guide = LookaheadGuide(
+            program, particles=PARTICLES, tempering=Constant(), known_start=known_start, search_again=math.inf
+        )
+        guide.remember(before.path, drives)
+        optimization = Optimization(self.steps, learning_rate=self.learning_rate, averaging=0.95)
         began = copy.deepcopy(program.state_dict())
-        for left, share in enumerate((1.0, *self.smaller), -len(self.smaller)):
-            try:
-                self._train(program, drives, before.path, known_start, share * self.learning_rate)
-                after = self.judge(program, drives, before.path, known_start=known_start)
-                break
-            except (FilterError, TrainingError):
-                program.load_state_dict(began)
-                if not left:
-                    raise
+        with torch.enable_grad():
+            train(program, guide, drives, Validation(), optimization, known_start=known_start, progress=False)
+        after = self.judge(program, drives, before.path, known_start=known_start)
         if not float(after.log_likelihood.sum()) > float(before.log_likelihood.sum()):
             program.load_state_dict(began)
             after = before
@@ -148,15 +145,6 @@ class ByDraws:
             decrement=None,
             gained=float((after.log_likelihood - before.log_likelihood).sum()),
         )
-
-    def _train(self, program: Program, drives: Trajectories, path: Path, known_start: bool, rate: float) -> None:
-        guide = LookaheadGuide(
-            program, particles=PARTICLES, tempering=Constant(), known_start=known_start, search_again=math.inf
-        )
-        guide.remember(path, drives)
-        optimization = Optimization(self.steps, learning_rate=rate, averaging=0.95)
-        with torch.enable_grad():
-            train(program, guide, drives, Validation(), optimization, known_start=known_start, progress=False)
 
     def judge(self, program: Program, drives: Trajectories, path: Path, *, known_start: bool) -> Judged:
         ahead = _at_rest(program, drives, path, known_start)

@@ -46,8 +46,7 @@ class Worth:
 
 
 ALWAYS = Worth()
-BY_LIKELIHOOD, BY_DRAWS = ByLikelihood(), ByDraws()
-FIRST_BY_DRAWS = ByDraws(steps=180, smaller=(0.3, 0.1))
+BY_LIKELIHOOD, BY_DRAWS, FIRST_BY_DRAWS = ByLikelihood(), ByDraws(), ByDraws(steps=180)
 
 
 @dataclass(frozen=True)
