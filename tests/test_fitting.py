@@ -11,8 +11,9 @@ from examples import drives, example
 import steady_ppl as st
 from steady_ppl.discovery.candidates import NATS
 from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, is_doubtful
-from steady_ppl.discovery.refits import first_refit, refit_with
-from steady_ppl.effects import chosen_variant
+from steady_ppl.discovery.refits import first_refit, likelier, refit_with
+from steady_ppl.effects import attached, chosen_variant, coefficient
+from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import find_path
 
 
@@ -39,6 +40,23 @@ def test_a_fit_never_ends_below_where_it_began() -> None:
     fit = ByDraws(steps=3, learning_rate=5.0).fit(program, data, known_start=True)
     assert fit.gained == 0.0
     assert all(torch.equal(value, before[name]) for name, value in program.named_parameters())
+
+
+def test_fits_by_draws_begin_at_the_likelier_program() -> None:
+    good, far = example("hovercraft", torch.float32), example("hovercraft", torch.float32)
+    data = drives(good, 4, 41, seed=1)
+    far.mass = torch.tensor(4.5)
+    paths = {program: find_path(program, data, known_start=True) for program in (good, far)}
+    for given, fitted in ((good, far), (far, good)):
+        program, path = likelier(given, fitted, data, paths[fitted], known_start=True)
+        assert float(program.mass.detach()) == float(good.mass.detach())
+        assert path.states.shape == paths[good].states.shape
+    stiff, still = good.with_effect("linear_drag", 1e3), good.with_effect("linear_drag", 0.0)
+    for given, fitted in ((still, stiff), (stiff, still)):
+        program, _ = likelier(given, fitted, data, paths[good], known_start=True)
+        assert float(coefficient(program, attached(program)[0]).detach()) == 0.0
+    with pytest.raises(FilterError):
+        likelier(stiff, stiff, data, paths[good], known_start=True)
 
 
 def test_a_program_whose_linearised_likelihood_is_off_is_fitted_by_draws(monkeypatch) -> None:

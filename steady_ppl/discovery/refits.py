@@ -127,9 +127,38 @@ def first_refit(program: Program, train: Trajectories, valid: Trajectories, *, k
     folds = [Fold(train, one.path, valid, second.path), Fold(valid, second.path, train, one.path)]
     rough = copy.deepcopy(program) if _far_wider(own, program, train) else None
     if rough is None and is_doubtful(own, train, one.path, known_start):
+        with seeded(seed, "paths by draws"):
+            own, first = likelier(program, own, train, one.path, known_start)
+            other, last = likelier(program, other, valid, second.path, known_start)
+        folds = [Fold(train, first, valid, last), Fold(valid, last, train, first)]
         refit = _refit([own, other], folds, known_start, [None, None], fitting=FIRST_BY_DRAWS)
         return replace(refit, fitting=BY_DRAWS)
     return replace(_refit([own, other], folds, known_start, [one, second]), rough=rough)
+
+
+def likelier(
+    given: Program, fitted: Program, drives: Trajectories, path: Path, known_start: bool
+) -> tuple[Program, Path]:
+    """Where a fit by draws begins, with a path: the program as given or as a linearised likelihood that is off has left
+    it, whichever the filter finds likelier.
+
+    Raises:
+        FilterError: neither can follow the drives.
+    """
+    try:
+        begun = FIRST_BY_DRAWS.judge(fitted, drives, path, known_start=known_start)
+    except FilterError:
+        begun = None
+    try:
+        found = find_path(given, drives, known_start=known_start)
+        asked = FIRST_BY_DRAWS.judge(given, drives, found, known_start=known_start)
+    except FilterError:
+        if begun is None:
+            raise
+        return fitted, path
+    if begun is not None and begun.log_likelihood.sum() > asked.log_likelihood.sum():
+        return fitted, path
+    return copy.deepcopy(given), asked.path
 
 
 def _far_wider(fitted: Program, program: Program, data: Trajectories) -> bool:
