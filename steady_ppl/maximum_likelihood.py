@@ -225,8 +225,8 @@ def _searched(
     while share > 0.01:
         for term, values in zip(terms, before, strict=True):
             set_values(term.parts, values + share * move[list(term.columns)])
-        there = _try(_along(terms, here), known_start, passes)
-        if there is not None and there.objective >= here.objective - GIVES_WAY:
+        there = _try(_along(terms, here), known_start, passes, here.objective - GIVES_WAY)
+        if there is not None:
             return share, there
         share /= 3
     for term, values in zip(terms, before, strict=True):
@@ -271,16 +271,27 @@ def _along(terms: Sequence[Term], here: _Here) -> list[Term]:
 
 
 def _look(terms: Sequence[Term], known_start: bool, passes: int = PASSES) -> _Here:
-    found, scores, slopes, owners = [], [], [], _owners(terms)
+    return _scored(terms, _valued(terms, known_start, passes))
+
+
+def _valued(terms: Sequence[Term], known_start: bool, passes: int) -> list[_TermHere]:
+    found, owners = [], _owners(terms)
     for term in terms:
         program, data = term.program, term.data
         ahead = smooth(
             program, data, term.path, known_start=known_start, passes=passes, tolerance=TOLERANCE, kernels=False
         )
-        scores.append(parameter_scores(program, data, smoothed(ahead, data), term.parts))
-        prior, slope = _prior(program, term.parts, [owners[column] for column in term.columns])
-        slopes.append(scores[-1].sum(0) + slope)
+        prior = log_prior(program, _shares(term.parts, [owners[column] for column in term.columns]))
         found.append(_TermHere(ahead, resting_path(ahead, data), float(ahead.log_likelihood.sum()) + prior))
+    return found
+
+
+def _scored(terms: Sequence[Term], found: list[_TermHere]) -> _Here:
+    scores, slopes, owners = [], [], _owners(terms)
+    for term, at in zip(terms, found, strict=True):
+        scores.append(parameter_scores(term.program, term.data, smoothed(at.ahead, term.data), term.parts))
+        shares = _shares(term.parts, [owners[column] for column in term.columns])
+        slopes.append(scores[-1].sum(0) + _slope_of_prior(term.program, term.parts, shares))
     count = len(owners)
     gradient = torch.zeros(count, dtype=torch.float64)
     by_drive = []
@@ -303,31 +314,34 @@ def posterior_score(program: Program, data: Trajectories, path: Path, known_star
     return _look([Term(program, data, path, parts, range(len(parts)))], known_start, PATIENT).gradient
 
 
-def _try(terms: Sequence[Term], known_start: bool, passes: int) -> _Here | None:
-    """None where the step went too far: a program diverges there."""
+def _try(terms: Sequence[Term], known_start: bool, passes: int, least: float) -> _Here | None:
+    """None where the step went too far: the objective falls below `least`, or a program diverges there."""
     try:
-        here = _look(terms, known_start, passes)
+        found = _valued(terms, known_start, passes)
+        finite = all(bool(torch.isfinite(term.ahead.log_likelihood).all()) for term in found)
+        if not finite or not sum(term.objective for term in found) >= least:
+            return None
+        here = _scored(terms, found)
     except FilterError:
         return None
-    finite = all(bool(torch.isfinite(term.ahead.log_likelihood).all()) for term in here.terms)
-    return here if finite and bool(torch.isfinite(here.gradient).all()) else None
+    return here if bool(torch.isfinite(here.gradient).all()) else None
 
 
-def _prior(program: Program, parts: list[Element], owners: Sequence[int]) -> tuple[float, Tensor]:
-    """The log prior and its slope in the unconstrained space, without the Jacobian: for the parameter's own mode. Of a
-    number that several programs have in common each has its share."""
+def _shares(parts: list[Element], owners: Sequence[int]) -> dict[str, float]:
+    """A program's share in the log prior of its parameters, which others may have in common with it."""
+    return {part.name.split("[")[0]: 1 / count for part, count in zip(parts, owners, strict=True)}
 
+
+def _slope_of_prior(program: Program, parts: list[Element], shares: dict[str, float]) -> Tensor:
+    """Of the log prior in the unconstrained space, without the Jacobian: for the parameter's own mode, `(P,)`."""
     slope = torch.zeros(len(parts), dtype=torch.float64)
-    if not program.priors:
-        return 0.0, slope
-    shares = {part.name.split("[")[0]: 1 / count for part, count in zip(parts, owners, strict=True)}
     for index, part in enumerate(parts):
         if part.name.split("[")[0] in program.priors:
             with moved(part, part.step):
                 up = log_prior(program, shares)
             with moved(part, -part.step):
                 slope[index] = (up - log_prior(program, shares)) / (2 * part.step)
-    return log_prior(program, shares), slope
+    return slope
 
 
 def log_prior(program: Program, shares: Mapping[str, float] | None = None) -> float:

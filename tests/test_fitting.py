@@ -11,7 +11,7 @@ from examples import drives, example
 import steady_ppl as st
 from steady_ppl.discovery.candidates import NATS
 from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, is_doubtful
-from steady_ppl.discovery.refits import first_refit, likelier, refit_with
+from steady_ppl.discovery.refits import Fold, first_by_draws, first_refit, likelier, refit_with
 from steady_ppl.effects import attached, chosen_variant, coefficient
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import find_path
@@ -46,17 +46,40 @@ def test_fits_by_draws_begin_at_the_likelier_program() -> None:
     good, far = example("hovercraft", torch.float32), example("hovercraft", torch.float32)
     data = drives(good, 4, 41, seed=1)
     far.mass = torch.tensor(4.5)
-    paths = {program: find_path(program, data, known_start=True) for program in (good, far)}
+    path = find_path(good, data, known_start=True)
+    fold = Fold(data, path, data, path)
     for given, fitted in ((good, far), (far, good)):
-        program, path = likelier(given, fitted, data, paths[fitted], known_start=True)
+        program, found = likelier(given, fitted, fold, known_start=True)
         assert float(program.mass.detach()) == float(good.mass.detach())
-        assert path.states.shape == paths[good].states.shape
+        assert found.states.shape == path.states.shape
     stiff, still = good.with_effect("linear_drag", 1e3), good.with_effect("linear_drag", 0.0)
     for given, fitted in ((still, stiff), (stiff, still)):
-        program, _ = likelier(given, fitted, data, paths[good], known_start=True)
+        program, _ = likelier(given, fitted, fold, known_start=True)
         assert float(coefficient(program, attached(program)[0]).detach()) == 0.0
     with pytest.raises(FilterError):
-        likelier(stiff, stiff, data, paths[good], known_start=True)
+        likelier(stiff, stiff, fold, known_start=True)
+
+
+def test_where_a_climb_by_draws_diverges_another_begins_at_the_program_as_given(monkeypatch) -> None:
+    given, fitted = example("hovercraft", torch.float32), example("hovercraft", torch.float32)
+    data = drives(fitted, 4, 41, seed=1)
+    given.mass = torch.tensor(1.8)
+    path = find_path(fitted, data, known_start=True)
+    folds = [Fold(data, path, data, path)] * 2
+    began = []
+
+    def train(program, guide, *arguments, **settings):
+        began.append(float(program.mass.detach()))
+        if began[-1] < 1.7:
+            raise FilterError("the model diverges")
+
+    monkeypatch.setattr("steady_ppl.discovery.fitting.train", train)
+    base = first_by_draws(given, [fitted, fitted], folds, True, seed=0)
+    assert began == pytest.approx([1.5, 1.8, 1.8])
+    assert [float(program.mass.detach()) for program in base.programs] == pytest.approx([1.8, 1.8])
+    assert isinstance(base.fitting, ByDraws)
+    with pytest.raises(FilterError, match="diverges"):
+        first_by_draws(fitted, [fitted, fitted], folds, True, seed=0)
 
 
 def test_a_program_whose_linearised_likelihood_is_off_is_fitted_by_draws(monkeypatch) -> None:

@@ -127,18 +127,25 @@ def first_refit(program: Program, train: Trajectories, valid: Trajectories, *, k
     folds = [Fold(train, one.path, valid, second.path), Fold(valid, second.path, train, one.path)]
     rough = copy.deepcopy(program) if _far_wider(own, program, train) else None
     if rough is None and is_doubtful(own, train, one.path, known_start):
-        with seeded(seed, "paths by draws"):
-            own, first = likelier(program, own, train, one.path, known_start)
-            other, last = likelier(program, other, valid, second.path, known_start)
-        folds = [Fold(train, first, valid, last), Fold(valid, last, train, first)]
-        refit = _refit([own, other], folds, known_start, [None, None], fitting=FIRST_BY_DRAWS)
-        return replace(refit, fitting=BY_DRAWS)
+        return first_by_draws(program, [own, other], folds, known_start, seed)
     return replace(_refit([own, other], folds, known_start, [one, second]), rough=rough)
 
 
-def likelier(
-    given: Program, fitted: Program, drives: Trajectories, path: Path, known_start: bool
-) -> tuple[Program, Path]:
+def first_by_draws(given: Program, fitted: list[Program], folds: list[Fold], known_start: bool, seed: int) -> Refit:
+    """From the likelier programs; where a climb from there meets one that diverges, from the program as given."""
+    with seeded(seed, "paths by draws"):
+        begun = [likelier(given, *pair, known_start=known_start) for pair in zip(fitted, folds, strict=True)]
+    (one, first), (other, second) = begun
+    train, valid = (fold.drives for fold in folds)
+    along = [Fold(train, first, valid, second), Fold(valid, second, train, first)]
+    try:
+        refit = _refit([one, other], along, known_start, [None, None], fitting=FIRST_BY_DRAWS)
+    except FilterError:
+        refit = _refit([copy.deepcopy(given) for _ in begun], along, known_start, [None, None], fitting=FIRST_BY_DRAWS)
+    return replace(refit, fitting=BY_DRAWS)
+
+
+def likelier(given: Program, fitted: Program, fold: Fold, *, known_start: bool) -> tuple[Program, Path]:
     """Where a fit by draws begins, with a path: the program as given or as a linearised likelihood that is off has left
     it, whichever the filter finds likelier.
 
@@ -146,18 +153,18 @@ def likelier(
         FilterError: neither can follow the drives.
     """
     try:
-        begun = FIRST_BY_DRAWS.judge(fitted, drives, path, known_start=known_start)
+        begun = FIRST_BY_DRAWS.judge(fitted, fold.drives, fold.path, known_start=known_start)
     except FilterError:
         begun = None
     try:
-        found = find_path(given, drives, known_start=known_start)
-        asked = FIRST_BY_DRAWS.judge(given, drives, found, known_start=known_start)
+        found = find_path(given, fold.drives, known_start=known_start)
+        asked = FIRST_BY_DRAWS.judge(given, fold.drives, found, known_start=known_start)
     except FilterError:
         if begun is None:
             raise
-        return fitted, path
+        return fitted, fold.path
     if begun is not None and begun.log_likelihood.sum() > asked.log_likelihood.sum():
-        return fitted, path
+        return fitted, fold.path
     return copy.deepcopy(given), asked.path
 
 
