@@ -12,14 +12,14 @@ from dataclasses import replace
 import torch
 
 from steady_ppl.data import Trajectories
-from steady_ppl.elements import Element, elements, moved
+from steady_ppl.elements import elements
 from steady_ppl.gaussian_smoother import find_path, resting_path, smooth
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.program import Program
 from steady_ppl.progress import stages
-from steady_ppl.scores import smoothed, substep_spreads
+from steady_ppl.scores import smoothed, widens
 
 ROUGH = 1.5  # mean square deviation, in the program's own, from which its noise is widened before anything is fitted
 FAR, SEARCHES = 6.0, 3  # standard deviations by which a drive strays from the others, and searches for its path
@@ -74,12 +74,13 @@ def led_back(program: Program, data: Trajectories, maximum: Maximum, known_start
     return maximum
 
 
-def roomy_path(program: Program, data: Trajectories, known_start: bool) -> Path:
+def roomy_path(program: Program, data: Trajectories, known_start: bool, path: Path | None = None) -> Path:
     """Find paths; where the drives are much rougher than the program says, widen its noise first, in place.
 
-    A program that lacks a strong effect explains nothing at its declared noise: scores there lead nowhere.
+    A program that lacks a strong effect explains nothing at its declared noise: scores there lead nowhere. A path that
+    is given is returned where the noise is wide enough.
     """
-    path = find_path(program, data, known_start=known_start)
+    path = path or find_path(program, data, known_start=known_start)
     ahead = smooth(program, data, path, known_start=known_start, kernels=False)
     parts = [part for part in elements(program) if widens(program, part, data)]
     while parts and _roughness(ahead, data) > ROUGH:
@@ -94,16 +95,6 @@ def roomy_path(program: Program, data: Trajectories, known_start: bool) -> Path:
             break
         path, ahead = wider, there
     return path
-
-
-def widens(program: Program, part: Element, data: Trajectories) -> bool:
-    """Whether a learnable number is the logarithm of the standard deviation of some channel."""
-    states = data.controls.new_ones((1, *data.steps.shape, len(program.states)))
-    here = substep_spreads(program, data, states)
-    with moved(part, 0.1):
-        there = substep_spreads(program, data, states)
-    change = (there / here).log()[:, data.transitions]
-    return bool(((change.abs() < 1e-6) | ((change - 0.1).abs() < 1e-3)).all()) and bool((change > 0.05).any())
 
 
 def _roughness(ahead: Lookahead, data: Trajectories) -> float:

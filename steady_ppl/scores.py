@@ -239,6 +239,16 @@ def substep_spreads(program: Program, data: Trajectories, states: Tensor, contro
         return channel_scales(program, states, controls[..., :-1, :, :], data.elapsed[:-1], data.steps)
 
 
+def widens(program: Program, part: Element, data: Trajectories) -> bool:
+    """Whether a learnable number is the logarithm of the standard deviation of some channel."""
+    states = data.controls.new_ones((1, *data.steps.shape, len(program.states)))
+    here = substep_spreads(program, data, states)
+    with moved(part, 0.1):
+        there = substep_spreads(program, data, states)
+    change = (there / here).log()[:, data.transitions]
+    return bool(((change.abs() < 1e-6) | ((change - 0.1).abs() < 1e-3)).all()) and bool((change > 0.05).any())
+
+
 @dataclass(frozen=True)
 class Measured:
     """What is measured at some states: the sites' distributions."""

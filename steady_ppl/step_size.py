@@ -16,10 +16,11 @@ from steady_ppl.data import Trajectories
 from steady_ppl.elements import elements, values_of
 from steady_ppl.errors import FilterError, UsageError
 from steady_ppl.gaussian_smoother import find_path, require_found, resting_path, smooth
-from steady_ppl.likelihood_fit import widens
+from steady_ppl.likelihood_fit import roomy_path
 from steady_ppl.linearization import Path
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.program import Program
+from steady_ppl.scores import widens
 from steady_ppl.stability import can_be_cut, counts_rows, is_step
 from steady_ppl.substeps import MAX_SUBSTEPS, with_substeps
 
@@ -27,6 +28,7 @@ MIN_GAIN = 3.0  # nats, of all drives together, from which a finer step counts
 MAX_SHIFT = 2.0  # nats that watched parameters of another step lie below the maximum: two standard deviations
 MAX_DECREMENT = 1.0  # nats that a scoring step at a finer step may promise; beyond it its refit may gain far more
 UNFITTED = 0.2  # share of what a scoring step promises at the program's own step, for parameters that are not fitted
+UNSETTLED = 50.0  # nats that a scoring step may promise at the program's own step; beyond it a look excludes nothing
 PRECISION = 0.005  # nats, of refits
 FINEST = 32  # substeps of a trial, at most, unless more are asked for; a program may always be tried at twice its own
 REFITS = 25  # scoring steps of a fit
@@ -81,7 +83,7 @@ class StepCheck:
 
     Attributes:
         trials: the program's own number of substeps first, then twice as many each time, to the first that changes
-            neither log p(y) nor the watched parameters by what counts.
+            neither log p(y) nor the watched parameters by what counts, or the second in a row whose fit loses.
         max_shift: nats by which the watched parameters may move.
         uncompared: why the program was fitted at no finer step, None where it was or where one look excluded a gain.
     """
@@ -93,10 +95,11 @@ class StepCheck:
     @property
     def suited(self) -> StepTrial:
         """The trial with the fewest substeps, beyond which twice as many change nothing that counts."""
-        for trial, finer in zip(self.trials, self.trials[1:], strict=False):
-            if not _differs(trial, finer, self.max_shift):
-                return trial
-        return self.trials[-1]
+        return next(
+            trial
+            for index, trial in enumerate(self.trials)
+            if not any(_differs(trial, finer, self.max_shift) for finer in self.trials[index + 1 :])
+        )
 
     @property
     def settled(self) -> bool:
@@ -121,8 +124,13 @@ class StepCheck:
         if self.gain > MIN_GAIN:
             said = f"{self._instead} gain {self.gain:.0f} nats"
             if not self.settled:
-                last = self.trials[-1].log_likelihood - self.trials[-2].log_likelihood
-                said += f", the last doubling {last:.0f} of them: more substeps may gain more"
+                coarser, last = self.trials[-2:]
+                gain = last.log_likelihood - coarser.log_likelihood
+                if gain > MIN_GAIN:
+                    said += f", the last doubling {gain:.0f} of them: more substeps may gain more"
+                else:
+                    name, far = last.farthest(coarser)
+                    said += f", the last doubling moves {name} by {far:.1f} standard deviations"
         elif self.too_coarse and self.suited.shift(self.trials[0]) > MAX_SHIFT:
             said = f"{self._instead} move {self._farthest}"
         else:
@@ -183,8 +191,9 @@ def check_step(
 
     Fits are made only where one look at a finer step does not exclude that it gains: its log p(y) with the parameters
     as they are is no higher, and a scoring step would hardly move them. Where two steps differ, the coarser one is
-    fitted from the finer one's parameters too, and judged there unless that is `MIN_GAIN` nats worse. A network keeps
-    its parameters.
+    fitted from the finer one's parameters too, and judged there unless that is `MIN_GAIN` nats worse. A finer step that
+    loses may have been fitted badly, from parameters that a coarse one has bent: one finer still is tried. A network
+    keeps its parameters.
 
     Args:
         program: with normal noise; see `linearize`.
@@ -215,8 +224,17 @@ def check_step(
             ahead = smooth(changed, data, path, known_start=known_start, kernels=False)
             require_found(ahead, changed, data)
             return StepTrial(substeps, float(ahead.log_likelihood.sum()), 0.0, changed, resting_path(ahead, data))
+        if steps:
+            path = roomy_path(changed, data, known_start, path)
         maximum = maximise(changed, data, path, known_start=known_start, steps=steps, precision=PRECISION)
         return _trial(changed, maximum, names)
+
+    def again(coarse: StepTrial, fine: StepTrial) -> StepTrial:
+        try:
+            found = trial(coarse.substeps, fine.program, fine.path, REFITS)
+        except FilterError:  # at the coarser step the finer one's parameters diverge
+            return coarse
+        return found if found.log_likelihood > coarse.log_likelihood - MIN_GAIN else coarse
 
     own = program.substeps
     most = min(MAX_SUBSTEPS, max(finest, 2 * own))
@@ -233,21 +251,22 @@ def check_step(
         look = trial(2 * own, program, first.path, 0)
         allowed = max(min(max_shift, MAX_DECREMENT), UNFITTED * first.decrement)
         moves = look.decrement - first.decrement > allowed
-        if look.reachable < first.reachable + 0.5 * MIN_GAIN and not moves:
+        fitted = not refits or first.decrement < UNSETTLED
+        if fitted and look.reachable < first.reachable + 0.5 * MIN_GAIN and not moves:
             return StepCheck((first,), max_shift)
         if not can_be_cut(program, data):
             return StepCheck((first,), max_shift, f"{UNKNOWN}: `transition` is no step in `step`")
         if refits and not isinstance(at, Maximum):
             first = trial(own, program, first.path, REFITS)
-        trials = [first]
+        trials, lost = [first], False
         trials.append(trial(2 * own, first.program, first.path, REFITS))
         while True:
             coarse, fine = trials[-2:]
             if refits and _differs(coarse, fine, max_shift):  # several maxima of one program are no matter of its step
-                again = trial(coarse.substeps, fine.program, fine.path, REFITS)
-                if again.log_likelihood > coarse.log_likelihood - MIN_GAIN:
-                    trials[-2] = again
-            if not _differs(trials[-2], fine, max_shift) or 2 * fine.substeps > most:
+                trials[-2] = again(coarse, fine)
+            lost, lost_before = fine.log_likelihood < trials[-2].log_likelihood - MIN_GAIN, lost
+            go_on = _differs(trials[-2], fine, max_shift) or (lost and not lost_before)
+            if not go_on or 2 * fine.substeps > most:
                 break
             trials.append(trial(2 * fine.substeps, fine.program, fine.path, REFITS))
     except FilterError as error:  # paths of the coarser step lead nowhere at the finer one: nothing speaks for that one

@@ -6,9 +6,12 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pyro
 import pyro.distributions as dist
 import pytest
+import scipy.linalg
 import torch
 from examples import MODELS, example
 from pyro.distributions import constraints
@@ -20,11 +23,13 @@ from steady_ppl import (
     FilterError,
     Fit,
     PlanarVehicle,
+    Program,
     WrappedNormal,
     check,
     discover,
     fit_by_likelihood,
     for_program,
+    read_table,
     seeded,
     simulate,
     stack,
@@ -100,6 +105,74 @@ def test_a_step_that_is_too_coarse_is_told_by_its_gain(steps_of_turning) -> None
     )
     for trial, finer in zip(found.trials[:-1], found.trials[1:], strict=True):
         assert finer.substeps == 2 * trial.substeps
+
+
+class Motor(Program):
+    """i' = (u - R i - k w) / L,  w' = (k i - b w) / J, in explicit steps"""
+
+    states = ("current [A]", "speed [rad/s]")
+    controls = ("voltage [V]",)
+    measurements = ("current [A]", "speed [rad/s]")
+    channels = ("current [A/s]", "speed [rad/s²]")
+    guesses = ("noise",)
+
+    def __init__(self):
+        super().__init__()
+        self.resistance = PyroParam(tensor(1.0), constraints.positive)
+        self.inductance = PyroParam(tensor(0.02), constraints.positive)
+        self.constant = PyroParam(tensor(0.5), constraints.positive)
+        self.friction = PyroParam(tensor(0.1), constraints.positive)
+        self.inertia = PyroParam(tensor(0.05), constraints.positive)
+        self.noise = PyroParam(tensor([5.0, 2.0]), constraints.positive)
+
+    def initial(self):
+        return pyro.sample("start", dist.Normal(torch.zeros(2), tensor([5.0, 10.0])).to_event(1))
+
+    def transition(self, state, control, time, step):
+        current, speed = state.unbind(-1)
+        mean = stack(
+            (control[..., 0] - self.resistance * current - self.constant * speed) / self.inductance,
+            (self.constant * current - self.friction * speed) / self.inertia,
+        )
+        rate = pyro.sample("rate", dist.Normal(mean, self.noise).to_event(1))
+        return state + step[..., None] * rate
+
+    def observe(self, state):
+        pyro.sample("seen", dist.Normal(state, tensor([0.05, 0.2])).to_event(1))
+
+
+def motors(inductance: float, drives: int = 12, rows: int = 151, step: float = 0.01, seed: int = 1):
+    """What a motor does, by matrix exponentials; its voltage is held for fifteen rows, its noise for one."""
+    rng = np.random.default_rng(seed)
+    rates = np.array([[-1.0 / inductance, -0.5 / inductance], [0.5 / 0.05, -0.1 / 0.05]])
+    decay = scipy.linalg.expm(step * rates)
+    pushed = np.linalg.solve(rates, decay - np.eye(2))
+    frames = []
+    for drive in range(drives):
+        voltage, state, states = np.repeat(rng.uniform(-12, 12, rows // 15 + 1), 15)[:rows], np.zeros(2), []
+        for one in voltage:
+            states.append(state)
+            push = np.array([one / inductance, 0.0]) + rng.normal(0, [5.0, 2.0])
+            state = decay @ state + pushed @ push
+        seen = np.array(states) + rng.normal(0, [0.05, 0.2], (rows, 2))
+        columns = {"trajectory": drive, "time": np.arange(rows) * step, "u.voltage": voltage}
+        frames.append(pd.DataFrame(columns | {"y.current": seen[:, 0], "y.speed": seen[:, 1]}))
+    return pd.concat(frames)
+
+
+@pytest.mark.parametrize(("inductance", "within"), [(0.02, 64), pytest.param(0.003, 128, marks=pytest.mark.slow)])
+def test_parameters_that_a_coarse_step_has_bent_do_not_acquit_it(inductance, within, tmp_path) -> None:
+    """At one step a row log p(y) is 360 and 1,100 nats lower. With the parameters of that fit two steps a row are 4,000
+    and 88,000 nats lower still, and scoring steps from there end in a maximum without noise."""
+    motors(inductance).to_csv(tmp_path / "motors.csv", index=False)
+    program = Motor()
+    data = for_program(program, read_table(tmp_path / "motors.csv"))
+    with seeded(0, "paths"):
+        maximum = fit_by_likelihood(program, data)
+        found = check_step(program, data, maximum, finest=128)
+    assert found.gain > 200 and 8 <= found.suited.substeps <= within
+    assert float(found.suited.program.inductance.detach()) == pytest.approx(inductance, rel=0.05)
+    assert found.sentence.startswith("the program's own time step is too coarse: ")
 
 
 def test_parameters_of_finer_steps_are_those_of_the_vehicle(steps_of_turning) -> None:

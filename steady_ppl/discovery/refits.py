@@ -17,10 +17,11 @@ from steady_ppl.effects import Variant, attach, attached, coefficient
 from steady_ppl.elements import elements
 from steady_ppl.errors import FilterError, SteadyError
 from steady_ppl.gaussian_smoother import find_path
-from steady_ppl.likelihood_fit import fit_by_likelihood, led_back, widens
+from steady_ppl.likelihood_fit import fit_by_likelihood, led_back
 from steady_ppl.linearization import Path
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.program import Program
+from steady_ppl.scores import widens
 from steady_ppl.seeding import seeded
 
 WIDER = math.log(20.0)  # log ratio of a channel's noise after a fit and before, from which it explains next to nothing
@@ -112,13 +113,21 @@ class Refit:
         return sum(common.split("[")[0] == name for common in self.judges.common)
 
 
-def first_refit(program: Program, train: Trajectories, valid: Trajectories, *, known_start: bool, seed: int) -> Refit:
-    """Fit the program as it stands, both ways round.
+def first_refit(
+    program: Program,
+    train: Trajectories,
+    valid: Trajectories,
+    *,
+    known_start: bool,
+    seed: int,
+    begin: Program | None = None,
+) -> Refit:
+    """Fit the program as it stands, both ways round; `begin` is the program with parameters nearer the maximum.
 
     Raises:
         FilterError: the drives cannot be smoothed.
     """
-    own = copy.deepcopy(program)
+    own = copy.deepcopy(begin or program)
     with seeded(seed, "paths"):
         one = fit_by_likelihood(own, train, known_start=known_start)
         other = copy.deepcopy(own)

@@ -66,8 +66,8 @@ def search(
     settings = Settings(known_start, withheld)
     declared = copy.deepcopy(declared or program)
 
-    def first(program: Program) -> Refit:
-        return first_refit(program, train, valid, known_start=known_start, seed=seed)
+    def first(program: Program, begin: Program | None = None) -> Refit:
+        return first_refit(program, train, valid, known_start=known_start, seed=seed, begin=begin)
 
     with stages(("fitting the program as it stands", 1), ("comparing time steps", 1), ("", 8)) as begin:
         begin()
@@ -77,7 +77,7 @@ def search(
         step = _step_of(base, known_start)
         if step.too_coarse:  # the step is no effect: what follows is about the program at the step that suits
             program, declared = (with_substeps(one, step.suited.substeps) for one in (program, declared))
-            base = first(program)
+            base = first(program, step.suited.program)
         begin()
         found = _rounds(Search(known_start, base, base, step, gained), declared, settings, sets, later_sets, seed)
         with_found = _step_of(found.final, known_start, found.found) if found.found else step
