@@ -22,25 +22,17 @@ def test_its_sensors_have_biases_of_their_own_and_nothing_of_bearings():
     assert {f"sensor_bias:{name}" for name in ("gps_x", "gps_y", "compass")} <= listed
 
 
-@pytest.fixture(scope="module")
-def boat() -> st.Discovery:
+@pytest.mark.slow
+def test_all_that_brakes_a_boat_is_named_from_gps_and_compass_and_nothing_else_is_left():
     truth = st.load_program(f"{MODELS / 'gps_boat.py'}:GpsBoatTruth")
     train, valid = (st.simulate(truth, 8, seed=seed).without_truth() for seed in (1, 2))
     program = st.load_program(MODELS / "gps_boat.py")
     fit = find_recipe("likelihood")(program, train, valid)
-    return st.discover(fit, train, valid, simulations=50)
-
-
-@pytest.mark.slow
-def test_all_that_brakes_a_boat_is_named_from_gps_and_compass(boat):
+    boat = st.discover(fit, train, valid, simulations=50)
     found = {finding.variant.name: finding for finding in boat.findings}
     assert found.keys() == {"yaw_linear_drag", "side_slip", "quadratic_drag"}
     for name, value in {"yaw_linear_drag": 0.6, "side_slip": 1.0, "quadratic_drag": 0.15}.items():
         (coefficient,), (sd,) = found[name].coefficient, found[name].sd
         assert abs(coefficient - value) < 4 * sd and coefficient == pytest.approx(value, rel=0.15)
     assert not boat.doubts
-
-
-@pytest.mark.slow
-def test_nothing_else_is_left_of_the_boat(boat):
     assert boat.search.is_complete and "confidence" in boat.figures["sentence"]
