@@ -82,14 +82,15 @@ def roomy_path(program: Program, data: Trajectories, known_start: bool, path: Pa
     """
     path = path or find_path(program, data, known_start=known_start)
     ahead = smooth(program, data, path, known_start=known_start, kernels=False)
-    parts = [part for part in elements(program) if widens(program, part, data)]
+    every = elements(program)
+    parts = [part for part, wider in zip(every, widens(program, every, data), strict=True) if wider]
     while parts and _roughness(ahead, data) > ROUGH:
         before = [part.parameter.data.clone() for part in parts]
         for part in parts:
             part.move(math.log(3.0))
         wider = find_path(program, data, known_start=known_start)
         there = smooth(program, data, wider, known_start=known_start, kernels=False)
-        if not float(there.log_likelihood.sum()) > float(ahead.log_likelihood.sum()):
+        if not float(there.log_likelihood.sum()) > float(ahead.log_likelihood.sum().nan_to_num(-math.inf)):
             for part, value in zip(parts, before, strict=True):
                 part.parameter.data.copy_(value)
             break

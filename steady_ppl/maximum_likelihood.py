@@ -23,13 +23,13 @@ from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.program import Program
 from steady_ppl.progress import stages
-from steady_ppl.scores import parameter_scores, smoothed, widens
+from steady_ppl.scores import parameter_scores, smoothed
 
 PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
 PATIENT = 30  # linearisations a step once no share of a step was accepted: some path swings about its mode
 REACH = 150  # steps of differences, 1.5 of a logarithm: the most that a number moves at once
-AGAINST = 0.5  # of a logarithm that a channel's noise moves at most where its own slope is against it: at hardly any
-# noise the slope is gone, and a fit that gets there early never comes back
+AGAINST = 1 / 3  # share of that for a number whose own score points the other way: noise or a friction that is driven
+# to nothing early has no score there, and a fit cannot return
 FEWER = 0.8  # share of fits that take one step more, by which the time left is told
 GIVES_WAY = 0.3  # nats by which an objective may fall: paths are at rest but for the tolerance
 
@@ -172,7 +172,6 @@ def climb(
         require_found(at.ahead, term.program, term.data)
     began = [at.objective for at in here.terms]
     reach = _gathered(terms, [[REACH * part.step for part in term.parts] for term in terms])
-    noise = _gathered(terms, [[widens(term.program, part, term.data) for part in term.parts] for term in terms]) > 0
     information = _firm(_of_drives(here) if information is None else information)
     taken, decrement, passes = 0, 0.0, PASSES
     with stages(*(("", FEWER**step) for step in range(steps + 1))) as begin:
@@ -191,7 +190,8 @@ def climb(
             if decrement < precision or taken == steps or behind:
                 break
             move = move * min(1.0, 1 / max(1e-9, float((move.abs() / reach).max())))
-            move = torch.where(noise & (move * here.gradient < 0), move.clamp(-AGAINST, AGAINST), move)
+            against = move * here.gradient < 0
+            move = torch.where(against, move.clamp(-AGAINST * reach, AGAINST * reach), move)
             share, there = _searched(terms, here, move, known_start, passes)
             if there is not None:
                 information = _updated(information, share * move, here.gradient - there.gradient)

@@ -17,7 +17,7 @@ search do not go so far: they are pushes on the channels, whose scores simulated
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import pyro.distributions as dist
@@ -239,14 +239,17 @@ def substep_spreads(program: Program, data: Trajectories, states: Tensor, contro
         return channel_scales(program, states, controls[..., :-1, :, :], data.elapsed[:-1], data.steps)
 
 
-def widens(program: Program, part: Element, data: Trajectories) -> bool:
-    """Whether a learnable number is the logarithm of the standard deviation of some channel."""
+def widens(program: Program, parts: Sequence[Element], data: Trajectories) -> list[bool]:
+    """Whether learnable numbers are each the logarithm of the standard deviation of some channel."""
     states = data.controls.new_ones((1, *data.steps.shape, len(program.states)))
-    here = substep_spreads(program, data, states)
-    with moved(part, 0.1):
-        there = substep_spreads(program, data, states)
-    change = (there / here).log()[:, data.transitions]
-    return bool(((change.abs() < 1e-6) | ((change - 0.1).abs() < 1e-3)).all()) and bool((change > 0.05).any())
+    here, found = substep_spreads(program, data, states), []
+    for part in parts:
+        with moved(part, 0.1):
+            there = substep_spreads(program, data, states)
+        change = (there / here).log().nan_to_num(0.0, 0.0, 0.0)[:, data.transitions]
+        still_or_moved = (change.abs() < 1e-6) | ((change - 0.1).abs() < 1e-3)
+        found.append(bool(still_or_moved.all()) and bool((change > 0.05).any()))
+    return found
 
 
 @dataclass(frozen=True)

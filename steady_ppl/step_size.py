@@ -6,8 +6,9 @@ lever arm, a drag. So a program is compared with itself at finer substeps before
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -21,14 +22,13 @@ from steady_ppl.linearization import Path
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.program import Program
 from steady_ppl.scores import widens
+from steady_ppl.seeding import seeded
 from steady_ppl.stability import can_be_cut, counts_rows, is_step
 from steady_ppl.substeps import MAX_SUBSTEPS, with_substeps
 
 MIN_GAIN = 3.0  # nats, of all drives together, from which a finer step counts
 MAX_SHIFT = 2.0  # nats that watched parameters of another step lie below the maximum: two standard deviations
-MAX_DECREMENT = 1.0  # nats that a scoring step at a finer step may promise; beyond it its refit may gain far more
-UNFITTED = 0.2  # share of what a scoring step promises at the program's own step, for parameters that are not fitted
-UNSETTLED = 50.0  # nats that a scoring step may promise at the program's own step; beyond it a look excludes nothing
+MAX_DECREMENT = 1.0  # nats that a scoring step may promise; beyond it more steps may gain far more
 PRECISION = 0.005  # nats, of refits
 FINEST = 32  # substeps of a trial, at most, unless more are asked for; a program may always be tried at twice its own
 REFITS = 25  # scoring steps of a fit
@@ -83,9 +83,9 @@ class StepCheck:
 
     Attributes:
         trials: the program's own number of substeps first, then twice as many each time, to the first that changes
-            neither log p(y) nor the watched parameters by what counts, or the second in a row whose fit loses.
+            neither log p(y) nor the watched parameters by what counts, or to one too many that loses.
         max_shift: nats by which the watched parameters may move.
-        uncompared: why the program was fitted at no finer step, None where it was or where one look excluded a gain.
+        uncompared: why nothing is known of steps finer than the suited one; None where something is.
     """
 
     trials: tuple[StepTrial, ...]
@@ -123,14 +123,14 @@ class StepCheck:
         otherwise."""
         if self.gain > MIN_GAIN:
             said = f"{self._instead} gain {self.gain:.0f} nats"
-            if not self.settled:
+            if self.suited is self.trials[-1]:
                 coarser, last = self.trials[-2:]
                 gain = last.log_likelihood - coarser.log_likelihood
                 if gain > MIN_GAIN:
                     said += f", the last doubling {gain:.0f} of them: more substeps may gain more"
                 else:
                     name, far = last.farthest(coarser)
-                    said += f", the last doubling moves {name} by {far:.1f} standard deviations"
+                    said += f", the last doubling moves {name} by {far:.1f} standard deviations: more may move it on"
         elif self.too_coarse and self.suited.shift(self.trials[0]) > MAX_SHIFT:
             said = f"{self._instead} move {self._farthest}"
         else:
@@ -189,16 +189,17 @@ def check_step(
 ) -> StepCheck:
     """Compare a program with itself at twice, four times … the substeps, refitted to the same drives.
 
-    Fits are made only where one look at a finer step does not exclude that it gains: its log p(y) with the parameters
-    as they are is no higher, and a scoring step would hardly move them. Where two steps differ, the coarser one is
+    Fits at finer steps are made only where one look does not exclude that they gain: log p(y) with the parameters as
+    they are is no higher there, and a scoring step would hardly move them. Where two steps differ, the coarser one is
     fitted from the finer one's parameters too, and judged there unless that is `MIN_GAIN` nats worse. A finer step that
-    loses may have been fitted badly, from parameters that a coarse one has bent: one finer still is tried. A network
-    keeps its parameters.
+    loses may have been fitted badly, from parameters that a coarse one has bent: finer ones still are tried as long as
+    each halves what is lacking. A network keeps its parameters.
 
     Args:
         program: with normal noise; see `linearize`.
         data: as returned by `for_program`.
-        at: the program's maximum on these drives, or a path near their posterior means; found when None.
+        at: the program's maximum on these drives, or a path near their posterior means, from which it is fitted to them
+            first; found when None.
         known_start: the first state is certain.
         watched: names of the parameters whose values a finer step must not move either; all but those of noise when
             None, of which a program that holds something within each substep needs more in shorter ones.
@@ -215,7 +216,9 @@ def check_step(
     if not is_step(program, data):  # in substeps it is another model, whose parameters are others
         watched = ()
     elif refits and watched is None:
-        watched = [part.name.split("[")[0] for part in elements(program) if not widens(program, part, data)]
+        parts = elements(program)
+        wider = widens(program, parts, data)
+        watched = [part.name.split("[")[0] for part, noise in zip(parts, wider, strict=True) if not noise]
     names = watched or ()
 
     def trial(substeps: int, like: Program, path: Path, steps: int) -> StepTrial:
@@ -225,14 +228,15 @@ def check_step(
             require_found(ahead, changed, data)
             return StepTrial(substeps, float(ahead.log_likelihood.sum()), 0.0, changed, resting_path(ahead, data))
         if steps:
-            path = roomy_path(changed, data, known_start, path)
+            with seeded(substeps, "wider noise"):
+                path = roomy_path(changed, data, known_start, path)
         maximum = maximise(changed, data, path, known_start=known_start, steps=steps, precision=PRECISION)
         return _trial(changed, maximum, names)
 
     def again(coarse: StepTrial, fine: StepTrial) -> StepTrial:
         try:
             found = trial(coarse.substeps, fine.program, fine.path, REFITS)
-        except FilterError:  # at the coarser step the finer one's parameters diverge
+        except FilterError:  # it diverges with these parameters, or these drives do not tell them apart
             return coarse
         return found if found.log_likelihood > coarse.log_likelihood - MIN_GAIN else coarse
 
@@ -246,33 +250,53 @@ def check_step(
         return StepCheck((first,), max_shift, f"{UNKNOWN}: `actuators` counts rows, which are shorter in substeps")
     if 2 * own > most:
         return StepCheck((first,), max_shift, f"{UNKNOWN}: {own} substeps a row are as many as are tried")
-    trials, reason = [first], None
+    trials, lost, lacking, reason = [first], False, math.inf, None
     try:
-        look = trial(2 * own, program, first.path, 0)
-        allowed = max(min(max_shift, MAX_DECREMENT), UNFITTED * first.decrement)
-        moves = look.decrement - first.decrement > allowed
-        fitted = not refits or first.decrement < UNSETTLED
-        if fitted and look.reachable < first.reachable + 0.5 * MIN_GAIN and not moves:
+        if refits and not (isinstance(at, Maximum) and first.decrement < MAX_DECREMENT):
+            trials = [again(first, first)]
+        (first,) = trials
+        look = trial(2 * own, first.program, first.path, 0)
+        moves = look.decrement - first.decrement > min(max_shift, MAX_DECREMENT)
+        if first.decrement < MAX_DECREMENT and look.reachable < first.reachable + 0.5 * MIN_GAIN and not moves:
             return StepCheck((first,), max_shift)
         if not can_be_cut(program, data):
             return StepCheck((first,), max_shift, f"{UNKNOWN}: `transition` is no step in `step`")
-        if refits and not isinstance(at, Maximum):
-            first = trial(own, program, first.path, REFITS)
-        trials, lost = [first], False
-        trials.append(trial(2 * own, first.program, first.path, REFITS))
-        while True:
-            coarse, fine = trials[-2:]
+        go_on = True
+        while go_on and 2 * trials[-1].substeps <= most:
+            coarse = trials[-1]
+            fine = trial(2 * coarse.substeps, coarse.program, coarse.path, REFITS)
+            trials.append(fine)
             if refits and _differs(coarse, fine, max_shift):  # several maxima of one program are no matter of its step
                 trials[-2] = again(coarse, fine)
-            lost, lost_before = fine.log_likelihood < trials[-2].log_likelihood - MIN_GAIN, lost
-            go_on = _differs(trials[-2], fine, max_shift) or (lost and not lost_before)
-            if not go_on or 2 * fine.substeps > most:
-                break
-            trials.append(trial(2 * fine.substeps, fine.program, fine.path, REFITS))
-    except FilterError as error:  # paths of the coarser step lead nowhere at the finer one: nothing speaks for that one
-        if len(trials) == 1:
-            reason = f"{UNKNOWN}: with {2 * own} substeps a row {error}"
-    return StepCheck(tuple(trials), max_shift, reason)
+            best = max(trials[:-1], key=lambda one: one.log_likelihood)
+            lacked, lacking = lacking, best.log_likelihood - fine.log_likelihood
+            if lacking > MIN_GAIN:
+                lost, go_on = True, refits and lacking < 0.5 * lacked
+            else:
+                lacking, go_on = math.inf, _differs(best, fine, max_shift)
+        for index in reversed(range(len(trials) - 2 if lost else 0)):
+            if refits and _differs(trials[index], trials[index + 1], max_shift):
+                trials[index] = again(trials[index], trials[index + 1])
+    except FilterError as error:
+        reason = f"{UNKNOWN}: with {2 * trials[-1].substeps} substeps a row {error}"
+    found = StepCheck(tuple(trials), max_shift)
+    return replace(found, uncompared=_uncompared(found, reason))
+
+
+def _uncompared(found: StepCheck, failure: str | None) -> str | None:
+    """Why nothing is known of steps finer than the suited one: fits there failed, or lost before they had converged."""
+    finer = [trial for trial in found.trials if trial.substeps > found.suited.substeps]
+    lost = [trial for trial in finer if trial.log_likelihood < found.suited.log_likelihood - MIN_GAIN]
+    if failure and (len(found.trials) == 1 or finer == lost != []):
+        return failure
+    doubtful = [trial for trial in lost if trial.decrement > MAX_DECREMENT]
+    if finer == lost and doubtful:
+        return f"{UNKNOWN}: fits with {_counts(doubtful)} substeps a row have not converged"
+    return None
+
+
+def _counts(trials: Sequence[StepTrial]) -> str:
+    return " and ".join(str(trial.substeps) for trial in trials)
 
 
 def can_refit(program: Program) -> bool:

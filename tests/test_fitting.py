@@ -11,8 +11,8 @@ from examples import drives, example
 import steady_ppl as st
 from steady_ppl.discovery.candidates import NATS
 from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, is_doubtful
-from steady_ppl.discovery.refits import Fold, first_by_draws, first_refit, likelier, refit_with
-from steady_ppl.effects import attached, chosen_variant, coefficient
+from steady_ppl.discovery.refits import Fold, first_by_draws, first_refit, refit_with, starts_by_draws
+from steady_ppl.effects import chosen_variant
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import find_path
 
@@ -49,15 +49,15 @@ def test_fits_by_draws_begin_at_the_likelier_program() -> None:
     path = find_path(good, data, known_start=True)
     fold = Fold(data, path, data, path)
     for given, fitted in ((good, far), (far, good)):
-        program, found = likelier(given, fitted, fold, known_start=True)
-        assert float(program.mass.detach()) == float(good.mass.detach())
-        assert found.states.shape == path.states.shape
+        first, second = starts_by_draws(given, fitted, fold, known_start=True)
+        assert first.program is good and second.program is far
+        assert first.log_likelihood > second.log_likelihood
+        assert first.path.states.shape == path.states.shape
     stiff, still = good.with_effect("linear_drag", 1e3), good.with_effect("linear_drag", 0.0)
     for given, fitted in ((still, stiff), (stiff, still)):
-        program, _ = likelier(given, fitted, fold, known_start=True)
-        assert float(coefficient(program, attached(program)[0]).detach()) == 0.0
+        assert [start.program is still for start in starts_by_draws(given, fitted, fold, known_start=True)] == [True]
     with pytest.raises(FilterError):
-        likelier(stiff, stiff, fold, known_start=True)
+        starts_by_draws(stiff, stiff, fold, known_start=True)
 
 
 def test_where_a_climb_by_draws_diverges_another_begins_at_the_program_as_given(monkeypatch) -> None:
@@ -78,8 +78,10 @@ def test_where_a_climb_by_draws_diverges_another_begins_at_the_program_as_given(
     assert began == pytest.approx([1.5, 1.8, 1.8])
     assert [float(program.mass.detach()) for program in base.programs] == pytest.approx([1.8, 1.8])
     assert isinstance(base.fitting, ByDraws)
+    began.clear()
     with pytest.raises(FilterError, match="diverges"):
-        first_by_draws(fitted, [fitted, fitted], folds, True, seed=0)
+        first_by_draws(fitted, [given, given], folds, True, seed=0)
+    assert began == pytest.approx([1.5])
 
 
 def test_a_program_whose_linearised_likelihood_is_off_is_fitted_by_draws(monkeypatch) -> None:

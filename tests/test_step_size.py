@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,9 @@ from steady_ppl import (
     step_size,
     write_table,
 )
+from steady_ppl.elements import elements
+from steady_ppl.gaussian_smoother import find_path
+from steady_ppl.maximum_likelihood import Maximum
 from steady_ppl.step_size import check_step
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -173,6 +177,59 @@ def test_parameters_that_a_coarse_step_has_bent_do_not_acquit_it(inductance, wit
     assert found.gain > 200 and 8 <= found.suited.substeps <= within
     assert float(found.suited.program.inductance.detach()) == pytest.approx(inductance, rel=0.05)
     assert found.sentence.startswith("the program's own time step is too coarse: ")
+
+
+def stubbed(monkeypatch, levels, *, at=True, looks=5.0):
+    """A check whose fits end at prescribed log p(y) and promise prescribed gains, by how often a step was fitted."""
+    program = example("hovercraft", torch.float32)
+    data = for_program(program, simulate(program, 3, seed=0))
+    fits = []
+
+    def maximise(changed, data, path, *, steps, **settings):
+        ends = levels[changed.substeps]
+        if steps:
+            fits.append(changed.substeps)
+        earlier = fits.count(changed.substeps) - (changed.substeps > 1)
+        level = ends[min(max(0, earlier), len(ends) - 1)]
+        if isinstance(level, str):
+            raise FilterError(level)
+        value, promised = level if isinstance(level, tuple) else (level, 0.0)
+        every = tuple(part.name for part in elements(changed))
+        likely = torch.full((3,), value / 3, dtype=torch.float64)
+        firm = torch.eye(len(every), dtype=torch.float64)
+        return Maximum(likely, value, path, every, firm, steps, promised if steps else promised + looks, 0.0)
+
+    monkeypatch.setattr(step_size, "maximise", maximise)
+    path = find_path(program, data, known_start=False)
+    own = replace(maximise(program, data, path, steps=0), decrement=0.0) if at else path
+    return check_step(program, data, own), fits
+
+
+@pytest.mark.parametrize(
+    ("levels", "substeps", "known"),
+    [
+        ({1: [-100], 2: [-200], 4: [-90], 8: [-89]}, 4, True),  # the first finer fit is a bad one
+        ({1: [-100], 2: [-4000], 4: [-4000]}, 1, True),  # finer steps are worse: a world that takes the own step
+        ({1: [-100], 2: [-150], 4: [-140], 8: [-130]}, 1, True),
+        ({1: [-100], 2: [(-150, 30.0)], 4: [(-145, 200.0)]}, 1, False),  # fits that have not converged say nothing
+        ({1: [-100], 2: [-4000], 4: ["broken"]}, 1, False),
+        ({1: [-100], 2: ["broken"]}, 1, False),
+        ({1: [-100, -50], 2: [-200, -50], 4: [-50]}, 1, True),  # several maxima of one program, no matter of its step
+        ({1: [-100, "diverges"], 2: [-50], 4: [-50]}, 2, True),  # the finer step's parameters diverge at the coarse one
+    ],
+)
+def test_what_fits_at_finer_steps_say_and_do_not(monkeypatch, levels, substeps, known) -> None:
+    found, _ = stubbed(monkeypatch, levels)
+    assert (found.suited.substeps, found.settled) == (substeps, known)
+    assert (found.uncompared is None) == known
+    assert found.too_coarse == (substeps > 1)
+
+
+def test_no_more_is_fitted_than_is_needed(monkeypatch) -> None:
+    _, fits = stubbed(monkeypatch, {1: [-100], 2: [-150], 4: [-145], 8: [-140]})
+    assert fits == [2, 4, 2]  # the last is two steps from the parameters of four
+    found, fits = stubbed(monkeypatch, {1: [-100], 2: [-110]}, at=False, looks=0.5)  # a fit, one look
+    assert fits == [1] and found.settled and not found.too_coarse
 
 
 def test_parameters_of_finer_steps_are_those_of_the_vehicle(steps_of_turning) -> None:

@@ -14,7 +14,7 @@ from steady_ppl.data import Trajectories
 from steady_ppl.discovery.common_noise import Judges, with_common_noise
 from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, Fitting, is_doubtful
 from steady_ppl.effects import Variant, attach, attached, coefficient
-from steady_ppl.elements import elements
+from steady_ppl.elements import elements, values_of
 from steady_ppl.errors import FilterError, SteadyError
 from steady_ppl.gaussian_smoother import find_path
 from steady_ppl.likelihood_fit import fit_by_likelihood, led_back
@@ -120,14 +120,14 @@ def first_refit(
     *,
     known_start: bool,
     seed: int,
-    begin: Program | None = None,
+    nearer: Program | None = None,
 ) -> Refit:
-    """Fit the program as it stands, both ways round; `begin` is the program with parameters nearer the maximum.
+    """Fit the program as it stands, both ways round; `nearer` has parameters from which fits begin instead.
 
     Raises:
         FilterError: the drives cannot be smoothed.
     """
-    own = copy.deepcopy(begin or program)
+    own = copy.deepcopy(program if nearer is None else nearer)
     with seeded(seed, "paths"):
         one = fit_by_likelihood(own, train, known_start=known_start)
         other = copy.deepcopy(own)
@@ -140,50 +140,61 @@ def first_refit(
     return replace(_refit([own, other], folds, known_start, [one, second]), rough=rough)
 
 
-def first_by_draws(given: Program, fitted: list[Program], folds: list[Fold], known_start: bool, seed: int) -> Refit:
-    """From the likelier programs; where a climb from there meets one that diverges, from the program as given."""
-    with seeded(seed, "paths by draws"):
-        begun = [likelier(given, *pair, known_start=known_start) for pair in zip(fitted, folds, strict=True)]
-    (one, first), (other, second) = begun
-    train, valid = (fold.drives for fold in folds)
-    along = [Fold(train, first, valid, second), Fold(valid, second, train, first)]
-    try:
-        refit = _refit([one, other], along, known_start, [None, None], fitting=FIRST_BY_DRAWS)
-    except FilterError:
-        refit = _refit([copy.deepcopy(given) for _ in begun], along, known_start, [None, None], fitting=FIRST_BY_DRAWS)
-    return replace(refit, fitting=BY_DRAWS)
+@dataclass(frozen=True)
+class Start:
+    """Where a fit by draws may begin: a program, a path of its drives and what log p(y) a filter finds for them all."""
+
+    program: Program
+    path: Path
+    log_likelihood: float
 
 
-def likelier(given: Program, fitted: Program, fold: Fold, *, known_start: bool) -> tuple[Program, Path]:
-    """Where a fit by draws begins, with a path: the program as given or as a linearised likelihood that is off has left
-    it, whichever the filter finds likelier.
+def starts_by_draws(given: Program, fitted: Program, fold: Fold, *, known_start: bool) -> list[Start]:
+    """Return the given program and its linearised fit as starts, the likelier first, as far as they follow the drives.
 
     Raises:
-        FilterError: neither can follow the drives.
+        FilterError: neither does.
     """
+    found, failures = list[Start](), list[FilterError]()
+    for program, near in ((given, None), (fitted, fold.path)):
+        try:
+            path = near or find_path(program, fold.drives, known_start=known_start)
+            judged = FIRST_BY_DRAWS.judge(program, fold.drives, path, known_start=known_start)
+            found.append(Start(program, judged.path, float(judged.log_likelihood.sum())))
+        except FilterError as error:
+            failures.append(error)
+    if not found:
+        raise failures[0]
+    return sorted(found, key=lambda start: start.log_likelihood, reverse=True)
+
+
+def first_by_draws(given: Program, fitted: list[Program], folds: list[Fold], known_start: bool, seed: int) -> Refit:
+    """Fit by draws from the likelier programs; where that diverges, once more from the program as given."""
+    with seeded(seed, "paths by draws"):
+        starts = [starts_by_draws(given, *pair, known_start=known_start) for pair in zip(fitted, folds, strict=True)]
+    likelier = [ranked[0] for ranked in starts]
+    as_given = [start for ranked in starts for start in ranked if start.program is given]
+
+    def climbed(begun: list[Start]) -> Refit:
+        (one, other), (train, valid) = (start.path for start in begun), (fold.drives for fold in folds)
+        along = [Fold(train, one, valid, other), Fold(valid, other, train, one)]
+        programs = [copy.deepcopy(start.program) for start in begun]
+        return _refit(programs, along, known_start, [None, None], fitting=FIRST_BY_DRAWS)
+
     try:
-        begun = FIRST_BY_DRAWS.judge(fitted, fold.drives, fold.path, known_start=known_start)
+        refit = climbed(likelier)
     except FilterError:
-        begun = None
-    try:
-        found = find_path(given, fold.drives, known_start=known_start)
-        asked = FIRST_BY_DRAWS.judge(given, fold.drives, found, known_start=known_start)
-    except FilterError:
-        if begun is None:
+        if len(as_given) < len(folds) or all(start.program is given for start in likelier):
             raise
-        return fitted, fold.path
-    if begun is not None and begun.log_likelihood.sum() > asked.log_likelihood.sum():
-        return fitted, fold.path
-    return copy.deepcopy(given), asked.path
+        refit = climbed(as_given)
+    return replace(refit, fitting=BY_DRAWS)
 
 
 def _far_wider(fitted: Program, program: Program, data: Trajectories) -> bool:
     """Whether a fit has made some channel's noise several times what it was."""
-    return any(
-        float(now.parameter.detach().flatten()[now.index] - then.parameter.detach().flatten()[then.index]) > WIDER
-        for now, then in zip(elements(fitted), elements(program), strict=True)
-        if widens(fitted, now, data)
-    )
+    parts = elements(fitted)
+    grown = values_of(parts) - values_of(elements(program)) > WIDER
+    return bool((grown & torch.tensor(widens(fitted, parts, data))).any())
 
 
 def refit_with(

@@ -66,8 +66,8 @@ def search(
     settings = Settings(known_start, withheld)
     declared = copy.deepcopy(declared or program)
 
-    def first(program: Program, begin: Program | None = None) -> Refit:
-        return first_refit(program, train, valid, known_start=known_start, seed=seed, begin=begin)
+    def first(program: Program, nearer: Program | None = None) -> Refit:
+        return first_refit(program, train, valid, known_start=known_start, seed=seed, nearer=nearer)
 
     with stages(("fitting the program as it stands", 1), ("comparing time steps", 1), ("", 8)) as begin:
         begin()
@@ -82,8 +82,9 @@ def search(
         found = _rounds(Search(known_start, base, base, step, gained), declared, settings, sets, later_sets, seed)
         with_found = _step_of(found.final, known_start, found.found) if found.found else step
         if found.found and with_found.too_coarse:  # what was found asks for a finer step: sizes are those of that step
-            program, declared = (with_substeps(one, with_found.suited.substeps) for one in (program, declared))
-            base = first(program)
+            finer = with_found.suited.substeps
+            program, declared = (with_substeps(one, finer) for one in (program, declared))
+            base = first(program, with_substeps(found.base.program, finer))
             again = Search(known_start, base, base, step, gained, with_found)
             found = _rounds(again, declared, settings, sets, later_sets, seed)
     return found
