@@ -166,8 +166,8 @@ def motors(inductance: float, drives: int = 12, rows: int = 151, step: float = 0
 
 @pytest.mark.parametrize(("inductance", "within"), [(0.02, 64), pytest.param(0.003, 128, marks=pytest.mark.slow)])
 def test_parameters_that_a_coarse_step_has_bent_do_not_acquit_it(inductance, within, tmp_path) -> None:
-    """At one step a row log p(y) is 341 and 968 nats lower. With the parameters of that fit two steps a row are 4,300 and
-    68,700 nats lower still, and scoring steps from there end without noise or without friction."""
+    """At one step a row log p(y) is 341 and 968 nats lower. With the parameters of that fit two steps a row are 4,300
+    and 68,700 nats lower still, and scoring steps from there end without noise or without friction."""
     motors(inductance).to_csv(tmp_path / "motors.csv", index=False)
     program = Motor()
     data = for_program(program, read_table(tmp_path / "motors.csv"))
