@@ -51,7 +51,7 @@ _STEADY = "import sys; from steady_ppl.command_line import main; sys.exit(main(s
 def lay(folder: Path) -> None:
     """Make everything in a new folder; commands run within it.
 
-    A cart whose fits and searches take less than a second makes the tables `t.csv`, `t.parquet` and `v.csv`, the runs
+    A cart whose fits and searches take seconds makes the tables `t.csv`, `t.parquet` and `v.csv`, the runs
     `before` and `after`, the fit `begun`, which has a checkpoint to go on from, and the stopped search `searched`; on
     drives with an effect the run `found`; `study.toml` is a study of it, and `studied` that study done. A hovercraft
     that sees bearings makes `h.csv` and the runs `hover` and `hover_too`.
@@ -59,9 +59,9 @@ def lay(folder: Path) -> None:
     folder.mkdir(parents=True)
     shutil.copytree(ROOT / "models", folder / "models", ignore=shutil.ignore_patterns("__pycache__"))
     cart = load_program(f"{folder}/models/linear_gaussian.py")
-    pushed = cart.with_effect("acceleration_bias", 30.0)
+    pushed = cart.with_effect("acceleration_bias", 3.0)
     for seed, name in enumerate(("pushed.csv", "pushed_too.csv")):
-        write_table(_drives(pushed, 10, 9, seed), folder / name)
+        write_table(_drives(pushed, 10, 30, seed), folder / name)
     write_table(_drives(cart, 10, 9, 0), folder / "t.csv")
     write_table(_drives(cart, 10, 9, 0), folder / "t.parquet")
     write_table(_drives(cart, 10, 9, 1), folder / "v.csv")
