@@ -44,10 +44,10 @@ paper: $(INSTALLED)
 	$(BIN)/python benchmarks/paper.py --out $(OUT)/paper $(if $(DATA),--data "$(DATA)") $(if $(QUICK),--quick)
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --durations 12
 
 found: $(INSTALLED)
-	$(BIN)/python -m pytest --numprocesses 2 -m slow
+	$(BIN)/python -m pytest --numprocesses 2 -m slow --durations 12
 
 calibrate: $(INSTALLED)
 	$(BIN)/python benchmarks/calibrate.py $(if $(QUICK),--quick) --results $(OUT)/calibration.jsonl
