@@ -273,7 +273,7 @@ def check_step(
             if lacking > MIN_GAIN:
                 lost, go_on = True, refits and lacking < 0.5 * lacked
             else:
-                lacking, go_on = math.inf, _differs(best, fine, max_shift)
+                lacking, go_on = math.inf, _differs(trials[-2] if lacked == math.inf else best, fine, max_shift)
         for index in reversed(range(len(trials) - 2 if lost else 0)):
             if refits and _differs(trials[index], trials[index + 1], max_shift):
                 trials[index] = again(trials[index], trials[index + 1])

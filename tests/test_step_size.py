@@ -297,6 +297,8 @@ def test_sizes_are_those_of_the_step_at_which_they_rest() -> None:
     assert low < 0.6 < high
     assert found.after.program.substeps > 1
     assert any("substeps a row instead of 1 move yaw_linear_drag" in note for note in found.notes)
+    *_, last, finer = found.search.with_found.trials
+    assert last is found.search.with_found.suited and finer.substeps == 2 * last.substeps  # nothing finer is fitted
 
 
 @pytest.mark.slow
