@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[1]
 RECORDS = [json.loads(line) for line in (ROOT / "benchmarks" / "results" / "truck.jsonl").read_text().splitlines()]
 PAGE = (ROOT / "docs" / "truck.md").read_text()
 PATHS = [record for record in RECORDS if record["part"] == "path"]
+assert PATHS
 PLANTED = [record for record in RECORDS if record["part"] == "planted"]
 
 
