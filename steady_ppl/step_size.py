@@ -251,6 +251,7 @@ def check_step(
     if 2 * own > most:
         return StepCheck((first,), max_shift, f"{UNKNOWN}: {own} substeps a row are as many as are tried")
     trials, lost, lacking, reason = [first], False, math.inf, None
+    begun_from: dict[int, float] = {}  # substeps → log p(y) of the finer fit from which theirs was begun again
     try:
         if refits and not (isinstance(at, Maximum) and first.decrement < MAX_DECREMENT):
             trials = [again(first, first)]
@@ -268,15 +269,19 @@ def check_step(
             trials.append(fine)
             if refits and _differs(coarse, fine, max_shift):  # several maxima of one program are no matter of its step
                 trials[-2] = again(coarse, fine)
+                begun_from[coarse.substeps] = fine.log_likelihood
             best = max(trials[:-1], key=lambda one: one.log_likelihood)
             lacked, lacking = lacking, best.log_likelihood - fine.log_likelihood
             if lacking > MIN_GAIN:
                 lost, go_on = True, refits and lacking < 0.5 * lacked
             else:
-                lacking, go_on = math.inf, _differs(trials[-2] if lacked == math.inf else best, fine, max_shift)
-        for index in reversed(range(len(trials) - 2 if lost else 0)):
-            if refits and _differs(trials[index], trials[index + 1], max_shift):
-                trials[index] = again(trials[index], trials[index + 1])
+                near = trials[-2] if trials[-2].log_likelihood > best.log_likelihood - MIN_GAIN else best
+                lacking, go_on = math.inf, _differs(near, fine, max_shift)
+        for index in reversed(range(len(trials) - 2)):
+            coarse, fine = trials[index : index + 2]
+            risen = fine.log_likelihood > begun_from.get(coarse.substeps, -math.inf) + MIN_GAIN
+            if refits and (lost or risen) and _differs(coarse, fine, max_shift):
+                trials[index] = again(coarse, fine)
     except FilterError as error:
         reason = f"{UNKNOWN}: with {2 * trials[-1].substeps} substeps a row {error}"
     found = StepCheck(tuple(trials), max_shift)

@@ -225,6 +225,13 @@ def test_what_fits_at_finer_steps_say_and_do_not(monkeypatch, levels, substeps, 
     assert found.too_coarse == (substeps > 1)
 
 
+def test_a_coarser_step_is_fitted_again_where_the_next_one_has_risen_since(monkeypatch) -> None:
+    """All three end at −50, the own one only from the parameters that two steps have got from four."""
+    found, fits = stubbed(monkeypatch, {1: [-100, -100, -50], 2: [-95, -50], 4: [-50]})
+    assert fits == [2, 1, 4, 2, 1]
+    assert not found.too_coarse and [trial.log_likelihood for trial in found.trials] == pytest.approx([-50] * 3)
+
+
 def test_no_more_is_fitted_than_is_needed(monkeypatch) -> None:
     _, fits = stubbed(monkeypatch, {1: [-100], 2: [-150], 4: [-145], 8: [-140]})
     assert fits == [2, 4, 2]  # the last is two steps from the parameters of four
@@ -297,8 +304,7 @@ def test_sizes_are_those_of_the_step_at_which_they_rest() -> None:
     assert low < 0.6 < high
     assert found.after.program.substeps > 1
     assert any("substeps a row instead of 1 move yaw_linear_drag" in note for note in found.notes)
-    *_, last, finer = found.search.with_found.trials
-    assert last is found.search.with_found.suited and finer.substeps == 2 * last.substeps  # nothing finer is fitted
+    assert found.search.with_found.trials[-2] is found.search.with_found.suited  # nothing finer than the next is fitted
 
 
 @pytest.mark.slow

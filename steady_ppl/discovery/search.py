@@ -34,7 +34,7 @@ from steady_ppl.step_size import StepCheck, check_step
 from steady_ppl.substeps import with_substeps
 
 BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
-MAX_SHIFT_OF_SIZES = 0.08  # nats by which a finer step may move what is reported: 0.4 standard deviations
+MAX_SHIFT_OF_SIZES = 0.08  # nats by which twice the substeps may move what is reported: 0.4 standard deviations
 FINEST = 128  # substeps at which a program is fitted, at most: what a coarser step leaves would be named as an effect
 MOST, CURVES = 5, 3  # effects in a program, and adding curves that are fitted
 
