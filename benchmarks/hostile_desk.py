@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import shutil
 import subprocess
 import sys
@@ -74,6 +75,8 @@ def lay(folder: Path) -> None:
     _must(*TRAINING, "after", at=folder)
     found = (*SEARCH[:2], "pushed.csv", "--valid", "pushed_too.csv", *SEARCH[5:], "found", "--json", "found.json")
     _must(*found, at=folder)
+    if not json.loads((folder / "found.json").read_text())["effects"]:
+        raise SystemExit("the search on drives with an effect names none")
     (folder / "study.toml").write_text(STUDY)
     _must("study", "study.toml", "--workers", "1", "--out", "studied", at=folder)
     shutil.copytree(folder / "after", folder / "begun")

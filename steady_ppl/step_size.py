@@ -250,7 +250,7 @@ def check_step(
         return StepCheck((first,), max_shift, f"{UNKNOWN}: `actuators` counts rows, which are shorter in substeps")
     if 2 * own > most:
         return StepCheck((first,), max_shift, f"{UNKNOWN}: {own} substeps a row are as many as are tried")
-    trials, lost, lacking, reason = [first], False, math.inf, None
+    trials, lacking, reason = [first], math.inf, None
     begun_from: dict[int, float] = {}  # substeps → log p(y) of the finer fit from which theirs was begun again
     try:
         if refits and not (isinstance(at, Maximum) and first.decrement < MAX_DECREMENT):
@@ -273,14 +273,14 @@ def check_step(
             best = max(trials[:-1], key=lambda one: one.log_likelihood)
             lacked, lacking = lacking, best.log_likelihood - fine.log_likelihood
             if lacking > MIN_GAIN:
-                lost, go_on = True, refits and lacking < 0.5 * lacked
+                go_on = refits and lacking < 0.5 * lacked
             else:
                 near = trials[-2] if trials[-2].log_likelihood > best.log_likelihood - MIN_GAIN else best
                 lacking, go_on = math.inf, _differs(near, fine, max_shift)
         for index in reversed(range(len(trials) - 2)):
             coarse, fine = trials[index : index + 2]
             risen = fine.log_likelihood > begun_from.get(coarse.substeps, -math.inf) + MIN_GAIN
-            if refits and (lost or risen) and _differs(coarse, fine, max_shift):
+            if refits and risen and _differs(coarse, fine, max_shift):
                 trials[index] = again(coarse, fine)
     except FilterError as error:
         reason = f"{UNKNOWN}: with {2 * trials[-1].substeps} substeps a row {error}"
