@@ -31,8 +31,7 @@ def simulate(
     from steady_ppl.command_parts import program_from, say
     from steady_ppl.probe import probe
     from steady_ppl.progress import stages
-    from steady_ppl.simulation import simulate as run
-    from steady_ppl.simulation import simulated_in
+    from steady_ppl.simulation import simulate as run, simulated_in
     from steady_ppl.substeps import with_substeps
     from steady_ppl.table import read_table, write_table
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bag_writing import Said, stamped, write_bag
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from test_import_bag import SCAN, U, taken, values
 
 from steady_ppl import BagColumn, BagMapping, read_bags

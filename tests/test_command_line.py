@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from small import HOVERCRAFT, TRUTH, simulated, steady, written
-from test_alpha_truck import command_log, pose_log
-from test_alpha_truck import write as write_logs
+from test_alpha_truck import command_log, pose_log, write as write_logs
 
 from steady_ppl import read_table
 from steady_ppl.command_line import run

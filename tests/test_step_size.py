@@ -44,8 +44,7 @@ from steady_ppl.step_size import check_step
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
-from continuous_worlds import Hovercraft, Unicycle
-from continuous_worlds import simulate as in_continuous_time
+from continuous_worlds import Hovercraft, Unicycle, simulate as in_continuous_time
 
 CASE = Path(__file__).parents[2] / "shared" / "cases" / "exact_unicycle"
 

@@ -14,8 +14,7 @@ import pyarrow
 import pyarrow.parquet
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from steady_ppl.data import Trajectories, pad, pad_time
 from steady_ppl.errors import DataError

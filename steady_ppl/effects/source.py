@@ -114,7 +114,7 @@ class Source:
     def _import(self, name: str, value: Any) -> str:
         if isinstance(value, ModuleType):
             return f"import {value.__name__}" + (f" as {name}" if name != value.__name__ else "")
-        if name in steady_ppl.__all__ and getattr(steady_ppl, name) is value:
+        if name in dir(steady_ppl) and getattr(steady_ppl, name) is value:
             return f"from steady_ppl import {name}"
         module, called = getattr(value, "__module__", None) or "_", getattr(value, "__name__", None)
         if module.startswith("_") or module == self.function.__module__ or not called:
