@@ -17,7 +17,7 @@ from steady_ppl import (
     seeded,
     why_not_linear,
 )
-from steady_ppl.progress import stages
+from steady_ppl.utils.progress import stages
 
 from .steady import doubts
 

@@ -53,19 +53,19 @@ from .planar_vehicle import (
     bearings_to as bearings_to,
     dense as dense,
     stack as stack,
-    wrap as wrap,
 )
 from .program import Program as Program, for_program as for_program
 from .program_file import load_program as load_program
 from .proof_pictures import open_loop_picture as open_loop_picture
 from .proving import Proof as Proof, prove as prove
 from .reporting import Report as Report, report as report
-from .seeding import seeded as seeded
 from .simulation import simulate as simulate
 from .smoother_guide import SmootherGuide as SmootherGuide
 from .substeps import with_substeps as with_substeps
 from .table import from_frame as from_frame, read_table as read_table, to_frame as to_frame, write_table as write_table
 from .tempering import Constant as Constant, LinearRamp as LinearRamp
 from .training import Optimization as Optimization, Trained as Trained, train as train
+from .utils.angles import wrap as wrap
+from .utils.random import seeded as seeded
 from .validation import Validation as Validation
 from .variational_guides import VariationalGuide as VariationalGuide

@@ -20,9 +20,10 @@ import torch
 
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError, UsageError
-from steady_ppl.given_files import require_file
-from steady_ppl.planar_vehicle import bearings_to, wrap
-from steady_ppl.seeding import seeded
+from steady_ppl.planar_vehicle import bearings_to
+from steady_ppl.utils.angles import wrap
+from steady_ppl.utils.files import require_file
+from steady_ppl.utils.random import seeded
 
 LANDMARKS = ((-1.230314, -0.606814), (0.797073, 0.889471), (-3.496525, 0.207874), (0.0, 6.0))
 """The landmarks of the published experiments, m."""

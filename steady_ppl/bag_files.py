@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from steady_ppl.bag_fields import undefined_types
-from steady_ppl.errors import DataError, SteadyError, UsageError, one_line
-from steady_ppl.given_files import require_file
+from steady_ppl.errors import DataError, SteadyError, UsageError
+from steady_ppl.utils.files import require_file
+from steady_ppl.utils.text import one_line
 
 Say = Callable[[str], None]
 

@@ -26,7 +26,7 @@ from typing import Any
 
 from steady_ppl.bag_fields import Steps, parse_field
 from steady_ppl.errors import UsageError
-from steady_ppl.given_files import require_file
+from steady_ppl.utils.files import require_file
 
 _CHOICES = {
     "between": (None, "hold", "interpolate"),

@@ -38,7 +38,7 @@ from steady_ppl.bag_rows import Piece, Series, held_pauses, in_rows
 from steady_ppl.command_parts import say as say_aside
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError, UsageError
-from steady_ppl.progress import stages
+from steady_ppl.utils.progress import stages
 
 
 def read_bags(paths: Sequence[str | Path], mapping: BagMapping, say: Say = say_aside) -> Trajectories:

@@ -28,13 +28,13 @@ from steady_ppl.long_drives import refuse_long
 from steady_ppl.misfit_maps import Misfit, Residuals, judge
 from steady_ppl.predictions import Prediction, named_horizons, predict
 from steady_ppl.program import Program, for_program, names
-from steady_ppl.progress import stages
 from steady_ppl.reference_motion import Reference, constant_velocity, last_measurement
-from steady_ppl.seeding import seeded
 from steady_ppl.simulated_sets import FEWEST, residuals, simulate_sets
 from steady_ppl.step_size import StepCheck, check_step
 from steady_ppl.stuck import Stretch, stuck
 from steady_ppl.tracking import track
+from steady_ppl.utils.progress import stages
+from steady_ppl.utils.random import seeded
 
 SECONDS = (1.0, 3.0)
 MOST = 4.0  # standard deviations of a single residual; beside a landmark the linearised program knows no more

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,15 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load, save_file
 from torch import Tensor
 
-from steady_ppl.errors import RunError, shown
-from steady_ppl.given_files import ANYTHING, NUMBER, WHOLE, misfit, require_file
-from steady_ppl.whole_file import whole_file
+from steady_ppl.errors import RunError
+from steady_ppl.utils.schema import ANYTHING, NUMBER, WHOLE, misfit
+from steady_ppl.utils.tensor_files import damaged, read_tensors, write_tensors
+from steady_ppl.utils.text import shown
 
-HASH = "sha256"  # of tensors and text, in the file's own text
 NUMBERS = {"step": WHOLE, "history": [{str: ANYTHING}], "kept_step": WHOLE, "best_held_out": [NUMBER]}
 """The form of what a checkpoint says in JSON beside its tensors."""
 
@@ -48,53 +45,6 @@ class Checkpoint:
     memory: dict[str, Tensor] = field(default_factory=dict)
 
 
-def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: Mapping[str, str] | None = None) -> None:
-    """Write tensors and text to a safetensors file, whole or not at all, with their hash, by which damage is told."""
-    kept = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
-    with whole_file(path, RunError) as beside:
-        try:
-            save_file(kept, beside, {**(text or {}), HASH: _hash(kept, text or {})})
-        except SafetensorError as error:  # what the file system refuses comes as its own
-            raise RunError(f"{path} cannot be written: {error}") from error
-
-
-def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read a file of `write_tensors`, or one from before there was a hash in it.
-
-    Raises:
-        RunError: the file is missing or damaged.
-    """
-    require_file(path, RunError)
-    try:
-        content = path.read_bytes()  # not by name: safetensors reads none that is not UTF-8
-        tensors = load(content)
-    except FileNotFoundError:
-        raise RunError(f"no file {path.name} in {path.parent}") from None
-    except SafetensorError as error:
-        raise RunError(f"{path.name} in {path.parent} is damaged ({error})") from error
-    except OSError as error:
-        raise RunError(f"{path.name} in {path.parent} cannot be read: {error.strerror or error}") from error
-    text = _text(content)
-    written = text.pop(HASH, None)
-    if written is not None and written != _hash(tensors, text):
-        raise _damaged(path, "its numbers are not those that were written")
-    return tensors, text
-
-
-def _text(content: bytes) -> dict[str, str]:
-    """The text beside the tensors of a safetensors file that is whole: its header's length comes first."""
-    end = 8 + int.from_bytes(content[:8], "little")
-    return json.loads(content[8:end]).get("__metadata__") or {}
-
-
-def _hash(tensors: Mapping[str, Tensor], text: Mapping[str, str]) -> str:
-    digest = hashlib.sha256(json.dumps(sorted(text.items())).encode())
-    for name, value in sorted(tensors.items()):
-        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode(errors="surrogatepass"))
-        digest.update(value.contiguous().reshape(-1).view(torch.uint8).numpy(force=True).tobytes())
-    return digest.hexdigest()
-
-
 def write_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimizer) -> None:
     """Write everything that `read_checkpoint` needs to go on as if nothing had happened."""
     tensors = {f"parameters/{name}": value for name, value in state.parameters.items()}
@@ -118,17 +68,17 @@ def read_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimi
     for key, value in tensors.items():
         group, _, name = key.partition("/")
         if group not in groups:
-            raise _damaged(path, f"no checkpoint has {shown(key, 100)}")
+            raise damaged(path, f"no checkpoint has {shown(key, 100)}")
         groups[group][name] = value
     if _shapes(groups["parameters"]) != _shapes(state.parameters):
         raise RunError(f"{path.name} in {path.parent} was written by a program with other parameters")
     if _shapes(groups["averaged"]) != _shapes(state.averaged):
-        raise _damaged(path, "the averaged parameters are others than the program's")
+        raise damaged(path, "the averaged parameters are others than the program's")
     if groups["kept"] and _shapes(groups["kept"]) != _shapes(state.averaged):
-        raise _damaged(path, "the kept parameters are others than the program's")
+        raise damaged(path, "the kept parameters are others than the program's")
     broken = [name for name, value in groups["parameters"].items() if not value.isfinite().all()]
     if broken:
-        raise _damaged(path, f"the parameters {', '.join(broken)} are not finite")
+        raise damaged(path, f"the parameters {', '.join(broken)} are not finite")
     numbers = _numbers(path, text)
     with torch.no_grad():
         for name, value in groups["parameters"].items():
@@ -141,10 +91,6 @@ def read_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimi
         setattr(state, name, said)
     slots = _slots(path, groups["optimizer"], optimizer)
     optimizer.load_state_dict({"state": slots, "param_groups": optimizer.state_dict()["param_groups"]})
-
-
-def _damaged(path: Path, why: str) -> RunError:
-    return RunError(f"{path.name} in {path.parent} is damaged ({why})")
 
 
 def _shapes(tensors: Mapping[str, Tensor]) -> dict[str, torch.Size]:
@@ -160,10 +106,10 @@ def _numbers(path: Path, text: Mapping[str, str]) -> dict[str, Any]:
     try:
         found = {name: json.loads(text[name]) for name in NUMBERS if name in text}
     except (ValueError, RecursionError):
-        raise _damaged(path, "the text beside the tensors is no JSON") from None
+        raise damaged(path, "the text beside the tensors is no JSON") from None
     problem = misfit(found, NUMBERS)
     if problem is not None:
-        raise _damaged(path, problem)
+        raise damaged(path, problem)
     return found
 
 
@@ -179,8 +125,8 @@ def _slots(path: Path, tensors: Mapping[str, Tensor], optimizer: torch.optim.Opt
         index, _, slot = key.partition("/")
         number = int(index) if index.isdecimal() else len(trained)
         if number >= len(trained) or (value.dim() and value.shape != trained[number].shape):
-            raise _damaged(path, f"the optimiser has no {shown(key, 100)} of shape {tuple(value.shape)}")
+            raise damaged(path, f"the optimiser has no {shown(key, 100)} of shape {tuple(value.shape)}")
         slots.setdefault(number, {})[slot] = value
     if len({frozenset(one) for one in slots.values()}) > 1:
-        raise _damaged(path, "the optimiser's memory is not complete")
+        raise damaged(path, "the optimiser's memory is not complete")
     return slots

@@ -31,10 +31,9 @@ def check(
     from steady_ppl.checking import check as compare
     from steady_ppl.command_parts import present, say
     from steady_ppl.fit import Fit
-    from steady_ppl.picture_files import require_picture, write_picture
     from steady_ppl.stuck import masked
     from steady_ppl.table import read_table, require_table_file, write_table
-    from steady_ppl.whole_file import require_place
+    from steady_ppl.utils.files import require_picture, require_place, write_picture
 
     require_picture(picture)
     require_place(json_file)

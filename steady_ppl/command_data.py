@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from steady_ppl.counted import random_seed
-from steady_ppl.harmless import tell
+from steady_ppl.utils.text import tell
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from steady_ppl.harmless import tell
+from steady_ppl.utils.text import tell
 
 
 def demo(

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from steady_ppl.errors import UsageError
-from steady_ppl.harmless import tell
+from steady_ppl.utils.text import tell
 
 Effects = Annotated[
     list[str] | None,

@@ -41,7 +41,7 @@ def evaluate(
     from steady_ppl.program_file import load_program
     from steady_ppl.run_recipe import fingerprint
     from steady_ppl.table import read_table
-    from steady_ppl.whole_file import require_place
+    from steady_ppl.utils.files import require_place
 
     if len(arguments) < 2:
         raise UsageError("evaluate needs at least one RUN and then a TABLE")

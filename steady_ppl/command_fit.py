@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import typer
 
 from steady_ppl.counted import MOST, count, random_seed
-from steady_ppl.errors import UsageError, shown
-from steady_ppl.harmless import tell
+from steady_ppl.errors import UsageError
+from steady_ppl.utils.text import shown, tell
 
 WORDS = {"true": True, "false": False, "none": None}
 RECIPES = ("steady", "likelihood", "steady-minus", "svi", "hand", "fit-hand", "fit-tv", "fit-truth")

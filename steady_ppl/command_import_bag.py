@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from steady_ppl.errors import UsageError
-from steady_ppl.harmless import tell
+from steady_ppl.utils.text import tell
 
 
 def import_bag(

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from steady_ppl.harmless import tell
+from steady_ppl.utils.text import tell
 
 NEXT = (
     "steady fit models/hovercraft.py train.csv --valid valid.csv --known-start --recipe likelihood --out runs/first",

@@ -32,10 +32,10 @@ from steady_ppl import (
 from steady_ppl.command_parts import hushed, say
 from steady_ppl.commanded import commanded
 from steady_ppl.errors import SteadyError
-from steady_ppl.harmless import tell
 from steady_ppl.outside import as_refusal
-from steady_ppl.progress import listening
 from steady_ppl.progress_line import progress_line
+from steady_ppl.utils.progress import listening
+from steady_ppl.utils.text import tell
 
 INTERRUPTED = 130  # what typer returns for Ctrl-C
 # left out of the help, which then fits one screen; as --debug, which the line of an unexpected error names

@@ -9,9 +9,9 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from steady_ppl.errors import ComputationError, UsageError, shown
-from steady_ppl.harmless import tell
-from steady_ppl.whole_file import whole_file
+from steady_ppl.errors import ComputationError, UsageError
+from steady_ppl.utils.files import whole_file
+from steady_ppl.utils.text import shown, tell
 
 LONGEST = 1000  # characters of a line that is said; a file that somebody gives can put more into it
 
@@ -21,8 +21,8 @@ def program_from(model: str, seed: int, substeps: int | None = None) -> Any:
     row as its class says when None."""
     from steady_ppl.probe import probe
     from steady_ppl.program_file import load_program
-    from steady_ppl.seeding import seeded
     from steady_ppl.substeps import with_substeps
+    from steady_ppl.utils.random import seeded
 
     with seeded(seed, "program"):
         program = load_program(model)

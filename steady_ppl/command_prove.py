@@ -36,11 +36,10 @@ def prove(
         run_labels,
         used_before,
     )
-    from steady_ppl.picture_files import require_picture, write_picture
     from steady_ppl.proving import prove as judge
     from steady_ppl.run_recipe import fingerprint
     from steady_ppl.table import read_table
-    from steady_ppl.whole_file import require_place
+    from steady_ppl.utils.files import require_picture, require_place, write_picture
 
     *runs, table = arguments
     if not runs:

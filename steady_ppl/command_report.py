@@ -11,7 +11,7 @@ import typer
 
 from steady_ppl.counted import count, random_seed
 from steady_ppl.errors import UsageError
-from steady_ppl.harmless import tell
+from steady_ppl.utils.text import tell
 
 SIMULATIONS = 100
 
@@ -43,7 +43,7 @@ def report(
     from steady_ppl.run_folder import read_discovery
     from steady_ppl.run_recipe import fingerprint
     from steady_ppl.table import read_table
-    from steady_ppl.whole_file import require_place
+    from steady_ppl.utils.files import require_place
 
     *runs, table = arguments
     if not runs:

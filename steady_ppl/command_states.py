@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from steady_ppl.counted import count, random_seed
-from steady_ppl.harmless import tell
+from steady_ppl.utils.text import tell
 
 
 def states(
@@ -36,7 +36,7 @@ def states(
     from steady_ppl.posterior_files import require_states_file, write_states
     from steady_ppl.program import for_program
     from steady_ppl.table import read_table
-    from steady_ppl.whole_file import require_place
+    from steady_ppl.utils.files import require_place
 
     require_states_file(out)
     require_place(out)

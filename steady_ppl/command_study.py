@@ -9,7 +9,7 @@ import typer
 
 from steady_ppl.counted import count
 from steady_ppl.errors import UsageError
-from steady_ppl.harmless import tell
+from steady_ppl.utils.text import tell
 
 
 def study(
@@ -54,10 +54,10 @@ def plot_study(
     out: Annotated[Path | None, typer.Option("--out", help="Picture to write; DIR/study.png when not given.")] = None,
 ) -> None:
     """Draw what a study has found so far, as its [picture] says, beside what is published."""
-    from steady_ppl.picture_files import require_picture, write_picture
     from steady_ppl.studies.pictures import study_picture
     from steady_ppl.studies.plan import recorded_plan
     from steady_ppl.studies.table import read_results
+    from steady_ppl.utils.files import require_picture, write_picture
 
     plan, place = recorded_plan(folder), out or folder / "study.png"
     require_picture(place)

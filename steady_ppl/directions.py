@@ -17,12 +17,12 @@ from torch import Tensor
 from steady_ppl.actuation import lagged
 from steady_ppl.data import Trajectories
 from steady_ppl.linearization import Path
-from steady_ppl.planar_vehicle import wrap, wrap_angles
 from steady_ppl.predictions import errors, on_a_circle
 from steady_ppl.program import Program, names, units
 from steady_ppl.sites import AtMean, running
 from steady_ppl.substeps import acting_controls, advance, row_controls
 from steady_ppl.tracking import Tracked
+from steady_ppl.utils.angles import wrap, wrap_angles
 
 LAG = 0.3  # s
 DEAD, KNEE = 0.2, 0.6  # of the largest command

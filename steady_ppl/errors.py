@@ -8,8 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from steady_ppl.harmless import harmless
-
 
 class SteadyError(Exception):
     """A problem the user can mend. The message says what was got, what was expected and what to do.
@@ -78,22 +76,6 @@ class FilterError(ComputationError):
 
 class TrainingError(ComputationError):
     """Training failed, for example on a loss that is not finite."""
-
-
-def shown(text: str, most: int | None = None) -> str:
-    """What somebody's file says, fit for one line of a terminal: what is not seen as escapes, cut where it is too long.
-
-    Example:
-        >>> shown("drive\\x1b[2J", most=40)
-        'drive\\\\x1b[2J'
-    """
-    return harmless(text if most is None or len(text) <= most else f"{text[: most - 1]}…", kept="")
-
-
-def one_line(error: BaseException) -> str:
-    """An error's type and the first line of its message."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
 def require(holds: bool, setting: str, value: object, wanted: str) -> None:

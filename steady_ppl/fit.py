@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from steady_ppl import effects
-from steady_ppl.checkpoint import read_tensors, write_tensors
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import RunError
 from steady_ppl.program import Program
@@ -25,7 +24,8 @@ from steady_ppl.run_folder import PARAMETERS, POSTERIOR, RECORD, read_record, ru
 from steady_ppl.run_forms import FINISHED
 from steady_ppl.substeps import is_count
 from steady_ppl.training import Trained
-from steady_ppl.whole_file import whole_file
+from steady_ppl.utils.files import whole_file
+from steady_ppl.utils.tensor_files import read_tensors, write_tensors
 
 if TYPE_CHECKING:
     import arviz

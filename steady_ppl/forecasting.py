@@ -15,9 +15,9 @@ from steady_ppl.errors import DataError
 from steady_ppl.posterior import DIMENSIONS, posterior
 from steady_ppl.predictions import on_a_circle
 from steady_ppl.program import Program, for_program, names, units
-from steady_ppl.seeding import seeded
 from steady_ppl.simulation import measure
-from steady_ppl.turns import draws_on_one_turn
+from steady_ppl.utils.angles import draws_on_one_turn
+from steady_ppl.utils.random import seeded
 
 if TYPE_CHECKING:
     import arviz

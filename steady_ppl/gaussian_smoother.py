@@ -20,7 +20,6 @@ from steady_ppl.linearization import Path, linearize
 from steady_ppl.lookahead import Lookahead, look_ahead
 from steady_ppl.particles import particle_filter
 from steady_ppl.paths import Paths
-from steady_ppl.planar_vehicle import wrap_angles
 from steady_ppl.program import Program
 from steady_ppl.sites import (
     KnownStart,
@@ -34,6 +33,7 @@ from steady_ppl.sites import (
 )
 from steady_ppl.stability import divergence
 from steady_ppl.substeps import acting_controls, sample_channels
+from steady_ppl.utils.angles import wrap_angles
 
 WORSE = 10.0  # nats by which a step may leave a path worse off, see `_Merit`: some such steps lead out of a bad place
 RESTS = 0.05  # a trajectory is at rest where no noise moves by more, in standard deviations of its channel

@@ -18,8 +18,8 @@ from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.program import Program
-from steady_ppl.progress import stages
 from steady_ppl.scores import smoothed, widens
+from steady_ppl.utils.progress import stages
 
 ROUGH = 1.5  # mean square deviation, in the program's own, from which its noise is widened before anything is fitted
 FAR, SEARCHES = 6.0, 3  # standard deviations by which a drive strays from the others, and searches for its path

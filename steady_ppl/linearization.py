@@ -18,7 +18,6 @@ from torch import Tensor
 from steady_ppl.compiled_rows import on_all_rows
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import ProgramError
-from steady_ppl.planar_vehicle import wrap
 from steady_ppl.probe import start_size, step_size
 from steady_ppl.program import Program, names
 from steady_ppl.sites import (
@@ -33,6 +32,7 @@ from steady_ppl.sites import (
     tangent_normal,
 )
 from steady_ppl.substeps import acting_controls, advance
+from steady_ppl.utils.angles import wrap
 
 
 @dataclass(frozen=True)

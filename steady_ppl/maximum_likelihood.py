@@ -18,12 +18,12 @@ from steady_ppl.data import Trajectories
 from steady_ppl.elements import Element, elements, moved, set_values, values_of
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import find_path, require_found, resting_path, smooth
-from steady_ppl.journal import Piece, piece
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.program import Program
-from steady_ppl.progress import stages
 from steady_ppl.scores import parameter_scores, smoothed
+from steady_ppl.utils.journal import Piece, piece
+from steady_ppl.utils.progress import stages
 
 PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
 PATIENT = 30  # linearisations a step once no share of a step was accepted: some path swings about its mode

@@ -15,13 +15,13 @@ import torch
 from torch import Tensor, fx, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from steady_ppl.errors import one_line
 from steady_ppl.kernel_writer import source
 from steady_ppl.kernels import Kernel
 from steady_ppl.program import Program
 from steady_ppl.scalar_graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph
 from steady_ppl.tangents import jacobian
 from steady_ppl.translation import Translation, evaluate
+from steady_ppl.utils.text import one_line
 
 TRACES = 8  # of one method of one program; each takes some tenths of a second
 RESTLESS = "its settings or tensors change from run to run"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import errno
 
-from steady_ppl.errors import ComputationError, SteadyError, UsageError, shown
+from steady_ppl.errors import ComputationError, SteadyError, UsageError
+from steady_ppl.utils.text import shown
 
 FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "Storage size calculation overflowed")

@@ -27,8 +27,8 @@ from steady_ppl.gaussian_smoother import smooth
 from steady_ppl.linearization import Path
 from steady_ppl.maximum_likelihood import PASSES, REACH, TOLERANCE, log_prior, maximise, posterior_score
 from steady_ppl.program import Program, for_program
-from steady_ppl.progress import stages
-from steady_ppl.seeding import seeded
+from steady_ppl.utils.progress import stages
+from steady_ppl.utils.random import seeded
 
 if TYPE_CHECKING:
     import arviz

@@ -28,7 +28,7 @@ from steady_ppl.posterior_pictures import (
 from steady_ppl.program import names
 from steady_ppl.proof_pictures import open_loop_picture
 from steady_ppl.training_pictures import held_out_curve, observation_noise, particle_curve
-from steady_ppl.turns import nearest_turn
+from steady_ppl.utils.angles import nearest_turn
 
 if TYPE_CHECKING:
     import arviz

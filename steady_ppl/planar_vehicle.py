@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import ProgramError, UsageError
 from steady_ppl.program import Program, names
+from steady_ppl.utils.angles import wrap
 
 
 class PlanarVehicle(Program):
@@ -167,19 +168,6 @@ def dense(layer: nn.Linear, inputs: Tensor) -> Tensor:
     columns = inputs.movedim(-1, 0).flatten(1)
     outputs = torch.addmm(layer.bias.unsqueeze(-1), layer.weight, columns)
     return outputs.view(-1, *inputs.shape[:-1]).movedim(0, -1)
-
-
-def wrap(angle: Tensor) -> Tensor:
-    """The same angle in [−π, π]."""
-    return angle - 2 * math.pi * (angle / (2 * math.pi)).round()
-
-
-def wrap_angles(difference: Tensor, angles: Sequence[int]) -> Tensor:
-    """A difference of states `(..., D)`, its angles, named by their index, in [−π, π]."""
-    difference = difference.clone()
-    for angle in angles:
-        difference[..., angle] = wrap(difference[..., angle])
-    return difference
 
 
 class WrappedNormal(dist.Normal):

@@ -13,10 +13,10 @@ from steady_ppl.data import Trajectories
 from steady_ppl.filtering import choose_filter, in_parts, run_filter
 from steady_ppl.long_drives import refuse_long
 from steady_ppl.program import Program, for_program, names, units
-from steady_ppl.progress import stages
-from steady_ppl.seeding import seeded
 from steady_ppl.sites import as_vector
-from steady_ppl.turns import paths_on_one_turn
+from steady_ppl.utils.angles import paths_on_one_turn
+from steady_ppl.utils.progress import stages
+from steady_ppl.utils.random import seeded
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", FutureWarning)  # an advertisement of arviz 1, once a day

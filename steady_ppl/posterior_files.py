@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from steady_ppl.errors import UsageError
-from steady_ppl.whole_file import whole_file
+from steady_ppl.utils.files import whole_file
 
 if TYPE_CHECKING:
     import arviz

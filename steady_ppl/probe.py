@@ -12,11 +12,12 @@ from pyro import poutine
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
-from steady_ppl.errors import ProgramError, SteadyError, one_line
+from steady_ppl.errors import ProgramError, SteadyError
 from steady_ppl.program import Program, names
 from steady_ppl.sites import Broadcasting, Observing, Recording, Replaying, broadcast_event, running
 from steady_ppl.stability import require_convergence
 from steady_ppl.substeps import MAX_SUBSTEPS, is_count
+from steady_ppl.utils.text import one_line
 
 DRAWS, ROWS, TRAJECTORIES = 7, 11, 13
 LEFT = (DRAWS, ROWS, TRAJECTORIES)

@@ -10,9 +10,10 @@ from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import CodeType, ModuleType
 
-from steady_ppl.errors import ProgramError, SteadyError, one_line
-from steady_ppl.given_files import require_file
+from steady_ppl.errors import ProgramError, SteadyError
 from steady_ppl.program import Program
+from steady_ppl.utils.files import require_file
+from steady_ppl.utils.text import one_line
 
 _LOADS = itertools.count()
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from steady_ppl.command_parts import is_quiet
-from steady_ppl.harmless import harmless
+from steady_ppl.utils.text import harmless
 
 PATIENCE = 2.0  # s, before anything is said
 CLEAR = "\r\x1b[K"

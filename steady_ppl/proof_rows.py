@@ -22,8 +22,8 @@ from steady_ppl.predictions import Prediction, named_horizons, predict, simulate
 from steady_ppl.program import Program, error_groups, for_program, units
 from steady_ppl.reference_motion import ConstantVelocity, constant_velocity
 from steady_ppl.scores import measured, substep_spreads
-from steady_ppl.seeding import seeded
 from steady_ppl.tracking import Tracked, track
+from steady_ppl.utils.random import seeded
 
 SECONDS = (1.0, 3.0, 10.0)
 BANDS = ("one step", "1 s", "3 s")

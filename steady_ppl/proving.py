@@ -23,7 +23,6 @@ from steady_ppl.long_drives import refuse_long
 from steady_ppl.paired_bootstrap import FEWEST
 from steady_ppl.predictions import named_horizons
 from steady_ppl.program import Program, names
-from steady_ppl.progress import stages
 from steady_ppl.proof_report import FLOOR, as_text, figures, verdict
 from steady_ppl.proof_rows import (
     SECONDS,
@@ -34,6 +33,7 @@ from steady_ppl.proof_rows import (
     keeping_velocity,
     noise_floor,
 )
+from steady_ppl.utils.progress import stages
 
 COASTING = "constant velocity"
 FAR_OFF = 2.0  # nats of a drive's log p(y) between a particle filter and the linearised program

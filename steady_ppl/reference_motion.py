@@ -14,12 +14,12 @@ from torch import Tensor
 
 from steady_ppl.data import Trajectories
 from steady_ppl.linearization import Path
-from steady_ppl.planar_vehicle import wrap
 from steady_ppl.predictions import Prediction, on_a_circle, predict
 from steady_ppl.program import Program
 from steady_ppl.sites import AtMean, Recording, Standardised, as_vector, normal_moments, running
 from steady_ppl.substeps import acting_controls, advance, sample_channels
 from steady_ppl.tracking import Tracked, track
+from steady_ppl.utils.angles import wrap
 
 MULTIPLES = (0.5, 1.0, 2.0, 4.0, 8.0)
 ABOUT = (

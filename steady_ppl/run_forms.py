@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from steady_ppl.given_files import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Absent, Among, Maybe
+from steady_ppl.utils.schema import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Absent, Among, Maybe
 
 FINISHED = ("finished", "interrupted")  # what the record of a run that can be used says
 

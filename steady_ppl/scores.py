@@ -27,10 +27,10 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.elements import Element, moved
 from steady_ppl.lookahead import Lookahead
-from steady_ppl.planar_vehicle import wrap_angles
 from steady_ppl.program import Program
 from steady_ppl.sites import AtMean, Recording, Standardised, as_vector, normal_moments, residual, running, unwrapped
 from steady_ppl.substeps import acting_controls, advance, channel_scales, sample_channels
+from steady_ppl.utils.angles import wrap_angles
 
 Moments = tuple[Tensor, Tensor]
 

@@ -11,9 +11,9 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import ProgramError
 from steady_ppl.program import Program, names
-from steady_ppl.seeding import seeded
 from steady_ppl.sites import broadcast_event, running
 from steady_ppl.substeps import MAX_SUBSTEPS, Held, advance, with_substeps, within_row
+from steady_ppl.utils.random import seeded
 
 GROWTH = 1.1  # of a deviation over a row, from which it counts
 FINER = 16  # times as many substeps, at which it must not grow nearly as much

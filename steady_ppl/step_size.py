@@ -22,9 +22,9 @@ from steady_ppl.linearization import Path
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.program import Program
 from steady_ppl.scores import widens
-from steady_ppl.seeding import seeded
 from steady_ppl.stability import can_be_cut, counts_rows, is_step
 from steady_ppl.substeps import MAX_SUBSTEPS, with_substeps
+from steady_ppl.utils.random import seeded
 
 MIN_GAIN = 3.0  # nats, of all drives together, from which a finer step counts
 MAX_SHIFT = 2.0  # nats that watched parameters of another step lie below the maximum: two standard deviations

@@ -21,9 +21,9 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data import Trajectories, pad, pad_time
-from steady_ppl.errors import DataError, shown
-from steady_ppl.given_files import require_file
-from steady_ppl.whole_file import whole_file
+from steady_ppl.errors import DataError
+from steady_ppl.utils.files import require_file, whole_file
+from steady_ppl.utils.text import shown
 
 SEPARATORS = {";": "semicolons", "\t": "tabs"}  # of other programs' CSV
 

@@ -19,10 +19,10 @@ from tqdm import tqdm
 from steady_ppl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import TrainingError, require
-from steady_ppl.harmless import tell
 from steady_ppl.joint import Joint
 from steady_ppl.program import Program
-from steady_ppl.seeding import seeded
+from steady_ppl.utils.random import seeded
+from steady_ppl.utils.text import tell
 from steady_ppl.validation import Validation, as_good
 
 SETTLED = 1.0  # nats a drive by which held-out log p(y) may rise at the end of a training that has converged

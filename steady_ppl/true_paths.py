@@ -11,10 +11,10 @@ from torch import Tensor
 from steady_ppl.data import Trajectories
 from steady_ppl.errors import DataError, ProgramError
 from steady_ppl.paths import Paths
-from steady_ppl.planar_vehicle import wrap
 from steady_ppl.program import Program, names
 from steady_ppl.sites import Recording, Replaying, running
 from steady_ppl.substeps import acting_controls, sample_row
+from steady_ppl.utils.angles import wrap
 
 PASSES = 30  # of Gauss and Newton's method
 AT_REST = 1e-9  # of a channel's size and unit, by which noise may still move when it is found

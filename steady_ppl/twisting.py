@@ -16,8 +16,8 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from steady_ppl.planar_vehicle import wrap
 from steady_ppl.resampling import by_component
+from steady_ppl.utils.angles import wrap
 
 Steering = tuple[Tensor, Tensor, Tensor, Tensor]
 Array = np.ndarray[Any, Any]

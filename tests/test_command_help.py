@@ -15,8 +15,8 @@ from small import TRUTH, steady, written
 
 from steady_ppl import command_line, progress_line
 from steady_ppl.command_line import COMMANDS, app, main
-from steady_ppl.progress import listening, stages
 from steady_ppl.progress_line import in_words
+from steady_ppl.utils.progress import listening, stages
 
 LINES, COLUMNS = 24, 80
 

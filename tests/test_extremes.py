@@ -17,7 +17,7 @@ from small import FEW, HOVERCRAFT, QUICK, steady, tree, written
 from steady_ppl import read_table
 from steady_ppl.errors import ComputationError, UsageError
 from steady_ppl.outside import as_refusal
-from steady_ppl.whole_file import whole_file
+from steady_ppl.utils.files import whole_file
 
 THIRTY = "9" * 30
 LONG = "n" * 300

@@ -17,8 +17,8 @@ from examples import example
 from small import HOVERCRAFT, steady, written
 
 import steady_ppl as st
-from steady_ppl.checkpoint import read_tensors
 from steady_ppl.run_folder import LOCK, run_folder
+from steady_ppl.utils.tensor_files import read_tensors
 
 HOLDER = """
 import sys

@@ -11,8 +11,8 @@ from examples import drives, example
 from small import simulated
 
 from steady_ppl import DataError, fixes, for_program, seeded
-from steady_ppl.planar_vehicle import wrap
 from steady_ppl.run_recipe import recipe_folder
+from steady_ppl.utils.angles import wrap
 
 
 def found(program, data):

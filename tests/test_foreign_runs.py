@@ -12,8 +12,8 @@ import pytest
 from small import HOVERCRAFT, contents, steady, written
 
 import steady_ppl as st
-from steady_ppl.harmless import harmless, tell
-from steady_ppl.whole_file import hidden_beside
+from steady_ppl.utils.files import hidden_beside
+from steady_ppl.utils.text import harmless, tell
 
 PACKAGE = Path(st.__file__).parent
 PAYLOAD = "from pathlib import Path\nPath({mark!r}).touch()\n"

@@ -21,8 +21,10 @@ from small import FEW, HOVERCRAFT, QUICK, contents, rewritten, simulated, steady
 
 import steady_ppl as st
 from steady_ppl.alpha_truck import read_alpha_truck
-from steady_ppl.errors import DataError, RunError, shown
-from steady_ppl.given_files import NUMBER, TEXT, WHOLE, Absent, Among, Maybe, misfit, read_json, require_file
+from steady_ppl.errors import DataError, RunError
+from steady_ppl.utils.files import read_json, require_file
+from steady_ppl.utils.schema import NUMBER, TEXT, WHOLE, Absent, Among, Maybe, misfit
+from steady_ppl.utils.text import shown
 
 CART = MODELS / "linear_gaussian.py"
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"

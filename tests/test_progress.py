@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from steady_ppl.progress import listening, stages
+from steady_ppl.utils.progress import listening, stages
 
 
 def test_stages_inside_a_stage_divide_its_share() -> None:

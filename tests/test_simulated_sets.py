@@ -10,7 +10,7 @@ from oracles import assert_mean
 import steady_ppl.simulated_sets as simulated
 from steady_ppl import FilterError
 from steady_ppl.program import for_program
-from steady_ppl.seeding import seeded
+from steady_ppl.utils.random import seeded
 
 
 def made(program, data, starts, known_start: bool = True):

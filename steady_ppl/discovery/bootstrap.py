@@ -19,7 +19,7 @@ from steady_ppl.lookahead import Lookahead
 from steady_ppl.predictions import simulate_again
 from steady_ppl.program import Program
 from steady_ppl.scores import parameter_scores, smoothed
-from steady_ppl.seeding import seeded
+from steady_ppl.utils.random import seeded
 
 LEAST_LEFT = 0.8  # share of the simulated sets that must not blow up
 

@@ -20,11 +20,11 @@ from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.elements import Element, elements
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import smooth
-from steady_ppl.journal import Piece, piece
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.program import Program
 from steady_ppl.scores import measured, smoothed, typical_spreads
-from steady_ppl.seeding import seeded
+from steady_ppl.utils.journal import Piece, piece
+from steady_ppl.utils.random import seeded
 
 LEADERS, ALIKE = 6, 0.85  # how many are refitted at least, and whose columns correlate so much with the first
 NATS = 2.0  # of held-out log p(y) within which two candidates cannot be told apart

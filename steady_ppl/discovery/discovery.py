@@ -24,9 +24,9 @@ from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
 from steady_ppl.joining import joined
 from steady_ppl.program import Program, for_program
-from steady_ppl.progress import stages
 from steady_ppl.proving import Proof, far_off, prove
-from steady_ppl.seeding import seeded
+from steady_ppl.utils.progress import stages
+from steady_ppl.utils.random import seeded
 
 FITTED_FURTHER = 10.0  # nats that fitting a run further may gain before it is said
 

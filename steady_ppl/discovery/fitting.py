@@ -25,9 +25,9 @@ from steady_ppl.linearized_guides import LookaheadGuide
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.maximum_likelihood import Maximum, kept_maximum, maximise
 from steady_ppl.program import Program
-from steady_ppl.seeding import seeded
 from steady_ppl.tempering import Constant
 from steady_ppl.training import Optimization, train
+from steady_ppl.utils.random import seeded
 from steady_ppl.validation import Validation
 
 DOUBTFUL = 0.5  # nats a drive by which the linearised log p(y) may be off

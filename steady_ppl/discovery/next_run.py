@@ -17,7 +17,7 @@ from steady_ppl.gaussian_smoother import smooth
 from steady_ppl.linearization import Path
 from steady_ppl.predictions import simulate_again
 from steady_ppl.program import Program, names
-from steady_ppl.seeding import seeded
+from steady_ppl.utils.random import seeded
 
 DRIVES = 24  # simulated for each proposal
 TYPES = 3  # of every way of driving

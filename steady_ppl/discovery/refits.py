@@ -22,7 +22,7 @@ from steady_ppl.linearization import Path
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.program import Program
 from steady_ppl.scores import widens
-from steady_ppl.seeding import seeded
+from steady_ppl.utils.random import seeded
 
 WIDER = math.log(20.0)  # log ratio of a channel's noise after a fit and before, from which it explains next to nothing
 NOTHING = 2.0  # nats below the program without, after which a fit is given up: a candidate at zero is that program

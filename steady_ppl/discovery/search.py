@@ -29,9 +29,9 @@ from steady_ppl.discovery.rounds import MARGIN, Found, Round, Search
 from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
 from steady_ppl.program import Program
-from steady_ppl.progress import stages
 from steady_ppl.step_size import StepCheck, check_step
 from steady_ppl.substeps import with_substeps
+from steady_ppl.utils.progress import stages
 
 BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
 MAX_SHIFT_OF_SIZES = 0.08  # nats by which twice the substeps may move what is reported: 0.4 standard deviations

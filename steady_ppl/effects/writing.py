@@ -15,7 +15,7 @@ from steady_ppl.errors import UsageError
 from steady_ppl.probe import probe
 from steady_ppl.program import Program
 from steady_ppl.program_file import load_program
-from steady_ppl.whole_file import whole_file
+from steady_ppl.utils.files import whole_file
 
 
 def write_program(program: Program, path: str | Path, *, force: bool = False) -> list[str]:

@@ -14,7 +14,7 @@ from steady_ppl.data import Trajectories
 from steady_ppl.fit import Fit
 from steady_ppl.program import Program, names, units
 from steady_ppl.reporting.packing import packed
-from steady_ppl.turns import nearest_turn
+from steady_ppl.utils.angles import nearest_turn
 
 NUMBERS = 300_000  # of all drives and runs: .8 MB of text
 QUANTILES = (0.05, 0.5, 0.95)

@@ -18,7 +18,7 @@ from steady_ppl.check_report import strongest
 from steady_ppl.errors import ComputationError
 from steady_ppl.fit import versions
 from steady_ppl.reporting.program_page import program_page
-from steady_ppl.whole_file import whole_file
+from steady_ppl.utils.files import whole_file
 
 if TYPE_CHECKING:
     from steady_ppl.reporting.gathering import Report

@@ -9,10 +9,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from steady_ppl.errors import UsageError, shown
-from steady_ppl.given_files import NUMBER, TEXT, WHOLE, Maybe, misfit
+from steady_ppl.errors import UsageError
 from steady_ppl.studies.job_files import is_program
 from steady_ppl.studies.plan import LARGEST
+from steady_ppl.utils.schema import NUMBER, TEXT, WHOLE, Maybe, misfit
+from steady_ppl.utils.text import shown
 
 SOURCES: dict[str, dict[str, Any]] = {
     "simulate": {"train": 16, "valid": 16, "test": 32, "effect": "", "sigma_deg": None},

@@ -15,12 +15,13 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from typing import Any, NamedTuple
 
-from steady_ppl.errors import ComputationError, UsageError, one_line, shown
+from steady_ppl.errors import ComputationError, UsageError
 from steady_ppl.fit import packages
 from steady_ppl.studies import job as work
 from steady_ppl.studies.job_files import JobFiles
 from steady_ppl.studies.places import Place, Row, Say, given_up
 from steady_ppl.studies.plan import Job
+from steady_ppl.utils.text import one_line, shown
 
 WORKER_WAIT = 30  # s for the first worker, and between looks at whether there still is one
 TRIES = 3  # of a job whose workers die; the scheduler itself tries it so often as it is set, four times at first

@@ -15,17 +15,18 @@ import torch
 
 from steady_ppl.data import Trajectories
 from steady_ppl.discovery import discover
-from steady_ppl.errors import RunError, one_line
+from steady_ppl.errors import RunError
 from steady_ppl.evaluation import evaluate
 from steady_ppl.filtering import choose_filter, log_likelihood
 from steady_ppl.fit import Fit, packages
 from steady_ppl.program import for_program
 from steady_ppl.program_file import load_program
 from steady_ppl.run_recipe import find_recipe, require_settings, trains
-from steady_ppl.seeding import seeded
 from steady_ppl.studies.job_data import drives, planted, told, told_settings
 from steady_ppl.studies.job_files import JobFiles
 from steady_ppl.studies.plan import HELD_OUT, IN_LIMITS, Job
+from steady_ppl.utils.random import seeded
+from steady_ppl.utils.text import one_line
 
 ERRORS = ("forward", "forward_mean", "state_estimation")
 CHANGED = "its program, recipe or table is not what it was when the study was begun: the same command tries it again"

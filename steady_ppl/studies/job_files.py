@@ -11,10 +11,10 @@ from typing import Any
 
 from steady_ppl.errors import UsageError
 from steady_ppl.fit import sha256
-from steady_ppl.given_files import require_file
 from steady_ppl.program_file import program_file
 from steady_ppl.run_recipe import recipe_file
 from steady_ppl.studies.plan import Job
+from steady_ppl.utils.files import require_file
 
 PARTS = ("train", "valid", "test")
 LOGS = ("vrpn-pose.csv", "vesc_drive.csv")

@@ -16,9 +16,9 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from scipy import stats
 
 from steady_ppl.errors import UsageError
-from steady_ppl.harmless import harmless
 from steady_ppl.proof_pictures import COLORS, MARKS
 from steady_ppl.studies.plan import IN_LIMITS, LARGEST, Picture, Plan
+from steady_ppl.utils.text import harmless
 
 SIZES = (-1.0, 0.0, *(1.25 ** (place - 0.5) for place in range(-6, 12)), math.inf)
 """Ends of ranges of what is missing, in detection limits: each a quarter wider than the one before, one of them around

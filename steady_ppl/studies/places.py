@@ -19,7 +19,7 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from steady_ppl.errors import RunError
 from steady_ppl.studies import job as work
 from steady_ppl.studies.plan import Job
-from steady_ppl.whole_file import whole_file
+from steady_ppl.utils.files import whole_file
 
 Row = dict[str, Any]
 Say = Callable[[str], None]

@@ -8,21 +8,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from steady_ppl.errors import RunError, shown
-from steady_ppl.given_files import (
-    ANYTHING,
-    LINES,
-    NUMBER,
-    TEXT,
-    TRUTH,
-    WHOLE,
-    Absent,
-    Maybe,
-    misfit,
-    read_json,
-    refuse_newer,
-)
-from steady_ppl.whole_file import whole_file
+from steady_ppl.errors import RunError
+from steady_ppl.utils.files import read_json, whole_file
+from steady_ppl.utils.schema import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Absent, Maybe, misfit, refuse_newer
+from steady_ppl.utils.text import shown
 
 HELD_OUT = "valid_log_likelihood"  # of validation drives
 IN_LIMITS = "in_limits"  # how large what is missing is, in detection limits

@@ -36,10 +36,11 @@ from pathlib import Path
 from typing import Any
 
 from steady_ppl.errors import UsageError, labelled
-from steady_ppl.given_files import ANYTHING, LINES, TEXT, TRUTH, WHOLE, Absent, misfit, require_file
 from steady_ppl.studies.axes import Axes, count, grid, method_axes, source_axes
 from steady_ppl.studies.job_files import JobFiles
 from steady_ppl.studies.plan import FIGURES, HELD_OUT, POINTS, TASKS, Job, Picture, Plan, undrawable, without_folder
+from steady_ppl.utils.files import require_file
+from steady_ppl.utils.schema import ANYTHING, LINES, TEXT, TRUTH, WHOLE, Absent, misfit
 
 MOST_JOBS = 100_000
 

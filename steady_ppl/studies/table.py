@@ -20,10 +20,9 @@ import pyarrow.parquet
 from pyarrow import types
 
 from steady_ppl.errors import RunError
-from steady_ppl.given_files import require_file
-from steady_ppl.harmless import harmless
 from steady_ppl.run_folder import only_writer
-from steady_ppl.whole_file import whole_file
+from steady_ppl.utils.files import require_file, whole_file
+from steady_ppl.utils.text import harmless
 
 TABLE, EARLIER, ARRIVED = "results.parquet", "earlier.parquet", "arrived"
 KINDS = (types.is_integer, types.is_floating, types.is_boolean, types.is_string, types.is_large_string, types.is_null)

@@ -2,49 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
-import stat
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from steady_ppl.errors import SteadyError, shown
-
-KINDS = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISCHR, "a device"), (stat.S_ISSOCK, "a socket"))
-
-
-def require_file(path: Path, refused: type[SteadyError]) -> None:
-    """Refuse a folder in place of a file, and what may never end: a pipe, a device. A missing file is left to be found.
-
-    Raises:
-        SteadyError, of the kind that is `refused`.
-    """
-    try:
-        mode = path.stat().st_mode
-    except (OSError, ValueError):
-        return
-    if not stat.S_ISREG(mode):
-        what = next((word for test, word in KINDS if test(mode)), "no file")
-        raise refused(f"{path} is {what}: expected a file")
-
-
-def read_json(path: Path, refused: type[SteadyError]) -> Any:
-    """What a JSON file says.
-
-    Raises:
-        FileNotFoundError, NotADirectoryError: there is none.
-        SteadyError, of the kind that is `refused`: it cannot be read, or is no JSON.
-    """
-    require_file(path, refused)
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
-        raise
-    except (OSError, ValueError) as error:
-        raise refused(f"{path} is damaged: {error}") from error
-    except RecursionError:
-        raise refused(f"{path} is damaged: it is nested too deeply") from None
+from steady_ppl.errors import SteadyError
+from steady_ppl.utils.text import shown
 
 
 def refuse_newer(record: Any, known: int, folder: Path, refused: type[SteadyError]) -> None:

@@ -27,3 +27,19 @@ def harmless(text: str, kept: str = "\t\n") -> str:
 def tell(text: object, *, end: str = "\n", aside: bool = False) -> None:
     """Print for a person or a pipe; `aside` goes to stderr. Everything that a command prints goes through here."""
     print(harmless(str(text)), end=end, file=sys.stderr if aside else sys.stdout, flush=True)
+
+
+def shown(text: str, most: int | None = None) -> str:
+    """What somebody's file says, fit for one line of a terminal: what is not seen as escapes, cut where it is too long.
+
+    Example:
+        >>> shown("drive\\x1b[2J", most=40)
+        'drive\\\\x1b[2J'
+    """
+    return harmless(text if most is None or len(text) <= most else f"{text[: most - 1]}…", kept="")
+
+
+def one_line(error: BaseException) -> str:
+    """An error's type and the first line of its message."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__

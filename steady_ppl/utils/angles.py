@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
+from torch import Tensor
 
 TURN = 2 * np.pi
 
@@ -30,3 +34,16 @@ def draws_on_one_turn(draws: np.ndarray) -> np.ndarray:
 def nearest_turn(angles: np.ndarray, middle: np.ndarray) -> np.ndarray:
     """Angles moved by whole turns to within half a turn of `middle`."""
     return angles - TURN * np.round((angles - middle) / TURN)
+
+
+def wrap(angle: Tensor) -> Tensor:
+    """The same angle in [−π, π]."""
+    return angle - 2 * math.pi * (angle / (2 * math.pi)).round()
+
+
+def wrap_angles(difference: Tensor, angles: Sequence[int]) -> Tensor:
+    """A difference of states `(..., D)`, its angles, named by their index, in [−π, π]."""
+    difference = difference.clone()
+    for angle in angles:
+        difference[..., angle] = wrap(difference[..., angle])
+    return difference

@@ -1,0 +1,127 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from steady_ppl.errors import SteadyError, UsageError
+from steady_ppl.utils.text import harmless
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@contextmanager
+def whole_file(path: Path, refused: type[SteadyError] = UsageError, beside: Path | None = None) -> Iterator[Path]:
+    """A file beside `path` for the block to write; it takes the place of `path` if the block succeeds, and is removed
+    if not.
+
+    Args:
+        path: the file that is meant.
+        refused: what is raised when the block, or the last step, meets an `OSError`.
+        beside: where the block writes; a hidden file of this process in the same folder when not given.
+
+    Raises:
+        UsageError, or `refused`: it cannot be written.
+    """
+    beside = beside or hidden_beside(path)
+    try:
+        beside.unlink(missing_ok=True)  # a link in its place would be written through
+        yield beside
+        os.replace(beside, path)
+    except OSError as error:
+        raise refused(f"{path} cannot be written: {error.strerror or error}") from error
+    finally:
+        with suppress(OSError):  # where nothing can be written nothing can be removed, and what went wrong is said
+            beside.unlink(missing_ok=True)
+
+
+def hidden_beside(path: Path) -> Path:
+    """This process's hidden file in the folder of `path`. Its name is short: that of `path` may be as long as any."""
+    return path.with_name(f".{zlib.crc32(os.fsencode(path.name)):08x}.{os.getpid()}.partial")
+
+
+def require_place(path: Path | None) -> None:
+    """Refuse a file whose folder does not exist, or that is one, before anything is computed; None is no file.
+
+    Raises:
+        UsageError: naming the folder.
+    """
+    if path is not None and not path.parent.is_dir():
+        raise UsageError(f"{path} cannot be written: there is no folder {path.parent}")
+    if path is not None and path.is_dir():
+        raise UsageError(f"{path} cannot be written: it is a folder")
+
+
+def require_picture(path: Path | None) -> None:
+    """Refuse a name whose ending is no picture's, or a place that there is not, before anything is computed; None is no
+    picture.
+
+    Raises:
+        UsageError: naming the endings that matplotlib writes, or the folder.
+    """
+    require_place(path)
+    if path is None:
+        return
+    from matplotlib.figure import Figure
+
+    formats = set(Figure().canvas.get_supported_filetypes()) - {"pgf"}  # which needs TeX
+    if path.suffix.lower()[1:] not in formats:
+        raise UsageError(f"{path}: expected a picture's name that ends in one of {', '.join(sorted(formats))}")
+
+
+def write_picture(figure: Figure, path: Path) -> None:
+    """Write a picture whole or not at all.
+
+    Raises:
+        UsageError: the file cannot be written.
+    """
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_text(harmless(text.get_text()))  # matplotlib draws no name that is not UTF-8
+    with whole_file(path) as beside:
+        figure.savefig(beside, format=path.suffix.lower()[1:], dpi=150)
+
+
+KINDS = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISCHR, "a device"), (stat.S_ISSOCK, "a socket"))
+
+
+def require_file(path: Path, refused: type[SteadyError]) -> None:
+    """Refuse a folder in place of a file, and what may never end: a pipe, a device. A missing file is left to be found.
+
+    Raises:
+        SteadyError, of the kind that is `refused`.
+    """
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return
+    if not stat.S_ISREG(mode):
+        what = next((word for test, word in KINDS if test(mode)), "no file")
+        raise refused(f"{path} is {what}: expected a file")
+
+
+def read_json(path: Path, refused: type[SteadyError]) -> Any:
+    """What a JSON file says.
+
+    Raises:
+        FileNotFoundError, NotADirectoryError: there is none.
+        SteadyError, of the kind that is `refused`: it cannot be read, or is no JSON.
+    """
+    require_file(path, refused)
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise
+    except (OSError, ValueError) as error:
+        raise refused(f"{path} is damaged: {error}") from error
+    except RecursionError:
+        raise refused(f"{path} is damaged: it is nested too deeply") from None
