@@ -20,7 +20,7 @@ from truck_programs import MECHANISTIC, SPACINGS
 from inference import steady
 from models.discovered_truck import DiscoveredTruck
 from steady_ppl import Program, Trajectories, bearings_to, discover, for_program, wrap
-from steady_ppl.joining import joined
+from steady_ppl.data.trajectories import joined
 
 CALIBRATION = (101, 102, 103, 104)  # draws of the bearings
 KEPT_FREE = ("noise", "erratic")  # the rest is known as calibrated: a fault in a gain would be fitted away

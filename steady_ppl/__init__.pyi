@@ -9,12 +9,19 @@ from .altering import (
     pushed as pushed,
     widened as widened,
 )
-from .arrays import from_arrays as from_arrays
 from .auto_rollout import AutoRollout as AutoRollout
-from .bag_mapping import BagColumn as BagColumn, BagMapping as BagMapping
-from .bags import read_bags as read_bags
 from .checking import Check as Check, check as check
-from .data import Trajectories as Trajectories
+from .data.rosbag.mapping import BagColumn as BagColumn, BagMapping as BagMapping
+from .data.rosbag.read import read_bags as read_bags
+from .data.table import (
+    cut as cut,
+    from_arrays as from_arrays,
+    from_frame as from_frame,
+    read_table as read_table,
+    to_frame as to_frame,
+    write_table as write_table,
+)
+from .data.trajectories import Trajectories as Trajectories
 from .discovery import Discovery as Discovery, discover as discover
 from .dynamics import Dynamics as Dynamics
 from .errors import (
@@ -41,7 +48,6 @@ from .joint import Joint as Joint
 from .likelihood_fit import fit_by_likelihood as fit_by_likelihood
 from .linearization import why_not_linear as why_not_linear
 from .linearized_guides import GaussianGuide as GaussianGuide, LookaheadGuide as LookaheadGuide
-from .long_drives import cut as cut
 from .parameter_draws import ParameterPosterior as ParameterPosterior, parameter_posterior as parameter_posterior
 from .particles import particle_filter as particle_filter, roll_out as roll_out
 from .paths import Filtered as Filtered, Paths as Paths
@@ -62,7 +68,6 @@ from .reporting import Report as Report, report as report
 from .simulation import simulate as simulate
 from .smoother_guide import SmootherGuide as SmootherGuide
 from .substeps import with_substeps as with_substeps
-from .table import from_frame as from_frame, read_table as read_table, to_frame as to_frame, write_table as write_table
 from .tempering import Constant as Constant, LinearRamp as LinearRamp
 from .training import Optimization as Optimization, Trained as Trained, train as train
 from .utils.angles import wrap as wrap

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.planar_vehicle import bearings_to
 from steady_ppl.utils.angles import wrap

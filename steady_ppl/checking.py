@@ -17,22 +17,23 @@ from torch import Tensor
 
 from steady_ppl.blame import SCATTER, Blame, blame, scored
 from steady_ppl.check_report import as_text, figures, verdict
-from steady_ppl.data import Trajectories
+from steady_ppl.data.frozen_sensors import Stretch, stuck
+from steady_ppl.data.table import refuse_long
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.directions import directions
 from steady_ppl.doubts import doubts_of_units
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
 from steady_ppl.gaussian_smoother import find_and_smooth
 from steady_ppl.linearization import why_not_linear
-from steady_ppl.long_drives import refuse_long
 from steady_ppl.misfit_maps import Misfit, Residuals, judge
 from steady_ppl.predictions import Prediction, named_horizons, predict
 from steady_ppl.program import Program, for_program, names
 from steady_ppl.reference_motion import Reference, constant_velocity, last_measurement
 from steady_ppl.simulated_sets import FEWEST, residuals, simulate_sets
 from steady_ppl.step_size import StepCheck, check_step
-from steady_ppl.stuck import Stretch, stuck
 from steady_ppl.tracking import track
+from steady_ppl.utils.display import Displayed
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
@@ -41,7 +42,7 @@ MOST = 4.0  # standard deviations of a single residual; beside a landmark the li
 
 
 @dataclass(frozen=True, repr=False)
-class Check:
+class Check(Displayed):
     """What `check` found.
 
     Attributes:
@@ -86,12 +87,6 @@ class Check:
 
     def __repr__(self) -> str:
         return f"Check({verdict(self)!r})"
-
-    def _repr_html_(self) -> str:
-        from steady_ppl.check_pictures import check_picture
-        from steady_ppl.display import of_result
-
-        return of_result(verdict(self), str(self), check_picture(self))
 
 
 @torch.no_grad()

@@ -29,11 +29,12 @@ def check(
 ) -> None:
     """Compare a run with measurements: where, when and in which regime it fails, and who is at fault."""
     from steady_ppl.checking import check as compare
-    from steady_ppl.command_parts import present, say
+    from steady_ppl.command_parts import present
+    from steady_ppl.data.frozen_sensors import masked
+    from steady_ppl.data.table import read_table, require_table_file, write_table
     from steady_ppl.fit import Fit
-    from steady_ppl.stuck import masked
-    from steady_ppl.table import read_table, require_table_file, write_table
     from steady_ppl.utils.files import require_picture, require_place, write_picture
+    from steady_ppl.utils.text import say
 
     require_picture(picture)
     require_place(json_file)

@@ -29,7 +29,7 @@ def alpha_truck(
     capture and commands; the bearings are simulated from the true poses. True states are kept in the x. columns.
     """
     from steady_ppl.alpha_truck import read_alpha_truck
-    from steady_ppl.table import write_table
+    from steady_ppl.data.table import write_table
 
     write_table(read_alpha_truck(folder, sigma_degrees=sigma_deg, seed=seed, centred=centred), out)
 
@@ -44,9 +44,8 @@ def cut(
 
     Each begins at its first row that has a measurement; pieces of one row or without a measurement are left out.
     """
-    from steady_ppl.command_parts import say
-    from steady_ppl.long_drives import cut
-    from steady_ppl.table import read_table, require_table_file, write_table
+    from steady_ppl.data.table import cut, read_table, require_table_file, write_table
+    from steady_ppl.utils.text import say
 
     require_table_file(out)
     drives = read_table(table)

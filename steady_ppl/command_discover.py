@@ -39,7 +39,8 @@ def discover(
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing run.")] = False,
 ) -> None:
     """Learn which physical effect a program lacks: none, one by name, several, or a curve that has no name."""
-    from steady_ppl.command_parts import present, program_from, say, write_json
+    from steady_ppl.command_parts import present, program_from, write_json
+    from steady_ppl.data.table import read_table
     from steady_ppl.discovery import discover as search
     from steady_ppl.discovery.kept_search import kept_search
     from steady_ppl.fit import Fit
@@ -47,8 +48,8 @@ def discover(
     from steady_ppl.run_folder import DISCOVERY
     from steady_ppl.run_recipe import fingerprint
     from steady_ppl.substeps import with_substeps
-    from steady_ppl.table import read_table
     from steady_ppl.utils.files import require_picture, require_place, write_picture
+    from steady_ppl.utils.text import say
 
     is_run = Path(source).is_dir()
     if program and not is_run:

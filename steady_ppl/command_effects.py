@@ -28,9 +28,10 @@ def add(
     Its parameters start at the run's values, a coefficient at the value that is given, else at the run's, else at the
     effect's typical one.
     """
-    from steady_ppl.command_parts import program_from, say
+    from steady_ppl.command_parts import program_from
     from steady_ppl.effects import added, write_program
     from steady_ppl.fit import Fit
+    from steady_ppl.utils.text import say
 
     is_run = Path(source).is_dir()
     if program and not is_run:

@@ -33,15 +33,16 @@ def evaluate(
     ] = None,
 ) -> None:
     """The paper's errors where true states exist; errors in measurement space always."""
-    from steady_ppl.command_parts import load_runs, present, run_labels, say, used_before
+    from steady_ppl.command_parts import load_runs, present, run_labels, used_before
+    from steady_ppl.data.table import read_table
     from steady_ppl.doubts import doubts_of_units
     from steady_ppl.evaluation import evaluate_all, incomparable, table_of
     from steady_ppl.paths import FEW
     from steady_ppl.program import for_program
     from steady_ppl.program_file import load_program
     from steady_ppl.run_recipe import fingerprint
-    from steady_ppl.table import read_table
     from steady_ppl.utils.files import require_place
+    from steady_ppl.utils.text import say
 
     if len(arguments) < 2:
         raise UsageError("evaluate needs at least one RUN and then a TABLE")

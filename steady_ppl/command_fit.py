@@ -69,9 +69,10 @@ def fit(
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing run.")] = False,
 ) -> None:
     """Learn a program's parameters from measurements."""
-    from steady_ppl.command_parts import is_quiet, program_from, say
+    from steady_ppl.command_parts import program_from
+    from steady_ppl.data.table import read_table
     from steady_ppl.run_recipe import run_recipe
-    from steady_ppl.table import read_table
+    from steady_ppl.utils.text import is_quiet, say
 
     given: dict[str, Any] = {"particles": particles, "draws": draws, "steps": steps, "hand": hand}
     given["guide"] = guide and guide.value

@@ -25,9 +25,9 @@ def import_bag(
     step: Annotated[float | None, typer.Option(help="Seconds between rows; before that of MAPPING.toml.")] = None,
 ) -> None:
     """Turn ROS bags into a table; without a mapping, list what is in them and print one to start from."""
-    from steady_ppl.bag_listing import listing
-    from steady_ppl.bags import open_bag, read_bags
-    from steady_ppl.table import require_table_file, write_table
+    from steady_ppl.data.rosbag.read import open_bag, read_bags
+    from steady_ppl.data.rosbag.reader import listing
+    from steady_ppl.data.table import require_table_file, write_table
 
     bags = [path for path in arguments if path.suffix != ".toml"]
     files = [path for path in arguments if path.suffix == ".toml"]
@@ -51,7 +51,7 @@ def import_bag(
 
 def _mapping(file: Path | None, maps: list[str], step: float | None) -> Any:
     """What a file, `--map` and `--step` say together."""
-    from steady_ppl.bag_mapping import BagMapping, parse_map, read_toml
+    from steady_ppl.data.rosbag.mapping import BagMapping, parse_map, read_toml
 
     content: dict[str, Any] = read_toml(file) if file else {}
     if step is not None:

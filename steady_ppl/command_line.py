@@ -29,13 +29,12 @@ from steady_ppl import (
     command_states,
     command_study,
 )
-from steady_ppl.command_parts import hushed, say
 from steady_ppl.commanded import commanded
 from steady_ppl.errors import SteadyError
 from steady_ppl.outside import as_refusal
 from steady_ppl.progress_line import progress_line
 from steady_ppl.utils.progress import listening
-from steady_ppl.utils.text import tell
+from steady_ppl.utils.text import hushed, say, tell
 
 INTERRUPTED = 130  # what typer returns for Ctrl-C
 # left out of the help, which then fits one screen; as --debug, which the line of an unexpected error names

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from steady_ppl.errors import ComputationError, UsageError
 from steady_ppl.utils.files import whole_file
-from steady_ppl.utils.text import shown, tell
-
-LONGEST = 1000  # characters of a line that is said; a file that somebody gives can put more into it
+from steady_ppl.utils.text import tell
 
 
 def program_from(model: str, seed: int, substeps: int | None = None) -> Any:
@@ -45,31 +41,6 @@ def as_json(content: Any, place: str) -> str:
         return json.dumps(content, indent=1, allow_nan=False)
     except ValueError as error:
         raise ComputationError(f"{place} is not written: a figure is not finite, the program has blown up") from error
-
-
-_quiet: ContextVar[bool] = ContextVar("quiet", default=False)
-
-
-@contextmanager
-def hushed(quiet: bool) -> Iterator[None]:
-    """Say nothing but errors and results, if asked for."""
-    token = _quiet.set(quiet)
-    try:
-        yield
-    finally:
-        _quiet.reset(token)
-
-
-def is_quiet() -> bool:
-    """Whether only errors and results are wanted."""
-    return _quiet.get()
-
-
-def say(line: str, *, always: bool = False) -> None:
-    """A word to the person, beside what a script reads; errors are said `always`."""
-    if always or not is_quiet():
-        lines = [shown(part, LONGEST) for part in line.splitlines()]
-        tell("\n".join([f"steady: {part}" for part in lines[:1]] + lines[1:]), aside=True)
 
 
 def present(text: str, content: Any, json_file: Path | None) -> None:

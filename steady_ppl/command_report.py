@@ -39,10 +39,10 @@ def report(
     What `steady discover … --out RUN` found is shown if one of the runs is such a RUN. The page needs no network.
     """
     from steady_ppl.command_parts import load_runs, run_labels, used_before
+    from steady_ppl.data.table import read_table
     from steady_ppl.reporting import report as gather
     from steady_ppl.run_folder import read_discovery
     from steady_ppl.run_recipe import fingerprint
-    from steady_ppl.table import read_table
     from steady_ppl.utils.files import require_place
 
     *runs, table = arguments

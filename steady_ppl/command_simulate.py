@@ -28,12 +28,13 @@ def simulate(
 ) -> None:
     """Simulate drives of a program, with measurements and true states."""
     from steady_ppl.command_effects import with_effects
-    from steady_ppl.command_parts import program_from, say
+    from steady_ppl.command_parts import program_from
+    from steady_ppl.data.table import read_table, write_table
     from steady_ppl.probe import probe
     from steady_ppl.simulation import simulate as run, simulated_in
     from steady_ppl.substeps import with_substeps
-    from steady_ppl.table import read_table, write_table
     from steady_ppl.utils.progress import stages
+    from steady_ppl.utils.text import say
 
     if controls and trajectories:
         raise UsageError("--controls has as many drives as its table: leave --trajectories out")

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.kernel_writer import LANES
 from steady_ppl.method import Method, close, compiled, distrust
 from steady_ppl.program import Program

@@ -96,7 +96,7 @@ def demonstrate(
 
 def record_drives(tour: Tour, size: Size) -> None:
     """Simulate drives of a hovercraft with drag, and forget its poses."""
-    from steady_ppl.table import read_table, write_table
+    from steady_ppl.data.table import read_table, write_table
 
     tour.step("Record drives, of a hovercraft that does have drag")
     drives = {"train": size.train, "valid": size.valid, "test": size.test}

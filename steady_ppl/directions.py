@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.actuation import lagged
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.linearization import Path
 from steady_ppl.predictions import errors, on_a_circle
 from steady_ppl.program import Program, names, units

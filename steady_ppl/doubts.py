@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pyro.distributions import constraints
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.program import Program, names, units
 
 if TYPE_CHECKING:

@@ -7,11 +7,11 @@ from typing import Any
 
 import torch
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.table import refuse_long
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, labelled
 from steady_ppl.filtering import choose_filter, evidence
 from steady_ppl.fit import Fit
-from steady_ppl.long_drives import refuse_long
 from steady_ppl.measurement_errors import measurement_errors
 from steady_ppl.metrics import forward, forward_mean, map_errors, state_estimation
 from steady_ppl.planar_vehicle import UnknownMap

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, require
 from steady_ppl.gaussian_smoother import find_and_smooth, means_as_path
 from steady_ppl.linearization import why_not_linear

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from steady_ppl import effects
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import RunError
 from steady_ppl.program import Program
 from steady_ppl.program_file import load_program
@@ -24,8 +24,8 @@ from steady_ppl.run_folder import PARAMETERS, POSTERIOR, RECORD, read_record, ru
 from steady_ppl.run_forms import FINISHED
 from steady_ppl.substeps import is_count
 from steady_ppl.training import Trained
-from steady_ppl.utils.files import whole_file
-from steady_ppl.utils.tensor_files import read_tensors, write_tensors
+from steady_ppl.utils.display import Displayed
+from steady_ppl.utils.files import read_tensors, whole_file, write_tensors
 
 if TYPE_CHECKING:
     import arviz
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(repr=False)
-class Fit:
+class Fit(Displayed):
     """A program with fitted parameters.
 
     Attributes:
@@ -57,11 +57,6 @@ class Fit:
 
     def __repr__(self) -> str:
         return f"Fit({self.program}, recipe={self.recipe!r})"
-
-    def _repr_html_(self) -> str:
-        from steady_ppl.display import of_fit
-
-        return of_fit(self)
 
     def posterior(
         self, data: Trajectories, *, draws: int = 100, particles: int | None = None, every: int = 1, seed: int = 0

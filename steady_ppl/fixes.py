@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError
 from steady_ppl.linearization import linearize_sensors
 from steady_ppl.predictions import simulate_again

@@ -10,7 +10,7 @@ import torch
 import xarray
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError
 from steady_ppl.posterior import DIMENSIONS, posterior
 from steady_ppl.predictions import on_a_circle

@@ -6,7 +6,7 @@ import pyro
 import pyro.distributions as dist
 import torch
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, require
 from steady_ppl.particles import STEPS_WORTH_COMPILING, particle_filter
 from steady_ppl.paths import Paths

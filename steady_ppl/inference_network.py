@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import require
 from steady_ppl.gaussian_smoother import find_and_smooth, means_as_path
 from steady_ppl.predictions import on_a_circle

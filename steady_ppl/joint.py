@@ -8,7 +8,7 @@ import pyro
 import pyro.distributions as dist
 from pyro.distributions import constraints
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.program import Program
 from steady_ppl.sites import KnownStart, Observing, masked
 from steady_ppl.substeps import acting_controls, sample_channels

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import torch
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.elements import elements
 from steady_ppl.gaussian_smoother import find_path, resting_path, smooth
 from steady_ppl.linearization import Path

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.compiled_rows import on_all_rows
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError
 from steady_ppl.probe import start_size, step_size
 from steady_ppl.program import Program, names

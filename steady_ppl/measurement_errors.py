@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.filtering import in_parts
 from steady_ppl.particles import particle_filter, roll_out
 from steady_ppl.program import Program

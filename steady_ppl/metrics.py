@@ -10,7 +10,7 @@ import math
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError
 from steady_ppl.filtering import in_parts, run_filter
 from steady_ppl.particles import roll_out

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.distributions import transform_to
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.elements import Element, elements, moved, set_values, values_of
 from steady_ppl.errors import FilterError, require
 from steady_ppl.gaussian_smoother import smooth

@@ -18,7 +18,7 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.compiled import stepping_for
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, ProgramError
 from steady_ppl.paths import Filtered
 from steady_ppl.program import Program

@@ -9,9 +9,9 @@ import torch
 import xarray
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.table import refuse_long
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.filtering import choose_filter, in_parts, run_filter
-from steady_ppl.long_drives import refuse_long
 from steady_ppl.program import Program, for_program, names, units
 from steady_ppl.sites import as_vector
 from steady_ppl.utils.angles import paths_on_one_turn

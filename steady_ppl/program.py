@@ -19,7 +19,7 @@ from torch import Tensor
 from steady_ppl.errors import DataError, ProgramError
 
 if TYPE_CHECKING:
-    from steady_ppl.data import Trajectories
+    from steady_ppl.data.trajectories import Trajectories
 
 
 class _WithEffects(_PyroModuleMeta):

@@ -8,8 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from steady_ppl.command_parts import is_quiet
-from steady_ppl.utils.text import harmless
+from steady_ppl.utils.text import harmless, is_quiet
 
 PATIENCE = 2.0  # s, before anything is said
 CLEAR = "\r\x1b[K"

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, UsageError
 from steady_ppl.filtering import neglected
 from steady_ppl.gaussian_smoother import find_and_smooth, smooth

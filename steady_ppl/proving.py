@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.table import refuse_long
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.doubts import doubts_of_units
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
-from steady_ppl.long_drives import refuse_long
 from steady_ppl.paired_bootstrap import FEWEST
 from steady_ppl.predictions import named_horizons
 from steady_ppl.program import Program, names
@@ -33,6 +33,7 @@ from steady_ppl.proof_rows import (
     keeping_velocity,
     noise_floor,
 )
+from steady_ppl.utils.display import Displayed
 from steady_ppl.utils.progress import stages
 
 COASTING = "constant velocity"
@@ -40,7 +41,7 @@ FAR_OFF = 2.0  # nats of a drive's log p(y) between a particle filter and the li
 
 
 @dataclass(frozen=True, repr=False)
-class Proof:
+class Proof(Displayed):
     """What `prove` found.
 
     Attributes:
@@ -73,12 +74,6 @@ class Proof:
 
     def __repr__(self) -> str:
         return f"Proof({verdict(self)!r})"
-
-    def _repr_html_(self) -> str:
-        from steady_ppl.display import of_result
-        from steady_ppl.proof_pictures import proof_picture
-
-        return of_result(verdict(self), str(self), proof_picture(self))
 
 
 @torch.no_grad()

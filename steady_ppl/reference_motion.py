@@ -12,7 +12,7 @@ import torch
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.linearization import Path
 from steady_ppl.predictions import Prediction, on_a_circle, predict
 from steady_ppl.program import Program

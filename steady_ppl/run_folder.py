@@ -15,9 +15,8 @@ from filelock import FileLock, Timeout
 from steady_ppl.commanded import command_line
 from steady_ppl.errors import RunError
 from steady_ppl.run_forms import BEGUN_RECORD, FINISHED, FINISHED_RECORD, FORMAT, FOUND
-from steady_ppl.utils.files import read_json, require_file, whole_file
+from steady_ppl.utils.files import read_json, read_tensors, require_file, whole_file
 from steady_ppl.utils.schema import misfit, refuse_newer
-from steady_ppl.utils.tensor_files import read_tensors
 
 PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY = (
     "parameters.safetensors",

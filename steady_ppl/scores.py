@@ -24,7 +24,7 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.elements import Element, moved
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.program import Program

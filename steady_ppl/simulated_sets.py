@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.directions import Direction, directions
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import smooth

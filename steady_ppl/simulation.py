@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError, SteadyError
 from steady_ppl.particles import roll_out
 from steady_ppl.program import Program, for_program, names

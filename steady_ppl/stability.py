@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError
 from steady_ppl.program import Program, names
 from steady_ppl.sites import broadcast_event, running

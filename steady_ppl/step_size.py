@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.elements import elements, values_of
 from steady_ppl.errors import FilterError, UsageError
 from steady_ppl.gaussian_smoother import find_path, require_found, resting_path, smooth

@@ -6,7 +6,7 @@ from contextlib import nullcontext
 
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.program import Program
 from steady_ppl.resampling import take
 from steady_ppl.sites import Observing, Recording, Standardised, running

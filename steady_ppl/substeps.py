@@ -28,7 +28,7 @@ from pyro import poutine
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError, UsageError
 from steady_ppl.program import Program
 from steady_ppl.sites import Recording, as_vector, unwrapped

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl import kalman_recursions
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.linearization import Linearization, Path, linearize
 from steady_ppl.program import Program
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from steady_ppl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import TrainingError, require
 from steady_ppl.joint import Joint
 from steady_ppl.program import Program

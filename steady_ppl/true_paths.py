@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, ProgramError
 from steady_ppl.paths import Paths
 from steady_ppl.program import Program, names

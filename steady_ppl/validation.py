@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import require
 from steady_ppl.filtering import log_likelihood
 from steady_ppl.linearization import why_not_linear

@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 from test_import_bag import SCAN, U, taken, values
 
 from steady_ppl import BagColumn, BagMapping, read_bags
-from steady_ppl.bag_clocks import align
+from steady_ppl.data.rosbag.resample import align
 
 
 @settings(max_examples=100, deadline=None)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from steady_ppl import BagColumn, DataError
-from steady_ppl.bag_rows import Series, in_rows
+from steady_ppl.data.rosbag.resample import Series, in_rows
 
 MS = 1_000_000
 STEP = 0.1

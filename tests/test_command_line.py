@@ -14,7 +14,7 @@ from test_alpha_truck import command_log, pose_log, write as write_logs
 
 from steady_ppl import read_table
 from steady_ppl.command_line import run
-from steady_ppl.table import to_frame
+from steady_ppl.data.table import to_frame
 
 # --- simulate ---------------------------------------------------------------------------------------------------------
 

@@ -14,6 +14,7 @@ from pyro.nn import PyroParam
 
 from models.linear_gaussian import LinearGaussian
 from steady_ppl import stack
+from steady_ppl.data.trajectories import joined
 from steady_ppl.discovery import common_noise
 from steady_ppl.discovery.candidates import judged
 from steady_ppl.discovery.common_noise import noise_numbers, with_common_noise
@@ -22,7 +23,6 @@ from steady_ppl.effects import chosen_variant
 from steady_ppl.elements import elements, values_of
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import find_path, smooth
-from steady_ppl.joining import joined
 from steady_ppl.maximum_likelihood import Term, climb, maximise
 
 HIDDEN = 0.15  # m/s², process noise that the sensor of these drives nearly hides

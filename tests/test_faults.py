@@ -18,7 +18,7 @@ from small import HOVERCRAFT, steady, written
 
 import steady_ppl as st
 from steady_ppl.run_folder import LOCK, run_folder
-from steady_ppl.utils.tensor_files import read_tensors
+from steady_ppl.utils.files import read_tensors
 
 HOLDER = """
 import sys

@@ -16,7 +16,7 @@ from small import simulated, steady
 from test_table import same
 
 from steady_ppl import BagColumn, BagMapping, DataError, Trajectories, read_bags, read_table
-from steady_ppl.table import to_frame
+from steady_ppl.data.table import to_frame
 
 TWIST, SCAN, ODOMETRY = "geometry_msgs/msg/Twist", "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 FLOATS = "std_msgs/msg/Float64MultiArray"

@@ -13,8 +13,7 @@ from small import steady
 from test_import_bag import FLOATS, MAPPING, SCAN, TWIST, drive, values
 
 from steady_ppl import BagColumn, BagMapping, UsageError, read_bags, read_table
-from steady_ppl.bag_files import open_bag
-from steady_ppl.bag_listing import listing
+from steady_ppl.data.rosbag.reader import listing, open_bag
 from steady_ppl.errors import SteadyError
 
 Y = ("--map", "y.a=/scan:ranges[0]")

@@ -9,7 +9,7 @@ import torch
 from examples import example
 
 import steady_ppl as st
-from steady_ppl.joining import joined
+from steady_ppl.data.trajectories import joined
 
 
 def table(drives: int, rows: int, seed: int) -> st.Trajectories:

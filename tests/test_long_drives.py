@@ -11,7 +11,7 @@ import torch
 from small import HOVERCRAFT, simulated, steady, written
 
 import steady_ppl as st
-from steady_ppl.long_drives import MOST_ROWS
+from steady_ppl.data.table import MOST_ROWS
 
 
 def test_pieces_are_the_rows_of_their_time_as_they_were():

@@ -9,7 +9,7 @@ import torch
 from examples import example
 
 import steady_ppl as st
-from steady_ppl.stuck import FEWEST, masked, stuck
+from steady_ppl.data.frozen_sensors import FEWEST, masked, stuck
 
 
 def table(rows: int = 61) -> st.Trajectories:

@@ -13,6 +13,7 @@ import truck_logs
 from small import MODELS, steady
 from small_studies import CART, STUDY, written
 
+from steady_ppl.data.table import write_table
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.program_file import load_program
 from steady_ppl.simulation import simulate
@@ -20,7 +21,6 @@ from steady_ppl.studies.job import CHANGED, in_limits, run
 from steady_ppl.studies.job_data import planted, told_settings
 from steady_ppl.studies.runnable import require_runnable
 from steady_ppl.studies.study_file import read_plan
-from steady_ppl.table import write_table
 
 
 def test_every_list_is_an_axis_and_seeds_are_outermost(tmp_path: Path):

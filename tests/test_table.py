@@ -16,9 +16,9 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 
-from steady_ppl.data import Trajectories, pad, pad_time
+from steady_ppl.data.table import from_frame, read_table, to_frame, write_table
+from steady_ppl.data.trajectories import Trajectories, pad, pad_time
 from steady_ppl.errors import DataError
-from steady_ppl.table import from_frame, read_table, to_frame, write_table
 
 SUFFIXES = ("csv", "parquet")
 

@@ -9,7 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.columns import PART, Column, Scoring
 from steady_ppl.elements import Element
 from steady_ppl.errors import FilterError

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.altering import by_channel
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.curves import by_height, multiplier, over_reading, over_state, variables
 from steady_ppl.effects import Variant
 from steady_ppl.program import Program, names

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects import attached
 from steady_ppl.elements import elements, moved, set_values, values_of
 from steady_ppl.errors import FilterError

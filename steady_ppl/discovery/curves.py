@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.altering import channel_means
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects import Effect, Variant
 from steady_ppl.predictions import on_a_circle
 from steady_ppl.program import Program, names, units

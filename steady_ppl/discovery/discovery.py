@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories, joined
 from steady_ppl.discovery.candidates import NATS
 from steady_ppl.discovery.discovery_report import as_text, figures, sentence
 from steady_ppl.discovery.finding import Finding, Shape, findings, shape_of
@@ -22,9 +22,9 @@ from steady_ppl.doubts import doubts_of_units
 from steady_ppl.effects import of_name, record, restore, written_class
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
-from steady_ppl.joining import joined
 from steady_ppl.program import Program, for_program
 from steady_ppl.proving import Proof, far_off, prove
+from steady_ppl.utils.display import Displayed
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
@@ -34,7 +34,7 @@ NOT_CONVERGED = "the program's own fit has not converged: no ranking below is to
 
 
 @dataclass(frozen=True, repr=False)
-class Discovery:
+class Discovery(Displayed):
     """What `discover` found.
 
     Attributes:
@@ -81,12 +81,6 @@ class Discovery:
 
     def __repr__(self) -> str:
         return f"Discovery({sentence(self)!r})"
-
-    def _repr_html_(self) -> str:
-        from steady_ppl.discovery.pictures import discovery_picture
-        from steady_ppl.display import of_result
-
-        return of_result(sentence(self), str(self), discovery_picture(self))
 
 
 def discover(

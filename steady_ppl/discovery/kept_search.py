@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.fit import Fit, program_source, versions
 from steady_ppl.program import Program
 from steady_ppl.run_folder import JOURNAL, require_same, run_folder, write_record

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import torch
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.table import refuse_long
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.elements import elements
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.linearization import why_not_linear
-from steady_ppl.long_drives import refuse_long
 from steady_ppl.program import Program, names
 
 FEWEST_DRIVES, FEWEST_SETS = 5, 50

@@ -27,7 +27,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError
 from steady_ppl.program import Program, names, units
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.declaration import Effect
 from steady_ppl.planar_vehicle import PlanarVehicle
 from steady_ppl.program import Program, names

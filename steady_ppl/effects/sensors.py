@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.declaration import Effect, power_of_two_below
 from steady_ppl.effects.planar_forces import no_bearings
 from steady_ppl.planar_vehicle import PlanarVehicle

@@ -10,7 +10,7 @@ import torch
 
 from steady_ppl.check_pictures import band, measured
 from steady_ppl.checking import Check
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.fit import Fit
 from steady_ppl.program import Program, names, units
 from steady_ppl.reporting.packing import packed

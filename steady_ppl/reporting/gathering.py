@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from steady_ppl.checking import Check, check
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import SteadyError, UsageError
 from steady_ppl.fit import Fit
 from steady_ppl.proving import Proof, prove, unfinished

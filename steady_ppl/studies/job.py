@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery import discover
 from steady_ppl.errors import RunError
 from steady_ppl.evaluation import evaluate

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import sys
 import unicodedata
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 # what moves the cursor, colours, renames the window, turns lines round, is not seen, or cannot be written at all
 UNSEEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # categories of Unicode: control, format, half of a pair, line separators
@@ -43,3 +46,31 @@ def one_line(error: BaseException) -> str:
     """An error's type and the first line of its message."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
+LONGEST = 1000  # characters of a line that is said; a file that somebody gives can put more into it
+
+
+_quiet: ContextVar[bool] = ContextVar("quiet", default=False)
+
+
+@contextmanager
+def hushed(quiet: bool) -> Iterator[None]:
+    """Say nothing but errors and results, if asked for."""
+    token = _quiet.set(quiet)
+    try:
+        yield
+    finally:
+        _quiet.reset(token)
+
+
+def is_quiet() -> bool:
+    """Whether only errors and results are wanted."""
+    return _quiet.get()
+
+
+def say(line: str, *, always: bool = False) -> None:
+    """A word to the person, beside what a script reads; errors are said `always`."""
+    if always or not is_quiet():
+        lines = [shown(part, LONGEST) for part in line.splitlines()]
+        tell("\n".join([f"steady: {part}" for part in lines[:1]] + lines[1:]), aside=True)

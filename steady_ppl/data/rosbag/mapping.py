@@ -13,7 +13,7 @@
     scale = 1.0                     # value = scale * read + offset
     offset = 0.0
 
-`steady_ppl/bags.py` says what each of them does to the numbers.
+`read_bags` says what each of them does to the numbers.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from steady_ppl.bag_fields import Steps, parse_field
+from steady_ppl.data.rosbag.fields import Steps, parse_field
 from steady_ppl.errors import UsageError
 from steady_ppl.utils.files import require_file
 

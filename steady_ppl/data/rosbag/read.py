@@ -17,8 +17,8 @@ A bag has messages at any time; a table has one row every `step` seconds.
   and a new one begins with the first after. It is left out, and this is said, if it has fewer than two rows or no
   measurement.
 - `clock` says whose time counts: the bag's (when a message arrived), the header's (when it was made), or the header's
-  moved onto the bag's (`steady_ppl/bag_clocks.py`). `late` is subtracted last. Messages are then sorted by time; those
-  of one time stay in their order.
+  moved onto the bag's (`resample.align`). `late` is subtracted last. Messages are then sorted by time; those of one
+  time stay in their order.
 - Every bag is a trajectory named after its file, or several, `name-1`, `name-2`, … where it pauses.
 """
 
@@ -30,15 +30,14 @@ from pathlib import Path
 
 import numpy as np
 
-from steady_ppl.bag_clocks import align
-from steady_ppl.bag_fields import check_field, has_stamp, number_at, stamp_of, yaw_at
-from steady_ppl.bag_files import Bag, Say, bag_label, open_bag
-from steady_ppl.bag_mapping import BagColumn, BagMapping
-from steady_ppl.bag_rows import Piece, Series, held_pauses, in_rows
-from steady_ppl.command_parts import say as say_aside
-from steady_ppl.data import Trajectories
+from steady_ppl.data.rosbag.fields import check_field, has_stamp, number_at, stamp_of, yaw_at
+from steady_ppl.data.rosbag.mapping import BagColumn, BagMapping
+from steady_ppl.data.rosbag.reader import Bag, Say, bag_label, open_bag
+from steady_ppl.data.rosbag.resample import Piece, Series, align, held_pauses, in_rows
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.utils.progress import stages
+from steady_ppl.utils.text import say as say_aside
 
 
 def read_bags(paths: Sequence[str | Path], mapping: BagMapping, say: Say = say_aside) -> Trajectories:
@@ -58,7 +57,7 @@ def read_bags(paths: Sequence[str | Path], mapping: BagMapping, say: Say = say_a
     """
     import pandas as pd
 
-    from steady_ppl.table import from_frame
+    from steady_ppl.data.table import from_frame
 
     files = [Path(path) for path in paths]
     labels = [bag_label(file) for file in files]

@@ -5,25 +5,39 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from functools import singledispatch
+from typing import Any
 
 import torch
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-if TYPE_CHECKING:
-    from steady_ppl.data import Trajectories
-    from steady_ppl.fit import Fit
-    from steady_ppl.program import Program
+from steady_ppl import check_report, proof_report
+from steady_ppl.check_pictures import check_picture
+from steady_ppl.checking import Check
+from steady_ppl.data.table import to_frame
+from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.discovery import discovery_report
+from steady_ppl.discovery.discovery import Discovery
+from steady_ppl.discovery.pictures import discovery_picture
+from steady_ppl.fit import Fit
+from steady_ppl.program import Program
+from steady_ppl.proof_pictures import proof_picture
+from steady_ppl.proving import Proof
 
 MOST = 12  # numbers of a parameter that are shown one by one
 DOTS = 90  # an inch, of pictures
 
 
-def of_trajectories(data: Trajectories) -> str:
-    """How many drives and rows, and what is in each column."""
-    from steady_ppl.table import to_frame
+@singledispatch
+def html(value: Any) -> str:
+    """The HTML of a table, a fit or a result."""
+    raise TypeError(f"no HTML is written of a {type(value).__name__}")
 
+
+@html.register
+def _(data: Trajectories) -> str:
+    """How many drives and rows, and what is in each column."""
     frame = to_frame(data)
     shortest, longest = int(data.lengths.min()), int(data.lengths.max())
     lengths = f"{longest}" if shortest == longest else f"{shortest} to {longest}"
@@ -37,7 +51,8 @@ def of_trajectories(data: Trajectories) -> str:
     return str(_sentence(about) + _table(("column", "least", "most", "empty"), rows))
 
 
-def of_fit(fit: Fit) -> str:
+@html.register
+def _(fit: Fit) -> str:
     """Program, recipe, parameters, how it was judged, and what must be known of it."""
     name, trained = type(fit.program).__name__, fit.trained
     said = _sentence(f"{name}, fitted by {fit.recipe}" if trained else f"{name}, recipe {fit.recipe}, nothing learned")
@@ -52,7 +67,22 @@ def of_fit(fit: Fit) -> str:
     return str(said)
 
 
-def of_result(sentence: str, text: str, picture: Figure) -> str:
+@html.register
+def _(found: Check) -> str:
+    return _of_result(check_report.verdict(found), str(found), check_picture(found))
+
+
+@html.register
+def _(found: Proof) -> str:
+    return _of_result(proof_report.verdict(found), str(found), proof_picture(found))
+
+
+@html.register
+def _(found: Discovery) -> str:
+    return _of_result(discovery_report.sentence(found), str(found), discovery_picture(found))
+
+
+def _of_result(sentence: str, text: str, picture: Figure) -> str:
     """A verdict, its picture, and all figures as text to unfold."""
     file = io.BytesIO()
     picture.savefig(file, format="png", dpi=DOTS)

@@ -10,6 +10,8 @@ Columns: `trajectory`, `time` (s), `u.<control>`, `y.<measurement>` and, where k
 from __future__ import annotations
 
 import csv
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -20,8 +22,8 @@ import pyarrow.parquet
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories, pad, pad_time
-from steady_ppl.errors import DataError
+from steady_ppl.data.trajectories import Trajectories, pad, pad_time
+from steady_ppl.errors import DataError, require
 from steady_ppl.utils.files import require_file, whole_file
 from steady_ppl.utils.text import shown
 
@@ -262,3 +264,110 @@ def _fail(
     where = ", ".join(f"{kind} {shown(str(place), 100)}" for kind, place in places if place is not None)
     message = " ".join(f"{name}: {where}{': ' if where else ''}{problem}".split())
     raise DataError(message, column=column, trajectory=trajectory, row=row)
+
+
+def from_arrays(drives: Sequence[Mapping[str, Any]], labels: Sequence[str] | None = None) -> Trajectories:
+    """The trajectories of arrays: for each drive its columns `time`, `u.…`, `y.…` and, where known, `x.…`.
+
+    Args:
+        drives: column → `(rows,)`, or `(rows, K)` for the columns `…_0` to `…_K-1`; NaN is an empty cell.
+        labels: the drives' names, 1, 2, … when not given.
+
+    Raises:
+        DataError: naming the column, the trajectory and the row.
+
+    Example:
+        >>> import numpy as np
+        >>> time = np.arange(3) / 10
+        >>> from_arrays([{"time": time, "u.left": 0 * time, "y.bearing": np.zeros((3, 2))}]).measurement_names
+        ('bearing_0', 'bearing_1')
+    """
+    labels = [str(i + 1) for i in range(len(drives))] if labels is None else list(labels)
+    if not drives or len(labels) != len(drives):
+        raise DataError(f"arrays: got {len(drives)} drives and {len(labels)} labels")
+    repeated = sorted({label for label in labels if labels.count(label) > 1})
+    if repeated:
+        raise DataError(f"arrays: {len(drives)} drives need {len(drives)} labels, and {repeated[0]} is there twice")
+    frames = []
+    for label, drive in zip(labels, drives, strict=True):
+        columns: dict[str, np.ndarray] = {}
+        for name, values in drive.items():
+            values = np.asarray(values)
+            parts = {name: values} if values.ndim < 2 else {f"{name}_{i}": part for i, part in enumerate(values.T)}
+            twice = sorted(parts.keys() & columns.keys() | ({name} & {"trajectory"}))
+            if twice:
+                why = "is what the labels are called" if name == "trajectory" else "is there twice"
+                raise DataError(f"arrays: column {twice[0]} of trajectory {label} {why}", column=twice[0])
+            columns |= parts
+        shapes = {name: values.shape for name, values in columns.items()}
+        if len(set(shapes.values())) > 1 or any(len(shape) != 1 for shape in shapes.values()):
+            told = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+            raise DataError(f"arrays: the columns of trajectory {label} differ in shape: {told}", trajectory=label)
+        frames.append(pd.DataFrame({"trajectory": label} | columns))
+        if set(columns) != set(frames[0].columns) - {"trajectory"}:
+            raise DataError(f"arrays: trajectory {label} has other columns than {labels[0]}", trajectory=label)
+    return from_frame(pd.concat(frames), name="arrays")
+
+
+MOST_PIECES = 1_000_000
+
+
+MOST_ROWS = 20_000
+
+
+def refuse_long(data: Trajectories) -> None:
+    """Whatever looks at a drive as a whole does not begin with one that is longer than `MOST_ROWS`.
+
+    Raises:
+        DataError: naming the longest.
+    """
+    longest = int(data.lengths.argmax())
+    rows = int(data.lengths[longest])
+    if rows > MOST_ROWS:
+        raise DataError(
+            f"trajectory {data.labels[longest]} has {rows} rows, and at most {MOST_ROWS} are looked at in one piece: "
+            "cut it by `steady data cut TABLE --seconds 60 --out PIECES`",
+            trajectory=data.labels[longest],
+        )
+
+
+def cut(data: Trajectories, seconds: float) -> Trajectories:
+    """The same drives in pieces.
+
+    A drive that is longer becomes `…-1`, `…-2`, … Each piece begins at its first row that has a measurement; pieces of
+    one row or without a measurement are left out. Time stays as recorded.
+
+    Args:
+        data: drives with labels.
+        seconds: of a piece.
+
+    Raises:
+        UsageError: no length of time.
+        DataError: nothing is left, or two pieces would have one name.
+
+    Example:
+        >>> import torch
+        >>> from steady_ppl import from_arrays
+        >>> time = torch.arange(50) / 10
+        >>> cut(from_arrays([{"time": time, "u.push": 0 * time, "y.range": time}]), 2.0).labels
+        ('1-1', '1-2', '1-3')
+    """
+    require(0 < seconds < math.inf, "seconds", seconds, "above 0")
+    frame = to_frame(data)
+    drives = frame.groupby("trajectory", sort=False)
+    since = frame["time"] - drives["time"].transform("first")
+    require(float(since.max()) / seconds < MOST_PIECES, "seconds", seconds, f"enough for {MOST_PIECES} pieces")
+    piece = np.floor(since / seconds + 1e-6).astype(int)  # a row that rounding puts before its time is in time
+    measured = frame.filter(regex=r"^y\.").notna().any(axis=1)
+    place = [frame["trajectory"], piece]
+    kept = measured.groupby(place).cummax()
+    kept &= kept.groupby(place).transform("sum") > 1
+    if not kept.any():
+        raise DataError(f"no piece of {seconds:g} s has two rows that begin with a measurement: take longer pieces")
+    several = piece.groupby(frame["trajectory"]).transform("max") > 0
+    called = frame["trajectory"].where(~several, frame["trajectory"].astype(str) + "-" + (piece + 1).astype(str))
+    names = called[kept].groupby([series[kept] for series in place], sort=False).first()
+    if names.duplicated().any():
+        twice = names[names.duplicated()].iloc[0]
+        raise DataError(f"two pieces would be called {twice}: give the trajectories other names", trajectory=twice)
+    return from_frame(frame.assign(trajectory=called)[kept])

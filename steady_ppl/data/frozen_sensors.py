@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from steady_ppl.data import Trajectories
+from steady_ppl.data.trajectories import Trajectories
 
 FEWEST = 12  # rows of a stretch
 STRAIGHT = 1e-6  # of the column's range over all drives, by which a row may be beside the line
