@@ -28,7 +28,7 @@ from steady_ppl import (
     seeded,
     simulate,
 )
-from steady_ppl.program import for_program
+from steady_ppl.model.program import for_program
 
 DRAWS, DRIVES, RUNS = 99, 1200, 40
 CHECKED = 5  # rows of a drive, evenly spread, at which states are ranked

@@ -42,7 +42,7 @@ from steady_ppl import (
     seeded,
 )
 from steady_ppl.gaussian_smoother import find_and_smooth
-from steady_ppl.joint import Joint
+from steady_ppl.model.joint import Joint
 from steady_ppl.proposals import Twist
 
 MUSTS = {"good": Bound(0.05), "first": Bound(0.1)}

@@ -25,7 +25,7 @@ from models.paper import (  # noqa: E402
     PaperTruck,
 )
 from steady_ppl import Fit, PlanarVehicle, Trajectories, seeded, simulate  # noqa: E402
-from steady_ppl.alpha_truck import read_alpha_truck  # noqa: E402
+from steady_ppl.datasets.alpha_truck import read_alpha_truck  # noqa: E402
 from steady_ppl.evaluation import evaluate  # noqa: E402
 
 # Chosen by held-out log p(y): on Hov with simulated drives of the seeds 101 to 104, on the truck with the valid split,

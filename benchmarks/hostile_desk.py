@@ -16,7 +16,7 @@ from hostile_bags import write_bags, write_logs
 
 from steady_ppl import load_program, simulate, write_table
 from steady_ppl.command_line import main
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 
 ROOT = Path(__file__).resolve().parent.parent
 FEW = ("--guide", "bootstrap", "--particles", "20", "--draws", "3", "--steps", "4", "--set", "validate_every=2")

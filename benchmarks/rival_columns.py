@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from steady_ppl import Program, Trajectories
-from steady_ppl.altering import by_channel
 from steady_ppl.discovery.columns import Column, columns_of
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.elements import elements, moved
 from steady_ppl.linearization import Path, linearize
-from steady_ppl.program import names
+from steady_ppl.model.interventions import by_channel
+from steady_ppl.model.program import names
+from steady_ppl.model.substeps import acting_controls
 from steady_ppl.scores import channel_moments
-from steady_ppl.substeps import acting_controls
 
 REGRESSED = ("push", "command", "history")  # forms of effects that change an acceleration
 

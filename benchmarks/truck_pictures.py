@@ -24,8 +24,8 @@ from truck_programs import learnt
 
 from steady_ppl import Program, Trajectories, for_program, roll_out
 from steady_ppl.metrics import forward_mean
-from steady_ppl.sites import AtMean
-from steady_ppl.substeps import acting_controls
+from steady_ppl.model.handlers import AtMean
+from steady_ppl.model.substeps import acting_controls
 
 SHOWN = {
     "fitted": ("#d55e00", "as written, fitted"),

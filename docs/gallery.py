@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from steady_ppl import Program, Trajectories, load_program, simulate
 from steady_ppl.effects import Effect, catalogue
-from steady_ppl.program import for_program, names, units
+from steady_ppl.model.program import for_program, names, units
 
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent

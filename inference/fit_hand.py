@@ -6,7 +6,7 @@ import torch
 
 from steady_ppl import Fit, Trajectories, UsageError, choose_filter, for_program, load_program, run_filter, seeded
 from steady_ppl.errors import require
-from steady_ppl.program import Program, names
+from steady_ppl.model.program import Program, names
 
 from . import fit_truth
 

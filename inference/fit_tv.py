@@ -14,7 +14,7 @@ import torch
 
 from steady_ppl import DataError, Fit, Trajectories, UnknownMap, UsageError, fixes, for_program, seeded
 from steady_ppl.errors import ComputationError, require
-from steady_ppl.program import names
+from steady_ppl.model.program import names
 
 from . import fit_truth
 

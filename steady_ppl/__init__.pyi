@@ -1,14 +1,4 @@
 from . import effects as effects
-from .actuation import delayed as delayed, lagged as lagged
-from .altering import (
-    Coloured as Coloured,
-    blurred as blurred,
-    channel_means as channel_means,
-    heavy_tailed as heavy_tailed,
-    misread as misread,
-    pushed as pushed,
-    widened as widened,
-)
 from .auto_rollout import AutoRollout as AutoRollout
 from .checking import Check as Check, check as check
 from .data.rosbag.mapping import BagColumn as BagColumn, BagMapping as BagMapping
@@ -44,30 +34,40 @@ from .fit import Fit as Fit
 from .fixes import fixes as fixes
 from .guides import PathGuide as PathGuide, SMCGuide as SMCGuide, TruthGuide as TruthGuide
 from .inference_network import InferenceNetwork as InferenceNetwork
-from .joint import Joint as Joint
 from .likelihood_fit import fit_by_likelihood as fit_by_likelihood
 from .linearization import why_not_linear as why_not_linear
 from .linearized_guides import GaussianGuide as GaussianGuide, LookaheadGuide as LookaheadGuide
-from .parameter_draws import ParameterPosterior as ParameterPosterior, parameter_posterior as parameter_posterior
-from .particles import particle_filter as particle_filter, roll_out as roll_out
-from .paths import Filtered as Filtered, Paths as Paths
-from .planar_vehicle import (
+from .model.actuation import delayed as delayed, lagged as lagged
+from .model.distributions import WrappedNormal as WrappedNormal
+from .model.interventions import (
+    Coloured as Coloured,
+    blurred as blurred,
+    channel_means as channel_means,
+    heavy_tailed as heavy_tailed,
+    misread as misread,
+    pushed as pushed,
+    widened as widened,
+)
+from .model.joint import Joint as Joint
+from .model.loading import load_program as load_program
+from .model.planar_vehicle import (
     ExplicitEuler as ExplicitEuler,
     PlanarVehicle as PlanarVehicle,
     UnknownMap as UnknownMap,
-    WrappedNormal as WrappedNormal,
     bearings_to as bearings_to,
     dense as dense,
     stack as stack,
 )
-from .program import Program as Program, for_program as for_program
-from .program_file import load_program as load_program
+from .model.program import Program as Program, for_program as for_program
+from .model.substeps import with_substeps as with_substeps
+from .parameter_draws import ParameterPosterior as ParameterPosterior, parameter_posterior as parameter_posterior
+from .particles import particle_filter as particle_filter, roll_out as roll_out
+from .paths import Filtered as Filtered, Paths as Paths
 from .proof_pictures import open_loop_picture as open_loop_picture
 from .proving import Proof as Proof, prove as prove
 from .reporting import Report as Report, report as report
 from .simulation import simulate as simulate
 from .smoother_guide import SmootherGuide as SmootherGuide
-from .substeps import with_substeps as with_substeps
 from .tempering import Constant as Constant, LinearRamp as LinearRamp
 from .training import Optimization as Optimization, Trained as Trained, train as train
 from .utils.angles import wrap as wrap

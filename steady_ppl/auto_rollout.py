@@ -14,8 +14,8 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError
-from steady_ppl.probe import start_size, step_size
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
+from steady_ppl.model.validate import start_size, step_size
 from steady_ppl.variational_guides import VariationalGuide
 
 

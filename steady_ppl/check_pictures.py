@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from steady_ppl.check_report import unit_of, verdict
-from steady_ppl.program import names, units
+from steady_ppl.model.program import names, units
 from steady_ppl.reference_motion import Reference
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.misfit_maps import Cell, Finding
-from steady_ppl.program import names, units
+from steady_ppl.model.program import names, units
 from steady_ppl.reference_motion import ABOUT, Reference
 
 if TYPE_CHECKING:

@@ -27,8 +27,8 @@ from steady_ppl.fit import Fit
 from steady_ppl.gaussian_smoother import find_and_smooth
 from steady_ppl.linearization import why_not_linear
 from steady_ppl.misfit_maps import Misfit, Residuals, judge
+from steady_ppl.model.program import Program, for_program, names
 from steady_ppl.predictions import Prediction, named_horizons, predict
-from steady_ppl.program import Program, for_program, names
 from steady_ppl.reference_motion import Reference, constant_velocity, last_measurement
 from steady_ppl.simulated_sets import FEWEST, residuals, simulate_sets
 from steady_ppl.step_size import StepCheck, check_step

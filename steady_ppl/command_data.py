@@ -28,8 +28,8 @@ def alpha_truck(
     The logs are published in datasets/alpha_truck of the repository MrVPlusOne/STEADY on GitHub. They are real motion
     capture and commands; the bearings are simulated from the true poses. True states are kept in the x. columns.
     """
-    from steady_ppl.alpha_truck import read_alpha_truck
     from steady_ppl.data.table import write_table
+    from steady_ppl.datasets.alpha_truck import read_alpha_truck
 
     write_table(read_alpha_truck(folder, sigma_degrees=sigma_deg, seed=seed, centred=centred), out)
 

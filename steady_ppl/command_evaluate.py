@@ -37,9 +37,9 @@ def evaluate(
     from steady_ppl.data.table import read_table
     from steady_ppl.doubts import doubts_of_units
     from steady_ppl.evaluation import evaluate_all, incomparable, table_of
+    from steady_ppl.model.loading import load_program
+    from steady_ppl.model.program import for_program
     from steady_ppl.paths import FEW
-    from steady_ppl.program import for_program
-    from steady_ppl.program_file import load_program
     from steady_ppl.run_recipe import fingerprint
     from steady_ppl.utils.files import require_place
     from steady_ppl.utils.text import say

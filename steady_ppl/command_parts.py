@@ -15,9 +15,9 @@ from steady_ppl.utils.text import tell
 def program_from(model: str, seed: int, substeps: int | None = None) -> Any:
     """Load a program, its random initial weights keyed by the seed, and try it once on a probe; with as many substeps a
     row as its class says when None."""
-    from steady_ppl.probe import probe
-    from steady_ppl.program_file import load_program
-    from steady_ppl.substeps import with_substeps
+    from steady_ppl.model.loading import load_program
+    from steady_ppl.model.substeps import with_substeps
+    from steady_ppl.model.validate import probe
     from steady_ppl.utils.random import seeded
 
     with seeded(seed, "program"):

@@ -30,9 +30,9 @@ def simulate(
     from steady_ppl.command_effects import with_effects
     from steady_ppl.command_parts import program_from
     from steady_ppl.data.table import read_table, write_table
-    from steady_ppl.probe import probe
+    from steady_ppl.model.substeps import with_substeps
+    from steady_ppl.model.validate import probe
     from steady_ppl.simulation import simulate as run, simulated_in
-    from steady_ppl.substeps import with_substeps
     from steady_ppl.utils.progress import stages
     from steady_ppl.utils.text import say
 

@@ -15,12 +15,12 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.kernel_writer import LANES
 from steady_ppl.method import Method, close, compiled, distrust
-from steady_ppl.program import Program
+from steady_ppl.model.handlers import Observing, Recording, Standardised, running
+from steady_ppl.model.program import Program
+from steady_ppl.model.substeps import advance
 from steady_ppl.resampling import by_component
 from steady_ppl.scalar_graph import NotCompilable
-from steady_ppl.sites import Observing, Recording, Standardised, running
 from steady_ppl.stepping import Stepping
-from steady_ppl.substeps import advance
 
 FILTER = "filter"  # the name of what is compiled for it
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from steady_ppl.kernel_writer import LANES
 from steady_ppl.method import Method, close, compiled, distrust
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 
 ROWS_WORTH_COMPILING = 1000  # of all trajectories together
 Function = Callable[..., Tensor]

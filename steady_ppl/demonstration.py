@@ -17,7 +17,7 @@ from typing import Any
 
 from steady_ppl.command_tour import WIDTH, Tour
 from steady_ppl.errors import ComputationError, RunError
-from steady_ppl.program_file import load_program
+from steady_ppl.model.loading import load_program
 from steady_ppl.rooms import TRUTH, empty_again, workbench
 from steady_ppl.run_folder import read_record
 

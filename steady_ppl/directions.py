@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from steady_ppl.actuation import lagged
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.linearization import Path
+from steady_ppl.model.actuation import lagged
+from steady_ppl.model.handlers import AtMean, running
+from steady_ppl.model.program import Program, names, units
+from steady_ppl.model.substeps import acting_controls, advance, row_controls
 from steady_ppl.predictions import errors, on_a_circle
-from steady_ppl.program import Program, names, units
-from steady_ppl.sites import AtMean, running
-from steady_ppl.substeps import acting_controls, advance, row_controls
 from steady_ppl.tracking import Tracked
 from steady_ppl.utils.angles import wrap, wrap_angles
 

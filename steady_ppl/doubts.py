@@ -10,7 +10,7 @@ from pyro.distributions import constraints
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.program import Program, names, units
+from steady_ppl.model.program import Program, names, units
 
 if TYPE_CHECKING:
     from steady_ppl.fit import Fit

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from steady_ppl.effects import attached
 from steady_ppl.errors import UsageError
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 
 LARGEST = 60  # parameters that are screened one by one; networks have more
 RELATIVE = 1e-3  # of a number, by which differences move it at least: single precision has seven digits

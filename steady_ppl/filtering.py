@@ -18,9 +18,9 @@ from steady_ppl.errors import DataError, require
 from steady_ppl.gaussian_smoother import find_and_smooth, means_as_path
 from steady_ppl.linearization import why_not_linear
 from steady_ppl.lookahead import Lookahead
+from steady_ppl.model.program import Program
 from steady_ppl.particles import particle_filter
 from steady_ppl.paths import Filtered
-from steady_ppl.program import Program
 from steady_ppl.proposals import Twist
 
 

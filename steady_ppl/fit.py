@@ -18,11 +18,11 @@ import torch
 from steady_ppl import effects
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import RunError
-from steady_ppl.program import Program
-from steady_ppl.program_file import load_program
+from steady_ppl.model.loading import load_program
+from steady_ppl.model.program import Program
+from steady_ppl.model.substeps import is_count
 from steady_ppl.run_folder import PARAMETERS, POSTERIOR, RECORD, read_record, run_folder, write_record
 from steady_ppl.run_forms import FINISHED
-from steady_ppl.substeps import is_count
 from steady_ppl.training import Trained
 from steady_ppl.utils.display import Displayed
 from steady_ppl.utils.files import read_tensors, whole_file, write_tensors

@@ -18,10 +18,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.linearization import Path, linearize
 from steady_ppl.lookahead import Lookahead, look_ahead
-from steady_ppl.particles import particle_filter
-from steady_ppl.paths import Paths
-from steady_ppl.program import Program
-from steady_ppl.sites import (
+from steady_ppl.model.handlers import (
     KnownStart,
     Recording,
     Replaying,
@@ -31,8 +28,11 @@ from steady_ppl.sites import (
     normal_moments,
     running,
 )
-from steady_ppl.stability import divergence
-from steady_ppl.substeps import acting_controls, sample_channels
+from steady_ppl.model.program import Program
+from steady_ppl.model.stability import divergence
+from steady_ppl.model.substeps import acting_controls, sample_channels
+from steady_ppl.particles import particle_filter
+from steady_ppl.paths import Paths
 from steady_ppl.utils.angles import wrap_angles
 
 WORSE = 10.0  # nats by which a step may leave a path worse off, see `_Merit`: some such steps lead out of a bad place

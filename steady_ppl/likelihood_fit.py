@@ -17,7 +17,7 @@ from steady_ppl.gaussian_smoother import find_path, resting_path, smooth
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.maximum_likelihood import Maximum, maximise
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 from steady_ppl.scores import smoothed, widens
 from steady_ppl.utils.progress import stages
 

@@ -18,9 +18,7 @@ from torch import Tensor
 from steady_ppl.compiled_rows import on_all_rows
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError
-from steady_ppl.probe import start_size, step_size
-from steady_ppl.program import Program, names
-from steady_ppl.sites import (
+from steady_ppl.model.handlers import (
     AtMean,
     Observing,
     Recording,
@@ -31,7 +29,9 @@ from steady_ppl.sites import (
     running,
     tangent_normal,
 )
-from steady_ppl.substeps import acting_controls, advance
+from steady_ppl.model.program import Program, names
+from steady_ppl.model.substeps import acting_controls, advance
+from steady_ppl.model.validate import start_size, step_size
 from steady_ppl.utils.angles import wrap
 
 

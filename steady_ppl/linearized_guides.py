@@ -20,7 +20,7 @@ from steady_ppl.gaussian_smoother import (
 from steady_ppl.guides import FilteringGuide, PathGuide
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 from steady_ppl.proposals import Twist
 from steady_ppl.tempering import LinearRamp, Tempering
 

@@ -20,7 +20,7 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 from steady_ppl.scores import parameter_scores, smoothed
 from steady_ppl.utils.journal import Piece, piece
 from steady_ppl.utils.progress import stages

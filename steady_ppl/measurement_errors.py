@@ -9,11 +9,11 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.filtering import in_parts
+from steady_ppl.model.handlers import AtMean, Recording, as_vector, residual, running
+from steady_ppl.model.program import Program
+from steady_ppl.model.substeps import acting_controls
 from steady_ppl.particles import particle_filter, roll_out
-from steady_ppl.program import Program
 from steady_ppl.resampling import systematic, take
-from steady_ppl.sites import AtMean, Recording, as_vector, residual, running
-from steady_ppl.substeps import acting_controls
 
 OPEN_LOOP = {"open_loop_1s": 1.0, "open_loop_3s": 3.0}
 OPEN_LOOP_DRAWS = 64

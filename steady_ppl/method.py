@@ -17,7 +17,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from steady_ppl.kernel_writer import source
 from steady_ppl.kernels import Kernel
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 from steady_ppl.scalar_graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph
 from steady_ppl.tangents import jacobian
 from steady_ppl.translation import Translation, evaluate

@@ -13,11 +13,11 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError
 from steady_ppl.filtering import in_parts, run_filter
+from steady_ppl.model.handlers import AtMean
+from steady_ppl.model.planar_vehicle import PlanarVehicle
+from steady_ppl.model.program import Program, error_groups, names
+from steady_ppl.model.substeps import acting_controls
 from steady_ppl.particles import roll_out
-from steady_ppl.planar_vehicle import PlanarVehicle
-from steady_ppl.program import Program, error_groups, names
-from steady_ppl.sites import AtMean
-from steady_ppl.substeps import acting_controls
 from steady_ppl.utils.angles import wrap
 
 Errors = dict[str, float]

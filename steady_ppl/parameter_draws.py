@@ -26,7 +26,7 @@ from steady_ppl.errors import FilterError, require
 from steady_ppl.gaussian_smoother import smooth
 from steady_ppl.linearization import Path
 from steady_ppl.maximum_likelihood import PASSES, REACH, TOLERANCE, log_prior, maximise, posterior_score
-from steady_ppl.program import Program, for_program
+from steady_ppl.model.program import Program, for_program
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 

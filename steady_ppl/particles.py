@@ -20,14 +20,14 @@ from torch import Tensor
 from steady_ppl.compiled import stepping_for
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, ProgramError
+from steady_ppl.model.handlers import KnownStart, Recording, Standardised, broadcast_event, running
+from steady_ppl.model.program import Program
+from steady_ppl.model.stability import divergence
+from steady_ppl.model.substeps import advance, channel_values
 from steady_ppl.paths import Filtered
-from steady_ppl.program import Program
 from steady_ppl.proposals import Proposal
 from steady_ppl.resampling import effective_sample_size, normalise, systematic, take
-from steady_ppl.sites import KnownStart, Recording, Standardised, broadcast_event, running
-from steady_ppl.stability import divergence
 from steady_ppl.stepping import Stepping
-from steady_ppl.substeps import advance, channel_values
 
 STEPS_WORTH_COMPILING = 1_000_000  # steps of particles, which take the program's own lines a second
 OnFrame = Callable[[int, Tensor, Tensor, Tensor], None]

@@ -15,6 +15,7 @@ import torch
 from matplotlib.axes import Axes
 
 from steady_ppl.errors import UsageError
+from steady_ppl.model.program import names
 from steady_ppl.posterior_pictures import (
     LANDMARK,
     TRUTH,
@@ -25,7 +26,6 @@ from steady_ppl.posterior_pictures import (
     require_trajectory,
     with_unit,
 )
-from steady_ppl.program import names
 from steady_ppl.proof_pictures import open_loop_picture
 from steady_ppl.training_pictures import held_out_curve, observation_noise, particle_curve
 from steady_ppl.utils.angles import nearest_turn

@@ -12,8 +12,8 @@ from torch import Tensor
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.filtering import choose_filter, in_parts, run_filter
-from steady_ppl.program import Program, for_program, names, units
-from steady_ppl.sites import as_vector
+from steady_ppl.model.handlers import as_vector
+from steady_ppl.model.program import Program, for_program, names, units
 from steady_ppl.utils.angles import paths_on_one_turn
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded

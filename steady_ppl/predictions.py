@@ -11,11 +11,11 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.linearization import Path
-from steady_ppl.program import Program
+from steady_ppl.model.handlers import AtMean, Observing, Recording, as_vector, residual, running
+from steady_ppl.model.program import Program
+from steady_ppl.model.substeps import acting_controls, advance
 from steady_ppl.simulation import measure
-from steady_ppl.sites import AtMean, Observing, Recording, as_vector, residual, running
 from steady_ppl.stepping import Stepping
-from steady_ppl.substeps import acting_controls, advance
 from steady_ppl.tracking import Tracked
 
 

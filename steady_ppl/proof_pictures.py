@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from steady_ppl.errors import UsageError
-from steady_ppl.program import units
+from steady_ppl.model.program import units
 from steady_ppl.proof_report import FLOOR, units_of_states
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from steady_ppl.effects import attached
+from steady_ppl.model.program import names, units
 from steady_ppl.paired_bootstrap import LEVEL, RESAMPLES, Change, paired
-from steady_ppl.program import names, units
 from steady_ppl.proof_rows import BANDS, Key, Row
 
 if TYPE_CHECKING:

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.linearization import Path
+from steady_ppl.model.handlers import AtMean, Recording, Standardised, as_vector, normal_moments, running
+from steady_ppl.model.program import Program
+from steady_ppl.model.substeps import acting_controls, advance, sample_channels
 from steady_ppl.predictions import Prediction, on_a_circle, predict
-from steady_ppl.program import Program
-from steady_ppl.sites import AtMean, Recording, Standardised, as_vector, normal_moments, running
-from steady_ppl.substeps import acting_controls, advance, sample_channels
 from steady_ppl.tracking import Tracked, track
 from steady_ppl.utils.angles import wrap
 

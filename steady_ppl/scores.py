@@ -27,9 +27,18 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.elements import Element, moved
 from steady_ppl.lookahead import Lookahead
-from steady_ppl.program import Program
-from steady_ppl.sites import AtMean, Recording, Standardised, as_vector, normal_moments, residual, running, unwrapped
-from steady_ppl.substeps import acting_controls, advance, channel_scales, sample_channels
+from steady_ppl.model.handlers import (
+    AtMean,
+    Recording,
+    Standardised,
+    as_vector,
+    normal_moments,
+    residual,
+    running,
+    unwrapped,
+)
+from steady_ppl.model.program import Program
+from steady_ppl.model.substeps import acting_controls, advance, channel_scales, sample_channels
 from steady_ppl.utils.angles import wrap_angles
 
 Moments = tuple[Tensor, Tensor]

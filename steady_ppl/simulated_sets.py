@@ -19,8 +19,8 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import smooth
 from steady_ppl.linearization import Path
 from steady_ppl.misfit_maps import Residuals
+from steady_ppl.model.program import Program, names
 from steady_ppl.predictions import Prediction, predict, simulate_again
-from steady_ppl.program import Program, names
 from steady_ppl.tracking import Tracked, track
 
 FEWEST = 20  # sets

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError, SteadyError
+from steady_ppl.model.handlers import Recording, as_vector, broadcast_event, running
+from steady_ppl.model.program import Program, for_program, names
+from steady_ppl.model.stability import counts_rows, is_step
+from steady_ppl.model.substeps import MAX_SUBSTEPS, acting_controls, with_substeps
 from steady_ppl.particles import roll_out
-from steady_ppl.program import Program, for_program, names
-from steady_ppl.sites import Recording, as_vector, broadcast_event, running
-from steady_ppl.stability import counts_rows, is_step
-from steady_ppl.substeps import MAX_SUBSTEPS, acting_controls, with_substeps
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import one_line

@@ -11,7 +11,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError
 from steady_ppl.gaussian_smoother import find_and_smooth
 from steady_ppl.lookahead import Steering
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 from steady_ppl.utils.angles import wrap
 from steady_ppl.variational_guides import VariationalGuide, log_ratio, times
 

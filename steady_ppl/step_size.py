@@ -20,10 +20,10 @@ from steady_ppl.gaussian_smoother import find_path, require_found, resting_path,
 from steady_ppl.likelihood_fit import roomy_path
 from steady_ppl.linearization import Path
 from steady_ppl.maximum_likelihood import Maximum, maximise
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
+from steady_ppl.model.stability import can_be_cut, counts_rows, is_step
+from steady_ppl.model.substeps import MAX_SUBSTEPS, with_substeps
 from steady_ppl.scores import widens
-from steady_ppl.stability import can_be_cut, counts_rows, is_step
-from steady_ppl.substeps import MAX_SUBSTEPS, with_substeps
 from steady_ppl.utils.random import seeded
 
 MIN_GAIN = 3.0  # nats, of all drives together, from which a finer step counts

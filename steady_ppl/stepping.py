@@ -7,10 +7,10 @@ from contextlib import nullcontext
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.program import Program
+from steady_ppl.model.handlers import Observing, Recording, Standardised, running
+from steady_ppl.model.program import Program
+from steady_ppl.model.substeps import acting_controls, advance, standardised
 from steady_ppl.resampling import take
-from steady_ppl.sites import Observing, Recording, Standardised, running
-from steady_ppl.substeps import acting_controls, advance, standardised
 
 
 class Stepping:

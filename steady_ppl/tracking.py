@@ -17,7 +17,7 @@ from torch import Tensor
 from steady_ppl import kalman_recursions
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.linearization import Linearization, Path, linearize
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 
 
 @dataclass(frozen=True)

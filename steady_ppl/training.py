@@ -19,8 +19,8 @@ from tqdm import tqdm
 from steady_ppl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import TrainingError, require
-from steady_ppl.joint import Joint
-from steady_ppl.program import Program
+from steady_ppl.model.joint import Joint
+from steady_ppl.model.program import Program
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import tell
 from steady_ppl.validation import Validation, as_good

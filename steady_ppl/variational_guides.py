@@ -17,10 +17,10 @@ from torch import Tensor, nn
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import require
 from steady_ppl.guides import sample_known
+from steady_ppl.model.handlers import KnownStart, Recording, Replaying, Standardised, broadcast_event, running
+from steady_ppl.model.program import Program
+from steady_ppl.model.substeps import acting_controls, sample_channels, sample_row
 from steady_ppl.paths import Paths
-from steady_ppl.program import Program
-from steady_ppl.sites import KnownStart, Recording, Replaying, Standardised, broadcast_event, running
-from steady_ppl.substeps import acting_controls, sample_channels, sample_row
 from steady_ppl.tempering import Constant, Tempering
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl import Trajectories, load_program, seeded, simulate
-from steady_ppl.program import Program, for_program
+from steady_ppl.model.program import Program, for_program
 
 MODELS = Path(__file__).parent.parent / "models"
 

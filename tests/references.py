@@ -15,8 +15,8 @@ from examples import copies, example
 from torch import Tensor
 
 from steady_ppl import Program, Trajectories, stack
-from steady_ppl.program import names
-from steady_ppl.sites import Observing, Recording, Standardised, running
+from steady_ppl.model.handlers import Observing, Recording, Standardised, running
+from steady_ppl.model.program import names
 
 FOLDER = Path(__file__).parent / "reference"
 

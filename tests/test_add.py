@@ -15,7 +15,7 @@ from small import steady
 
 from steady_ppl import UsageError, load_program, simulate
 from steady_ppl.effects import Effect, attached, catalogue, not_applicable, register, registry, write_program
-from steady_ppl.program import names
+from steady_ppl.model.program import names
 
 SYSTEMS = ("hovercraft", "truck", "pendulum")
 ROOT = MODELS.parent

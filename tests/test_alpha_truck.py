@@ -10,9 +10,9 @@ import pytest
 import torch
 from truck_logs import RADIUS, TURN_RATE, command_log, pose_log, write
 
-from steady_ppl.alpha_truck import LANDMARKS, read_alpha_truck
 from steady_ppl.data.frozen_sensors import stuck
 from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.datasets.alpha_truck import LANDMARKS, read_alpha_truck
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.utils.angles import wrap
 

@@ -17,7 +17,7 @@ from small import HOVERCRAFT, only_start, simulated, steady, written
 from test_recipes import held_out, same, values
 
 from steady_ppl import UsageError, bearings_to, load_program, seeded, simulate
-from steady_ppl.planar_vehicle import PlanarVehicle
+from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.run_recipe import find_recipe
 
 QUIET = {"progress": False}

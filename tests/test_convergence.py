@@ -14,10 +14,10 @@ from examples import MODELS, example
 
 from steady_ppl import for_program, seeded, simulate, with_substeps
 from steady_ppl.effects import catalogue, chosen_variant
+from steady_ppl.model.handlers import AtMean
+from steady_ppl.model.program import names
+from steady_ppl.model.substeps import acting_controls
 from steady_ppl.particles import roll_out
-from steady_ppl.program import names
-from steady_ppl.sites import AtMean
-from steady_ppl.substeps import acting_controls
 
 PROGRAMS = (
     "hovercraft",

@@ -8,8 +8,8 @@ from examples import drives, example
 from oracles import assert_mean
 
 import steady_ppl as st
-from steady_ppl.sites import AtMean, running
-from steady_ppl.substeps import acting_controls
+from steady_ppl.model.handlers import AtMean, running
+from steady_ppl.model.substeps import acting_controls
 
 
 def dynamics(name: str = "hovercraft.py:HovercraftTruth", **effects: float):

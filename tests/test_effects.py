@@ -18,10 +18,10 @@ from steady_ppl import Fit, Joint, TruthGuide, UsageError, channel_means, for_pr
 from steady_ppl.effects import Effect, attached, catalogue, chosen_variant, find, not_applicable, parsed, record
 from steady_ppl.effects.page import page
 from steady_ppl.filtering import log_likelihood
-from steady_ppl.probe import probe
-from steady_ppl.program import names
-from steady_ppl.sites import Recording, Replaying
-from steady_ppl.substeps import acting_controls, sample_row
+from steady_ppl.model.handlers import Recording, Replaying
+from steady_ppl.model.program import names
+from steady_ppl.model.substeps import acting_controls, sample_row
+from steady_ppl.model.validate import probe
 from steady_ppl.true_paths import true_paths
 
 PROGRAMS = ("hovercraft", "truck", "pendulum")

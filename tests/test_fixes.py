@@ -135,6 +135,6 @@ def test_fit_tv_says_how_many_rows_it_interpolated() -> None:
 
 
 def load_recipe(name: str):
-    from steady_ppl.program_file import run_file
+    from steady_ppl.model.loading import run_file
 
     return run_file(recipe_folder() / f"{name}.py")

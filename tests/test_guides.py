@@ -32,8 +32,8 @@ from steady_ppl import (
     simulate,
     stack,
 )
-from steady_ppl.sites import Replaying, running
-from steady_ppl.substeps import sample_row
+from steady_ppl.model.handlers import Replaying, running
+from steady_ppl.model.substeps import sample_row
 from steady_ppl.true_paths import true_paths
 
 

@@ -20,7 +20,7 @@ from examples import MODELS, example
 from small import FEW, HOVERCRAFT, QUICK, contents, rewritten, simulated, steady, tree, written
 
 import steady_ppl as st
-from steady_ppl.alpha_truck import read_alpha_truck
+from steady_ppl.datasets.alpha_truck import read_alpha_truck
 from steady_ppl.errors import DataError, RunError
 from steady_ppl.utils.files import read_json, require_file
 from steady_ppl.utils.schema import NUMBER, TEXT, WHOLE, Absent, Among, Maybe, misfit

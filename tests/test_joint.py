@@ -16,8 +16,8 @@ from pyro.infer import Trace_ELBO
 from torch import Tensor
 
 from steady_ppl import Joint, PathGuide, Paths, Program, Trajectories, particle_filter, seeded, stack
-from steady_ppl.sites import Observing, Replaying
-from steady_ppl.substeps import sample_row
+from steady_ppl.model.handlers import Observing, Replaying
+from steady_ppl.model.substeps import sample_row
 
 PROGRAMS = (
     "linear_gaussian",

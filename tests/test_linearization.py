@@ -16,8 +16,8 @@ from torch import Tensor
 
 from steady_ppl import Program, ProgramError, seeded, stack
 from steady_ppl.linearization import Linearization, Path, linearize, why_not_linear
-from steady_ppl.sites import Standardised, running
-from steady_ppl.substeps import advance
+from steady_ppl.model.handlers import Standardised, running
+from steady_ppl.model.substeps import advance
 
 PROGRAMS = (
     "linear_gaussian",

@@ -17,8 +17,8 @@ from steady_ppl import particle_filter, seeded, stack, twisting
 from steady_ppl.gaussian_smoother import smooth, smoother_paths
 from steady_ppl.linearization import Path, linearize
 from steady_ppl.lookahead import look_ahead
+from steady_ppl.model.handlers import Standardised, running
 from steady_ppl.proposals import Twist
-from steady_ppl.sites import Standardised, running
 
 
 def anywhere(program, data) -> Path:

@@ -12,10 +12,10 @@ from oracles import CartPosterior, assert_mean, cart_parameters
 from small import simulated
 
 from steady_ppl import Fit, Trajectories
+from steady_ppl.model.handlers import Replaying
+from steady_ppl.model.program import names
+from steady_ppl.model.substeps import sample_row
 from steady_ppl.posterior import posterior
-from steady_ppl.program import names
-from steady_ppl.sites import Replaying
-from steady_ppl.substeps import sample_row
 
 ROWS = 9
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from steady_ppl import ProgramError, for_program, load_program, log_likelihood, simulate
-from steady_ppl.probe import probe
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
+from steady_ppl.model.validate import probe
 
 BOAT = """\
 import pyro

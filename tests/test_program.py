@@ -15,8 +15,8 @@ from pyro.nn import PyroParam
 from small import HOVERCRAFT
 
 from steady_ppl import DataError, Program, ProgramError, load_program, simulate
-from steady_ppl.probe import probe
-from steady_ppl.program import error_groups, for_program, names, units
+from steady_ppl.model.program import error_groups, for_program, names, units
+from steady_ppl.model.validate import probe
 
 BOAT = """\
 from steady_ppl import Program

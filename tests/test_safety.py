@@ -30,7 +30,7 @@ CALLS = {
 }  # fmt: skip
 METHODS = {"exec_module", "load_module", "to_pickle", "read_pickle"}
 ALLOWED = {
-    ("steady_ppl/program_file.py", "exec_module"): "a program or recipe that the person names is code",
+    ("steady_ppl/model/loading.py", "exec_module"): "a program or recipe that the person names is code",
     ("steady_ppl/__init__.py", "importlib.import_module"): "the package's own names, from a list in the file",
     ("steady_ppl/__init__.py", "import_module"): "the package's own names, from a list in the file",
     (

@@ -15,7 +15,7 @@ from small_studies import CART, STUDY, written
 
 from steady_ppl.data.table import write_table
 from steady_ppl.errors import DataError, UsageError
-from steady_ppl.program_file import load_program
+from steady_ppl.model.loading import load_program
 from steady_ppl.simulation import simulate
 from steady_ppl.studies.job import CHANGED, in_limits, run
 from steady_ppl.studies.job_data import planted, told_settings

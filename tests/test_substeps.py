@@ -37,14 +37,9 @@ from steady_ppl.compiled import CompiledStepping, stepping_for
 from steady_ppl.compiled_rows import on_all_rows
 from steady_ppl.gaussian_smoother import find_path, smooth
 from steady_ppl.linearization import linearize
-from steady_ppl.particles import roll_out
-from steady_ppl.probe import probe
-from steady_ppl.simulation import simulated_in, simulated_substeps
-from steady_ppl.sites import AtMean, Recording, Standardised, running
-from steady_ppl.stability import counts_rows, is_step
-from steady_ppl.step_size import check_step
-from steady_ppl.stepping import Stepping
-from steady_ppl.substeps import (
+from steady_ppl.model.handlers import AtMean, Recording, Standardised, running
+from steady_ppl.model.stability import counts_rows, is_step
+from steady_ppl.model.substeps import (
     acting_controls,
     advance,
     channel_scales,
@@ -52,6 +47,11 @@ from steady_ppl.substeps import (
     row_controls,
     sample_channels,
 )
+from steady_ppl.model.validate import probe
+from steady_ppl.particles import roll_out
+from steady_ppl.simulation import simulated_in, simulated_substeps
+from steady_ppl.step_size import check_step
+from steady_ppl.stepping import Stepping
 
 K = 3
 

@@ -16,8 +16,8 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import smooth
 from steady_ppl.linearization import Path
 from steady_ppl.lookahead import Lookahead
+from steady_ppl.model.program import Program
 from steady_ppl.predictions import simulate_again
-from steady_ppl.program import Program
 from steady_ppl.scores import parameter_scores, smoothed
 from steady_ppl.utils.random import seeded
 

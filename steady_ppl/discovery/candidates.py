@@ -21,7 +21,7 @@ from steady_ppl.elements import Element, elements
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian_smoother import smooth
 from steady_ppl.lookahead import Lookahead
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 from steady_ppl.scores import measured, smoothed, typical_spreads
 from steady_ppl.utils.journal import Piece, piece
 from steady_ppl.utils.random import seeded

@@ -9,13 +9,13 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from steady_ppl.altering import by_channel
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.curves import by_height, multiplier, over_reading, over_state, variables
 from steady_ppl.effects import Variant
-from steady_ppl.program import Program, names
+from steady_ppl.model.interventions import by_channel
+from steady_ppl.model.program import Program, names
+from steady_ppl.model.substeps import acting_controls, row_controls
 from steady_ppl.scores import Smoothed, channel_moments, measured, substep_spreads
-from steady_ppl.substeps import acting_controls, row_controls
 
 PART = 400  # trajectories at a time
 

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 
-from steady_ppl.altering import channel_means
 from steady_ppl.discovery.curves import variables
 from steady_ppl.discovery.refits import Fold, Refit
 from steady_ppl.effects import Variant
-from steady_ppl.program import Program, names
-from steady_ppl.substeps import acting_controls, row_controls
+from steady_ppl.model.interventions import channel_means
+from steady_ppl.model.program import Program, names
+from steady_ppl.model.substeps import acting_controls, row_controls
 
 if TYPE_CHECKING:
     from steady_ppl.discovery.discovery import Discovery

@@ -13,7 +13,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.refits import Fold, Refit, as_declared
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.elements import Element, moved
-from steady_ppl.program import Program, names
+from steady_ppl.model.program import Program, names
 from steady_ppl.scores import measured, substep_spreads
 
 

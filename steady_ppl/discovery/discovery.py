@@ -22,7 +22,7 @@ from steady_ppl.doubts import doubts_of_units
 from steady_ppl.effects import of_name, record, restore, written_class
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
-from steady_ppl.program import Program, for_program
+from steady_ppl.model.program import Program, for_program
 from steady_ppl.proving import Proof, far_off, prove
 from steady_ppl.utils.display import Displayed
 from steady_ppl.utils.progress import stages

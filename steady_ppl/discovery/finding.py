@@ -17,7 +17,7 @@ from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.rounds import MARGIN, Found, Search
 from steady_ppl.discovery.screening import Tested
 from steady_ppl.effects import Variant, attached
-from steady_ppl.program import Program, names
+from steady_ppl.model.program import Program, names
 
 INTERVAL = 0.9
 RESAMPLES = 2000

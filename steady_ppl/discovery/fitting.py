@@ -24,7 +24,7 @@ from steady_ppl.linearization import Path
 from steady_ppl.linearized_guides import LookaheadGuide
 from steady_ppl.lookahead import Lookahead
 from steady_ppl.maximum_likelihood import Maximum, kept_maximum, maximise
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 from steady_ppl.tempering import Constant
 from steady_ppl.training import Optimization, train
 from steady_ppl.utils.random import seeded

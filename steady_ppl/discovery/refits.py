@@ -20,7 +20,7 @@ from steady_ppl.gaussian_smoother import find_path
 from steady_ppl.likelihood_fit import fit_by_likelihood, led_back
 from steady_ppl.linearization import Path
 from steady_ppl.maximum_likelihood import Maximum, maximise
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 from steady_ppl.scores import widens
 from steady_ppl.utils.random import seeded
 

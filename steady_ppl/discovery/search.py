@@ -28,9 +28,9 @@ from steady_ppl.discovery.refits import Refit, Worth, first_refit
 from steady_ppl.discovery.rounds import MARGIN, Found, Round, Search
 from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
+from steady_ppl.model.substeps import with_substeps
 from steady_ppl.step_size import StepCheck, check_step
-from steady_ppl.substeps import with_substeps
 from steady_ppl.utils.progress import stages
 
 BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another

@@ -14,11 +14,11 @@ from pyro.distributions import constraints
 from pyro.nn import PyroParam
 from torch import Tensor
 
-from steady_ppl.altering import Coloured, blurred, channel_means, heavy_tailed, misread, pushed, widened
 from steady_ppl.effects.declaration import Effect, Variant
 from steady_ppl.effects.registry import chosen_variant, is_known
 from steady_ppl.errors import UsageError
-from steady_ppl.program import Program, names
+from steady_ppl.model.interventions import Coloured, blurred, channel_means, heavy_tailed, misread, pushed, widened
+from steady_ppl.model.program import Program, names
 
 Methods = dict[str, Any]
 

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError
-from steady_ppl.program import Program, names, units
+from steady_ppl.model.program import Program, names, units
 
 VERDICTS = {
     "push": "dynamics",

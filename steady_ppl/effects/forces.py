@@ -9,7 +9,7 @@ import torch
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.declaration import Effect
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 
 
 def _axes(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:

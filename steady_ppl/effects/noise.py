@@ -9,8 +9,8 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.declaration import Effect
 from steady_ppl.effects.planar_forces import no_bearings
 from steady_ppl.effects.wheels import needs_commanded_speed
-from steady_ppl.planar_vehicle import PlanarVehicle
-from steady_ppl.program import Program, names
+from steady_ppl.model.planar_vehicle import PlanarVehicle
+from steady_ppl.model.program import Program, names
 
 
 def _groups(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from steady_ppl.effects.declaration import VERDICTS, Effect
 from steady_ppl.effects.registry import catalogue, not_applicable
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 
 HEAD = """# Effects
 

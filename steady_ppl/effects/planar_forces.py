@@ -10,9 +10,9 @@ import torch
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.declaration import Effect
-from steady_ppl.planar_vehicle import PlanarVehicle
-from steady_ppl.program import Program, names
-from steady_ppl.sites import broadcast_event, running
+from steady_ppl.model.handlers import broadcast_event, running
+from steady_ppl.model.planar_vehicle import PlanarVehicle
+from steady_ppl.model.program import Program, names
 from steady_ppl.utils.random import seeded
 
 STARTS = 500  # drawn, where nothing else says where a vehicle goes

@@ -18,7 +18,7 @@ from steady_ppl.effects.methods import Layer, fits, imports, layer_of, methods
 from steady_ppl.effects.registry import chosen_variant
 from steady_ppl.effects.source import WIDTH, broken
 from steady_ppl.errors import UsageError
-from steady_ppl.program import Program, names
+from steady_ppl.model.program import Program, names
 
 
 def program_text(program: Program, class_name: str, base: type[Program], module: str, values: Sequence[str]) -> str:

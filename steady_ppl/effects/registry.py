@@ -15,7 +15,7 @@ from steady_ppl.effects.planar_forces import PLANAR_FORCES
 from steady_ppl.effects.sensors import SENSORS
 from steady_ppl.effects.wheels import WHEELS
 from steady_ppl.errors import UsageError
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 
 _EFFECTS: list[Effect] = [*FORCES, *PLANAR_FORCES, *WHEELS, *ACTUATORS, *SENSORS, *NOISES]
 

@@ -8,8 +8,8 @@ from typing import Any
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.declaration import Effect, power_of_two_below
 from steady_ppl.effects.planar_forces import no_bearings
-from steady_ppl.planar_vehicle import PlanarVehicle
-from steady_ppl.program import Program, names, units
+from steady_ppl.model.planar_vehicle import PlanarVehicle
+from steady_ppl.model.program import Program, names, units
 
 
 def _each(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:

@@ -10,7 +10,7 @@ import torch
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.declaration import Effect
 from steady_ppl.effects.planar_forces import needs_grip, not_planar
-from steady_ppl.program import Program, names
+from steady_ppl.model.program import Program, names
 
 
 def needs_commanded_speed(program: Program) -> str | None:

@@ -12,9 +12,9 @@ from steady_ppl.effects.attach import added, written_class
 from steady_ppl.effects.program_text import program_text, tensor_text
 from steady_ppl.effects.source import broken
 from steady_ppl.errors import UsageError
-from steady_ppl.probe import probe
-from steady_ppl.program import Program
-from steady_ppl.program_file import load_program
+from steady_ppl.model.loading import load_program
+from steady_ppl.model.program import Program
+from steady_ppl.model.validate import probe
 from steady_ppl.utils.files import whole_file
 
 

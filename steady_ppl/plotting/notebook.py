@@ -21,7 +21,7 @@ from steady_ppl.discovery import discovery_report
 from steady_ppl.discovery.discovery import Discovery
 from steady_ppl.discovery.pictures import discovery_picture
 from steady_ppl.fit import Fit
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 from steady_ppl.proof_pictures import proof_picture
 from steady_ppl.proving import Proof
 

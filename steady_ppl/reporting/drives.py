@@ -12,7 +12,7 @@ from steady_ppl.check_pictures import band, measured
 from steady_ppl.checking import Check
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.fit import Fit
-from steady_ppl.program import Program, names, units
+from steady_ppl.model.program import Program, names, units
 from steady_ppl.reporting.packing import packed
 from steady_ppl.utils.angles import nearest_turn
 

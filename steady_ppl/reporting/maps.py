@@ -10,7 +10,7 @@ from steady_ppl.check_pictures import subject
 from steady_ppl.check_report import place, sentence
 from steady_ppl.checking import Check
 from steady_ppl.misfit_maps import Cell
-from steady_ppl.program import names
+from steady_ppl.model.program import names
 from steady_ppl.reporting.packing import packed
 
 AROUND = 0.5  # s shown before and after a stretch

@@ -19,8 +19,8 @@ from steady_ppl.errors import RunError
 from steady_ppl.evaluation import evaluate
 from steady_ppl.filtering import choose_filter, log_likelihood
 from steady_ppl.fit import Fit, packages
-from steady_ppl.program import for_program
-from steady_ppl.program_file import load_program
+from steady_ppl.model.loading import load_program
+from steady_ppl.model.program import for_program
 from steady_ppl.run_recipe import find_recipe, require_settings, trains
 from steady_ppl.studies.job_data import drives, planted, told, told_settings
 from steady_ppl.studies.job_files import JobFiles

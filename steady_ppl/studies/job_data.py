@@ -8,14 +8,14 @@ from typing import Any
 
 import torch
 
-from steady_ppl.alpha_truck import read_alpha_truck
 from steady_ppl.command_effects import with_effects
 from steady_ppl.data.table import read_table
 from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.datasets.alpha_truck import read_alpha_truck
 from steady_ppl.effects import Variant, chosen_variant, parsed
 from steady_ppl.errors import DataError, UsageError
-from steady_ppl.program import Program
-from steady_ppl.program_file import load_program
+from steady_ppl.model.loading import load_program
+from steady_ppl.model.program import Program
 from steady_ppl.simulation import simulate
 from steady_ppl.studies.job_files import PARTS, TABLES, is_program
 from steady_ppl.studies.plan import Job

@@ -11,7 +11,7 @@ from typing import Any
 
 from steady_ppl.errors import UsageError
 from steady_ppl.fit import sha256
-from steady_ppl.program_file import program_file
+from steady_ppl.model.loading import program_file
 from steady_ppl.run_recipe import recipe_file
 from steady_ppl.studies.plan import Job
 from steady_ppl.utils.files import require_file

@@ -9,8 +9,8 @@ from typing import Any
 from steady_ppl.discovery import discover
 from steady_ppl.errors import UsageError, labelled
 from steady_ppl.measurement_errors import OPEN_LOOP
-from steady_ppl.program import Program, error_groups, for_program
-from steady_ppl.program_file import load_program
+from steady_ppl.model.loading import load_program
+from steady_ppl.model.program import Program, error_groups, for_program
 from steady_ppl.run_recipe import find_recipe, require_kind, require_settings
 from steady_ppl.simulation import simulate
 from steady_ppl.studies.job import ERRORS

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError
-from steady_ppl.program import Program, names
-from steady_ppl.sites import broadcast_event, running
-from steady_ppl.substeps import MAX_SUBSTEPS, Held, advance, with_substeps, within_row
+from steady_ppl.model.handlers import broadcast_event, running
+from steady_ppl.model.program import Program, names
+from steady_ppl.model.substeps import MAX_SUBSTEPS, Held, advance, with_substeps, within_row
 from steady_ppl.utils.random import seeded
 
 GROWTH = 1.1  # of a deviation over a row, from which it counts

@@ -60,7 +60,7 @@ class Program(PyroModule, metaclass=_WithEffects):
         decays: weight decay relative to the recipe's, by the beginning of a parameter's name; only the matrices of
             `torch.nn.Linear` decay.
         resting: state components that start at zero in every drive; a table need not have them.
-        substeps: in how many steps of `transition` the program takes a row; see `steady_ppl.substeps`.
+        substeps: in how many steps of `transition` the program takes a row; see `steady_ppl.model.substeps`.
         duration, step: of a simulated trajectory, s.
         simulated_step: the longest substep of a simulated trajectory, s.
     """

@@ -9,9 +9,9 @@ import pyro.distributions as dist
 from pyro.distributions import constraints
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.program import Program
-from steady_ppl.sites import KnownStart, Observing, masked
-from steady_ppl.substeps import acting_controls, sample_channels
+from steady_ppl.model.handlers import KnownStart, Observing, masked
+from steady_ppl.model.program import Program
+from steady_ppl.model.substeps import acting_controls, sample_channels
 
 
 class Joint:

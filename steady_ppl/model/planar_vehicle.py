@@ -9,13 +9,12 @@ from typing import ClassVar
 
 import pyro.distributions as dist
 import torch
-from pyro.distributions import constraints
 from torch import Tensor, nn
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError, UsageError
-from steady_ppl.program import Program, names
-from steady_ppl.utils.angles import wrap
+from steady_ppl.model.distributions import WrappedNormal
+from steady_ppl.model.program import Program, names
 
 
 class PlanarVehicle(Program):
@@ -168,45 +167,6 @@ def dense(layer: nn.Linear, inputs: Tensor) -> Tensor:
     columns = inputs.movedim(-1, 0).flatten(1)
     outputs = torch.addmm(layer.bias.unsqueeze(-1), layer.weight, columns)
     return outputs.view(-1, *inputs.shape[:-1]).movedim(0, -1)
-
-
-class WrappedNormal(dist.Normal):
-    """Normal(0, scale) on the difference of two angles, wrapped to [−π, π].
-
-    The neglected windings hold less than 10⁻¹⁸ of the mass at a scale of 20°, 3 · 10⁻⁴ at 50°.
-    """
-
-    support = constraints.real
-
-    def residual(self, value: Tensor) -> Tensor:
-        """`value − loc`, wrapped."""
-        return wrap(value - self.loc)
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        return -0.5 * (self.residual(value) / self.scale) ** 2 - self.scale.log() - 0.5 * math.log(2 * math.pi)
-
-    def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:
-        return wrap(super().rsample(torch.Size(sample_shape)))
-
-    def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
-        with torch.no_grad():
-            return self.rsample(sample_shape)
-
-
-class WrappedStudentT(dist.StudentT):
-    """Student t on the difference of two angles, wrapped to [−π, π]; its mass beyond half a turn is neglected."""
-
-    support = constraints.real
-
-    def residual(self, value: Tensor) -> Tensor:
-        """`value − loc`, wrapped."""
-        return wrap(value - self.loc)
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        return dist.StudentT(self.df, torch.zeros_like(self.loc), self.scale).log_prob(self.residual(value))
-
-    def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:
-        return wrap(super().rsample(torch.Size(sample_shape)))
 
 
 def bearings_to(landmarks: Sequence[Sequence[float]] | Tensor, state: Tensor, sd: float | Tensor) -> dist.Independent:

@@ -15,10 +15,10 @@ from pyro import poutine
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
-from steady_ppl.planar_vehicle import WrappedNormal, WrappedStudentT
-from steady_ppl.program import Program, names
-from steady_ppl.sites import AtMean, Recording, as_vector, normal_moments, unwrapped
-from steady_ppl.substeps import row_ends
+from steady_ppl.model.distributions import WrappedNormal, WrappedStudentT
+from steady_ppl.model.handlers import AtMean, Recording, as_vector, normal_moments, unwrapped
+from steady_ppl.model.program import Program, names
+from steady_ppl.model.substeps import row_ends
 
 Change = Callable[[Any, slice], Any]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import CodeType, ModuleType
 
 from steady_ppl.errors import ProgramError, SteadyError
-from steady_ppl.program import Program
+from steady_ppl.model.program import Program
 from steady_ppl.utils.files import require_file
 from steady_ppl.utils.text import one_line
 

@@ -13,10 +13,10 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.errors import ProgramError, SteadyError
-from steady_ppl.program import Program, names
-from steady_ppl.sites import Broadcasting, Observing, Recording, Replaying, broadcast_event, running
-from steady_ppl.stability import require_convergence
-from steady_ppl.substeps import MAX_SUBSTEPS, is_count
+from steady_ppl.model.handlers import Broadcasting, Observing, Recording, Replaying, broadcast_event, running
+from steady_ppl.model.program import Program, names
+from steady_ppl.model.stability import require_convergence
+from steady_ppl.model.substeps import MAX_SUBSTEPS, is_count
 from steady_ppl.utils.text import one_line
 
 DRAWS, ROWS, TRAJECTORIES = 7, 11, 13

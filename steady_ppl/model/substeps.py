@@ -30,8 +30,8 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError, UsageError
-from steady_ppl.program import Program
-from steady_ppl.sites import Recording, as_vector, unwrapped
+from steady_ppl.model.handlers import Recording, as_vector, unwrapped
+from steady_ppl.model.program import Program
 
 MAX_SUBSTEPS = 1000  # of a row
 LEAST = 0.1  # share of a channel's standard deviation in a substep that it has on average over a row, at least

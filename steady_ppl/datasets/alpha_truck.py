@@ -20,7 +20,7 @@ import torch
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
-from steady_ppl.planar_vehicle import bearings_to
+from steady_ppl.model.planar_vehicle import bearings_to
 from steady_ppl.utils.angles import wrap
 from steady_ppl.utils.files import require_file
 from steady_ppl.utils.random import seeded
