@@ -7,7 +7,7 @@ from typing import Any
 
 import lazy_loader
 
-from steady_ppl.utils.display import Displayed
+from steady_ppl.utils import late
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
@@ -18,4 +18,16 @@ def _html(value: Any) -> str:
     return html(value)
 
 
-Displayed.renderer = staticmethod(_html)
+def _attach_listed(program: Any) -> Any:
+    from steady_ppl.effects.attach import attach_listed
+
+    return attach_listed(program)
+
+
+def _with_effect(program: Any, *arguments: Any, **options: Any) -> Any:
+    from steady_ppl.effects.attach import with_effect
+
+    return with_effect(program, *arguments, **options)
+
+
+late.html, late.attach_listed, late.with_effect = _html, _attach_listed, _with_effect

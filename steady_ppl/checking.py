@@ -33,7 +33,7 @@ from steady_ppl.reference_motion import Reference, constant_velocity, last_measu
 from steady_ppl.simulated_sets import FEWEST, residuals, simulate_sets
 from steady_ppl.step_size import StepCheck, check_step
 from steady_ppl.tracking import track
-from steady_ppl.utils.display import Displayed
+from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 

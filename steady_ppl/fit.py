@@ -24,8 +24,8 @@ from steady_ppl.model.substeps import is_count
 from steady_ppl.run_folder import PARAMETERS, POSTERIOR, RECORD, read_record, run_folder, write_record
 from steady_ppl.run_forms import FINISHED
 from steady_ppl.training import Trained
-from steady_ppl.utils.display import Displayed
 from steady_ppl.utils.files import read_tensors, whole_file, write_tensors
+from steady_ppl.utils.late import Displayed
 
 if TYPE_CHECKING:
     import arviz

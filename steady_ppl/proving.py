@@ -33,7 +33,7 @@ from steady_ppl.proof_rows import (
     keeping_velocity,
     noise_floor,
 )
-from steady_ppl.utils.display import Displayed
+from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.progress import stages
 
 COASTING = "constant velocity"

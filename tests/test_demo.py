@@ -8,6 +8,7 @@ from small import steady
 
 from steady_ppl import Fit, RunError, command_tour, demonstration, load_program, read_table
 from steady_ppl.demonstration import RECORD, Size, demonstrate
+from steady_ppl.effects import attached
 from steady_ppl.errors import ComputationError
 from steady_ppl.run_folder import write_record
 
@@ -48,7 +49,7 @@ def test_what_it_adds_is_a_program_that_was_fitted(told: tuple[Path, list[str]])
     found = json.loads((out / "discovery.json").read_text())["effects"]
     assert found
     for name in (finding["effect"].split(":")[0] for finding in found):
-        assert name in program.attached and name in file.stem
+        assert name in [variant.effect.name for variant in attached(program)] and name in file.stem
         assert not getattr(after.program, name).equal(getattr(program, name))
 
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.errors import DataError
-from steady_ppl.utils.display import Displayed
+from steady_ppl.utils.late import Displayed
 
 ALIKE = 1.25  # ratio of the drives' steps up to which they count as one
 

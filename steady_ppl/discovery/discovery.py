@@ -24,7 +24,7 @@ from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.proving import Proof, far_off, prove
-from steady_ppl.utils.display import Displayed
+from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 

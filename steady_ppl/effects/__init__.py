@@ -11,9 +11,9 @@ from steady_ppl.effects.attach import (
     with_effect,
     written_class,
 )
+from steady_ppl.effects.codegen import write_program
 from steady_ppl.effects.declaration import Effect, Variant
 from steady_ppl.effects.registry import catalogue, chosen_variant, find, not_applicable, of_name, parsed, register
-from steady_ppl.effects.writing import write_program
 
 __all__ = [
     "Effect",

@@ -15,7 +15,7 @@ from pyro.nn import PyroParam
 from torch import Tensor
 
 from steady_ppl.effects.declaration import Effect, Variant
-from steady_ppl.effects.registry import chosen_variant, is_known
+from steady_ppl.effects.registry import chosen_variant, is_known, parsed
 from steady_ppl.errors import UsageError
 from steady_ppl.model.interventions import Coloured, blurred, channel_means, heavy_tailed, misread, pushed, widened
 from steady_ppl.model.program import Program, names
@@ -61,6 +61,15 @@ def attach(program: Program, variant: Variant, value: float | Sequence[float] | 
         setattr(program, name, PyroParam(start, _constraint(effect)))
     program.priors = {**program.priors, name: prior(effect)}  # type: ignore[misc]
     program.rates = {name: _rate(variant), **program.rates}  # type: ignore[misc]
+    return program
+
+
+def attach_listed(program: Program) -> Program:
+    """Give this very program the effects that its class lists."""
+    for text in program.effects:
+        name, at, options, value = parsed(text)
+        attach(program, chosen_variant(program, name, at, **options), value)
+    type(program).__name__ = written_class(program).__name__
     return program
 
 

@@ -1,7 +1,7 @@
 """What an effect is: a name, an equation, and a function that says how it acts on a program.
 
 The function is written like a method of the program (`self` is the program, shapes as in `transition` and `observe`)
-with the coefficient as `c`; it has one `return`, at its end. The form says what it takes and returns:
+with the coefficient as `c`. The form says what it takes and returns:
 
     push       (self, state, control, time, step, c)   adds to channels' means: {channel: (...)}; may ask for `mean`
     command    (self, state, control, time, c)         the control that acts, (..., U)

@@ -7,38 +7,41 @@ all times at once.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import pyro
 import torch
 from pyro.nn import PyroModule, PyroParam, PyroSample
-from pyro.nn.module import _PyroModuleMeta
 from torch import Tensor
 
 from steady_ppl.errors import DataError, ProgramError
+from steady_ppl.utils import late
 
 if TYPE_CHECKING:
     from steady_ppl.data.trajectories import Trajectories
 
 
-class _WithEffects(_PyroModuleMeta):
-    """Adds the effects that a class lists when one of it is made."""
+def _then_effects(init: Callable[..., None]) -> Callable[..., None]:
+    """An `__init__` after which the program, once the outermost is done, has the effects that its class lists."""
 
-    effects: Sequence[str]
+    @wraps(init)
+    def wrapped(self: Any, *arguments: Any, **options: Any) -> None:
+        outermost = "_begun" not in self.__dict__
+        self.__dict__["_begun"] = True
+        try:
+            init(self, *arguments, **options)
+        finally:
+            if outermost:
+                del self.__dict__["_begun"]
+        if outermost and self.effects:
+            late.attach_listed(self)
 
-    def __call__(cls, *arguments: Any, **options: Any) -> Any:
-        program = super().__call__(*arguments, **options)
-        if cls.effects:
-            from steady_ppl.effects import attach, chosen_variant, parsed
-
-            for text in cls.effects:
-                name, at, where, value = parsed(text)
-                attach(program, chosen_variant(program, name, at, **where), value)
-        return program
+    return wrapped
 
 
-class Program(PyroModule, metaclass=_WithEffects):
+class Program(PyroModule):
     """A state-space model as a Pyro program.
 
     A subclass declares its components as "name [unit]" and writes three methods. `...` is any shape, the same for all
@@ -52,8 +55,8 @@ class Program(PyroModule, metaclass=_WithEffects):
         angles: the state components that live on a circle.
         error_groups: what an error is reported for: name → components whose Euclidean norm it is.
         motion: channel → the state components that are its position and its velocity; the generic effects go by it.
-        effects: names of effects that the program has besides what it writes out, see `steady_ppl.effects`.
-        attached: coefficient's name → the effect that a program written by `steady add` has, as users write it.
+        effects: effects that the program has besides what it writes out: `("linear_drag=0.1", "slope=0.05,-0.03")`.
+        attached: coefficient's name → the effect that has it.
         guesses: beginnings of the names of parameters whose declared value is a guess, from which a fit may depart.
         priors: parameter's name → its prior, a Pyro distribution over the parameter's value.
         rates: learning rates relative to the recipe's, by the beginning of a parameter's name.
@@ -84,10 +87,16 @@ class Program(PyroModule, metaclass=_WithEffects):
     step: float = 0.1
     simulated_step: float = 0.005
 
+    @_then_effects
     def __init__(self) -> None:
         # parameters belong to this object, not to Pyro's global store, where a second program would find them
         with pyro.settings.context(module_local_params=True):
             super().__init__()
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "__init__" in vars(cls):
+            cls.__init__ = _then_effects(cls.__init__)  # type: ignore[method-assign]
 
     def __setattr__(self, name: str, value: Any) -> None:
         hidden = isinstance(value, PyroParam | PyroSample | torch.nn.Parameter) and hasattr(type(self), name)
@@ -169,9 +178,7 @@ class Program(PyroModule, metaclass=_WithEffects):
 
     def with_effect(self, effect: Any, value: Any = None, **where: Any) -> Program:
         """A copy with a physical effect added, its coefficient a learnable parameter; see `effects.attach`."""
-        from steady_ppl.effects import with_effect
-
-        return with_effect(self, effect, value, **where)
+        return late.with_effect(self, effect, value, **where)
 
     def example_controls(self, time: Tensor) -> Tensor:
         """Controls of simulated drives, `(rows, trajectories, U)` at `time` of `(rows, trajectories)`; zero unless
