@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
+from steady_ppl.effects.attach import with_effects
 from steady_ppl.errors import UsageError
 from steady_ppl.utils.text import tell
 
@@ -54,31 +55,6 @@ def effects(
 ) -> None:
     """List the physical effects that a program may lack."""
     from steady_ppl.command_parts import program_from
-    from steady_ppl.effects.page import page
+    from steady_ppl.effects.registry import page
 
     tell(page(program_from(model, 0) if model else None), end="")
-
-
-def with_effects(program: Any, effects: list[str], say: Any) -> Any:
-    """A program with effects as users write them; says which values they have."""
-    from steady_ppl.effects import added, chosen_variant, parsed, set_coefficient
-
-    named: list[str] = []
-    for text in effects:
-        name, at, options, value = parsed(text)
-        variant = chosen_variant(program, name, at, **options)
-        if variant.name in named:
-            raise UsageError(f"effect {variant.name} is given twice")
-        named.append(variant.name)
-        there = [known for known in added(program) if known.name == variant.name]
-        if there and (not options or dict(there[0].options) == dict(variant.options)):
-            variant, origin = there[0], "as given" if value else "of the run"
-            if value is not None:
-                program = set_coefficient(program, variant, value)
-        else:
-            program, origin = program.with_effect(variant, value), "as given" if value else "typical"
-            variant = added(program)[-1]
-        numbers = getattr(program, variant.parameter).detach().flatten().tolist()
-        unit = "" if variant.unit == "1" else f" {variant.unit}"
-        say(f"{variant.label} = {', '.join(f'{number:.4g}' for number in numbers)}{unit} ({origin})")
-    return program

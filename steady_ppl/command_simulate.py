@@ -27,9 +27,9 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate drives of a program, with measurements and true states."""
-    from steady_ppl.command_effects import with_effects
     from steady_ppl.command_parts import program_from
     from steady_ppl.data.table import read_table, write_table
+    from steady_ppl.effects.attach import with_effects
     from steady_ppl.model.substeps import with_substeps
     from steady_ppl.model.validate import probe
     from steady_ppl.simulation import simulate as run, simulated_in

@@ -16,7 +16,7 @@ from small import steady
 from inference import steady as recipe
 from steady_ppl import Fit, Joint, TruthGuide, UsageError, channel_means, for_program, load_program, simulate
 from steady_ppl.effects import Effect, attached, catalogue, chosen_variant, find, not_applicable, parsed, record
-from steady_ppl.effects.page import page
+from steady_ppl.effects.registry import page
 from steady_ppl.filtering import log_likelihood
 from steady_ppl.model.handlers import Recording, Replaying
 from steady_ppl.model.program import names

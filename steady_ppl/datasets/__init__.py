@@ -1,1 +1,1 @@
-"""."""
+"""Published logs as trajectories."""

@@ -7,13 +7,13 @@ import math
 from dataclasses import replace
 from typing import Any
 
-from steady_ppl.effects.actuators import ACTUATORS
-from steady_ppl.effects.declaration import Effect, Variant
-from steady_ppl.effects.forces import FORCES
-from steady_ppl.effects.noise import NOISES
-from steady_ppl.effects.planar_forces import PLANAR_FORCES
-from steady_ppl.effects.sensors import SENSORS
-from steady_ppl.effects.wheels import WHEELS
+from steady_ppl.effects.catalogue.actuators import ACTUATORS
+from steady_ppl.effects.catalogue.forces import FORCES
+from steady_ppl.effects.catalogue.noise import NOISES
+from steady_ppl.effects.catalogue.planar_forces import PLANAR_FORCES
+from steady_ppl.effects.catalogue.sensors import SENSORS
+from steady_ppl.effects.catalogue.wheels import WHEELS
+from steady_ppl.effects.declaration import VERDICTS, Effect, Variant
 from steady_ppl.errors import UsageError
 from steady_ppl.model.program import Program
 
@@ -145,3 +145,43 @@ def _numbers(text: str, numbers: str, most: int | None = None) -> tuple[float, .
     if not found or len(found) > (most or len(found)):
         raise UsageError(f"effect {text}: expected NAME or NAME=NUMBER (NUMBER,NUMBER for two components)")
     return found
+
+
+HEAD = """# Effects
+
+What `steady effects` prints. `steady simulate MODEL --effect NAME[:AT][:OPTION=NUMBER][=NUMBER[,NUMBER]]` adds one to \
+a simulation, `steady add` writes it into a program, `program.with_effect(NAME, VALUE)` does so in Python. `c` is the \
+coefficient; without a value it is the typical one.
+"""
+
+
+def page(program: Program | None = None) -> str:
+    """All effects, or those that a program could have and why it could not have the others, in Markdown."""
+    lines = [HEAD]
+    for verdict in dict.fromkeys(VERDICTS.values()):
+        chosen = [effect for effect in catalogue(program) if effect.verdict == verdict]
+        if chosen:
+            header = ["name", *(["at"] * bool(program)), "equation", "unit of c", "typical c", "options", "feels"]
+            lines += [f"## {verdict.capitalize()}", "", f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
+        for effect in chosen:
+            typical = effect.typical if isinstance(effect.typical, tuple) else (effect.typical,)
+            cells = (
+                f"`{effect.name}`",
+                *([", ".join(_places(effect, program))] if program else []),
+                effect.text.replace("|", r"\|"),
+                effect.unit,
+                ", ".join(f"{value:.3g}" for value in typical),
+                ", ".join(effect.profiled),
+                effect.feels,
+            )
+            lines.append(f"| {' | '.join(cells)} |".replace("|  |", "| |"))
+        lines += [""] * bool(chosen)
+    if program is not None:
+        lines += [f"## Not for {type(program).__name__}", ""]
+        lines += [f"- `{name}`: {reason}" for name, reason in not_applicable(program).items()]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _places(effect: Effect, program: Program) -> list[str]:
+    """Where it can act, the first where nothing is said."""
+    return list(dict.fromkeys(variant.at for variant in effect.variants(program) if variant.at))

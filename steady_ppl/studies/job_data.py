@@ -8,11 +8,11 @@ from typing import Any
 
 import torch
 
-from steady_ppl.command_effects import with_effects
 from steady_ppl.data.table import read_table
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.datasets.alpha_truck import read_alpha_truck
 from steady_ppl.effects import Variant, chosen_variant, parsed
+from steady_ppl.effects.attach import with_effects
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.model.loading import load_program
 from steady_ppl.model.program import Program

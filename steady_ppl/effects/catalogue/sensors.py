@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.effects.catalogue.planar_forces import no_bearings
 from steady_ppl.effects.declaration import Effect, power_of_two_below
-from steady_ppl.effects.planar_forces import no_bearings
 from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.model.program import Program, names, units
 

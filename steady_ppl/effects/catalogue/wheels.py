@@ -8,8 +8,8 @@ from typing import Any
 import torch
 
 from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.effects.catalogue.planar_forces import needs_grip, not_planar
 from steady_ppl.effects.declaration import Effect
-from steady_ppl.effects.planar_forces import needs_grip, not_planar
 from steady_ppl.model.program import Program, names
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.effects.catalogue.planar_forces import not_planar
 from steady_ppl.effects.declaration import Effect, power_of_two_below
-from steady_ppl.effects.planar_forces import not_planar
 from steady_ppl.model.actuation import delayed, lagged
 from steady_ppl.model.program import Program, names, units
 

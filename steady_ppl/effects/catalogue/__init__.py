@@ -1,0 +1,1 @@
+"""The effects that everybody has, by what they act on. Each file ends in the list that `registry` reads."""
