@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.kernel_writer import LANES
-from steady_ppl.method import Method, close, compiled, distrust
+from steady_ppl.kernels.codegen import LANES
+from steady_ppl.kernels.graph import NotCompilable
+from steady_ppl.kernels.jit import Method, close, compiled, distrust
 from steady_ppl.model.handlers import Observing, Recording, Standardised, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import advance
 from steady_ppl.resampling import by_component
-from steady_ppl.scalar_graph import NotCompilable
 from steady_ppl.stepping import Stepping
 
 FILTER = "filter"  # the name of what is compiled for it

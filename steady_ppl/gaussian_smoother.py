@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from steady_ppl.compiled_rows import on_all_rows
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
+from steady_ppl.kernels.jit import on_all_rows
 from steady_ppl.linearization import Path, linearize
 from steady_ppl.lookahead import Lookahead, look_ahead
 from steady_ppl.model.handlers import (

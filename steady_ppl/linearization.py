@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from steady_ppl.compiled_rows import on_all_rows
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError
+from steady_ppl.kernels.jit import on_all_rows
 from steady_ppl.model.handlers import (
     AtMean,
     Observing,

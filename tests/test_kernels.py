@@ -10,10 +10,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from steady_ppl.kernel_writer import LANES, source
-from steady_ppl.kernels import Kernel
-from steady_ppl.method import Method, close
-from steady_ppl.scalar_graph import PARTICLE, NotCompilable, ScalarGraph
+from steady_ppl.kernels.codegen import LANES, source
+from steady_ppl.kernels.graph import PARTICLE, NotCompilable, ScalarGraph
+from steady_ppl.kernels.jit import Kernel, Method, close
 
 SPECIAL = [
     0.0,

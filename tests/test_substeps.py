@@ -34,8 +34,8 @@ from steady_ppl import (
     with_substeps,
 )
 from steady_ppl.compiled import CompiledStepping, stepping_for
-from steady_ppl.compiled_rows import on_all_rows
 from steady_ppl.gaussian_smoother import find_path, smooth
+from steady_ppl.kernels.jit import on_all_rows
 from steady_ppl.linearization import linearize
 from steady_ppl.model.handlers import AtMean, Recording, Standardised, running
 from steady_ppl.model.stability import counts_rows, is_step

@@ -11,9 +11,9 @@ from typing import Any
 
 from llvmlite import ir
 
-from steady_ppl.lane_math import OPERATIONS
-from steady_ppl.lanes import FLOAT, Lanes
-from steady_ppl.scalar_graph import PARTICLE, Each, NotCompilable, Product, ScalarGraph
+from steady_ppl.kernels.graph import PARTICLE, Each, NotCompilable, Product, ScalarGraph
+from steady_ppl.kernels.simd import FLOAT, Lanes
+from steady_ppl.kernels.simd_math import OPERATIONS
 
 NAME = "kernel"
 LANES = 16

@@ -10,7 +10,7 @@ import math
 from functools import partial
 from typing import Any
 
-from steady_ppl.lanes import Lanes, number, truth
+from steady_ppl.kernels.simd import Lanes, number, truth
 
 
 def polynomial(x: Lanes, *coefficients: float) -> Lanes:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, fx
 
-from steady_ppl.scalar_graph import NotCompilable, ScalarGraph
+from steady_ppl.kernels.graph import NotCompilable, ScalarGraph
 
 aten: Any = torch.ops.aten
 
