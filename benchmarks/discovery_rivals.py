@@ -97,7 +97,7 @@ def smoothed_residuals(
     base: Refit | None = None,
 ) -> dict[str, Ranking]:
     """Posterior means of the fitted program's noise, regressed on each effect's columns at the posterior states."""
-    from steady_ppl.gaussian_smoother import smooth
+    from steady_ppl.gaussian.smoother import smooth
     from steady_ppl.scores import smoothed
 
     began = time.perf_counter()
@@ -140,8 +140,8 @@ def innovations(
 
 def _whitened(base: Refit, known_start: bool) -> tuple[Tensor, Tensor]:
     """Independent standard normal innovations under the program, `(T, B, K)`, and where there are any."""
-    from steady_ppl.predictions import predict
-    from steady_ppl.tracking import track
+    from steady_ppl.gaussian.kalman import track
+    from steady_ppl.gaussian.predict import predict
 
     data, path = base.folds[0].held_out, base.folds[0].held_out_path
     tracked = track(base.program, data, path, known_start=known_start)

@@ -41,9 +41,9 @@ from steady_ppl import (
     particle_filter,
     seeded,
 )
-from steady_ppl.gaussian_smoother import find_and_smooth
+from steady_ppl.gaussian.smoother import find_and_smooth
+from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.model.joint import Joint
-from steady_ppl.proposals import Twist
 
 MUSTS = {"good": Bound(0.05), "first": Bound(0.1)}
 CHEAPER = 20

@@ -11,8 +11,8 @@ from pyro.infer import Trace_ELBO
 from torch import Tensor
 
 from steady_ppl import Constant, Joint, LookaheadGuide, Program, Trajectories, for_program, seeded
-from steady_ppl.gaussian_smoother import standard_noise
-from steady_ppl.linearization import Path
+from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.smoother import standard_noise
 from steady_ppl.true_paths import true_paths
 
 RESAMPLED = 200

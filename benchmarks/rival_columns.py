@@ -15,7 +15,7 @@ from steady_ppl import Program, Trajectories
 from steady_ppl.discovery.columns import Column, columns_of
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.elements import elements, moved
-from steady_ppl.linearization import Path, linearize
+from steady_ppl.gaussian.linearize import Path, linearize
 from steady_ppl.model.interventions import by_channel
 from steady_ppl.model.program import names
 from steady_ppl.model.substeps import acting_controls

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl import Program, Trajectories
-from steady_ppl.predictions import errors
+from steady_ppl.gaussian.predict import errors
 
 POSE = 3  # of a planar vehicle's state x, y, heading come first
 HEADINGS, PLACES, REACH = 16, 9, 1.5  # a search begins on a grid of so many, over so many times the landmarks' extent

@@ -12,8 +12,9 @@ import warnings
 import numpy as np
 import torch
 
-from steady_ppl import DataError, Fit, Trajectories, UnknownMap, UsageError, fixes, for_program, seeded
+from steady_ppl import DataError, Fit, Trajectories, UnknownMap, UsageError, for_program, seeded
 from steady_ppl.errors import ComputationError, require
+from steady_ppl.gaussian import single_row_map as fixes
 from steady_ppl.model.program import names
 
 from . import fit_truth

@@ -24,7 +24,7 @@ from steady_ppl import (
     train,
     why_not_linear,
 )
-from steady_ppl.paths import few_starts
+from steady_ppl.smc.genealogy import few_starts
 
 # What the paper and its authors' code use, best with AuthorsHovercraft or AuthorsTruck; hours on two cores:
 # steady.fit(program, table, valid, **PAPER). They kept the single best validation, by a bootstrap of 100,000 particles

@@ -31,11 +31,11 @@ from .filtering import (
     smoothed_states as smoothed_states,
 )
 from .fit import Fit as Fit
-from .fixes import fixes as fixes
+from .gaussian.linearize import why_not_linear as why_not_linear
+from .gaussian.single_row_map import fixes as fixes
 from .guides import PathGuide as PathGuide, SMCGuide as SMCGuide, TruthGuide as TruthGuide
 from .inference_network import InferenceNetwork as InferenceNetwork
 from .likelihood_fit import fit_by_likelihood as fit_by_likelihood
-from .linearization import why_not_linear as why_not_linear
 from .linearized_guides import GaussianGuide as GaussianGuide, LookaheadGuide as LookaheadGuide
 from .model.actuation import delayed as delayed, lagged as lagged
 from .model.distributions import WrappedNormal as WrappedNormal
@@ -61,12 +61,12 @@ from .model.planar_vehicle import (
 from .model.program import Program as Program, for_program as for_program
 from .model.substeps import with_substeps as with_substeps
 from .parameter_draws import ParameterPosterior as ParameterPosterior, parameter_posterior as parameter_posterior
-from .particles import particle_filter as particle_filter, roll_out as roll_out
-from .paths import Filtered as Filtered, Paths as Paths
 from .proof_pictures import open_loop_picture as open_loop_picture
 from .proving import Proof as Proof, prove as prove
 from .reporting import Report as Report, report as report
-from .simulation import simulate as simulate
+from .smc.filter import particle_filter as particle_filter, roll_out as roll_out
+from .smc.genealogy import Filtered as Filtered, Paths as Paths
+from .smc.simulate import simulate as simulate
 from .smoother_guide import SmootherGuide as SmootherGuide
 from .tempering import Constant as Constant, LinearRamp as LinearRamp
 from .training import Optimization as Optimization, Trained as Trained, train as train

@@ -39,8 +39,8 @@ def evaluate(
     from steady_ppl.evaluation import evaluate_all, incomparable, table_of
     from steady_ppl.model.loading import load_program
     from steady_ppl.model.program import for_program
-    from steady_ppl.paths import FEW
     from steady_ppl.run_recipe import fingerprint
+    from steady_ppl.smc.genealogy import FEW
     from steady_ppl.utils.files import require_place
     from steady_ppl.utils.text import say
 

@@ -32,7 +32,7 @@ def simulate(
     from steady_ppl.effects.attach import with_effects
     from steady_ppl.model.substeps import with_substeps
     from steady_ppl.model.validate import probe
-    from steady_ppl.simulation import simulate as run, simulated_in
+    from steady_ppl.smc.simulate import simulate as run, simulated_in
     from steady_ppl.utils.progress import stages
     from steady_ppl.utils.text import say
 

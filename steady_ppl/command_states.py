@@ -33,8 +33,8 @@ def states(
     from steady_ppl.doubts import doubts_of_units
     from steady_ppl.fit import Fit
     from steady_ppl.model.program import for_program
-    from steady_ppl.paths import few_starts
     from steady_ppl.posterior_files import require_states_file, write_states
+    from steady_ppl.smc.genealogy import few_starts
     from steady_ppl.utils.files import require_place
     from steady_ppl.utils.text import say
 

@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.linearization import Path
+from steady_ppl.gaussian.kalman import Tracked
+from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.predict import errors, on_a_circle
 from steady_ppl.model.actuation import lagged
 from steady_ppl.model.handlers import AtMean, running
 from steady_ppl.model.program import Program, names, units
 from steady_ppl.model.substeps import acting_controls, advance, row_controls
-from steady_ppl.predictions import errors, on_a_circle
-from steady_ppl.tracking import Tracked
 from steady_ppl.utils.angles import wrap, wrap_angles
 
 LAG = 0.3  # s

@@ -15,13 +15,13 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, require
-from steady_ppl.gaussian_smoother import find_and_smooth, means_as_path
-from steady_ppl.linearization import why_not_linear
-from steady_ppl.lookahead import Lookahead
+from steady_ppl.gaussian.information_filter import Lookahead
+from steady_ppl.gaussian.linearize import why_not_linear
+from steady_ppl.gaussian.smoother import find_and_smooth, means_as_path
+from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.model.program import Program
-from steady_ppl.particles import particle_filter
-from steady_ppl.paths import Filtered
-from steady_ppl.proposals import Twist
+from steady_ppl.smc.filter import particle_filter
+from steady_ppl.smc.genealogy import Filtered
 
 
 def run_filter(

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError
+from steady_ppl.gaussian.predict import on_a_circle
 from steady_ppl.model.program import Program, for_program, names, units
 from steady_ppl.posterior import DIMENSIONS, posterior
-from steady_ppl.predictions import on_a_circle
-from steady_ppl.simulation import measure
+from steady_ppl.smc.simulate import measure
 from steady_ppl.utils.angles import draws_on_one_turn
 from steady_ppl.utils.random import seeded
 

@@ -10,9 +10,8 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, require
 from steady_ppl.model.handlers import masked
 from steady_ppl.model.program import Program
-from steady_ppl.particles import STEPS_WORTH_COMPILING, particle_filter
-from steady_ppl.paths import Paths
-from steady_ppl.proposals import Proposal
+from steady_ppl.smc.filter import STEPS_WORTH_COMPILING, Proposal, particle_filter
+from steady_ppl.smc.genealogy import Paths
 from steady_ppl.tempering import LinearRamp, Tempering
 from steady_ppl.true_paths import true_paths
 

@@ -13,9 +13,9 @@ import torch
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.elements import elements
-from steady_ppl.gaussian_smoother import find_path, resting_path, smooth
-from steady_ppl.linearization import Path
-from steady_ppl.lookahead import Lookahead
+from steady_ppl.gaussian.information_filter import Lookahead
+from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.smoother import find_path, resting_path, smooth
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.model.program import Program
 from steady_ppl.scores import smoothed, widens

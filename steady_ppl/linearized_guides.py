@@ -9,7 +9,9 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, require
-from steady_ppl.gaussian_smoother import (
+from steady_ppl.gaussian.information_filter import Lookahead
+from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.smoother import (
     find_and_try,
     means_as_path,
     require_found,
@@ -17,11 +19,9 @@ from steady_ppl.gaussian_smoother import (
     smooth,
     smoother_paths,
 )
+from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.guides import FilteringGuide, PathGuide
-from steady_ppl.linearization import Path
-from steady_ppl.lookahead import Lookahead
 from steady_ppl.model.program import Program
-from steady_ppl.proposals import Twist
 from steady_ppl.tempering import LinearRamp, Tempering
 
 WORTH_COMPILING = 200  # rows of all trajectories together; a training linearises them hundreds of times

@@ -12,8 +12,8 @@ from steady_ppl.filtering import in_parts
 from steady_ppl.model.handlers import AtMean, Recording, as_vector, residual, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls
-from steady_ppl.particles import particle_filter, roll_out
-from steady_ppl.resampling import systematic, take
+from steady_ppl.smc.filter import particle_filter, roll_out
+from steady_ppl.smc.resampling import systematic, take
 
 OPEN_LOOP = {"open_loop_1s": 1.0, "open_loop_3s": 3.0}
 OPEN_LOOP_DRAWS = 64

@@ -17,7 +17,7 @@ from steady_ppl.model.handlers import AtMean
 from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.model.program import Program, error_groups, names
 from steady_ppl.model.substeps import acting_controls
-from steady_ppl.particles import roll_out
+from steady_ppl.smc.filter import roll_out
 from steady_ppl.utils.angles import wrap
 
 Errors = dict[str, float]

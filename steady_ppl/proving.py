@@ -20,9 +20,9 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.doubts import doubts_of_units
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.fit import Fit
+from steady_ppl.gaussian.predict import named_horizons
 from steady_ppl.model.program import Program, names
 from steady_ppl.paired_bootstrap import FEWEST
-from steady_ppl.predictions import named_horizons
 from steady_ppl.proof_report import FLOOR, as_text, figures, verdict
 from steady_ppl.proof_rows import (
     SECONDS,

@@ -13,12 +13,12 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.linearization import Path
+from steady_ppl.gaussian.kalman import Tracked, track
+from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.predict import Prediction, on_a_circle, predict
 from steady_ppl.model.handlers import AtMean, Recording, Standardised, as_vector, normal_moments, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance, sample_channels
-from steady_ppl.predictions import Prediction, on_a_circle, predict
-from steady_ppl.tracking import Tracked, track
 from steady_ppl.utils.angles import wrap
 
 MULTIPLES = (0.5, 1.0, 2.0, 4.0, 8.0)

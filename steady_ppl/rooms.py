@@ -92,7 +92,7 @@ def _copy_rooms(folder: Path) -> None:
 def _simulate_tables(folder: Path) -> list[Path]:
     from steady_ppl.data.table import write_table
     from steady_ppl.model.loading import load_program
-    from steady_ppl.simulation import simulate
+    from steady_ppl.smc.simulate import simulate
     from steady_ppl.utils.progress import stages
 
     program = load_program(str(folder / TRUTH))

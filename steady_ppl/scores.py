@@ -26,7 +26,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.elements import Element, moved
-from steady_ppl.lookahead import Lookahead
+from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.model.handlers import (
     AtMean,
     Recording,

@@ -16,12 +16,12 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.directions import Direction, directions
 from steady_ppl.errors import FilterError
-from steady_ppl.gaussian_smoother import smooth
-from steady_ppl.linearization import Path
+from steady_ppl.gaussian.kalman import Tracked, track
+from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.predict import Prediction, predict, simulate_again
+from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.misfit_maps import Residuals
 from steady_ppl.model.program import Program, names
-from steady_ppl.predictions import Prediction, predict, simulate_again
-from steady_ppl.tracking import Tracked, track
 
 FEWEST = 20  # sets
 ROWS = 500_000  # of all drives of a block

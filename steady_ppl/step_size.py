@@ -16,9 +16,9 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.elements import elements, values_of
 from steady_ppl.errors import FilterError, UsageError
-from steady_ppl.gaussian_smoother import find_path, require_found, resting_path, smooth
+from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.likelihood_fit import roomy_path
-from steady_ppl.linearization import Path
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import can_be_cut, counts_rows, is_step

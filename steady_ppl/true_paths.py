@@ -13,7 +13,7 @@ from steady_ppl.errors import DataError, ProgramError
 from steady_ppl.model.handlers import Recording, Replaying, running
 from steady_ppl.model.program import Program, names
 from steady_ppl.model.substeps import acting_controls, sample_row
-from steady_ppl.paths import Paths
+from steady_ppl.smc.genealogy import Paths
 from steady_ppl.utils.angles import wrap
 
 PASSES = 30  # of Gauss and Newton's method

@@ -20,7 +20,7 @@ from steady_ppl.guides import sample_known
 from steady_ppl.model.handlers import KnownStart, Recording, Replaying, Standardised, broadcast_event, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, sample_channels, sample_row
-from steady_ppl.paths import Paths
+from steady_ppl.smc.genealogy import Paths
 from steady_ppl.tempering import Constant, Tempering
 
 

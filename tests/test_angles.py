@@ -11,9 +11,9 @@ import torch
 from examples import cut, drives, example
 
 from steady_ppl import WrappedNormal, particle_filter, seeded, stack, wrap
-from steady_ppl.gaussian_smoother import find_and_smooth
-from steady_ppl.lookahead import Lookahead
-from steady_ppl.proposals import Twist
+from steady_ppl.gaussian.information_filter import Lookahead
+from steady_ppl.gaussian.smoother import find_and_smooth
+from steady_ppl.gaussian.twisted_proposal import Twist
 
 Truth = type(example("hovercraft:HovercraftTruth"))
 

@@ -11,10 +11,10 @@ from examples import copies, drives, example
 from oracles import CartPosterior, assert_mean, cart_parameters, cart_system, kalman
 
 from steady_ppl import seeded
-from steady_ppl.gaussian_smoother import find_and_smooth, means_as_path
-from steady_ppl.linearization import Path, linearize
-from steady_ppl.predictions import on_a_circle, predict, simulate_again
-from steady_ppl.tracking import filter_and_smooth, track
+from steady_ppl.gaussian.kalman import filter_and_smooth, track
+from steady_ppl.gaussian.linearize import Path, linearize
+from steady_ppl.gaussian.predict import on_a_circle, predict, simulate_again
+from steady_ppl.gaussian.smoother import find_and_smooth, means_as_path
 
 
 def anywhere(data) -> Path:

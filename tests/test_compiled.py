@@ -23,11 +23,10 @@ from steady_ppl import (
     particle_filter,
     seeded,
 )
-from steady_ppl.compiled import CompiledStepping, stepping_for
-from steady_ppl.gaussian_smoother import find_and_smooth
-from steady_ppl.linearization import Path, linearize
-from steady_ppl.proposals import Twist
-from steady_ppl.stepping import Stepping
+from steady_ppl.gaussian.linearize import Path, linearize
+from steady_ppl.gaussian.smoother import find_and_smooth
+from steady_ppl.gaussian.twisted_proposal import Twist
+from steady_ppl.smc.backends import CompiledStepping, Stepping, stepping_for
 
 HovercraftTruth = type(example("hovercraft:HovercraftTruth"))
 EXAMPLES = [

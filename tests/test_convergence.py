@@ -17,7 +17,7 @@ from steady_ppl.effects import catalogue, chosen_variant
 from steady_ppl.model.handlers import AtMean
 from steady_ppl.model.program import names
 from steady_ppl.model.substeps import acting_controls
-from steady_ppl.particles import roll_out
+from steady_ppl.smc.filter import roll_out
 
 PROGRAMS = (
     "hovercraft",

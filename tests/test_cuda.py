@@ -10,9 +10,9 @@ from examples import copies, drives, example
 from oracles import assert_mean
 
 from steady_ppl import particle_filter, seeded
-from steady_ppl.gaussian_smoother import find_and_smooth
+from steady_ppl.gaussian.smoother import find_and_smooth
+from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.model.program import for_program
-from steady_ppl.proposals import Twist
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 

@@ -13,7 +13,7 @@ from steady_ppl.discovery.declared_noise import departures
 from steady_ppl.discovery.refits import Fold, Refit
 from steady_ppl.discovery.rounds import Found
 from steady_ppl.elements import elements
-from steady_ppl.linearization import Path
+from steady_ppl.gaussian.linearize import Path
 
 
 def fitted(*programs) -> Refit:

@@ -14,7 +14,7 @@ from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, is_doubtful
 from steady_ppl.discovery.refits import Fold, first_by_draws, first_refit, refit_with, starts_by_draws
 from steady_ppl.effects import chosen_variant
 from steady_ppl.errors import FilterError
-from steady_ppl.gaussian_smoother import find_path
+from steady_ppl.gaussian.smoother import find_path
 
 
 def test_both_ways_agree_where_the_program_is_nearly_linear() -> None:

@@ -55,7 +55,7 @@ def test_long_training_does_not_get_further(fitted, drives):
 
 def likelihood(program, table) -> float:
     """Log p(y) of the linearised program."""
-    from steady_ppl.gaussian_smoother import find_path, smooth
+    from steady_ppl.gaussian.smoother import find_path, smooth
 
     data = st.for_program(program, table)
     with st.seeded(0, "paths"):

@@ -15,7 +15,7 @@ from pyro import poutine
 from torch import Tensor
 
 from steady_ppl import Program, ProgramError, seeded, stack
-from steady_ppl.linearization import Linearization, Path, linearize, why_not_linear
+from steady_ppl.gaussian.linearize import Linearization, Path, linearize, why_not_linear
 from steady_ppl.model.handlers import Standardised, running
 from steady_ppl.model.substeps import advance
 

@@ -13,12 +13,13 @@ from examples import copies, example
 from oracles import START_MEAN, START_SD, CartPosterior, assert_mean, cart_parameters, kalman
 from torch import Tensor
 
-from steady_ppl import particle_filter, seeded, stack, twisting
-from steady_ppl.gaussian_smoother import smooth, smoother_paths
-from steady_ppl.linearization import Path, linearize
-from steady_ppl.lookahead import look_ahead
+from steady_ppl import particle_filter, seeded, stack
+from steady_ppl.gaussian import twisted_proposal
+from steady_ppl.gaussian.information_filter import look_ahead
+from steady_ppl.gaussian.linearize import Path, linearize
+from steady_ppl.gaussian.smoother import smooth, smoother_paths
+from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.model.handlers import Standardised, running
-from steady_ppl.proposals import Twist
 
 
 def anywhere(program, data) -> Path:
@@ -298,12 +299,12 @@ def test_one_after_the_other_and_in_parallel_particles_are_steered_the_same() ->
     state, path = 5 * torch.randn(7, 3, 4, **double), torch.randn(3, 4, **double)
     angles = torch.tensor([False, True, False, True])
     factor = torch.randn(3, 2, 2, **double).triu() + 2 * torch.eye(2, **double)
-    steering = (torch.randn(3, 2, **double), torch.randn(3, 2, 4, **double), factor, twisting.inverse(factor))
+    steering = (torch.randn(3, 2, **double), torch.randn(3, 2, 4, **double), factor, twisted_proposal.inverse(factor))
     own, stays = torch.randn(7, 3, 2, **double), torch.rand(7, 3) < 0.5
     for share in (0.0, 0.3):
-        one = twisting.steer(state, path, angles, steering, own, stays & (share > 0), share)
-        other = twisting.steer_in_parallel(state, path, angles, steering, own, stays & (share > 0), share)
+        one = twisted_proposal.steer(state, path, angles, steering, own, stays & (share > 0), share)
+        other = twisted_proposal.steer_in_parallel(state, path, angles, steering, own, stays & (share > 0), share)
         torch.testing.assert_close(one, other)
     future = (torch.randn(3, 4, 4, **double), torch.randn(3, 4, **double), torch.randn(3, **double))
-    one = twisting.log_future(state, path, angles, *future)
-    torch.testing.assert_close(one, twisting.log_future_in_parallel(state, path, angles, *future))
+    one = twisted_proposal.log_future(state, path, angles, *future)
+    torch.testing.assert_close(one, twisted_proposal.log_future_in_parallel(state, path, angles, *future))

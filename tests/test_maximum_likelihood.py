@@ -13,7 +13,7 @@ from steady_ppl.discovery.candidates import gain_of_fits
 from steady_ppl.discovery.refits import first_refit, refit_near, refit_with
 from steady_ppl.effects import chosen_variant
 from steady_ppl.elements import elements
-from steady_ppl.gaussian_smoother import smooth
+from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood_fit import roomy_path
 from steady_ppl.maximum_likelihood import maximise
 
@@ -24,7 +24,7 @@ def set_values(program, values) -> None:
 
 
 def likelihood_of_cart(program, data) -> float:
-    from steady_ppl.gaussian_smoother import find_path
+    from steady_ppl.gaussian.smoother import find_path
 
     path = find_path(program, data, known_start=True)
     return float(smooth(program, data, path, known_start=True).log_likelihood.sum())

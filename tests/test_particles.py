@@ -13,12 +13,13 @@ from examples import copies, cut, drives, elsewhere, example
 from oracles import CartPosterior, assert_mean, cart_parameters, kalman
 
 from steady_ppl import DataError, FilterError, ProgramError, particle_filter, roll_out, seeded
-from steady_ppl.gaussian_smoother import find_and_smooth
+from steady_ppl.gaussian.smoother import find_and_smooth
+from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.model.handlers import AtMean, Replaying
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import sample_row
-from steady_ppl.proposals import Proposal, Twist
-from steady_ppl.resampling import systematic
+from steady_ppl.smc.filter import Proposal
+from steady_ppl.smc.resampling import systematic
 
 PROGRAMS = ("linear_gaussian", "hovercraft", "hovercraft:HovercraftTruth", "truck", "pendulum")
 

@@ -18,7 +18,7 @@ from references import PROBLEMS, Reference, errors_off, reference, rolled_out, r
 from torch import Tensor
 
 from steady_ppl import Constant, GaussianGuide, LookaheadGuide, PathGuide, Program, SMCGuide, Trajectories, seeded
-from steady_ppl.resampling import take
+from steady_ppl.smc.resampling import take
 
 RUNS, LIMIT = 40, 4.0
 NOTICED = 2 * LIMIT
@@ -121,7 +121,7 @@ def test_ancestors_applied_twice_are_noticed(name, monkeypatch):
     def twice(values: Tensor, index: Tensor) -> Tensor:
         return take(values, index) if values.is_floating_point() else take(values, take(values, index))
 
-    monkeypatch.setattr("steady_ppl.paths.take", twice)
+    monkeypatch.setattr("steady_ppl.smc.genealogy.take", twice)
     problem = reference(name)
     assert worst(problem, drawn(bootstrap(problem.program), problem.data)) > NOTICED
 

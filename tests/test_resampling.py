@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 from oracles import assert_mean
 
 from steady_ppl import seeded
-from steady_ppl.resampling import effective_sample_size, normalise, systematic, systematic_in_parallel, take
+from steady_ppl.smc.resampling import effective_sample_size, normalise, systematic, systematic_in_parallel, take
 
 weights = st.lists(st.one_of(st.just(0.0), st.floats(1e-12, 1.0)), min_size=1, max_size=12).filter(any)
 draws = st.integers(1, 30)

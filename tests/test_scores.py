@@ -13,7 +13,7 @@ from steady_ppl.discovery.columns import Column, Scoring
 from steady_ppl.discovery.curves import curves
 from steady_ppl.effects import attach, chosen_variant, parsed
 from steady_ppl.elements import elements, moved
-from steady_ppl.gaussian_smoother import find_path, means_as_path, smooth
+from steady_ppl.gaussian.smoother import find_path, means_as_path, smooth
 from steady_ppl.scores import Smoothed, parameter_scores, smoothed, typical_spreads
 
 EFFECTS = (

@@ -38,7 +38,7 @@ from steady_ppl import (
     write_table,
 )
 from steady_ppl.elements import elements
-from steady_ppl.gaussian_smoother import find_path
+from steady_ppl.gaussian.smoother import find_path
 from steady_ppl.maximum_likelihood import Maximum
 from steady_ppl.step_size import check_step
 

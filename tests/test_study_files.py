@@ -16,7 +16,7 @@ from small_studies import CART, STUDY, written
 from steady_ppl.data.table import write_table
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.model.loading import load_program
-from steady_ppl.simulation import simulate
+from steady_ppl.smc.simulate import simulate
 from steady_ppl.studies.job import CHANGED, in_limits, run
 from steady_ppl.studies.job_data import planted, told_settings
 from steady_ppl.studies.runnable import require_runnable

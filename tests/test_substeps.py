@@ -33,10 +33,9 @@ from steady_ppl import (
     stack,
     with_substeps,
 )
-from steady_ppl.compiled import CompiledStepping, stepping_for
-from steady_ppl.gaussian_smoother import find_path, smooth
+from steady_ppl.gaussian.linearize import linearize
+from steady_ppl.gaussian.smoother import find_path, smooth
 from steady_ppl.kernels.jit import on_all_rows
-from steady_ppl.linearization import linearize
 from steady_ppl.model.handlers import AtMean, Recording, Standardised, running
 from steady_ppl.model.stability import counts_rows, is_step
 from steady_ppl.model.substeps import (
@@ -48,10 +47,10 @@ from steady_ppl.model.substeps import (
     sample_channels,
 )
 from steady_ppl.model.validate import probe
-from steady_ppl.particles import roll_out
-from steady_ppl.simulation import simulated_in, simulated_substeps
+from steady_ppl.smc.backends import CompiledStepping, Stepping, stepping_for
+from steady_ppl.smc.filter import roll_out
+from steady_ppl.smc.simulate import simulated_in, simulated_substeps
 from steady_ppl.step_size import check_step
-from steady_ppl.stepping import Stepping
 
 K = 3
 

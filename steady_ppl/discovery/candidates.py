@@ -19,8 +19,8 @@ from steady_ppl.discovery.screening import LEVEL, Screened, Tested, screen
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.elements import Element, elements
 from steady_ppl.errors import FilterError
-from steady_ppl.gaussian_smoother import smooth
-from steady_ppl.lookahead import Lookahead
+from steady_ppl.gaussian.information_filter import Lookahead
+from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.model.program import Program
 from steady_ppl.scores import measured, smoothed, typical_spreads
 from steady_ppl.utils.journal import Piece, piece

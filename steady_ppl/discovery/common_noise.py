@@ -17,7 +17,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects import attached
 from steady_ppl.elements import elements, moved, set_values, values_of
 from steady_ppl.errors import FilterError
-from steady_ppl.linearization import Path
+from steady_ppl.gaussian.linearize import Path
 from steady_ppl.maximum_likelihood import Maximum, Term, climb
 from steady_ppl.model.program import Program
 from steady_ppl.scores import channel_moments, substep_spreads

@@ -17,10 +17,10 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects import Effect, Variant
+from steady_ppl.gaussian.predict import on_a_circle
 from steady_ppl.model.interventions import channel_means
 from steady_ppl.model.program import Program, names, units
 from steady_ppl.model.substeps import acting_controls, row_controls
-from steady_ppl.predictions import on_a_circle
 
 KNOTS = 7
 REACH = 0.4  # of the variable's range over which heights are alike

@@ -19,10 +19,10 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.filtering import neglected
-from steady_ppl.gaussian_smoother import find_path, require_found, resting_path, smooth
-from steady_ppl.linearization import Path
+from steady_ppl.gaussian.information_filter import Lookahead
+from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.linearized_guides import LookaheadGuide
-from steady_ppl.lookahead import Lookahead
 from steady_ppl.maximum_likelihood import Maximum, kept_maximum, maximise
 from steady_ppl.model.program import Program
 from steady_ppl.tempering import Constant

@@ -13,10 +13,10 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.refits import Refit, wide, wide_drives
 from steady_ppl.discovery.rounds import Found
-from steady_ppl.gaussian_smoother import smooth
-from steady_ppl.linearization import Path
+from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.predict import simulate_again
+from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.model.program import Program, names
-from steady_ppl.predictions import simulate_again
 from steady_ppl.utils.random import seeded
 
 DRIVES = 24  # simulated for each proposal

@@ -16,9 +16,9 @@ from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, Fitting, is_doub
 from steady_ppl.effects import Variant, attach, attached, coefficient
 from steady_ppl.elements import elements, values_of
 from steady_ppl.errors import FilterError, SteadyError
-from steady_ppl.gaussian_smoother import find_path
+from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.smoother import find_path
 from steady_ppl.likelihood_fit import fit_by_likelihood, led_back
-from steady_ppl.linearization import Path
 from steady_ppl.maximum_likelihood import Maximum, maximise
 from steady_ppl.model.program import Program
 from steady_ppl.scores import widens

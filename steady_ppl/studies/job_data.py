@@ -16,7 +16,7 @@ from steady_ppl.effects.attach import with_effects
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.model.loading import load_program
 from steady_ppl.model.program import Program
-from steady_ppl.simulation import simulate
+from steady_ppl.smc.simulate import simulate
 from steady_ppl.studies.job_files import PARTS, TABLES, is_program
 from steady_ppl.studies.plan import Job
 

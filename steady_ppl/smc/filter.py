@@ -17,17 +17,15 @@ import torch
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
-from steady_ppl.compiled import stepping_for
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, ProgramError
 from steady_ppl.model.handlers import KnownStart, Recording, Standardised, broadcast_event, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import divergence
 from steady_ppl.model.substeps import advance, channel_values
-from steady_ppl.paths import Filtered
-from steady_ppl.proposals import Proposal
-from steady_ppl.resampling import effective_sample_size, normalise, systematic, take
-from steady_ppl.stepping import Stepping
+from steady_ppl.smc.backends import Stepping, stepping_for
+from steady_ppl.smc.genealogy import Filtered
+from steady_ppl.smc.resampling import effective_sample_size, normalise, systematic, take
 
 STEPS_WORTH_COMPILING = 1_000_000  # steps of particles, which take the program's own lines a second
 OnFrame = Callable[[int, Tensor, Tensor, Tensor], None]
@@ -213,3 +211,26 @@ def roll_out(
         with running(*state.shape[:-1]), handler or nullcontext():
             state = advance(program, state, control, time, step)
         yield state
+
+
+class Proposal:
+    """The program's own noise: the bootstrap filter.
+
+    Attributes:
+        looks_ahead: whether weights know of later measurements, at measured rows and at others.
+    """
+
+    looks_ahead = False
+
+    def start(self, particles: int) -> tuple[Tensor | None, Tensor | float]:
+        """The standard normal noise of `initial`, `(N, B, C)`, and its log density less that of the proposal, `(N, B)`;
+        None lets the program draw."""
+        return None, 0.0
+
+    def step(self, row: int, state: Tensor) -> tuple[Tensor | None, Tensor | float]:
+        """The same for the `transition` after a row, from states `(N, B, D)`."""
+        return None, 0.0
+
+    def log_future(self, row: int, state: Tensor) -> Tensor:
+        """What is thought of all measurements after a row, `(N, B)` in double precision."""
+        return state.new_zeros(state.shape[:-1], dtype=torch.float64)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.resampling import systematic, take
+from steady_ppl.smc.resampling import systematic, take
 
 FEW = 10  # particles in effect: with fewer, what a filter says hangs on a handful of draws
 

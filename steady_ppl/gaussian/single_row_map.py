@@ -15,11 +15,11 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError
-from steady_ppl.linearization import linearize_sensors
+from steady_ppl.gaussian.linearize import linearize_sensors
+from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.model.handlers import broadcast_event, running
 from steady_ppl.model.program import Program, names
 from steady_ppl.model.validate import step_size
-from steady_ppl.predictions import simulate_again
 
 DAMPING = 1e-2  # of the first step, relative to the curvature
 AT_ONCE = 50_000  # rows of all places and drives

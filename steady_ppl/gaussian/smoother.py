@@ -15,9 +15,9 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
+from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
+from steady_ppl.gaussian.linearize import Path, linearize
 from steady_ppl.kernels.jit import on_all_rows
-from steady_ppl.linearization import Path, linearize
-from steady_ppl.lookahead import Lookahead, look_ahead
 from steady_ppl.model.handlers import (
     KnownStart,
     Recording,
@@ -31,8 +31,8 @@ from steady_ppl.model.handlers import (
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import divergence
 from steady_ppl.model.substeps import acting_controls, sample_channels
-from steady_ppl.particles import particle_filter
-from steady_ppl.paths import Paths
+from steady_ppl.smc.filter import particle_filter
+from steady_ppl.smc.genealogy import Paths
 from steady_ppl.utils.angles import wrap_angles
 
 WORSE = 10.0  # nats by which a step may leave a path worse off, see `_Merit`: some such steps lead out of a bad place

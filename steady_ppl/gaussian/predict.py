@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.linearization import Path
+from steady_ppl.gaussian.kalman import Tracked
+from steady_ppl.gaussian.linearize import Path
 from steady_ppl.model.handlers import AtMean, Observing, Recording, as_vector, residual, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance
-from steady_ppl.simulation import measure
-from steady_ppl.stepping import Stepping
-from steady_ppl.tracking import Tracked
+from steady_ppl.smc.backends import Stepping
+from steady_ppl.smc.simulate import measure
 
 
 @dataclass(frozen=True)
