@@ -15,9 +15,8 @@ from torch import Tensor
 from uniformity import inside, ranks, together, uniform
 
 from steady_ppl import Program, Trajectories, run_filter, seeded, simulate
-from steady_ppl.maximum_likelihood import maximise
-from steady_ppl.model.program import for_program
-from steady_ppl.parameter_draws import (
+from steady_ppl.likelihood.maximize import maximise
+from steady_ppl.likelihood.parameter_posterior import (
     RELIABLE,
     LogLikelihood,
     about_maximum,
@@ -27,6 +26,7 @@ from steady_ppl.parameter_draws import (
     resampled,
     weighed,
 )
+from steady_ppl.model.program import for_program
 
 DRAWS, DRIVES = 99, 4
 VALUES = 400  # as many as users get

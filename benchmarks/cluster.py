@@ -33,7 +33,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from dask_cluster import Dask, wait_for  # noqa: E402
 
-from steady_ppl.fit import packages  # noqa: E402
+from steady_ppl.runs.fit import packages  # noqa: E402
 from steady_ppl.studies.cluster import Cluster, computed  # noqa: E402
 from steady_ppl.studies.places import Local, Place  # noqa: E402
 from steady_ppl.studies.plan import Job  # noqa: E402

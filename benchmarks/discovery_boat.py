@@ -22,7 +22,7 @@ from resumable import Record, digest, run
 
 import steady_ppl as st
 from steady_ppl.effects import chosen_variant
-from steady_ppl.run_recipe import find_recipe
+from steady_ppl.runs.recipes import find_recipe
 
 FOLDER = Path(__file__).parent
 BOAT = FOLDER.parent / "models" / "gps_boat.py"

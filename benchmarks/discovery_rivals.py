@@ -98,7 +98,7 @@ def smoothed_residuals(
 ) -> dict[str, Ranking]:
     """Posterior means of the fitted program's noise, regressed on each effect's columns at the posterior states."""
     from steady_ppl.gaussian.smoother import smooth
-    from steady_ppl.scores import smoothed
+    from steady_ppl.likelihood.scores import smoothed
 
     began = time.perf_counter()
     base = base or fitted(tables, program, known_start)

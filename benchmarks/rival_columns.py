@@ -14,12 +14,12 @@ from torch import Tensor
 from steady_ppl import Program, Trajectories
 from steady_ppl.discovery.columns import Column, columns_of
 from steady_ppl.effects import Variant, attached, catalogue
-from steady_ppl.elements import elements, moved
 from steady_ppl.gaussian.linearize import Path, linearize
+from steady_ppl.likelihood.parameters import elements, moved
+from steady_ppl.likelihood.scores import channel_moments
 from steady_ppl.model.interventions import by_channel
 from steady_ppl.model.program import names
 from steady_ppl.model.substeps import acting_controls
-from steady_ppl.scores import channel_moments
 
 REGRESSED = ("push", "command", "history")  # forms of effects that change an acceleration
 

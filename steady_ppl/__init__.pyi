@@ -1,5 +1,4 @@
 from . import effects as effects
-from .auto_rollout import AutoRollout as AutoRollout
 from .checking import Check as Check, check as check
 from .data.rosbag.mapping import BagColumn as BagColumn, BagMapping as BagMapping
 from .data.rosbag.read import read_bags as read_bags
@@ -13,7 +12,6 @@ from .data.table import (
 )
 from .data.trajectories import Trajectories as Trajectories
 from .discovery import Discovery as Discovery, discover as discover
-from .dynamics import Dynamics as Dynamics
 from .errors import (
     DataError as DataError,
     FilterError as FilterError,
@@ -23,20 +21,31 @@ from .errors import (
     TrainingError as TrainingError,
     UsageError as UsageError,
 )
-from .filtering import (
+from .gaussian.linearize import why_not_linear as why_not_linear
+from .gaussian.single_row_map import fixes as fixes
+from .guides.base import (
+    Constant as Constant,
+    LinearRamp as LinearRamp,
+    PathGuide as PathGuide,
+    SMCGuide as SMCGuide,
+    TruthGuide as TruthGuide,
+)
+from .guides.linearized import GaussianGuide as GaussianGuide, LookaheadGuide as LookaheadGuide
+from .guides.network import InferenceNetwork as InferenceNetwork
+from .guides.smoother import SmootherGuide as SmootherGuide
+from .guides.variational import AutoRollout as AutoRollout, VariationalGuide as VariationalGuide
+from .likelihood.evidence import (
     choose_filter as choose_filter,
     log_likelihood as log_likelihood,
     neglected as neglected,
     run_filter as run_filter,
     smoothed_states as smoothed_states,
 )
-from .fit import Fit as Fit
-from .gaussian.linearize import why_not_linear as why_not_linear
-from .gaussian.single_row_map import fixes as fixes
-from .guides import PathGuide as PathGuide, SMCGuide as SMCGuide, TruthGuide as TruthGuide
-from .inference_network import InferenceNetwork as InferenceNetwork
-from .likelihood_fit import fit_by_likelihood as fit_by_likelihood
-from .linearized_guides import GaussianGuide as GaussianGuide, LookaheadGuide as LookaheadGuide
+from .likelihood.fit import fit_by_likelihood as fit_by_likelihood
+from .likelihood.parameter_posterior import (
+    ParameterPosterior as ParameterPosterior,
+    parameter_posterior as parameter_posterior,
+)
 from .model.actuation import delayed as delayed, lagged as lagged
 from .model.distributions import WrappedNormal as WrappedNormal
 from .model.interventions import (
@@ -60,17 +69,15 @@ from .model.planar_vehicle import (
 )
 from .model.program import Program as Program, for_program as for_program
 from .model.substeps import with_substeps as with_substeps
-from .parameter_draws import ParameterPosterior as ParameterPosterior, parameter_posterior as parameter_posterior
 from .proof_pictures import open_loop_picture as open_loop_picture
 from .proving import Proof as Proof, prove as prove
 from .reporting import Report as Report, report as report
+from .runs.export import Dynamics as Dynamics
+from .runs.fit import Fit as Fit
 from .smc.filter import particle_filter as particle_filter, roll_out as roll_out
 from .smc.genealogy import Filtered as Filtered, Paths as Paths
 from .smc.simulate import simulate as simulate
-from .smoother_guide import SmootherGuide as SmootherGuide
-from .tempering import Constant as Constant, LinearRamp as LinearRamp
-from .training import Optimization as Optimization, Trained as Trained, train as train
+from .training.loop import Optimization as Optimization, Trained as Trained, train as train
+from .training.validation import Validation as Validation
 from .utils.angles import wrap as wrap
 from .utils.random import seeded as seeded
-from .validation import Validation as Validation
-from .variational_guides import VariationalGuide as VariationalGuide

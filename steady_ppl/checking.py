@@ -21,9 +21,7 @@ from steady_ppl.data.frozen_sensors import Stretch, stuck
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.directions import directions
-from steady_ppl.doubts import doubts_of_units
 from steady_ppl.errors import DataError, UsageError
-from steady_ppl.fit import Fit
 from steady_ppl.gaussian.kalman import track
 from steady_ppl.gaussian.linearize import why_not_linear
 from steady_ppl.gaussian.predict import Prediction, named_horizons, predict
@@ -31,6 +29,8 @@ from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.misfit_maps import Misfit, Residuals, judge
 from steady_ppl.model.program import Program, for_program, names
 from steady_ppl.reference_motion import Reference, constant_velocity, last_measurement
+from steady_ppl.runs.diagnostics import doubts_of_units
+from steady_ppl.runs.fit import Fit
 from steady_ppl.simulated_sets import FEWEST, residuals, simulate_sets
 from steady_ppl.step_size import StepCheck, check_step
 from steady_ppl.utils.late import Displayed

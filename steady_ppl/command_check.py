@@ -32,7 +32,7 @@ def check(
     from steady_ppl.command_parts import present
     from steady_ppl.data.frozen_sensors import masked
     from steady_ppl.data.table import read_table, require_table_file, write_table
-    from steady_ppl.fit import Fit
+    from steady_ppl.runs.fit import Fit
     from steady_ppl.utils.files import require_picture, require_place, write_picture
     from steady_ppl.utils.text import say
 

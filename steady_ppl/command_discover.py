@@ -43,11 +43,11 @@ def discover(
     from steady_ppl.data.table import read_table
     from steady_ppl.discovery import discover as search
     from steady_ppl.discovery.kept_search import kept_search
-    from steady_ppl.fit import Fit
     from steady_ppl.model.substeps import with_substeps
     from steady_ppl.model.validate import probe
-    from steady_ppl.run_folder import DISCOVERY
-    from steady_ppl.run_recipe import fingerprint
+    from steady_ppl.runs.fit import Fit
+    from steady_ppl.runs.folder import DISCOVERY
+    from steady_ppl.runs.recipes import fingerprint
     from steady_ppl.utils.files import require_picture, require_place, write_picture
     from steady_ppl.utils.text import say
 

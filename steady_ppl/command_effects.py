@@ -31,7 +31,7 @@ def add(
     """
     from steady_ppl.command_parts import program_from
     from steady_ppl.effects import added, write_program
-    from steady_ppl.fit import Fit
+    from steady_ppl.runs.fit import Fit
     from steady_ppl.utils.text import say
 
     is_run = Path(source).is_dir()

@@ -35,11 +35,11 @@ def evaluate(
     """The paper's errors where true states exist; errors in measurement space always."""
     from steady_ppl.command_parts import load_runs, present, run_labels, used_before
     from steady_ppl.data.table import read_table
-    from steady_ppl.doubts import doubts_of_units
     from steady_ppl.evaluation import evaluate_all, incomparable, table_of
     from steady_ppl.model.loading import load_program
     from steady_ppl.model.program import for_program
-    from steady_ppl.run_recipe import fingerprint
+    from steady_ppl.runs.diagnostics import doubts_of_units
+    from steady_ppl.runs.recipes import fingerprint
     from steady_ppl.smc.genealogy import FEW
     from steady_ppl.utils.files import require_place
     from steady_ppl.utils.text import say

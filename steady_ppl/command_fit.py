@@ -71,7 +71,7 @@ def fit(
     """Learn a program's parameters from measurements."""
     from steady_ppl.command_parts import program_from
     from steady_ppl.data.table import read_table
-    from steady_ppl.run_recipe import run_recipe
+    from steady_ppl.runs.recipes import run_recipe
     from steady_ppl.utils.text import is_quiet, say
 
     given: dict[str, Any] = {"particles": particles, "draws": draws, "steps": steps, "hand": hand}

@@ -20,7 +20,7 @@ NEXT = (
 
 def init(folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to make.")]) -> None:
     """Make a folder to work in: programs, recipes and first tables of drives to try them on."""
-    from steady_ppl.rooms import ROOMS, furnish
+    from steady_ppl.runs.workbench import ROOMS, furnish
 
     tables = furnish(folder)
     tell(f"{folder}: {', '.join(f'{room}/' for room in ROOMS)}, {', '.join(table.name for table in tables)}")

@@ -29,10 +29,10 @@ from steady_ppl import (
     command_states,
     command_study,
 )
-from steady_ppl.commanded import commanded
 from steady_ppl.errors import SteadyError
 from steady_ppl.outside import as_refusal
 from steady_ppl.progress_line import progress_line
+from steady_ppl.runs.folder import commanded
 from steady_ppl.utils.progress import listening
 from steady_ppl.utils.text import hushed, say, tell
 

@@ -72,7 +72,7 @@ def load_runs(labels: Mapping[str, Path], programs: Sequence[str] | None) -> dic
     Raises:
         UsageError: another number of programs than of runs.
     """
-    from steady_ppl.fit import Fit
+    from steady_ppl.runs.fit import Fit
 
     if programs and len(programs) != len(labels):
         raise UsageError(
@@ -84,7 +84,7 @@ def load_runs(labels: Mapping[str, Path], programs: Sequence[str] | None) -> dic
 
 def used_before(runs: Mapping[str, Path], table: str) -> list[str]:
     """Which runs, by label, have already learned from the table of this fingerprint."""
-    from steady_ppl.run_folder import read_record
+    from steady_ppl.runs.folder import read_record
 
     notes = []
     for label, run in runs.items():

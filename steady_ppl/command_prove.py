@@ -38,7 +38,7 @@ def prove(
     )
     from steady_ppl.data.table import read_table
     from steady_ppl.proving import prove as judge
-    from steady_ppl.run_recipe import fingerprint
+    from steady_ppl.runs.recipes import fingerprint
     from steady_ppl.utils.files import require_picture, require_place, write_picture
 
     *runs, table = arguments

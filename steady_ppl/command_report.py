@@ -41,8 +41,8 @@ def report(
     from steady_ppl.command_parts import load_runs, run_labels, used_before
     from steady_ppl.data.table import read_table
     from steady_ppl.reporting import report as gather
-    from steady_ppl.run_folder import read_discovery
-    from steady_ppl.run_recipe import fingerprint
+    from steady_ppl.runs.folder import read_discovery
+    from steady_ppl.runs.recipes import fingerprint
     from steady_ppl.utils.files import require_place
 
     *runs, table = arguments
@@ -82,7 +82,7 @@ def _how(
 ) -> list[str]:
     """How each of the runs, and what was discovered, were made, by which command if one did; the table; the command as
     it was given."""
-    from steady_ppl.run_folder import RECORD, read_record
+    from steady_ppl.runs.folder import RECORD, read_record
 
     given: list[tuple[str, Any]] = [
         ("--discovery", discovery),

@@ -30,10 +30,10 @@ def states(
     The table has for each state its median and the ends of its 90 % interval, `…_low` and `…_high`.
     """
     from steady_ppl.data.table import read_table
-    from steady_ppl.doubts import doubts_of_units
-    from steady_ppl.fit import Fit
     from steady_ppl.model.program import for_program
-    from steady_ppl.posterior_files import require_states_file, write_states
+    from steady_ppl.runs.diagnostics import doubts_of_units
+    from steady_ppl.runs.fit import Fit
+    from steady_ppl.runs.posterior import require_states_file, write_states
     from steady_ppl.smc.genealogy import few_starts
     from steady_ppl.utils.files import require_place
     from steady_ppl.utils.text import say

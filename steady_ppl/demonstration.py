@@ -18,8 +18,8 @@ from typing import Any
 from steady_ppl.command_tour import WIDTH, Tour
 from steady_ppl.errors import ComputationError, RunError
 from steady_ppl.model.loading import load_program
-from steady_ppl.rooms import TRUTH, empty_again, workbench
-from steady_ppl.run_folder import read_record
+from steady_ppl.runs.folder import read_record
+from steady_ppl.runs.workbench import TRUTH, empty_again, workbench
 
 RECORD = "demo.json"  # of a demonstration; a folder without one is not a demonstration's
 OWNERS = "models/hovercraft.py"

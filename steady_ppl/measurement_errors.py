@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.filtering import in_parts
+from steady_ppl.likelihood.evidence import in_parts
 from steady_ppl.model.handlers import AtMean, Recording, as_vector, residual, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError
-from steady_ppl.filtering import in_parts, run_filter
+from steady_ppl.likelihood.evidence import in_parts, run_filter
 from steady_ppl.model.handlers import AtMean
 from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.model.program import Program, error_groups, names

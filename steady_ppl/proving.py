@@ -17,9 +17,7 @@ from torch import Tensor
 
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.doubts import doubts_of_units
 from steady_ppl.errors import DataError, UsageError
-from steady_ppl.fit import Fit
 from steady_ppl.gaussian.predict import named_horizons
 from steady_ppl.model.program import Program, names
 from steady_ppl.paired_bootstrap import FEWEST
@@ -33,6 +31,8 @@ from steady_ppl.proof_rows import (
     keeping_velocity,
     noise_floor,
 )
+from steady_ppl.runs.diagnostics import doubts_of_units
+from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.progress import stages
 

@@ -14,16 +14,16 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.elements import elements, values_of
 from steady_ppl.errors import FilterError, UsageError
 from steady_ppl.gaussian.linearize import Path
 from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
-from steady_ppl.likelihood_fit import roomy_path
-from steady_ppl.maximum_likelihood import Maximum, maximise
+from steady_ppl.likelihood.fit import roomy_path
+from steady_ppl.likelihood.maximize import Maximum, maximise
+from steady_ppl.likelihood.parameters import elements, values_of
+from steady_ppl.likelihood.scores import widens
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import can_be_cut, counts_rows, is_step
 from steady_ppl.model.substeps import MAX_SUBSTEPS, with_substeps
-from steady_ppl.scores import widens
 from steady_ppl.utils.random import seeded
 
 MIN_GAIN = 3.0  # nats, of all drives together, from which a finer step counts

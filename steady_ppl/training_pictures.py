@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from steady_ppl.errors import UsageError
 
 if TYPE_CHECKING:
-    from steady_ppl.fit import Fit
+    from steady_ppl.runs.fit import Fit
 
 COLOR, MARK = "#0072b2", "#d55e00"  # Okabe and Ito
 

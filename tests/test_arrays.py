@@ -8,7 +8,7 @@ import pytest
 from small import simulated
 
 import steady_ppl as st
-from steady_ppl import arrays
+from steady_ppl.data import table
 
 
 def columns(data, drive: int) -> dict[str, np.ndarray]:
@@ -74,7 +74,7 @@ def test_wrong_arrays_are_named(drives, labels, said: str) -> None:
 
 
 def test_the_example_runs() -> None:
-    assert doctest.testmod(arrays).attempted and not doctest.testmod(arrays).failed
+    assert doctest.testmod(table).attempted and not doctest.testmod(arrays).failed
 
 
 def test_frames_keep_their_index_to_themselves() -> None:

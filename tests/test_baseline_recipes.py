@@ -18,7 +18,7 @@ from test_recipes import held_out, same, values
 
 from steady_ppl import UsageError, bearings_to, load_program, seeded, simulate
 from steady_ppl.model.planar_vehicle import PlanarVehicle
-from steady_ppl.run_recipe import find_recipe
+from steady_ppl.runs.recipes import find_recipe
 
 QUIET = {"progress": False}
 LEARN = {"steps": 60, "learning_rate": 0.05}

@@ -13,7 +13,7 @@ import pytest
 from small import FEW, HOVERCRAFT, QUICK, contents, impossible, simulated, steady, written
 
 from steady_ppl import Fit, SMCGuide
-from steady_ppl.run_folder import run_folder
+from steady_ppl.runs.folder import run_folder
 
 # --- fit --------------------------------------------------------------------------------------------------------------
 

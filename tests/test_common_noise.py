@@ -20,10 +20,10 @@ from steady_ppl.discovery.candidates import judged
 from steady_ppl.discovery.common_noise import noise_numbers, with_common_noise
 from steady_ppl.discovery.refits import Worth, first_refit, refit_with
 from steady_ppl.effects import chosen_variant
-from steady_ppl.elements import elements, values_of
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path, smooth
-from steady_ppl.maximum_likelihood import Term, climb, maximise
+from steady_ppl.likelihood.maximize import Term, climb, maximise
+from steady_ppl.likelihood.parameters import elements, values_of
 
 HIDDEN = 0.15  # m/s², process noise that the sensor of these drives nearly hides
 

@@ -17,15 +17,14 @@ from steady_ppl import (
     FilterError,
     GaussianGuide,
     SMCGuide,
-    compiled_rows,
-    linearized_guides,
-    method,
     particle_filter,
     seeded,
 )
 from steady_ppl.gaussian.linearize import Path, linearize
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
+from steady_ppl.guides import linearized
+from steady_ppl.kernels import jit
 from steady_ppl.smc.backends import CompiledStepping, Stepping, stepping_for
 
 HovercraftTruth = type(example("hovercraft:HovercraftTruth"))
@@ -87,15 +86,15 @@ def test_a_kernels_jacobians_are_those_of_torch(name, monkeypatch):
     torch.manual_seed(1)
     states, noise = 2 * torch.randn(9, 3, len(program.states)), torch.randn(8, 3, len(program.channels))
     by_torch = linearize(program, data, Path(states, noise))
-    monkeypatch.setattr(compiled_rows, "ROWS_WORTH_COMPILING", 1)
+    monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", 1)
     by_kernel = linearize(program, data, Path(states, noise))
-    assert by_kernel.in_plain_torch is None and method._COMPILED[program]
+    assert by_kernel.in_plain_torch is None and jit._COMPILED[program]
     for part in ("offset", "state", "noise", "residual", "measurement", "precision", "log_scale"):
         torch.testing.assert_close(getattr(by_kernel, part), getattr(by_torch, part), rtol=1e-4, atol=2e-5)
 
 
 def test_a_program_has_kernels_for_the_filter_and_for_its_jacobians(monkeypatch):
-    monkeypatch.setattr(compiled_rows, "ROWS_WORTH_COMPILING", 1)
+    monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", 1)
     program = single("hovercraft")
     data = drives(program, 2, 9)
     path = Path(torch.randn(9, 2, 6), torch.randn(8, 2, 3))
@@ -105,7 +104,7 @@ def test_a_program_has_kernels_for_the_filter_and_for_its_jacobians(monkeypatch)
 
 
 def test_jacobians_that_cannot_be_compiled_come_from_torch_and_the_guide_says_why(monkeypatch):
-    monkeypatch.setattr(linearized_guides, "WORTH_COMPILING", 1)
+    monkeypatch.setattr(linearized, "WORTH_COMPILING", 1)
     data = drives(example("hovercraft", torch.float32), 2, 12)
     guide = GaussianGuide(Switching(), draws=3, known_start=True)
     with seeded("plain"):
@@ -118,7 +117,7 @@ def test_jacobians_that_cannot_be_compiled_come_from_torch_and_the_guide_says_wh
 
 
 def test_jacobians_that_have_fallen_behind_their_program_are_found_out(monkeypatch):
-    monkeypatch.setattr(compiled_rows, "ROWS_WORTH_COMPILING", 1)
+    monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", 1)
     program = Stale()
     data = drives(example("hovercraft", torch.float32), 2, 31)
     path = Path(torch.randn(31, 2, 6), torch.randn(30, 2, 3))

@@ -12,8 +12,8 @@ from steady_ppl.discovery.common_noise import Judges
 from steady_ppl.discovery.declared_noise import departures
 from steady_ppl.discovery.refits import Fold, Refit
 from steady_ppl.discovery.rounds import Found
-from steady_ppl.elements import elements
 from steady_ppl.gaussian.linearize import Path
+from steady_ppl.likelihood.parameters import elements
 
 
 def fitted(*programs) -> Refit:

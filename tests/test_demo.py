@@ -10,7 +10,7 @@ from steady_ppl import Fit, RunError, command_tour, demonstration, load_program,
 from steady_ppl.demonstration import RECORD, Size, demonstrate
 from steady_ppl.effects import attached
 from steady_ppl.errors import ComputationError
-from steady_ppl.run_folder import write_record
+from steady_ppl.runs.folder import write_record
 
 QUICK = Size(train=6, valid=6, test=8, steps=25, simulations=50)
 FILES = [f"{name}.{kind}" for name in ("check", "discovery", "proof") for kind in ("json", "png", "txt")]

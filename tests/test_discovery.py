@@ -22,8 +22,8 @@ from steady_ppl.discovery.next_run import next_run
 from steady_ppl.discovery.places import variance_of_places
 from steady_ppl.effects import Effect, chosen_variant, parsed
 from steady_ppl.effects.registry import _EFFECTS, register
-from steady_ppl.likelihood_fit import led_back
-from steady_ppl.maximum_likelihood import maximise
+from steady_ppl.likelihood.fit import led_back
+from steady_ppl.likelihood.maximize import maximise
 from steady_ppl.pictures import unknown_effect
 
 DRIVES, ROWS, SETS = 10, 81, 50

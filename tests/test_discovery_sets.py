@@ -13,7 +13,7 @@ from scipy import stats
 
 from steady_ppl import for_program
 from steady_ppl.effects import chosen_variant, find, parsed
-from steady_ppl.elements import elements
+from steady_ppl.likelihood.parameters import elements
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmarks"))
 

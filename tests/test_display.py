@@ -13,7 +13,7 @@ from small import simulated
 
 import steady_ppl as st
 from steady_ppl.pictures import unknown_effect
-from steady_ppl.training import Trained
+from steady_ppl.training.loop import Trained
 
 PNG = b"\x89PNG"
 

@@ -17,12 +17,12 @@ from inference import steady as recipe
 from steady_ppl import Fit, Joint, TruthGuide, UsageError, channel_means, for_program, load_program, simulate
 from steady_ppl.effects import Effect, attached, catalogue, chosen_variant, find, not_applicable, parsed, record
 from steady_ppl.effects.registry import page
-from steady_ppl.filtering import log_likelihood
+from steady_ppl.guides.base import true_paths
+from steady_ppl.likelihood.evidence import log_likelihood
 from steady_ppl.model.handlers import Recording, Replaying
 from steady_ppl.model.program import names
 from steady_ppl.model.substeps import acting_controls, sample_row
 from steady_ppl.model.validate import probe
-from steady_ppl.true_paths import true_paths
 
 PROGRAMS = ("hovercraft", "truck", "pendulum")
 EFFECTS = [(program, effect.name) for program in PROGRAMS for effect in catalogue(example(program))]

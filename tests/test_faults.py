@@ -17,12 +17,12 @@ from examples import example
 from small import HOVERCRAFT, steady, written
 
 import steady_ppl as st
-from steady_ppl.run_folder import LOCK, run_folder
+from steady_ppl.runs.folder import LOCK, run_folder
 from steady_ppl.utils.files import read_tensors
 
 HOLDER = """
 import sys
-from steady_ppl.run_folder import run_folder
+from steady_ppl.runs.folder import run_folder
 with run_folder(sys.argv[1], force=True) as folder:
     (folder / "parameters.safetensors").write_bytes(b"half")
     print("open", flush=True)

@@ -11,7 +11,7 @@ from examples import copies, drives, example
 from oracles import CartPosterior, assert_mean, cart_parameters, kalman
 
 from steady_ppl import DataError, log_likelihood, smoothed_states
-from steady_ppl.filtering import in_parts
+from steady_ppl.likelihood.evidence import in_parts
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def test_parts_hold_every_trajectory_once_and_in_order(data):
 def test_log_likelihood_in_parts_is_that_of_each_trajectory(data, monkeypatch):
     still = example("linear_gaussian").requires_grad_(False)
     still.noise = torch.tensor(1e-9, dtype=torch.float64)  # with a known start every particle is the same
-    monkeypatch.setattr("steady_ppl.filtering.in_parts", partial(in_parts, at_once=20))
+    monkeypatch.setattr("steady_ppl.likelihood.evidence.in_parts", partial(in_parts, at_once=20))
     exact = kalman(data, cart_parameters(still), known_start=True).log_likelihood
     found = log_likelihood(still, data, particles=10, known_start=True, every=1)
     torch.testing.assert_close(found, exact, rtol=1e-6, atol=1e-6)

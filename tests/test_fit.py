@@ -18,7 +18,7 @@ from small import HOVERCRAFT, TRUTH, contents, simulated, steady, written
 
 from steady_ppl import Fit, Program, ProgramError, RunError, SteadyError, Trained, load_program, write_table
 from steady_ppl.evaluation import evaluate
-from steady_ppl.run_recipe import run_recipe
+from steady_ppl.runs.recipes import run_recipe
 
 FILES = {"parameters.safetensors", "posterior.nc", "run.json"}
 NEURAL = f"{MODELS / 'neural_vehicle.py'}:NeuralHovercraft"

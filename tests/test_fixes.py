@@ -12,7 +12,7 @@ from small import simulated
 
 from steady_ppl import DataError, for_program, seeded
 from steady_ppl.gaussian import single_row_map as fixes
-from steady_ppl.run_recipe import recipe_folder
+from steady_ppl.runs.recipes import recipe_folder
 from steady_ppl.utils.angles import wrap
 
 

@@ -12,7 +12,7 @@ from oracles import assert_mean, cart_parameters, kalman
 from small import simulated
 
 import steady_ppl as st
-from steady_ppl.forecasting import forecast
+from steady_ppl.runs.posterior import forecast
 
 ROWS, KNOWN, COPIES = 12, 7, 400
 

@@ -7,7 +7,7 @@ from examples import MODELS
 
 import steady_ppl as st
 from steady_ppl.effects import not_applicable
-from steady_ppl.run_recipe import find_recipe
+from steady_ppl.runs.recipes import find_recipe
 
 BOAT, TRUTH = MODELS / "gps_boat.py", f"{MODELS / 'gps_boat.py'}:GpsBoatTruth"
 

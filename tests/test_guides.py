@@ -32,9 +32,9 @@ from steady_ppl import (
     simulate,
     stack,
 )
+from steady_ppl.guides.base import true_paths
 from steady_ppl.model.handlers import Replaying, running
 from steady_ppl.model.substeps import sample_row
-from steady_ppl.true_paths import true_paths
 
 
 def negative_q(program, guide: PathGuide, data, *, known_start: bool = False) -> Tensor:

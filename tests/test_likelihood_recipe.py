@@ -16,9 +16,9 @@ from small import HOVERCRAFT, steady, written
 from test_recipes import HeavyTailed
 
 import steady_ppl as st
-from steady_ppl.doubts import doubts_of_fit, doubts_of_units
-from steady_ppl.run_recipe import find_recipe
-from steady_ppl.training import Trained
+from steady_ppl.runs.diagnostics import doubts_of_fit, doubts_of_units
+from steady_ppl.runs.recipes import find_recipe
+from steady_ppl.training.loop import Trained
 
 NEURAL = f"{MODELS / 'neural_vehicle.py'}:NeuralHovercraft"
 

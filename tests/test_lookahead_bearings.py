@@ -12,11 +12,11 @@ from oracles import CartPosterior, assert_mean, cart_parameters
 from torch import Tensor
 
 from steady_ppl import FilterError, for_program, particle_filter, seeded, simulate
-from steady_ppl.filtering import neglected, run_filter
 from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
 from steady_ppl.gaussian.linearize import Path, linearize
 from steady_ppl.gaussian.smoother import find_and_smooth, find_path, smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
+from steady_ppl.likelihood.evidence import neglected, run_filter
 from steady_ppl.model.handlers import Standardised, running
 from steady_ppl.utils.angles import wrap
 

@@ -223,7 +223,7 @@ def test_a_guide_remembers_its_paths_from_one_refresh_to_the_next(monkeypatch):
         searched.append(data.labels)
         return find_and_smooth(program, data, **settings)
 
-    monkeypatch.setattr("steady_ppl.linearized_guides.find_and_try", counting)
+    monkeypatch.setattr("steady_ppl.guides.linearized.find_and_try", counting)
     guide = GaussianGuide(program, draws=4, known_start=True, tempering=Constant())
     guide.refresh(data.subset([0, 1]), 0.0)
     guide.refresh(data.subset([1, 0]), 0.0)
@@ -248,7 +248,7 @@ def test_a_guide_leaves_a_wrong_place_for_a_likelier_path(guide, monkeypatch):
     right = {name: value.clone() for name, value in looking.memory.items()}
     wrong = right["states/2"] + torch.tensor([0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
     stays_put = lambda ahead, part: ahead.linearization.path  # noqa: E731
-    monkeypatch.setattr("steady_ppl.linearized_guides.means_as_path", stays_put)
+    monkeypatch.setattr("steady_ppl.guides.linearized.means_as_path", stays_put)
     looking.memory["states/2"] = wrong
     looking.refresh(data, 0.4)
     assert torch.equal(looking.memory["states/2"], wrong)
@@ -269,7 +269,7 @@ def test_a_search_that_was_not_needed_may_fail(guide, monkeypatch):
     def fails(*_, **__):
         raise FilterError("no path")
 
-    monkeypatch.setattr("steady_ppl.linearized_guides.find_and_try", fails)
+    monkeypatch.setattr("steady_ppl.guides.linearized.find_and_try", fails)
     assert looking.refresh(data, 0.3)["searches_failed"] == 1
     looking.memory["noise/3"].fill_(math.nan)
     with pytest.raises(FilterError, match="no path"):
@@ -291,9 +291,9 @@ def test_a_search_that_is_lost_for_one_drive_serves_the_others(monkeypatch):
             ahead, log_likelihood=ahead.log_likelihood * torch.tensor([math.nan, 1.0, 1.0])[: len(ahead.log_likelihood)]
         )
 
-    monkeypatch.setattr("steady_ppl.linearized_guides.find_and_try", one_is_lost)
+    monkeypatch.setattr("steady_ppl.guides.linearized.find_and_try", one_is_lost)
     stays_put = lambda ahead, part: ahead.linearization.path  # noqa: E731
-    monkeypatch.setattr("steady_ppl.linearized_guides.means_as_path", stays_put)
+    monkeypatch.setattr("steady_ppl.guides.linearized.means_as_path", stays_put)
     looking.refresh(data, 0.5)
     torch.testing.assert_close(looking.memory["states/2"], right["2"], rtol=0, atol=0.05)
     assert (looking.memory["states/1"] - right["1"]).abs().max() > 2

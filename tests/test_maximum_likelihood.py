@@ -12,10 +12,10 @@ from examples import drives, example
 from steady_ppl.discovery.candidates import gain_of_fits
 from steady_ppl.discovery.refits import first_refit, refit_near, refit_with
 from steady_ppl.effects import chosen_variant
-from steady_ppl.elements import elements
 from steady_ppl.gaussian.smoother import smooth
-from steady_ppl.likelihood_fit import roomy_path
-from steady_ppl.maximum_likelihood import maximise
+from steady_ppl.likelihood.fit import roomy_path
+from steady_ppl.likelihood.maximize import maximise
+from steady_ppl.likelihood.parameters import elements
 
 
 def set_values(program, values) -> None:

@@ -12,7 +12,7 @@ from examples import drives, example
 from oracles import assert_mean, cart_parameters, cart_system, kalman
 
 from steady_ppl import seeded
-from steady_ppl.filtering import in_parts
+from steady_ppl.likelihood.evidence import in_parts
 from steady_ppl.measurement_errors import measurement_errors
 
 

@@ -12,7 +12,7 @@ from examples import cut, drives, example
 from oracles import CartPosterior, assert_mean, cart_parameters, cart_system
 
 from steady_ppl import seeded
-from steady_ppl.filtering import in_parts
+from steady_ppl.likelihood.evidence import in_parts
 from steady_ppl.metrics import forward, forward_mean, squared_errors, state_estimation
 
 HORIZON = 10

@@ -13,8 +13,8 @@ from small import simulated
 
 from steady_ppl import Fit, UsageError, check
 from steady_ppl.check_pictures import check_picture
-from steady_ppl.posterior import posterior
-from steady_ppl.training import Trained
+from steady_ppl.runs.posterior import posterior
+from steady_ppl.training.loop import Trained
 
 matplotlib.use("Agg")
 

@@ -15,7 +15,7 @@ from steady_ppl import Fit, Trajectories
 from steady_ppl.model.handlers import Replaying
 from steady_ppl.model.program import names
 from steady_ppl.model.substeps import sample_row
-from steady_ppl.posterior import posterior
+from steady_ppl.runs.posterior import posterior
 
 ROWS = 9
 

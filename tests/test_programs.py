@@ -18,11 +18,11 @@ from scipy.integrate import solve_ivp
 from small import HOVERCRAFT, TRUTH, only_start, simulated, steady, written
 
 from steady_ppl import ExplicitEuler, Joint, SteadyError, TruthGuide, dense, for_program, load_program, simulate, stack
+from steady_ppl.guides.base import true_paths
 from steady_ppl.model.handlers import Recording, Replaying
 from steady_ppl.model.program import names
 from steady_ppl.model.substeps import acting_controls, sample_row
 from steady_ppl.model.validate import probe
-from steady_ppl.true_paths import true_paths
 
 ABSTRACT = {"NeuralVehicle"}
 PROGRAMS = [

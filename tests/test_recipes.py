@@ -15,7 +15,7 @@ from examples import MODELS
 from small import HOVERCRAFT, contents, only_start, simulated, steady, written
 
 from steady_ppl import UsageError, for_program, load_program, log_likelihood, seeded, simulate, stack
-from steady_ppl.run_recipe import find_recipe, recipe_folder
+from steady_ppl.runs.recipes import find_recipe, recipe_folder
 
 QUIET = {"progress": False}
 FEW = {

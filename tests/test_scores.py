@@ -12,9 +12,9 @@ from examples import drives, example
 from steady_ppl.discovery.columns import Column, Scoring
 from steady_ppl.discovery.curves import curves
 from steady_ppl.effects import attach, chosen_variant, parsed
-from steady_ppl.elements import elements, moved
 from steady_ppl.gaussian.smoother import find_path, means_as_path, smooth
-from steady_ppl.scores import Smoothed, parameter_scores, smoothed, typical_spreads
+from steady_ppl.likelihood.parameters import elements, moved
+from steady_ppl.likelihood.scores import Smoothed, parameter_scores, smoothed, typical_spreads
 
 EFFECTS = (
     "linear_drag",

@@ -8,9 +8,9 @@ from examples import example
 from test_substeps import joint_density
 
 from steady_ppl import fit_by_likelihood, for_program, seeded, simulate, with_substeps
-from steady_ppl.elements import elements, moved
 from steady_ppl.gaussian.smoother import find_path, means_as_path, smooth, smoother_paths
-from steady_ppl.scores import parameter_scores, smoothed
+from steady_ppl.likelihood.parameters import elements, moved
+from steady_ppl.likelihood.scores import parameter_scores, smoothed
 
 Cart = type(example("linear_gaussian"))
 

@@ -10,7 +10,7 @@ from examples import example
 from small import simulated
 
 from steady_ppl import Fit
-from steady_ppl.posterior_files import states_frame
+from steady_ppl.runs.posterior import states_frame
 from steady_ppl.utils.angles import TURN, draws_on_one_turn, nearest_turn, paths_on_one_turn
 
 GENERATOR = np.random.default_rng(0)

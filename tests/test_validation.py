@@ -7,7 +7,7 @@ from small import simulated
 from test_recipes import HeavyTailed
 
 from steady_ppl import Validation, for_program, log_likelihood, seeded, simulate
-from steady_ppl.validation import as_good
+from steady_ppl.training.validation import as_good
 
 
 def test_better_is_as_good() -> None:

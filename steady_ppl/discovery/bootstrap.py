@@ -11,14 +11,14 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.columns import PART, Column, Scoring
-from steady_ppl.elements import Element
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import Path
 from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.gaussian.smoother import smooth
+from steady_ppl.likelihood.parameters import Element
+from steady_ppl.likelihood.scores import parameter_scores, smoothed
 from steady_ppl.model.program import Program
-from steady_ppl.scores import parameter_scores, smoothed
 from steady_ppl.utils.random import seeded
 
 LEAST_LEFT = 0.8  # share of the simulated sets that must not blow up

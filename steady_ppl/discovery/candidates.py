@@ -17,12 +17,12 @@ from steady_ppl.discovery.declared_noise import departures
 from steady_ppl.discovery.refits import ALWAYS, BY_LIKELIHOOD, Refit, Worth, refit_with
 from steady_ppl.discovery.screening import LEVEL, Screened, Tested, screen
 from steady_ppl.effects import Variant, attached, catalogue
-from steady_ppl.elements import Element, elements
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.smoother import smooth
+from steady_ppl.likelihood.parameters import Element, elements
+from steady_ppl.likelihood.scores import measured, smoothed, typical_spreads
 from steady_ppl.model.program import Program
-from steady_ppl.scores import measured, smoothed, typical_spreads
 from steady_ppl.utils.journal import Piece, piece
 from steady_ppl.utils.random import seeded
 

@@ -12,10 +12,10 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.curves import by_height, multiplier, over_reading, over_state, variables
 from steady_ppl.effects import Variant
+from steady_ppl.likelihood.scores import Smoothed, channel_moments, measured, substep_spreads
 from steady_ppl.model.interventions import by_channel
 from steady_ppl.model.program import Program, names
 from steady_ppl.model.substeps import acting_controls, row_controls
-from steady_ppl.scores import Smoothed, channel_moments, measured, substep_spreads
 
 PART = 400  # trajectories at a time
 

@@ -15,12 +15,12 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects import attached
-from steady_ppl.elements import elements, moved, set_values, values_of
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.linearize import Path
-from steady_ppl.maximum_likelihood import Maximum, Term, climb
+from steady_ppl.likelihood.maximize import Maximum, Term, climb
+from steady_ppl.likelihood.parameters import elements, moved, set_values, values_of
+from steady_ppl.likelihood.scores import channel_moments, substep_spreads
 from steady_ppl.model.program import Program
-from steady_ppl.scores import channel_moments, substep_spreads
 
 FORMS = ("spread", "colour")  # of effects that are process noise
 MOVED, LIKE = 0.1, 1e-3  # by how much a number is moved, and what its effect on log spreads may vary by from row to row

@@ -12,9 +12,9 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.refits import Fold, Refit, as_declared
 from steady_ppl.effects import Variant, attached, catalogue
-from steady_ppl.elements import Element, moved
+from steady_ppl.likelihood.parameters import Element, moved
+from steady_ppl.likelihood.scores import measured, substep_spreads
 from steady_ppl.model.program import Program, names
-from steady_ppl.scores import measured, substep_spreads
 
 
 @dataclass(frozen=True)

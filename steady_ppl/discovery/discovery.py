@@ -18,12 +18,12 @@ from steady_ppl.discovery.next_run import NextRun, next_run
 from steady_ppl.discovery.requirements import FEWEST_DRIVES, require, unexcited
 from steady_ppl.discovery.rounds import Found, Search
 from steady_ppl.discovery.search import MOST, search
-from steady_ppl.doubts import doubts_of_units
 from steady_ppl.effects import of_name, record, restore, written_class
 from steady_ppl.errors import DataError, UsageError
-from steady_ppl.fit import Fit
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.proving import Proof, far_off, prove
+from steady_ppl.runs.diagnostics import doubts_of_units
+from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded

@@ -18,17 +18,17 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
-from steady_ppl.filtering import neglected
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import Path
 from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
-from steady_ppl.linearized_guides import LookaheadGuide
-from steady_ppl.maximum_likelihood import Maximum, kept_maximum, maximise
+from steady_ppl.guides.base import Constant
+from steady_ppl.guides.linearized import LookaheadGuide
+from steady_ppl.likelihood.evidence import neglected
+from steady_ppl.likelihood.maximize import Maximum, kept_maximum, maximise
 from steady_ppl.model.program import Program
-from steady_ppl.tempering import Constant
-from steady_ppl.training import Optimization, train
+from steady_ppl.training.loop import Optimization, train
+from steady_ppl.training.validation import Validation
 from steady_ppl.utils.random import seeded
-from steady_ppl.validation import Validation
 
 DOUBTFUL = 0.5  # nats a drive by which the linearised log p(y) may be off
 PARTICLES, JUDGING = 100, 400  # of the guide and of the judge: see docs/discovery.md, step 4

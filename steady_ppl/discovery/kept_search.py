@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.fit import Fit, program_source, versions
 from steady_ppl.model.program import Program
-from steady_ppl.run_folder import JOURNAL, require_same, run_folder, write_record
-from steady_ppl.run_recipe import fingerprint
+from steady_ppl.runs.fit import Fit, program_source, versions
+from steady_ppl.runs.folder import JOURNAL, require_same, run_folder, write_record
+from steady_ppl.runs.recipes import fingerprint
 from steady_ppl.utils.journal import journal
 
 

@@ -14,14 +14,14 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.common_noise import Judges, with_common_noise
 from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, Fitting, is_doubtful
 from steady_ppl.effects import Variant, attach, attached, coefficient
-from steady_ppl.elements import elements, values_of
 from steady_ppl.errors import FilterError, SteadyError
 from steady_ppl.gaussian.linearize import Path
 from steady_ppl.gaussian.smoother import find_path
-from steady_ppl.likelihood_fit import fit_by_likelihood, led_back
-from steady_ppl.maximum_likelihood import Maximum, maximise
+from steady_ppl.likelihood.fit import fit_by_likelihood, led_back
+from steady_ppl.likelihood.maximize import Maximum, maximise
+from steady_ppl.likelihood.parameters import elements, values_of
+from steady_ppl.likelihood.scores import widens
 from steady_ppl.model.program import Program
-from steady_ppl.scores import widens
 from steady_ppl.utils.random import seeded
 
 WIDER = math.log(20.0)  # log ratio of a channel's noise after a fit and before, from which it explains next to nothing

@@ -8,9 +8,9 @@ import torch
 
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.elements import elements
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.linearize import why_not_linear
+from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.program import Program, names
 
 FEWEST_DRIVES, FEWEST_SETS = 5, 50

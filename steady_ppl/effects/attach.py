@@ -272,8 +272,6 @@ _AROUND: dict[str, Callable[[Any, Variant], Methods]] = {
 
 def with_effects(program: Any, effects: list[str], say: Any) -> Any:
     """A program with effects as users write them; says which values they have."""
-    from steady_ppl.effects import added, chosen_variant, parsed, set_coefficient
-
     named: list[str] = []
     for text in effects:
         name, at, options, value = parsed(text)

@@ -256,7 +256,7 @@ class Twist(Proposal):
         stays = torch.zeros(trajectories, particles, dtype=torch.bool, device=state.device).t()
         if self.untwisted:
             stays = torch.rand(trajectories, particles, **kind).t() < self.untwisted
-        steer = steer if state.device.type == "cpu" else steer_in_parallel
+        steered = steer if state.device.type == "cpu" else steer_in_parallel
         shift, gain, factor, whitening = (part[row] for part in self.steering)
         steering = shift, gain, factor, whitening
-        return steer(state, self.path[row], self.angles, steering, own, stays, self.untwisted)
+        return steered(state, self.path[row], self.angles, steering, own, stays, self.untwisted)

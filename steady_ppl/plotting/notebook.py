@@ -20,10 +20,10 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery import discovery_report
 from steady_ppl.discovery.discovery import Discovery
 from steady_ppl.discovery.pictures import discovery_picture
-from steady_ppl.fit import Fit
 from steady_ppl.model.program import Program
 from steady_ppl.proof_pictures import proof_picture
 from steady_ppl.proving import Proof
+from steady_ppl.runs.fit import Fit
 
 MOST = 12  # numbers of a parameter that are shown one by one
 DOTS = 90  # an inch, of pictures

@@ -11,9 +11,9 @@ import torch
 from steady_ppl.check_pictures import band, measured
 from steady_ppl.checking import Check
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.fit import Fit
 from steady_ppl.model.program import Program, names, units
 from steady_ppl.reporting.packing import packed
+from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.angles import nearest_turn
 
 NUMBERS = 300_000  # of all drives and runs: .8 MB of text

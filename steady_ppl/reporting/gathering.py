@@ -10,11 +10,11 @@ from typing import Any
 from steady_ppl.checking import Check, check
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import SteadyError, UsageError
-from steady_ppl.fit import Fit
 from steady_ppl.proving import Proof, prove, unfinished
 from steady_ppl.reporting.drives import Shown, chosen, given, of_run
 from steady_ppl.reporting.maps import maps
 from steady_ppl.reporting.writing import html, write_page
+from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.progress import stages
 
 

@@ -9,8 +9,8 @@ from latex2mathml.converter import convert
 from markupsafe import Markup, escape
 
 from steady_ppl.effects import Effect, attached, written_class
-from steady_ppl.fit import Fit
 from steady_ppl.plotting.notebook import parameter_rows
+from steady_ppl.runs.fit import Fit
 
 
 def program_page(label: str, fit: Fit) -> dict[str, Any]:

@@ -16,8 +16,8 @@ from plotly.offline import get_plotlyjs
 
 from steady_ppl.check_report import strongest
 from steady_ppl.errors import ComputationError
-from steady_ppl.fit import versions
 from steady_ppl.reporting.program_page import program_page
+from steady_ppl.runs.fit import versions
 from steady_ppl.utils.files import whole_file
 
 if TYPE_CHECKING:

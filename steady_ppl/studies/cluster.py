@@ -16,7 +16,7 @@ from concurrent.futures import CancelledError
 from typing import Any, NamedTuple
 
 from steady_ppl.errors import ComputationError, UsageError
-from steady_ppl.fit import packages
+from steady_ppl.runs.fit import packages
 from steady_ppl.studies import job as work
 from steady_ppl.studies.job_files import JobFiles
 from steady_ppl.studies.places import Place, Row, Say, given_up

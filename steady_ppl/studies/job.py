@@ -17,11 +17,11 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery import discover
 from steady_ppl.errors import RunError
 from steady_ppl.evaluation import evaluate
-from steady_ppl.filtering import choose_filter, log_likelihood
-from steady_ppl.fit import Fit, packages
+from steady_ppl.likelihood.evidence import choose_filter, log_likelihood
 from steady_ppl.model.loading import load_program
 from steady_ppl.model.program import for_program
-from steady_ppl.run_recipe import find_recipe, require_settings, trains
+from steady_ppl.runs.fit import Fit, packages
+from steady_ppl.runs.recipes import find_recipe, require_settings, trains
 from steady_ppl.studies.job_data import drives, planted, told, told_settings
 from steady_ppl.studies.job_files import JobFiles
 from steady_ppl.studies.plan import HELD_OUT, IN_LIMITS, Job

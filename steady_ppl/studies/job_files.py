@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from steady_ppl.errors import UsageError
-from steady_ppl.fit import sha256
 from steady_ppl.model.loading import program_file
-from steady_ppl.run_recipe import recipe_file
+from steady_ppl.runs.fit import sha256
+from steady_ppl.runs.recipes import recipe_file
 from steady_ppl.studies.plan import Job
 from steady_ppl.utils.files import require_file
 

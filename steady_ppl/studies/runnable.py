@@ -11,7 +11,7 @@ from steady_ppl.errors import UsageError, labelled
 from steady_ppl.measurement_errors import OPEN_LOOP
 from steady_ppl.model.loading import load_program
 from steady_ppl.model.program import Program, error_groups, for_program
-from steady_ppl.run_recipe import find_recipe, require_kind, require_settings
+from steady_ppl.runs.recipes import find_recipe, require_kind, require_settings
 from steady_ppl.smc.simulate import simulate
 from steady_ppl.studies.job import ERRORS
 from steady_ppl.studies.job_data import drives, told, told_settings, truth, without_effect

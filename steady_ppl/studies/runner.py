@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from steady_ppl.errors import ComputationError, RunError
-from steady_ppl.fit import packages
+from steady_ppl.runs.fit import packages
 from steady_ppl.studies.job import CHANGED, in_words
 from steady_ppl.studies.places import Place, Row, Say, given_up
 from steady_ppl.studies.plan import RECORD, Job, Plan, record_plan, recorded_plan

@@ -20,7 +20,7 @@ import pyarrow.parquet
 from pyarrow import types
 
 from steady_ppl.errors import RunError
-from steady_ppl.run_folder import only_writer
+from steady_ppl.runs.folder import only_writer
 from steady_ppl.utils.files import require_file, whole_file
 from steady_ppl.utils.text import harmless
 

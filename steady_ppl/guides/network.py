@@ -19,10 +19,10 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import require
 from steady_ppl.gaussian.predict import on_a_circle
 from steady_ppl.gaussian.smoother import find_and_smooth, means_as_path
+from steady_ppl.guides.variational import VariationalGuide, log_ratio, times
+from steady_ppl.likelihood.scores import channel_moments
 from steady_ppl.model.program import Program, names
 from steady_ppl.model.validate import start_size, step_size
-from steady_ppl.scores import channel_moments
-from steady_ppl.variational_guides import VariationalGuide, log_ratio, times
 
 HIDDEN, BOUND = 16, 3.0  # units beside the affine mean, and how many times the usual size it reaches
 

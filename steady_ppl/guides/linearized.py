@@ -20,9 +20,8 @@ from steady_ppl.gaussian.smoother import (
     smoother_paths,
 )
 from steady_ppl.gaussian.twisted_proposal import Twist
-from steady_ppl.guides import FilteringGuide, PathGuide
+from steady_ppl.guides.base import FilteringGuide, LinearRamp, PathGuide, Tempering
 from steady_ppl.model.program import Program
-from steady_ppl.tempering import LinearRamp, Tempering
 
 WORTH_COMPILING = 200  # rows of all trajectories together; a training linearises them hundreds of times
 

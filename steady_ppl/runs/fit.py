@@ -21,16 +21,15 @@ from steady_ppl.errors import RunError
 from steady_ppl.model.loading import load_program
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import is_count
-from steady_ppl.run_folder import PARAMETERS, POSTERIOR, RECORD, read_record, run_folder, write_record
-from steady_ppl.run_forms import FINISHED
-from steady_ppl.training import Trained
+from steady_ppl.runs.folder import FINISHED, PARAMETERS, POSTERIOR, RECORD, read_record, run_folder, write_record
+from steady_ppl.training.loop import Trained
 from steady_ppl.utils.files import read_tensors, whole_file, write_tensors
 from steady_ppl.utils.late import Displayed
 
 if TYPE_CHECKING:
     import arviz
 
-    from steady_ppl.dynamics import Dynamics
+    from steady_ppl.runs.export import Dynamics
 
 
 @dataclass(repr=False)
@@ -61,8 +60,8 @@ class Fit(Displayed):
     def posterior(
         self, data: Trajectories, *, draws: int = 100, particles: int | None = None, every: int = 1, seed: int = 0
     ) -> arviz.InferenceData:
-        """Posterior draws of states and channel noise as ArviZ `InferenceData`; see `steady_ppl.posterior`."""
-        from steady_ppl.posterior import posterior
+        """Posterior draws of states and channel noise as ArviZ `InferenceData`; see `steady_ppl.runs.posterior`."""
+        from steady_ppl.runs.posterior import posterior
 
         return posterior(
             self.program,
@@ -85,8 +84,8 @@ class Fit(Displayed):
         particles: int | None = None,
         seed: int = 0,
     ) -> arviz.InferenceData:
-        """What planned `controls` lead to, or what comes `after` so many seconds; see `steady_ppl.forecasting`."""
-        from steady_ppl.forecasting import forecast
+        """What planned `controls` lead to, or what comes `after` so many seconds; see `steady_ppl.runs.posterior`."""
+        from steady_ppl.runs.posterior import forecast
 
         return forecast(
             self.program,
@@ -102,7 +101,7 @@ class Fit(Displayed):
 
     def dynamics(self, step: float | None = None) -> Dynamics:
         """A copy of the learned dynamics as a plain torch module; `step` is the program's when not given."""
-        from steady_ppl.dynamics import Dynamics
+        from steady_ppl.runs.export import Dynamics
 
         return Dynamics(copy.deepcopy(self.program), self.program.step if step is None else step)
 
@@ -121,7 +120,7 @@ class Fit(Displayed):
         """Write into an open run folder; `begun` is what its record already says."""
         write_tensors(folder / PARAMETERS, self.program.state_dict())
         if train is not None:
-            from steady_ppl.posterior_files import netcdf
+            from steady_ppl.runs.posterior import netcdf
 
             drawn = self.posterior(train, draws=50, seed=self.seed)
             with whole_file(folder / POSTERIOR, RunError) as beside:

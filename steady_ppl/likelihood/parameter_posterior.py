@@ -21,11 +21,11 @@ from torch import Tensor
 from torch.distributions import transform_to
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.elements import Element, elements, moved, set_values, values_of
 from steady_ppl.errors import FilterError, require
 from steady_ppl.gaussian.linearize import Path
 from steady_ppl.gaussian.smoother import smooth
-from steady_ppl.maximum_likelihood import PASSES, REACH, TOLERANCE, log_prior, maximise, posterior_score
+from steady_ppl.likelihood.maximize import PASSES, REACH, TOLERANCE, log_prior, maximise, posterior_score
+from steady_ppl.likelihood.parameters import Element, elements, moved, set_values, values_of
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded

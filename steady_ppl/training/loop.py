@@ -16,14 +16,14 @@ from pyro.infer import Trace_ELBO
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from steady_ppl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import TrainingError, require
 from steady_ppl.model.joint import Joint
 from steady_ppl.model.program import Program
+from steady_ppl.training.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from steady_ppl.training.validation import Validation, as_good
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import tell
-from steady_ppl.validation import Validation, as_good
 
 SETTLED = 1.0  # nats a drive by which held-out log p(y) may rise at the end of a training that has converged
 

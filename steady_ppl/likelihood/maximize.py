@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.elements import Element, elements, moved, set_values, values_of
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import Path
 from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
+from steady_ppl.likelihood.parameters import Element, elements, moved, set_values, values_of
+from steady_ppl.likelihood.scores import parameter_scores, smoothed
 from steady_ppl.model.program import Program
-from steady_ppl.scores import parameter_scores, smoothed
 from steady_ppl.utils.journal import Piece, piece
 from steady_ppl.utils.progress import stages
 

@@ -12,13 +12,13 @@ from typing import Any
 import torch
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.doubts import doubts_of_fit, doubts_of_units
 from steady_ppl.errors import UsageError, require
-from steady_ppl.fit import Fit, program_source, sha256, versions
 from steady_ppl.model.loading import program_file, run_file
 from steady_ppl.model.program import Program, for_program
-from steady_ppl.rooms import workbench
-from steady_ppl.run_folder import CHECKPOINT, require_same, run_folder, write_record
+from steady_ppl.runs.diagnostics import doubts_of_fit, doubts_of_units
+from steady_ppl.runs.fit import Fit, program_source, sha256, versions
+from steady_ppl.runs.folder import CHECKPOINT, require_same, run_folder, write_record
+from steady_ppl.runs.workbench import workbench
 from steady_ppl.utils.files import read_tensors
 
 Recipe = Callable[..., Fit]

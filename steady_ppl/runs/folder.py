@@ -4,19 +4,31 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
-from steady_ppl.commanded import command_line
 from steady_ppl.errors import RunError
-from steady_ppl.run_forms import BEGUN_RECORD, FINISHED, FINISHED_RECORD, FORMAT, FOUND
 from steady_ppl.utils.files import read_json, read_tensors, require_file, whole_file
-from steady_ppl.utils.schema import misfit, refuse_newer
+from steady_ppl.utils.schema import (
+    ANYTHING,
+    LINES,
+    NUMBER,
+    TEXT,
+    TRUTH,
+    WHOLE,
+    Absent,
+    Among,
+    Maybe,
+    misfit,
+    refuse_newer,
+)
 
 PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY = (
     "parameters.safetensors",
@@ -213,3 +225,89 @@ def read_discovery(source: Path) -> dict[str, Any] | None:
     if problem is not None:
         raise RunError(f"{file} is not what `steady discover` writes: {problem}")
     return found
+
+
+FINISHED = ("finished", "interrupted")  # what the record of a run that can be used says
+
+
+FORMAT = 1
+
+
+BEGUN_RECORD = {
+    "format": Absent(WHOLE),
+    "program": Maybe({"class": TEXT, "file": TEXT, "sha256": TEXT}),
+    "recipe": TEXT,
+    "status": TEXT,
+    "command": Absent(Maybe(TEXT)),
+}
+
+
+FINISHED_RECORD = {
+    "effects": Absent(LINES),
+    "substeps": Absent(WHOLE),
+    "known_start": TRUTH,
+    "seed": WHOLE,
+    "settings": {str: ANYTHING},
+    "kept_step": Maybe(WHOLE),
+    "history": [{str: ANYTHING}],
+    "notes": LINES,
+}
+
+
+NUMBERS = Maybe(Among((NUMBER, [Maybe(NUMBER)])))
+
+
+FOUND = {
+    "source": Absent(TEXT),
+    "sentence": TEXT,
+    "complete": Absent(TRUTH),
+    "candidates": [
+        {
+            "effect": TEXT,
+            "kind": TEXT,
+            "p_value": Maybe(NUMBER),
+            "coefficient": NUMBERS,
+            "sd": NUMBERS,
+            "absent": Maybe(NUMBER),
+            "unit": TEXT,
+            "detection_limit": NUMBERS,
+            "heldout_gain": Maybe(NUMBER),
+            "heldout_gain_ci": Maybe([NUMBER]),
+            "note": Maybe(TEXT),
+        }
+    ],
+    "effects": [
+        {
+            "effect": TEXT,
+            "text": TEXT,
+            "unit": TEXT,
+            "class": LINES,
+            "confidence": Maybe(NUMBER),
+            "coefficient": [NUMBER],
+            "interval_90": [[NUMBER]],
+            "heldout_gain": Maybe(NUMBER),
+        }
+    ],
+    "shape": Maybe({"channel": TEXT, "variable": TEXT, "points": [NUMBER], "curve": [NUMBER], "band": [NUMBER]}),
+    "doubts": LINES,
+    "notes": LINES,
+    "next_run": Maybe({"between": LINES, "way": TEXT, "separation": NUMBER, "usual": NUMBER}),
+}
+
+
+_command: ContextVar[str | None] = ContextVar("command", default=None)
+
+
+@contextmanager
+def commanded(words: Sequence[str]) -> Iterator[None]:
+    """Let the record of every run that the block makes say which command line made it."""
+    token = _command.set(shlex.join(words))
+    try:
+        yield
+    finally:
+        _command.reset(token)
+
+
+def command_line() -> str | None:
+    """The words of it as a shell takes them; None in Python."""
+    return _command.get()

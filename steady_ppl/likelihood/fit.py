@@ -12,13 +12,13 @@ from dataclasses import replace
 import torch
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.elements import elements
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import Path
 from steady_ppl.gaussian.smoother import find_path, resting_path, smooth
-from steady_ppl.maximum_likelihood import Maximum, maximise
+from steady_ppl.likelihood.maximize import Maximum, maximise
+from steady_ppl.likelihood.parameters import elements
+from steady_ppl.likelihood.scores import smoothed, widens
 from steady_ppl.model.program import Program
-from steady_ppl.scores import smoothed, widens
 from steady_ppl.utils.progress import stages
 
 ROUGH = 1.5  # mean square deviation, in the program's own, from which its noise is widened before anything is fitted

@@ -13,7 +13,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.program import Program, names, units
 
 if TYPE_CHECKING:
-    from steady_ppl.fit import Fit
+    from steady_ppl.runs.fit import Fit
 
 VANISHED = math.log(20.0)  # log ratio by which a positive number falls to next to nothing
 GONE = math.log(1e3)  # the same of a guess, such as noise

@@ -25,8 +25,8 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.elements import Element, moved
 from steady_ppl.gaussian.information_filter import Lookahead
+from steady_ppl.likelihood.parameters import Element, moved
 from steady_ppl.model.handlers import (
     AtMean,
     Recording,

@@ -10,8 +10,8 @@ import torch
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import require
-from steady_ppl.filtering import log_likelihood
 from steady_ppl.gaussian.linearize import why_not_linear
+from steady_ppl.likelihood.evidence import log_likelihood
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.smc.filter import STEPS_WORTH_COMPILING
 from steady_ppl.utils.random import seeded

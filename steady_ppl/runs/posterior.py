@@ -3,20 +3,32 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 import torch
 import xarray
 from torch import Tensor
 
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.filtering import choose_filter, in_parts, run_filter
+from steady_ppl.errors import DataError, UsageError
+from steady_ppl.gaussian.predict import on_a_circle
+from steady_ppl.likelihood.evidence import choose_filter, in_parts, run_filter
 from steady_ppl.model.handlers import as_vector
 from steady_ppl.model.program import Program, for_program, names, units
-from steady_ppl.utils.angles import paths_on_one_turn
+from steady_ppl.smc.simulate import measure
+from steady_ppl.utils.angles import draws_on_one_turn, paths_on_one_turn
+from steady_ppl.utils.files import whole_file
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
+
+if TYPE_CHECKING:
+    import arviz
+
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", FutureWarning)  # an advertisement of arviz 1, once a day
@@ -163,3 +175,144 @@ def _constants(program: Program, data: Trajectories, coordinates: dict, evidence
         for index, (name, unit) in enumerate(zip(names(program.states), units(program.states), strict=True)):
             variables[f"true_{name}"] = (both, _by_trajectory(data.states[..., index]), {"units": unit})
     return xarray.Dataset(variables, shown)
+
+
+INTERVAL = (0.05, 0.95)
+
+
+SUFFIXES = (".csv", ".parquet", ".nc")
+
+
+def states_frame(posterior: arviz.InferenceData) -> pd.DataFrame:
+    """Median and 90 % interval of every state, a row a trajectory and time step.
+
+    Args:
+        posterior: of `Fit.posterior`.
+
+    Returns:
+        Columns `trajectory`, `time` (s) and for each state component `name`, `name_low`, `name_high`, in its unit.
+    """
+    states = posterior["posterior"]
+    time = posterior["constant_data"]["time"]
+    plain = [name for name, values in states.data_vars.items() if values.dims == ("chain", "draw", *time.dims)]
+    inside = np.isfinite(states[plain[0]].values[0, 0])
+    labels = np.repeat(time["trajectory"].values, inside.sum(1))
+    columns: dict[str, np.ndarray] = {"trajectory": labels, "time": time.values[inside]}
+    for name in plain:
+        low, middle, high = np.quantile(states[name].values[0][:, inside], (INTERVAL[0], 0.5, INTERVAL[1]), axis=0)
+        columns |= {str(name): middle, f"{name}_low": low, f"{name}_high": high}
+    return pd.DataFrame(columns)
+
+
+def require_states_file(path: Path) -> None:
+    """Refuse a file that states cannot be written to.
+
+    Raises:
+        UsageError: another suffix than those of a table or of netCDF.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise UsageError(f"{path}: states are written as {', '.join(SUFFIXES)}")
+
+
+def write_states(posterior: arviz.InferenceData, path: Path) -> None:
+    """Write a posterior whole or not at all: a table of medians and intervals, or all draws as netCDF.
+
+    Raises:
+        UsageError: another suffix, or the file cannot be written.
+    """
+    require_states_file(path)
+    suffix = path.suffix.lower()
+    with whole_file(path) as beside:
+        if suffix == ".nc":
+            beside.write_bytes(netcdf(posterior))
+        elif suffix == ".csv":
+            states_frame(posterior).to_csv(beside, index=False)
+        else:
+            states_frame(posterior).to_parquet(beside, index=False)
+
+
+def netcdf(draws: arviz.InferenceData) -> memoryview:
+    """The bytes of a netCDF file. HDF5 is kept away from disks: on one that is full it prints pages and may crash."""
+    return draws.to_datatree().to_netcdf(None, engine="h5netcdf")
+
+
+@torch.no_grad()
+def forecast(
+    program: Program,
+    data: Trajectories,
+    *,
+    controls: Tensor | None = None,
+    after: float | None = None,
+    step: float | None = None,
+    draws: int = 200,
+    particles: int | None = None,
+    known_start: bool = False,
+    seed: int = 0,
+) -> arviz.InferenceData:
+    """Draw what happens, and what is measured, after a moment up to which measurements are used.
+
+    Args:
+        program: the state-space model.
+        data: drives with the program's columns; rows after the last measurement hold what is planned.
+        controls: more of it, `(H, U)` or `(H, B, U)`, see `Trajectories.continued`.
+        after: s since each drive's start; later measurements are not used. Each drive's last measured row when None.
+        step: s between the rows of `controls`.
+        draws: equally weighted futures of each drive; parameters are those of the program, without their doubt.
+        particles: N of the filter, for each trajectory; None: see `choose_filter`.
+        known_start: start at the true first state.
+        seed: the same seed gives the same draws.
+
+    Returns:
+        What `posterior` returns, and with it `predictions`: one variable a state component and one `measured_…` a
+        measurement, noise included, over (chain, draw, trajectory, row), NaN but in the rows after that moment, angles
+        within half a turn of their mean; and `predictions_constant_data` with these rows' times and what the table has
+        measured in them, `measured_…`, of which nothing was used.
+
+    Raises:
+        DataError: a drive has no row after that moment, or a moment before its first row.
+    """
+    table = data if controls is None else data.continued(controls, step)
+    run = for_program(program, table)
+    last = _last_measured(run) if after is None else run.elapsed.new_full((len(run),), after)
+    future = (run.elapsed > last + 0.01 * run.median_step) & run.rows  # decimal seconds are not binary ones
+    for drive, label in enumerate(run.labels):
+        if not bool(future[:, drive].any()):
+            raise DataError(
+                f"trajectory {label} has no row after {float(last[drive]):g} s: give planned `controls`, or an earlier "
+                "`after`, or add rows with controls and empty y. cells",
+                trajectory=label,
+            )
+        if bool(future[0, drive]):
+            raise DataError(f"trajectory {label} begins after {float(last[drive]):g} s", trajectory=label)
+    known = replace(table, observed=table.observed & ~future[..., None].to(table.observed.device))
+    found = posterior(program, known, draws=draws, particles=particles, known_start=known_start, seed=seed)
+    states = np.stack([found["posterior"][name].values[0] for name in names(program.states)], -1)
+    path = torch.from_numpy(states).to(run.controls).nan_to_num(0.0).transpose(1, 2)
+    with seeded(seed, "forecast"):
+        measured = measure(program, path).transpose(1, 2).numpy(force=True)
+    there = future.t().numpy(force=True)
+    later = torch.where(run.observed & future[..., None], run.measurements, torch.nan).transpose(0, 1)
+    of_row = ("trajectory", "row")
+    time = np.where(there, run.elapsed.double().t().numpy(force=True), np.nan)
+    constants: dict[str, tuple] = {"time": (of_row, time, {"units": "s"})}
+    variables: dict[str, tuple] = {}
+    for index, (name, unit) in enumerate(zip(names(program.states), units(program.states), strict=True)):
+        variables[name] = (DIMENSIONS, np.where(there, states[None, ..., index], np.nan), {"units": unit})
+    circular = on_a_circle(program, run, path[0]).tolist()
+    for index, (name, unit) in enumerate(zip(names(program.measurements), units(program.measurements), strict=True)):
+        values = draws_on_one_turn(measured[..., index]) if circular[index] else measured[..., index]
+        about = {"units": unit, "circular": int(circular[index])}
+        variables[f"measured_{name}"] = (DIMENSIONS, np.where(there, values[None], np.nan), about)
+        constants[f"measured_{name}"] = (of_row, later[..., index].double().numpy(force=True), {"units": unit})
+    coordinates = found["posterior"].coords
+    shown = {name: coordinates[name] for name in of_row}
+    found.add_groups(
+        predictions=xarray.Dataset(variables, {name: coordinates[name] for name in DIMENSIONS}),
+        predictions_constant_data=xarray.Dataset(constants, shown),
+    )
+    return found
+
+
+def _last_measured(data: Trajectories) -> Tensor:
+    """When each drive was last measured, s; zero where it never was."""
+    return torch.where(data.observed.any(-1), data.elapsed, 0.0).amax(0)

@@ -11,9 +11,9 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError
 from steady_ppl.gaussian.information_filter import Steering
 from steady_ppl.gaussian.smoother import find_and_smooth
+from steady_ppl.guides.variational import VariationalGuide, log_ratio, times
 from steady_ppl.model.program import Program
 from steady_ppl.utils.angles import wrap
-from steady_ppl.variational_guides import VariationalGuide, log_ratio, times
 
 
 class SmootherGuide(VariationalGuide):

@@ -1,0 +1,1 @@
+"""How well a program explains given drives: log p(y), its derivatives, its maximum, the posterior about that."""

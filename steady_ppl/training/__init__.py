@@ -1,0 +1,1 @@
+"""One training loop for every guide, its stopping rule and its checkpoints."""
