@@ -32,7 +32,7 @@ from foundation import Bound, report, run_jobs
 from inference import steady
 from models.paper import PaperHovercraftTruth, PaperNeuralHovercraft, PaperNeuralTruck
 from steady_ppl import Fit, Program, Trajectories, for_program, neglected, run_filter, seeded
-from steady_ppl.evaluation import evaluate
+from steady_ppl.comparison.evaluate import evaluate
 
 
 def unknown_drag() -> Program:

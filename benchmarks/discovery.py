@@ -22,11 +22,11 @@ from resumable import digest, run, stored
 
 import steady_ppl
 from steady_ppl import for_program
+from steady_ppl.comparison.prove import prove
 from steady_ppl.discovery import Discovery, discover
-from steady_ppl.discovery.discovery_report import ranked
 from steady_ppl.discovery.refits import Refit, refit_with
+from steady_ppl.discovery.result import ranked
 from steady_ppl.effects import chosen_variant, parsed
-from steady_ppl.proving import prove
 
 RESULTS = Path(__file__).parent / "results" / "discovery.jsonl"
 RIVAL_SETS, BRUTE_SETS = 140, 40

@@ -25,8 +25,8 @@ from models.paper import (  # noqa: E402
     PaperTruck,
 )
 from steady_ppl import Fit, PlanarVehicle, Trajectories, seeded, simulate  # noqa: E402
+from steady_ppl.comparison.evaluate import evaluate  # noqa: E402
 from steady_ppl.datasets.alpha_truck import read_alpha_truck  # noqa: E402
-from steady_ppl.evaluation import evaluate  # noqa: E402
 
 # Chosen by held-out log p(y): on Hov with simulated drives of the seeds 101 to 104, on the truck with the valid split,
 # draws 11 and 12 of the bearings. The truck's ramp ends at an observation weight of .35 (tried: ramps of 1, 3 and 8

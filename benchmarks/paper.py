@@ -39,7 +39,7 @@ from paper_tables import tables
 from resumable import Record, run
 
 from steady_ppl import Fit
-from steady_ppl.evaluation import evaluate
+from steady_ppl.comparison.evaluate import evaluate
 from steady_ppl.pictures import posterior_velocities
 
 FEW = {"steps": 100, "validate_every": 50}

@@ -19,8 +19,8 @@ from models.paper import (
     PaperTruck,
 )
 from steady_ppl import Fit, Trajectories, for_program, log_likelihood, seeded
+from steady_ppl.comparison.metrics import state_estimation
 from steady_ppl.errors import FilterError
-from steady_ppl.metrics import state_estimation
 
 Settings = dict[str, Any]
 RECIPES: dict[str, Callable[..., Fit]] = {

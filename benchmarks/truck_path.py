@@ -11,9 +11,9 @@ from experiments import truck
 
 from models.truck import Truck
 from steady_ppl import Fit, Trajectories, discover
+from steady_ppl.comparison.evaluate import evaluate
 from steady_ppl.data.trajectories import joined
 from steady_ppl.effects import record
-from steady_ppl.evaluation import evaluate
 from steady_ppl.utils.random import seeded
 
 MOST = 5  # discoveries after one another

@@ -17,7 +17,7 @@ from models.neural_vehicle import NeuralTruck
 from models.paper import PaperNeuralTruck, PaperTruck
 from models.truck import Truck
 from steady_ppl import Fit, Trajectories, for_program, seeded, smoothed_states
-from steady_ppl.evaluation import evaluate
+from steady_ppl.comparison.evaluate import evaluate
 from steady_ppl.model.substeps import acting_controls, row_controls
 
 # Steps, rate and ramp were chosen by held-out log p(y) of the valid split, draws 11 to 14 of the bearings, with 64

@@ -35,7 +35,7 @@ from models.hovercraft import HovercraftTruth
 from models.hovercraft_unknown_map import HovercraftUnknownMap, NeuralHovercraftUnknownMap
 from models.neural_vehicle import NeuralHovercraft
 from steady_ppl import UnknownMap, seeded, simulate
-from steady_ppl.evaluation import evaluate
+from steady_ppl.comparison.evaluate import evaluate
 
 DRIVES, SIMULATED, AWAY = 16, 640, 1.0
 FAR, WORSE = 1.5, 1.15  # times the bound, and times the forward error with the known map

@@ -1,5 +1,8 @@
 from . import effects as effects
-from .checking import Check as Check, check as check
+from .comparison.prove import prove as prove
+from .comparison.result import Proof as Proof
+from .criticism.check import check as check
+from .criticism.result import Check as Check
 from .data.rosbag.mapping import BagColumn as BagColumn, BagMapping as BagMapping
 from .data.rosbag.read import read_bags as read_bags
 from .data.table import (
@@ -70,7 +73,6 @@ from .model.planar_vehicle import (
 from .model.program import Program as Program, for_program as for_program
 from .model.substeps import with_substeps as with_substeps
 from .proof_pictures import open_loop_picture as open_loop_picture
-from .proving import Proof as Proof, prove as prove
 from .reporting import Report as Report, report as report
 from .runs.export import Dynamics as Dynamics
 from .runs.fit import Fit as Fit

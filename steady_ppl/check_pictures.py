@@ -9,12 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from steady_ppl.check_report import unit_of, verdict
+from steady_ppl.criticism.baselines import Reference
+from steady_ppl.criticism.result import unit_of, verdict
 from steady_ppl.model.program import names, units
-from steady_ppl.reference_motion import Reference
 
 if TYPE_CHECKING:
-    from steady_ppl.checking import Check
+    from steady_ppl.criticism.result import Check
 
 MEASURED, NEAR, FAR, REFERENCE, FLOOR = "black", "#0072b2", "#d55e00", "#cc79a7", "#009e73"
 COMPONENTS = 4  # panels at most

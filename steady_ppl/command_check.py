@@ -28,8 +28,8 @@ def check(
     seed: Annotated[int, random_seed()] = 0,
 ) -> None:
     """Compare a run with measurements: where, when and in which regime it fails, and who is at fault."""
-    from steady_ppl.checking import check as compare
     from steady_ppl.command_parts import present
+    from steady_ppl.criticism.check import check as compare
     from steady_ppl.data.frozen_sensors import masked
     from steady_ppl.data.table import read_table, require_table_file, write_table
     from steady_ppl.runs.fit import Fit

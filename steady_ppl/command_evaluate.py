@@ -34,8 +34,8 @@ def evaluate(
 ) -> None:
     """The paper's errors where true states exist; errors in measurement space always."""
     from steady_ppl.command_parts import load_runs, present, run_labels, used_before
+    from steady_ppl.comparison.evaluate import evaluate_all, incomparable, table_of
     from steady_ppl.data.table import read_table
-    from steady_ppl.evaluation import evaluate_all, incomparable, table_of
     from steady_ppl.model.loading import load_program
     from steady_ppl.model.program import for_program
     from steady_ppl.runs.diagnostics import doubts_of_units

@@ -36,8 +36,8 @@ def prove(
         run_labels,
         used_before,
     )
+    from steady_ppl.comparison.prove import prove as judge
     from steady_ppl.data.table import read_table
-    from steady_ppl.proving import prove as judge
     from steady_ppl.runs.recipes import fingerprint
     from steady_ppl.utils.files import require_picture, require_place, write_picture
 

@@ -33,7 +33,7 @@ from steady_ppl.utils.angles import nearest_turn
 if TYPE_CHECKING:
     import arviz
 
-    from steady_ppl.checking import Check
+    from steady_ppl.criticism.result import Check
     from steady_ppl.discovery import Discovery
 
 __all__ = [

@@ -9,12 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
+from steady_ppl.comparison.result import FLOOR, units_of_states
 from steady_ppl.errors import UsageError
 from steady_ppl.model.program import units
-from steady_ppl.proof_report import FLOOR, units_of_states
 
 if TYPE_CHECKING:
-    from steady_ppl.proving import Proof
+    from steady_ppl.comparison.result import Proof
 
 COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "black")  # Okabe and Ito
 MARKS = "os^Dvx+"

@@ -74,7 +74,7 @@ def test_wrong_arrays_are_named(drives, labels, said: str) -> None:
 
 
 def test_the_example_runs() -> None:
-    assert doctest.testmod(table).attempted and not doctest.testmod(arrays).failed
+    assert doctest.testmod(table).attempted and not doctest.testmod(table).failed
 
 
 def test_frames_keep_their_index_to_themselves() -> None:

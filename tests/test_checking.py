@@ -16,9 +16,9 @@ from oracles import assert_mean, cart_parameters, kalman
 from small import finite
 
 import steady_ppl as st
-from steady_ppl.checking import _in_own_spreads
-from steady_ppl.misfit_maps import Residuals
-from steady_ppl.reference_motion import ConstantVelocity, Reference
+from steady_ppl.criticism.baselines import ConstantVelocity, Reference
+from steady_ppl.criticism.check import _in_own_spreads
+from steady_ppl.criticism.residual_maps import Residuals
 
 CHANCE = 1e-4
 

@@ -12,7 +12,7 @@ from examples import MODELS, example
 from small import HOVERCRAFT, QUICK, contents, impossible, only_start, simulated, steady, written
 
 from steady_ppl import Fit, load_program, read_table
-from steady_ppl.evaluation import evaluate
+from steady_ppl.comparison.evaluate import evaluate
 
 ERRORS = {"location", "angle", "velocity", "yaw_rate"}
 
@@ -135,7 +135,7 @@ def nothing_computed(monkeypatch) -> None:
     def too_late(*_, **__):
         raise AssertionError("computed before everything was checked")
 
-    monkeypatch.setattr("steady_ppl.evaluation.choose_filter", too_late)
+    monkeypatch.setattr("steady_ppl.comparison.evaluate.choose_filter", too_late)
 
 
 @pytest.mark.usefixtures("nothing_computed")

@@ -17,7 +17,7 @@ from safetensors.torch import load_file
 from small import HOVERCRAFT, TRUTH, contents, simulated, steady, written
 
 from steady_ppl import Fit, Program, ProgramError, RunError, SteadyError, Trained, load_program, write_table
-from steady_ppl.evaluation import evaluate
+from steady_ppl.comparison.evaluate import evaluate
 from steady_ppl.runs.recipes import run_recipe
 
 FILES = {"parameters.safetensors", "posterior.nc", "run.json"}

@@ -16,10 +16,10 @@ from scipy import stats
 from small import FEW, HOVERCRAFT, TRUTH, contents, finite, only_start, simulated, steady, written
 
 import steady_ppl as st
+from steady_ppl.comparison.bootstrap import Sums, paired
+from steady_ppl.comparison.prove import far_off, prove
+from steady_ppl.comparison.scores import Key
 from steady_ppl.model.program import Program, for_program
-from steady_ppl.paired_bootstrap import Sums, paired
-from steady_ppl.proof_rows import Key
-from steady_ppl.proving import far_off, prove
 
 matplotlib.use("Agg")
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from oracles import assert_mean
 
-import steady_ppl.simulated_sets as simulated
+import steady_ppl.criticism.reference_sets as simulated
 from steady_ppl import FilterError
 from steady_ppl.model.program import for_program
 from steady_ppl.utils.random import seeded

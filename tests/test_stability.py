@@ -22,10 +22,10 @@ from steady_ppl import (
     stack,
     with_substeps,
 )
+from steady_ppl.criticism.step_size import check_step
 from steady_ppl.model.stability import counts_rows, divergence
 from steady_ppl.model.validate import probe
 from steady_ppl.smc.simulate import simulated_in
-from steady_ppl.step_size import check_step
 
 Cart = type(example("linear_gaussian"))
 

@@ -37,10 +37,10 @@ from steady_ppl import (
     step_size,
     write_table,
 )
+from steady_ppl.criticism.step_size import check_step
 from steady_ppl.gaussian.smoother import find_path
 from steady_ppl.likelihood.maximize import Maximum
 from steady_ppl.likelihood.parameters import elements
-from steady_ppl.step_size import check_step
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 

@@ -33,6 +33,7 @@ from steady_ppl import (
     stack,
     with_substeps,
 )
+from steady_ppl.criticism.step_size import check_step
 from steady_ppl.gaussian.linearize import linearize
 from steady_ppl.gaussian.smoother import find_path, smooth
 from steady_ppl.kernels.jit import on_all_rows
@@ -50,7 +51,6 @@ from steady_ppl.model.validate import probe
 from steady_ppl.smc.backends import CompiledStepping, Stepping, stepping_for
 from steady_ppl.smc.filter import roll_out
 from steady_ppl.smc.simulate import simulated_in, simulated_substeps
-from steady_ppl.step_size import check_step
 
 K = 3
 

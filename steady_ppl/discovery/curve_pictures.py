@@ -17,7 +17,7 @@ from steady_ppl.model.program import Program, names
 from steady_ppl.model.substeps import acting_controls, row_controls
 
 if TYPE_CHECKING:
-    from steady_ppl.discovery.discovery import Discovery
+    from steady_ppl.discovery.result import Discovery
 
 CHOSEN = "#d55e00"  # Okabe and Ito
 SMALL = 8  # points, of letters

@@ -4,83 +4,32 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 
+from steady_ppl.comparison.prove import far_off, prove
+from steady_ppl.comparison.result import Proof
 from steady_ppl.data.trajectories import Trajectories, joined
 from steady_ppl.discovery.candidates import NATS
-from steady_ppl.discovery.discovery_report import as_text, figures, sentence
-from steady_ppl.discovery.finding import Finding, Shape, findings, shape_of
+from steady_ppl.discovery.finding import Finding, findings, shape_of
 from steady_ppl.discovery.fitting import ByDraws
-from steady_ppl.discovery.next_run import NextRun, next_run
+from steady_ppl.discovery.next_run import next_run
 from steady_ppl.discovery.requirements import FEWEST_DRIVES, require, unexcited
+from steady_ppl.discovery.result import Discovery
 from steady_ppl.discovery.rounds import Found, Search
 from steady_ppl.discovery.search import MOST, search
 from steady_ppl.effects import of_name, record, restore, written_class
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.model.program import Program, for_program
-from steady_ppl.proving import Proof, far_off, prove
 from steady_ppl.runs.diagnostics import doubts_of_units
 from steady_ppl.runs.fit import Fit
-from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
 FITTED_FURTHER = 10.0  # nats that fitting a run further may gain before it is said
 
 NOT_CONVERGED = "the program's own fit has not converged: no ranking below is to be trusted"
-
-
-@dataclass(frozen=True, repr=False)
-class Discovery(Displayed):
-    """What `discover` found.
-
-    Attributes:
-        search: everything that was tested and fitted.
-        findings: the effects that are missing, the one that brings most first; empty where none or a curve is.
-        shape: the curve where no effect of the catalogue explains the drives.
-        next_run: controls that would separate the first class of several members; None where there is none, or where
-            no way of driving that was tried does.
-        proof: the program before and after on the validation drives, by the fits to the training drives.
-        before, after: the programs, fitted to all drives; equal where no effect was found by name.
-        doubts: why no ranking is to be trusted, empty as a rule.
-        notes: what was left out or is not as it seems.
-    """
-
-    search: Search
-    findings: list[Finding]
-    shape: Shape | None
-    next_run: NextRun | None
-    proof: Proof
-    before: Fit
-    after: Fit
-    doubts: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-
-    @property
-    def verdict(self) -> str:
-        """none, dynamics, actuator, sensor, noise or other."""
-        if self.findings:
-            return self.findings[0].kind
-        return "none" if self.search.rounds[0].quiet else "other"
-
-    @property
-    def p_value(self) -> float:
-        """Family-wise: how often drives of the fitted program would look as wrong somewhere."""
-        return self.search.rounds[0].screening.tests.p_value
-
-    @property
-    def figures(self) -> dict[str, Any]:
-        """Everything as a plain dict, ready for JSON."""
-        return figures(self)
-
-    def __str__(self) -> str:
-        return as_text(self)
-
-    def __repr__(self) -> str:
-        return f"Discovery({sentence(self)!r})"
 
 
 def discover(

@@ -13,14 +13,14 @@ from matplotlib.figure import Figure
 
 from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.curve_pictures import CHOSEN, SMALL, curve_panel, titled
-from steady_ppl.discovery.discovery_report import limit_of, sentence
 from steady_ppl.discovery.finding import Finding, gain_interval
+from steady_ppl.discovery.result import limit_of, sentence
 from steady_ppl.discovery.screening import Tested
 from steady_ppl.effects import Variant
 from steady_ppl.proof_pictures import open_loop_picture
 
 if TYPE_CHECKING:
-    from steady_ppl.discovery.discovery import Discovery
+    from steady_ppl.discovery.result import Discovery
 
 ALIKE, OTHER, LIMIT = "#e69f00", "#0072b2", "#009e73"  # Okabe and Ito
 MOST = 9  # candidates of a group

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from steady_ppl.criticism.step_size import StepCheck
 from steady_ppl.discovery.candidates import NATS, NO_DOUBT, Candidate, Screening
 from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.screening import LEVEL, Tested
-from steady_ppl.step_size import StepCheck
 
 MARGIN = 3.0  # nats by which a curve must be better than named effects
 

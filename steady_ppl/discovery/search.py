@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+from steady_ppl.criticism.step_size import StepCheck, check_step
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.candidates import (
     NATS,
@@ -30,7 +31,6 @@ from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import with_substeps
-from steady_ppl.step_size import StepCheck, check_step
 from steady_ppl.utils.progress import stages
 
 BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another

@@ -12,17 +12,15 @@ import torch
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from steady_ppl import check_report, proof_report
 from steady_ppl.check_pictures import check_picture
-from steady_ppl.checking import Check
+from steady_ppl.comparison.result import Proof, verdict as comparison_verdict
+from steady_ppl.criticism.result import Check, verdict as criticism_verdict
 from steady_ppl.data.table import to_frame
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.discovery import discovery_report
-from steady_ppl.discovery.discovery import Discovery
 from steady_ppl.discovery.pictures import discovery_picture
+from steady_ppl.discovery.result import Discovery, sentence
 from steady_ppl.model.program import Program
 from steady_ppl.proof_pictures import proof_picture
-from steady_ppl.proving import Proof
 from steady_ppl.runs.fit import Fit
 
 MOST = 12  # numbers of a parameter that are shown one by one
@@ -69,17 +67,17 @@ def _(fit: Fit) -> str:
 
 @html.register
 def _(found: Check) -> str:
-    return _of_result(check_report.verdict(found), str(found), check_picture(found))
+    return _of_result(criticism_verdict(found), str(found), check_picture(found))
 
 
 @html.register
 def _(found: Proof) -> str:
-    return _of_result(proof_report.verdict(found), str(found), proof_picture(found))
+    return _of_result(comparison_verdict(found), str(found), proof_picture(found))
 
 
 @html.register
 def _(found: Discovery) -> str:
-    return _of_result(discovery_report.sentence(found), str(found), discovery_picture(found))
+    return _of_result(sentence(found), str(found), discovery_picture(found))
 
 
 def _of_result(sentence: str, text: str, picture: Figure) -> str:

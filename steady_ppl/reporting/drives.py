@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from steady_ppl.check_pictures import band, measured
-from steady_ppl.checking import Check
+from steady_ppl.criticism.result import Check
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.program import Program, names, units
 from steady_ppl.reporting.packing import packed

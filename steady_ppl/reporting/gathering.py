@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from steady_ppl.checking import Check, check
+from steady_ppl.comparison.prove import prove, unfinished
+from steady_ppl.comparison.result import Proof
+from steady_ppl.criticism.check import check
+from steady_ppl.criticism.result import Check
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import SteadyError, UsageError
-from steady_ppl.proving import Proof, prove, unfinished
 from steady_ppl.reporting.drives import Shown, chosen, given, of_run
 from steady_ppl.reporting.maps import maps
 from steady_ppl.reporting.writing import html, write_page

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from steady_ppl.check_pictures import subject
-from steady_ppl.check_report import place, sentence
-from steady_ppl.checking import Check
-from steady_ppl.misfit_maps import Cell
+from steady_ppl.criticism.residual_maps import Cell
+from steady_ppl.criticism.result import Check, place, sentence
 from steady_ppl.model.program import names
 from steady_ppl.reporting.packing import packed
 

@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 from plotly.offline import get_plotlyjs
 
-from steady_ppl.check_report import strongest
+from steady_ppl.criticism.result import strongest
 from steady_ppl.errors import ComputationError
 from steady_ppl.reporting.program_page import program_page
 from steady_ppl.runs.fit import versions

@@ -13,10 +13,10 @@ from typing import Any
 
 import torch
 
+from steady_ppl.comparison.evaluate import evaluate
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery import discover
 from steady_ppl.errors import RunError
-from steady_ppl.evaluation import evaluate
 from steady_ppl.likelihood.evidence import choose_filter, log_likelihood
 from steady_ppl.model.loading import load_program
 from steady_ppl.model.program import for_program

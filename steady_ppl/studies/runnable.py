@@ -6,9 +6,9 @@ import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from steady_ppl.comparison.metrics import OPEN_LOOP
 from steady_ppl.discovery import discover
 from steady_ppl.errors import UsageError, labelled
-from steady_ppl.measurement_errors import OPEN_LOOP
 from steady_ppl.model.loading import load_program
 from steady_ppl.model.program import Program, error_groups, for_program
 from steady_ppl.runs.recipes import find_recipe, require_kind, require_settings

@@ -8,21 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from steady_ppl.data.table import refuse_long
-from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.errors import DataError, UsageError
-from steady_ppl.gaussian.predict import named_horizons
-from steady_ppl.model.program import Program, names
-from steady_ppl.paired_bootstrap import FEWEST
-from steady_ppl.proof_report import FLOOR, as_text, figures, verdict
-from steady_ppl.proof_rows import (
+from steady_ppl.comparison.bootstrap import FEWEST
+from steady_ppl.comparison.result import FLOOR, Proof
+from steady_ppl.comparison.scores import (
     SECONDS,
     Judged,
     Row,
@@ -31,49 +24,17 @@ from steady_ppl.proof_rows import (
     keeping_velocity,
     noise_floor,
 )
+from steady_ppl.data.table import refuse_long
+from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.errors import DataError, UsageError
+from steady_ppl.gaussian.predict import named_horizons
+from steady_ppl.model.program import Program, names
 from steady_ppl.runs.diagnostics import doubts_of_units
 from steady_ppl.runs.fit import Fit
-from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.progress import stages
 
 COASTING = "constant velocity"
 FAR_OFF = 2.0  # nats of a drive's log p(y) between a particle filter and the linearised program
-
-
-@dataclass(frozen=True, repr=False)
-class Proof(Displayed):
-    """What `prove` found.
-
-    Attributes:
-        rows: name → figures, in the order in which they were given, then the constant velocity and the noise floor.
-        reference: the name of the row that the others are compared with.
-        horizons: name → how many rows ahead, "one step" first.
-        step: s, of a row.
-        trajectories: how many drives.
-        known_start: whether the true first states were given.
-        seed: of the resampling.
-        notes: what was left out or is not as it seems.
-    """
-
-    rows: dict[str, Row]
-    reference: str
-    horizons: dict[str, int]
-    step: float
-    trajectories: int
-    known_start: bool
-    seed: int
-    notes: list[str]
-
-    @property
-    def figures(self) -> dict[str, Any]:
-        """Everything as a plain dict, ready for JSON."""
-        return figures(self)
-
-    def __str__(self) -> str:
-        return as_text(self.figures)
-
-    def __repr__(self) -> str:
-        return f"Proof({verdict(self)!r})"
 
 
 @torch.no_grad()

@@ -5,17 +5,71 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from steady_ppl.comparison.result import Proof
 from steady_ppl.discovery.candidates import Candidate
-from steady_ppl.discovery.finding import Finding, gain_interval
+from steady_ppl.discovery.finding import Finding, Shape, gain_interval
+from steady_ppl.discovery.next_run import NextRun
 from steady_ppl.discovery.refits import Refit
+from steady_ppl.discovery.rounds import Search
 from steady_ppl.discovery.screening import LEVEL, Tested
+from steady_ppl.runs.fit import Fit
+from steady_ppl.utils.late import Displayed
 
-if TYPE_CHECKING:
-    from steady_ppl.discovery.discovery import Discovery
+
+@dataclass(frozen=True, repr=False)
+class Discovery(Displayed):
+    """What `discover` found.
+
+    Attributes:
+        search: everything that was tested and fitted.
+        findings: the effects that are missing, the one that brings most first; empty where none or a curve is.
+        shape: the curve where no effect of the catalogue explains the drives.
+        next_run: controls that would separate the first class of several members; None where there is none, or where
+            no way of driving that was tried does.
+        proof: the program before and after on the validation drives, by the fits to the training drives.
+        before, after: the programs, fitted to all drives; equal where no effect was found by name.
+        doubts: why no ranking is to be trusted, empty as a rule.
+        notes: what was left out or is not as it seems.
+    """
+
+    search: Search
+    findings: list[Finding]
+    shape: Shape | None
+    next_run: NextRun | None
+    proof: Proof
+    before: Fit
+    after: Fit
+    doubts: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def verdict(self) -> str:
+        """none, dynamics, actuator, sensor, noise or other."""
+        if self.findings:
+            return self.findings[0].kind
+        return "none" if self.search.rounds[0].quiet else "other"
+
+    @property
+    def p_value(self) -> float:
+        """Family-wise: how often drives of the fitted program would look as wrong somewhere."""
+        return self.search.rounds[0].screening.tests.p_value
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """Everything as a plain dict, ready for JSON."""
+        return figures(self)
+
+    def __str__(self) -> str:
+        return as_text(self)
+
+    def __repr__(self) -> str:
+        return f"Discovery({sentence(self)!r})"
+
 
 WIDTH, SHOWN = 100, 12
 IN_WORDS = {

@@ -13,14 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from steady_ppl.criticism.perturbations import Direction, directions
+from steady_ppl.criticism.residual_maps import Residuals
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.directions import Direction, directions
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.kalman import Tracked, track
 from steady_ppl.gaussian.linearize import Path
 from steady_ppl.gaussian.predict import Prediction, predict, simulate_again
 from steady_ppl.gaussian.smoother import smooth
-from steady_ppl.misfit_maps import Residuals
 from steady_ppl.model.program import Program, names
 
 FEWEST = 20  # sets

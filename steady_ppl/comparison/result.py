@@ -4,17 +4,53 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor
 
+from steady_ppl.comparison.bootstrap import LEVEL, RESAMPLES, Change, paired
+from steady_ppl.comparison.scores import BANDS, Key, Row
 from steady_ppl.effects import attached
 from steady_ppl.model.program import names, units
-from steady_ppl.paired_bootstrap import LEVEL, RESAMPLES, Change, paired
-from steady_ppl.proof_rows import BANDS, Key, Row
+from steady_ppl.utils.late import Displayed
 
-if TYPE_CHECKING:
-    from steady_ppl.proving import Proof
+
+@dataclass(frozen=True, repr=False)
+class Proof(Displayed):
+    """What `prove` found.
+
+    Attributes:
+        rows: name → figures, in the order in which they were given, then the constant velocity and the noise floor.
+        reference: the name of the row that the others are compared with.
+        horizons: name → how many rows ahead, "one step" first.
+        step: s, of a row.
+        trajectories: how many drives.
+        known_start: whether the true first states were given.
+        seed: of the resampling.
+        notes: what was left out or is not as it seems.
+    """
+
+    rows: dict[str, Row]
+    reference: str
+    horizons: dict[str, int]
+    step: float
+    trajectories: int
+    known_start: bool
+    seed: int
+    notes: list[str]
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """Everything as a plain dict, ready for JSON."""
+        return figures(self)
+
+    def __str__(self) -> str:
+        return as_text(self.figures)
+
+    def __repr__(self) -> str:
+        return f"Proof({verdict(self)!r})"
+
 
 WIDTH, NAME = 100, 20
 FLOOR = "noise floor"

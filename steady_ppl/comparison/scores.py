@@ -10,6 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from steady_ppl.comparison.bootstrap import Sums
+from steady_ppl.comparison.metrics import squared_errors
+from steady_ppl.criticism.baselines import ConstantVelocity, constant_velocity
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, UsageError
 from steady_ppl.gaussian.information_filter import Lookahead
@@ -19,10 +22,7 @@ from steady_ppl.gaussian.predict import Prediction, named_horizons, predict, sim
 from steady_ppl.gaussian.smoother import find_and_smooth, smooth
 from steady_ppl.likelihood.evidence import neglected
 from steady_ppl.likelihood.scores import measured, substep_spreads
-from steady_ppl.metrics import squared_errors
 from steady_ppl.model.program import Program, error_groups, for_program, units
-from steady_ppl.paired_bootstrap import Sums
-from steady_ppl.reference_motion import ConstantVelocity, constant_velocity
 from steady_ppl.utils.random import seeded
 
 SECONDS = (1.0, 3.0, 10.0)

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from steady_ppl.directions import Direction
-from steady_ppl.misfit_maps import LEVEL, standardise, tail_p_value
+from steady_ppl.criticism.perturbations import Direction
+from steady_ppl.criticism.residual_maps import LEVEL, standardise, tail_p_value
 
 Array = np.ndarray[Any, Any]
 KINDS = ("sensor", "actuator", "dynamics")

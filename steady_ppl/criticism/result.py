@@ -4,17 +4,71 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from steady_ppl.misfit_maps import Cell, Finding
-from steady_ppl.model.program import names, units
-from steady_ppl.reference_motion import ABOUT, Reference
+from steady_ppl.criticism.attribution import Blame
+from steady_ppl.criticism.baselines import ABOUT, Reference
+from steady_ppl.criticism.residual_maps import Cell, Finding, Misfit, Residuals
+from steady_ppl.criticism.step_size import StepCheck
+from steady_ppl.data.frozen_sensors import Stretch
+from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.gaussian.predict import Prediction
+from steady_ppl.model.program import Program, names, units
+from steady_ppl.utils.late import Displayed
 
-if TYPE_CHECKING:
-    from steady_ppl.checking import Check
+
+@dataclass(frozen=True, repr=False)
+class Check(Displayed):
+    """What `check` found.
+
+    Attributes:
+        program: that was judged.
+        data: the drives, as the program reads them.
+        horizons: name → how many rows ahead, "one step" first.
+        predictions: horizon → measured less predicted.
+        floor: horizon → RMSE of each component in each simulated set, `(M, K)`: what the noise alone would leave.
+        reference: the vehicle that keeps its velocity, or why there is none.
+        held: horizon → measured less last measured, and where both exist.
+        step: the program beside itself at finer steps, refitted to these drives.
+        misfit: the maps; every cell with its residual.
+        blame: who is at fault.
+        residuals: names of the measurement components and, after them, of the channels.
+        standardised: the residuals themselves, one set, with the variables that the regimes are ranges of.
+        stuck: stretches of the table in which nothing was measured though something is written.
+        notes: what was left out.
+    """
+
+    program: Program
+    data: Trajectories
+    horizons: dict[str, int]
+    predictions: dict[int, Prediction]
+    floor: dict[int, np.ndarray]
+    reference: Reference | str
+    held: dict[int, tuple[Tensor, Tensor]]
+    step: StepCheck
+    misfit: Misfit
+    blame: Blame
+    residuals: list[str]
+    standardised: Residuals
+    stuck: list[Stretch]
+    notes: list[str]
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """Everything as a plain dict, ready for JSON."""
+        return figures(self)
+
+    def __str__(self) -> str:
+        return as_text(self.figures)
+
+    def __repr__(self) -> str:
+        return f"Check({verdict(self)!r})"
+
 
 SHOWN = 8  # findings in the table
 WHO = {

@@ -8,85 +8,36 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from steady_ppl.blame import SCATTER, Blame, blame, scored
-from steady_ppl.check_report import as_text, figures, verdict
-from steady_ppl.data.frozen_sensors import Stretch, stuck
+from steady_ppl.criticism.attribution import SCATTER, blame, scored
+from steady_ppl.criticism.baselines import constant_velocity, last_measurement
+from steady_ppl.criticism.perturbations import directions
+from steady_ppl.criticism.reference_sets import FEWEST, residuals, simulate_sets
+from steady_ppl.criticism.residual_maps import Residuals, judge
+from steady_ppl.criticism.result import Check
+from steady_ppl.criticism.step_size import check_step
+from steady_ppl.data.frozen_sensors import stuck
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.directions import directions
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.kalman import track
 from steady_ppl.gaussian.linearize import why_not_linear
-from steady_ppl.gaussian.predict import Prediction, named_horizons, predict
+from steady_ppl.gaussian.predict import named_horizons, predict
 from steady_ppl.gaussian.smoother import find_and_smooth
-from steady_ppl.misfit_maps import Misfit, Residuals, judge
 from steady_ppl.model.program import Program, for_program, names
-from steady_ppl.reference_motion import Reference, constant_velocity, last_measurement
 from steady_ppl.runs.diagnostics import doubts_of_units
 from steady_ppl.runs.fit import Fit
-from steady_ppl.simulated_sets import FEWEST, residuals, simulate_sets
-from steady_ppl.step_size import StepCheck, check_step
-from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
 SECONDS = (1.0, 3.0)
 MOST = 4.0  # standard deviations of a single residual; beside a landmark the linearised program knows no more
-
-
-@dataclass(frozen=True, repr=False)
-class Check(Displayed):
-    """What `check` found.
-
-    Attributes:
-        program: that was judged.
-        data: the drives, as the program reads them.
-        horizons: name → how many rows ahead, "one step" first.
-        predictions: horizon → measured less predicted.
-        floor: horizon → RMSE of each component in each simulated set, `(M, K)`: what the noise alone would leave.
-        reference: the vehicle that keeps its velocity, or why there is none.
-        held: horizon → measured less last measured, and where both exist.
-        step: the program beside itself at finer steps, refitted to these drives.
-        misfit: the maps; every cell with its residual.
-        blame: who is at fault.
-        residuals: names of the measurement components and, after them, of the channels.
-        standardised: the residuals themselves, one set, with the variables that the regimes are ranges of.
-        stuck: stretches of the table in which nothing was measured though something is written.
-        notes: what was left out.
-    """
-
-    program: Program
-    data: Trajectories
-    horizons: dict[str, int]
-    predictions: dict[int, Prediction]
-    floor: dict[int, np.ndarray]
-    reference: Reference | str
-    held: dict[int, tuple[Tensor, Tensor]]
-    step: StepCheck
-    misfit: Misfit
-    blame: Blame
-    residuals: list[str]
-    standardised: Residuals
-    stuck: list[Stretch]
-    notes: list[str]
-
-    @property
-    def figures(self) -> dict[str, Any]:
-        """Everything as a plain dict, ready for JSON."""
-        return figures(self)
-
-    def __str__(self) -> str:
-        return as_text(self.figures)
-
-    def __repr__(self) -> str:
-        return f"Check({verdict(self)!r})"
 
 
 @torch.no_grad()

@@ -7,12 +7,11 @@ from typing import Any
 
 import torch
 
+from steady_ppl.comparison.metrics import forward, forward_mean, map_errors, measurement_errors, state_estimation
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, labelled
 from steady_ppl.likelihood.evidence import choose_filter, evidence
-from steady_ppl.measurement_errors import measurement_errors
-from steady_ppl.metrics import forward, forward_mean, map_errors, state_estimation
 from steady_ppl.model.planar_vehicle import UnknownMap
 from steady_ppl.model.program import Program, for_program, names
 from steady_ppl.runs.fit import Fit
