@@ -10,7 +10,7 @@ import torch
 from discovery_sets import BenchmarkSet, benchmark_sets, owner, tables
 
 from steady_ppl import Fit, check, simulate
-from steady_ppl.discovery import discover
+from steady_ppl.discovery.discover import discover
 
 SEED = 60_000
 CLEAN = {"one long drive": (1, 30.0, False), "twelve drives": (12, 6.0, True)}  # number, s, known start

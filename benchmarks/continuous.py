@@ -35,7 +35,7 @@ from scipy import stats
 
 import steady_ppl
 from steady_ppl import Program, discover, load_program
-from steady_ppl.discovery import Discovery
+from steady_ppl.discovery.result import Discovery
 from steady_ppl.effects import chosen_variant, find
 
 FOLDER = Path(__file__).parent

@@ -23,9 +23,9 @@ from resumable import digest, run, stored
 import steady_ppl
 from steady_ppl import for_program
 from steady_ppl.comparison.prove import prove
-from steady_ppl.discovery import Discovery, discover
+from steady_ppl.discovery.discover import discover
 from steady_ppl.discovery.refits import Refit, refit_with
-from steady_ppl.discovery.result import ranked
+from steady_ppl.discovery.result import Discovery, ranked
 from steady_ppl.effects import chosen_variant, parsed
 
 RESULTS = Path(__file__).parent / "results" / "discovery.jsonl"

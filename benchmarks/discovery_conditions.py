@@ -20,7 +20,7 @@ from discovery_limits import owner, with_effects
 from discovery_scores import made_by, share, uniformity
 
 from steady_ppl import Program, Trajectories, seeded, simulate
-from steady_ppl.discovery import discover
+from steady_ppl.discovery.discover import discover
 
 RESULTS = Path(__file__).parent / "results" / "discovery-conditions.jsonl"
 EFFECTS = ("", "quadratic_drag=0.04", "actuator_lag=0.15", "landmark_bias:bearing_1=0.05", "yaw_bias=0.025")

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from steady_ppl import Program, for_program, load_program, simulate
 from steady_ppl.discovery.candidates import Screening, Settings, screen_program
-from steady_ppl.discovery.columns import columns_of
+from steady_ppl.discovery.effect_scores import columns_of
 from steady_ppl.discovery.refits import Refit, first_refit
 from steady_ppl.discovery.screening import GONE, Screened
 from steady_ppl.effects import Variant, attached, catalogue, chosen_variant, parsed

@@ -20,7 +20,7 @@ from experiments import Split, hov, learn, truck
 
 from steady_ppl import Fit, SteadyError, write_table
 from steady_ppl.comparison.evaluate import evaluate, table_of
-from steady_ppl.pictures import posterior_trajectories
+from steady_ppl.plotting import posterior_trajectories
 
 NAMES = {"hand": "Hand", "steady": "learned", "fit-truth": "FitTruth", "truth": "true model"}
 

@@ -40,7 +40,7 @@ from resumable import Record, run
 
 from steady_ppl import Fit
 from steady_ppl.comparison.evaluate import evaluate
-from steady_ppl.pictures import posterior_velocities
+from steady_ppl.plotting import posterior_velocities
 
 FEW = {"steps": 100, "validate_every": 50}
 QUICK: dict[str, Settings] = {"svi": FEW, "steady": FEW, "steady-minus": FEW, "fit-tv": {"iterations": 5}}

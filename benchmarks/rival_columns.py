@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl import Program, Trajectories
-from steady_ppl.discovery.columns import Column, columns_of
+from steady_ppl.discovery.effect_scores import Column, columns_of
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.gaussian.linearize import Path, linearize
 from steady_ppl.likelihood.parameters import elements, moved

@@ -14,7 +14,8 @@ from .data.table import (
     write_table as write_table,
 )
 from .data.trajectories import Trajectories as Trajectories
-from .discovery import Discovery as Discovery, discover as discover
+from .discovery.discover import discover as discover
+from .discovery.result import Discovery as Discovery
 from .errors import (
     DataError as DataError,
     FilterError as FilterError,
@@ -72,8 +73,9 @@ from .model.planar_vehicle import (
 )
 from .model.program import Program as Program, for_program as for_program
 from .model.substeps import with_substeps as with_substeps
-from .proof_pictures import open_loop_picture as open_loop_picture
-from .reporting import Report as Report, report as report
+from .plotting.comparison import open_loop_picture as open_loop_picture
+from .reporting.html import Report as Report
+from .reporting.report import report as report
 from .runs.export import Dynamics as Dynamics
 from .runs.fit import Fit as Fit
 from .smc.filter import particle_filter as particle_filter, roll_out as roll_out

@@ -46,7 +46,7 @@ def check(
     drives = read_table(table)
     found = compare(Fit.load(run, program), drives, simulations=simulations, seed=seed)
     if picture is not None:
-        from steady_ppl.check_pictures import check_picture
+        from steady_ppl.plotting.check import check_picture
 
         write_picture(check_picture(found), picture)
     present(str(found), {"run": str(run), **found.figures}, json_file)

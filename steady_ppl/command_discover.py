@@ -41,8 +41,8 @@ def discover(
     """Learn which physical effect a program lacks: none, one by name, several, or a curve that has no name."""
     from steady_ppl.command_parts import present, program_from, write_json
     from steady_ppl.data.table import read_table
-    from steady_ppl.discovery import discover as search
-    from steady_ppl.discovery.kept_search import kept_search
+    from steady_ppl.discovery.discover import discover as search
+    from steady_ppl.discovery.resume import kept_search
     from steady_ppl.model.substeps import with_substeps
     from steady_ppl.model.validate import probe
     from steady_ppl.runs.fit import Fit
@@ -79,6 +79,6 @@ def discover(
             say(note)
         say(f"{out}: {found.after.program}")
     if picture is not None:
-        from steady_ppl.discovery.pictures import discovery_picture
+        from steady_ppl.plotting.discovery import discovery_picture
 
         write_picture(discovery_picture(found), picture)

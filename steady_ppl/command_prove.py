@@ -54,7 +54,7 @@ def prove(
     found = judge(rows, drives, truth="truth" if truth is not None else None, seed=seed)
     found.notes[:0] = used_before(labels, fingerprint(drives))
     if picture is not None:
-        from steady_ppl.proof_pictures import proof_picture
+        from steady_ppl.plotting.comparison import proof_picture
 
         write_picture(proof_picture(found), picture)
     runs_by_label = {label: str(run) for label, run in labels.items()}

@@ -40,7 +40,7 @@ def report(
     """
     from steady_ppl.command_parts import load_runs, run_labels, used_before
     from steady_ppl.data.table import read_table
-    from steady_ppl.reporting import report as gather
+    from steady_ppl.reporting.report import report as gather
     from steady_ppl.runs.folder import read_discovery
     from steady_ppl.runs.recipes import fingerprint
     from steady_ppl.utils.files import require_place

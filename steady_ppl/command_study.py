@@ -29,11 +29,9 @@ def study(
     """
     import joblib
 
-    from steady_ppl.studies.cluster import Cluster
-    from steady_ppl.studies.places import Local
-    from steady_ppl.studies.runnable import require_runnable
-    from steady_ppl.studies.runner import run_study
-    from steady_ppl.studies.study_file import read_plan
+    from steady_ppl.studies.executors import Cluster, Local
+    from steady_ppl.studies.plan_file import read_plan
+    from steady_ppl.studies.runner import require_runnable, run_study
     from steady_ppl.utils.text import say
 
     if workers is not None and cluster is not None:

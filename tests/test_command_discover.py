@@ -86,7 +86,7 @@ def test_a_folder_that_does_not_exist_is_said_before_anything_is_computed(tmp_pa
 
 def test_a_run_that_cannot_be_written_is_said_before_anything_is_computed(tmp_path, capsys, monkeypatch):
     table = written(tmp_path / "drives.csv", simulated(trajectories=12, rows=20))
-    monkeypatch.setattr("steady_ppl.discovery.discover", lambda *a, **k: pytest.fail("it was computed"))
+    monkeypatch.setattr("steady_ppl.discovery.discover.discover", lambda *a, **k: pytest.fail("it was computed"))
     assert "cannot be written" in refused(capsys, "discover", HOVERCRAFT, table, "--out", table / "run")
 
 

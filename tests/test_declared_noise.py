@@ -9,9 +9,9 @@ import torch
 from examples import drives, example
 
 from steady_ppl.discovery.common_noise import Judges
-from steady_ppl.discovery.declared_noise import departures
+from steady_ppl.discovery.noise_departure import departures
 from steady_ppl.discovery.refits import Fold, Refit
-from steady_ppl.discovery.rounds import Found
+from steady_ppl.discovery.search import Found
 from steady_ppl.gaussian.linearize import Path
 from steady_ppl.likelihood.parameters import elements
 

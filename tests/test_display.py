@@ -12,7 +12,7 @@ from examples import example
 from small import simulated
 
 import steady_ppl as st
-from steady_ppl.pictures import unknown_effect
+from steady_ppl.plotting.discovery import unknown_effect
 from steady_ppl.training.loop import Trained
 
 PNG = b"\x89PNG"

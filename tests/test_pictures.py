@@ -12,7 +12,7 @@ from examples import example
 from small import simulated
 
 from steady_ppl import Fit, UsageError, check
-from steady_ppl.check_pictures import check_picture
+from steady_ppl.plotting.check import check_picture
 from steady_ppl.runs.posterior import posterior
 from steady_ppl.training.loop import Trained
 
@@ -20,17 +20,17 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 
-from steady_ppl.pictures import (
+from steady_ppl.plotting import (
     effective_sizes,
-    forecast_band,
     held_out_curve,
-    innovations,
     observation_noise,
     particle_curve,
     posterior_states,
     posterior_trajectories,
     posterior_velocities,
 )
+from steady_ppl.plotting.check import innovations
+from steady_ppl.plotting.posterior import forecast_band
 
 
 @pytest.fixture(scope="module")

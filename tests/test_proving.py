@@ -25,7 +25,7 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 
-from steady_ppl.proof_pictures import open_loop_picture
+from steady_ppl.plotting.comparison import open_loop_picture
 
 
 def hovercraft(name: str = "hovercraft") -> Program:

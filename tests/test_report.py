@@ -18,11 +18,8 @@ from small import simulated, steady
 
 import steady_ppl as st
 from steady_ppl.effects import attached
-from steady_ppl.reporting.drives import chosen
-from steady_ppl.reporting.maps import where_to_look
-from steady_ppl.reporting.packing import packed
-from steady_ppl.reporting.program_page import _equation
-from steady_ppl.reporting.writing import said, spread
+from steady_ppl.reporting.drives import chosen, packed, where_to_look
+from steady_ppl.reporting.html import _equation, said, spread
 
 MOST = 6_000_000  # bytes
 

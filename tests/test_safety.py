@@ -34,7 +34,7 @@ ALLOWED = {
     ("steady_ppl/__init__.py", "importlib.import_module"): "the package's own names, from a list in the file",
     ("steady_ppl/__init__.py", "import_module"): "the package's own names, from a list in the file",
     (
-        "steady_ppl/studies/places.py",
+        "steady_ppl/studies/executors.py",
         "joblib",
     ): "hands jobs to its own processes, or to a cluster that is named",
     ("steady_ppl/command_study.py", "joblib"): "counts the cores",

@@ -9,8 +9,8 @@ import pytest
 import torch
 from examples import drives, example
 
-from steady_ppl.discovery.columns import Column, Scoring
 from steady_ppl.discovery.curves import curves
+from steady_ppl.discovery.effect_scores import Column, Scoring
 from steady_ppl.effects import attach, chosen_variant, parsed
 from steady_ppl.gaussian.smoother import find_path, means_as_path, smooth
 from steady_ppl.likelihood.parameters import elements, moved

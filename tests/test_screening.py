@@ -10,9 +10,8 @@ import torch
 from examples import example
 from scipy import stats
 
-from steady_ppl.discovery.bootstrap import Simulated
-from steady_ppl.discovery.columns import Column
 from steady_ppl.discovery.curves import between, by_height, height, knots_of, variables
+from steady_ppl.discovery.effect_scores import Column, Simulated
 from steady_ppl.discovery.screening import LEVEL, _critical, screen
 from steady_ppl.effects import chosen_variant
 

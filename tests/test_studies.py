@@ -12,11 +12,10 @@ from small import steady
 from small_studies import STUDY, written
 
 from steady_ppl.errors import ComputationError
-from steady_ppl.studies.cluster import Deaths
-from steady_ppl.studies.places import Local, Place, Row, Say
+from steady_ppl.studies.executors import Deaths, Local, Place, Row, Say
 from steady_ppl.studies.plan import Job
+from steady_ppl.studies.plan_file import read_plan
 from steady_ppl.studies.runner import run_study
-from steady_ppl.studies.study_file import read_plan
 from steady_ppl.studies.table import TABLE, read_results
 
 

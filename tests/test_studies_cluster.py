@@ -18,10 +18,10 @@ from dask_cluster import Dask, free_port, wait_for
 from small import MODELS, steady
 
 from steady_ppl.errors import UsageError
-from steady_ppl.studies import cluster as clusters
-from steady_ppl.studies.cluster import Cluster
+from steady_ppl.studies import executors as clusters
+from steady_ppl.studies.executors import Cluster
+from steady_ppl.studies.plan_file import read_plan
 from steady_ppl.studies.runner import run_study
-from steady_ppl.studies.study_file import read_plan
 from steady_ppl.studies.table import read_results
 
 pytest.importorskip("distributed", reason="needs dask.distributed: pip install 'steady-ppl[cluster]'")

@@ -17,10 +17,9 @@ from steady_ppl.data.table import write_table
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.model.loading import load_program
 from steady_ppl.smc.simulate import simulate
-from steady_ppl.studies.job import CHANGED, in_limits, run
-from steady_ppl.studies.job_data import planted, told_settings
-from steady_ppl.studies.runnable import require_runnable
-from steady_ppl.studies.study_file import read_plan
+from steady_ppl.studies.job import CHANGED, in_limits, planted, run, told_settings
+from steady_ppl.studies.plan_file import read_plan
+from steady_ppl.studies.runner import require_runnable
 
 
 def test_every_list_is_an_axis_and_seeds_are_outermost(tmp_path: Path):

@@ -14,11 +14,11 @@ import pytest
 from small_studies import row, written
 
 from steady_ppl.errors import RunError
+from steady_ppl.studies.executors import Local
 from steady_ppl.studies.job import CHANGED
-from steady_ppl.studies.places import Local
 from steady_ppl.studies.plan import RECORD, record_plan, recorded_plan
+from steady_ppl.studies.plan_file import read_plan
 from steady_ppl.studies.runner import run_study
-from steady_ppl.studies.study_file import read_plan
 from steady_ppl.studies.table import ARRIVED, EARLIER, TABLE, StudyTable, read_results, study_table
 
 

@@ -1,6 +1,1 @@
-"""Which physical effect is missing from a program."""
-
-from steady_ppl.discovery.discovery import discover
-from steady_ppl.discovery.result import Discovery
-
-__all__ = ["Discovery", "discover"]
+"""Which physical effect a program lacks: screen the catalogue, refit the leaders, judge them on held-out drives."""

@@ -10,10 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from steady_ppl.discovery.bootstrap import Simulated, scores_along, simulate_scores
-from steady_ppl.discovery.columns import Column, columns_of
 from steady_ppl.discovery.curves import curves
-from steady_ppl.discovery.declared_noise import departures
+from steady_ppl.discovery.effect_scores import Column, Simulated, columns_of, scores_along, simulate_scores
+from steady_ppl.discovery.noise_departure import departures
 from steady_ppl.discovery.refits import ALWAYS, BY_LIKELIHOOD, Refit, Worth, refit_with
 from steady_ppl.discovery.screening import LEVEL, Screened, Tested, screen
 from steady_ppl.effects import Variant, attached, catalogue

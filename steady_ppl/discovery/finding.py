@@ -12,10 +12,10 @@ from scipy import stats
 
 from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.curves import unit_of
-from steady_ppl.discovery.places import variance_of_places
+from steady_ppl.discovery.profile import variance_of_places
 from steady_ppl.discovery.refits import Refit
-from steady_ppl.discovery.rounds import MARGIN, Found, Search
 from steady_ppl.discovery.screening import Tested
+from steady_ppl.discovery.search import MARGIN, Found, Search
 from steady_ppl.effects import Variant, attached
 from steady_ppl.model.program import Program, names
 

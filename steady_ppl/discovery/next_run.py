@@ -12,7 +12,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.refits import Refit, wide, wide_drives
-from steady_ppl.discovery.rounds import Found
+from steady_ppl.discovery.search import Found
 from steady_ppl.gaussian.linearize import Path
 from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.gaussian.smoother import smooth

@@ -15,8 +15,8 @@ from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.finding import Finding, Shape, gain_interval
 from steady_ppl.discovery.next_run import NextRun
 from steady_ppl.discovery.refits import Refit
-from steady_ppl.discovery.rounds import Search
 from steady_ppl.discovery.screening import LEVEL, Tested
+from steady_ppl.discovery.search import Search
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.late import Displayed
 

@@ -16,10 +16,9 @@ import torch
 from scipy import optimize, stats
 from torch import Tensor
 
-from steady_ppl.discovery.bootstrap import Simulated
-from steady_ppl.discovery.columns import Column
 from steady_ppl.discovery.curves import NAME as CURVE
-from steady_ppl.discovery.declared_noise import Departure
+from steady_ppl.discovery.effect_scores import Column, Simulated
+from steady_ppl.discovery.noise_departure import Departure
 from steady_ppl.effects import Variant
 
 LEVEL, POWER = 0.05, 0.95

@@ -9,29 +9,138 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 from steady_ppl.criticism.step_size import StepCheck, check_step
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.candidates import (
     NATS,
     NEARLY,
+    NO_DOUBT,
     Candidate,
     Screening,
     Settings,
     fitted,
+    judged,
     leaders,
     screen_program,
 )
-from steady_ppl.discovery.look_again import RIVALS, labels, look_again
-from steady_ppl.discovery.places import at_its_best_place
-from steady_ppl.discovery.refits import Refit, Worth, first_refit
-from steady_ppl.discovery.rounds import MARGIN, Found, Round, Search
+from steady_ppl.discovery.profile import at_its_best_place
+from steady_ppl.discovery.refits import Refit, Worth, first_refit, refit_near, refit_with
+from steady_ppl.discovery.screening import LEVEL, Tested
 from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import with_substeps
 from steady_ppl.utils.progress import stages
+
+MARGIN = 3.0  # nats by which a curve must be better than named effects
+
+
+@dataclass(frozen=True)
+class Round:
+    """What was tested, fitted and chosen.
+
+    Attributes:
+        screening: the tests of the program so far.
+        candidates: those that were fitted, best first.
+        chosen: what is added, None when the round ends the search.
+    """
+
+    screening: Screening
+    candidates: list[Candidate]
+    chosen: Candidate | None
+
+    @property
+    def quiet(self) -> bool:
+        """Whether the tests found nothing."""
+        return self.screening.tests.p_value > LEVEL
+
+
+@dataclass(frozen=True)
+class Found:
+    """An effect that was chosen.
+
+    Attributes:
+        candidate: the best.
+        candidates: all that were fitted in its place, best first.
+        without: the program without it.
+    """
+
+    candidate: Candidate
+    candidates: list[Candidate]
+    without: Refit
+
+    @property
+    def alike(self) -> list[Candidate]:
+        """Those that these drives cannot tell from the best, itself first."""
+        best = self.candidate.total
+        close = [c for c in self.candidates if c.total >= best - NATS]
+        return [self.candidate, *(c for c in close if c is not self.candidate and not c.against_its_sign)]
+
+
+@dataclass
+class Search:
+    """What a search came to.
+
+    Attributes:
+        known_start: the first states are certain.
+        base: the program as it stands, fitted.
+        gained: nats that fitting the program as it stands gained on the training drives.
+        rounds: in their order; the last tests the final program unless the search ended early.
+        found: the effects that were added.
+        final: the program with all of them, fitted.
+        step: the program as it stands beside itself at finer steps; all else is at the step that suits.
+        with_found: the program with what was found beside itself at finer steps, where these asked for a second search
+            at the step that suits; None where they did not.
+        curves: fits of curves in place of the first effect, best first, where effects alone did not explain the drives.
+        broke: effects that were taken back because the program with them blew up on drives of its own.
+    """
+
+    known_start: bool
+    base: Refit
+    final: Refit
+    step: StepCheck
+    gained: float
+    with_found: StepCheck | None = None
+    rounds: list[Round] = field(default_factory=list)
+    found: list[Found] = field(default_factory=list)
+    curves: list[Candidate] = field(default_factory=list)
+    broke: list[str] = field(default_factory=list)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the tests of the last round found nothing more that an effect or a curve could bring."""
+        tests = self.rounds[-1].screening.tests
+        return not any(tested.p_value <= tests.critical for tested in tests.tested if not tested.departure)
+
+    @property
+    def departed(self) -> list[Tested]:
+        """What says, in the last tests, that the fitted noise is not the declared."""
+        tests = self.rounds[-1].screening.tests
+        return [tested for tested in tests.tested if tested.departure and tested.p_value <= tests.critical]
+
+    @property
+    def curve(self) -> Candidate | None:
+        """The curve that explains the drives better than all effects that were found; where the noise alone may be what
+        the tests found, one that is significant itself."""
+        best = next((curve for curve in self.curves if isinstance(curve.refit, Refit)), None)
+        if best is None or best.total <= self.gain + MARGIN:
+            return None
+        tests = self.rounds[0].screening.tests
+        of_all = min(tested.p_value for tested in tests.tested if tested.is_curve)
+        return best if not self.departed or best.total > NO_DOUBT or of_all <= tests.critical else None
+
+    @property
+    def needs_a_name(self) -> bool:
+        """Whether neither a curve nor departed noise can be what the tests found."""
+        return self.curve is None and not self.departed
+
+    @property
+    def gain(self) -> float:
+        """Held-out log p(y) of the final program above the first, nats."""
+        return float((self.final.held_out - self.base.held_out[: len(self.final.held_out)]).sum())
+
 
 BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
 MAX_SHIFT_OF_SIZES = 0.08  # nats by which twice the substeps may move what is reported: 0.4 standard deviations
@@ -204,3 +313,73 @@ def _curves(base: Refit, screening: Screening, settings: Settings) -> list[Candi
         return candidate.total - (MARGIN if candidate.variant.options.get("times") else 0.0)
 
     return sorted(found, key=worth, reverse=True)
+
+
+RIVALS = 12.0  # nats behind the best in its round, with which a candidate is looked at again beside other effects
+
+
+RUNAWAY = 25.0  # nats above every fit that it is a part of, from which a fit's likelihood is not to be believed
+
+
+def labels(refit: Refit) -> list[str]:
+    """The effects of a program."""
+    return [variant.label for variant in attached(refit.program)]
+
+
+def look_again(search: Search, settings: Settings) -> None:
+    """Drop effects that are not needed beside the others, and let the rivals of each have its place."""
+    for found in list(search.found):
+        without = _without(search, found, settings)
+        if isinstance(without, str):
+            continue
+        rivals = [found.candidate] + [
+            c for c in found.candidates if c is not found.candidate and c.total > found.candidate.total - RIVALS
+        ]
+        there = {variant.name for variant in attached(without.program)}
+        again = []
+        for rival in rivals:
+            if rival.variant.name not in there and isinstance(rival.refit, Refit):
+                start = rival.refit.coefficient(rival.variant)
+                refit = refit_with(without, rival.variant, start, known_start=settings.known_start)
+                again.append(at_its_best_place(without, judged(without, rival.tested, refit), settings))
+        as_it_stands = judged(without, found.candidate.tested, search.final)
+        if all(c.total < as_it_stands.total for c in again if c.variant.name == found.candidate.variant.name):
+            again = [as_it_stands, *(c for c in again if c.variant.name != found.candidate.variant.name)]
+        again.sort(key=lambda candidate: -candidate.total)
+        best = next((c for c in again if not c.against_its_sign), None)
+        place = search.found.index(found)
+        if best is None or best.total <= NATS or isinstance(best.refit, str):
+            search.found.pop(place)
+            search.final = without
+        else:
+            search.found[place] = Found(best, again, without)
+            search.final = best.refit
+
+
+def _without(search: Search, found: Found, settings: Settings) -> Refit | str:
+    """The program with the other effects, fitted one after the other and from where the fit of all ended: the likelier,
+    lest a fit that has stuck make an effect look needed."""
+    others = [other for other in search.found if other is not found]
+    variants = [other.candidate.variant for other in others]
+    afresh = _with_all(search.base, others, settings)
+    near = refit_near(search.base, search.final, variants, known_start=settings.known_start)
+    if isinstance(afresh, str) or isinstance(near, str):
+        return afresh if isinstance(near, str) else near
+    most = (
+        max(_objective(search.final), _objective(afresh)) + RUNAWAY
+    )  # above all that it is a part of: it has run away
+    return near if _objective(afresh) < _objective(near) < most else afresh
+
+
+def _objective(refit: Refit) -> float:
+    return sum(maximum.objective for maximum in refit.maxima)
+
+
+def _with_all(base: Refit, effects: Sequence[Found], settings: Settings) -> Refit | str:
+    now: Refit | str = base
+    for found in effects:
+        if isinstance(now, str) or isinstance(found.candidate.refit, str):
+            return now
+        start = found.candidate.refit.coefficient(found.candidate.variant)
+        now = refit_with(now, found.candidate.variant, start, known_start=settings.known_start)
+    return now

@@ -12,15 +12,15 @@ import torch
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from steady_ppl.check_pictures import check_picture
 from steady_ppl.comparison.result import Proof, verdict as comparison_verdict
 from steady_ppl.criticism.result import Check, verdict as criticism_verdict
 from steady_ppl.data.table import to_frame
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.discovery.pictures import discovery_picture
 from steady_ppl.discovery.result import Discovery, sentence
 from steady_ppl.model.program import Program
-from steady_ppl.proof_pictures import proof_picture
+from steady_ppl.plotting.check import check_picture
+from steady_ppl.plotting.comparison import proof_picture
+from steady_ppl.plotting.discovery import discovery_picture
 from steady_ppl.runs.fit import Fit
 
 MOST = 12  # numbers of a parameter that are shown one by one

@@ -1,5 +1,1 @@
-"""One page of HTML that says what a program explains of some drives, where it fails and what it lacks."""
-
-from steady_ppl.reporting.gathering import Report, report
-
-__all__ = ["Report", "report"]
+"""One page of HTML that says what programs explain of some drives, where they fail and what they lack."""

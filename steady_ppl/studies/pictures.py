@@ -16,7 +16,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from scipy import stats
 
 from steady_ppl.errors import UsageError
-from steady_ppl.proof_pictures import COLORS, MARKS
+from steady_ppl.plotting.comparison import COLORS, MARKS
 from steady_ppl.studies.plan import IN_LIMITS, LARGEST, Picture, Plan
 from steady_ppl.utils.text import harmless
 

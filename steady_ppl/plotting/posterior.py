@@ -11,6 +11,7 @@ import torch
 from matplotlib.axes import Axes
 
 from steady_ppl.errors import UsageError
+from steady_ppl.utils.angles import nearest_turn
 
 if TYPE_CHECKING:
     import arviz
@@ -194,3 +195,45 @@ def _bands(
 def _in_body_frame(heading: Any, vx: Any, vy: Any) -> tuple[Any, Any]:
     cos, sin = np.cos(heading), np.sin(heading)
     return cos * vx + sin * vy, cos * vy - sin * vx
+
+
+def forecast_band(
+    found: arviz.InferenceData, trajectory: str, of: str, *, axes: Axes | None = None, color: str = LANDMARK
+) -> Axes:
+    """Median and 90 % of a forecast, what was measured before and, where the table has any, after the moment.
+
+    Args:
+        found: of `Fit.forecast`.
+        trajectory: its label.
+        of: a state component or a measurement; `measured_…` for a measurement that is called like a state.
+        axes: drawn on; new ones when not given.
+
+    Raises:
+        UsageError: nothing of that name was forecast, or there is no such trajectory.
+    """
+    require_trajectory(found, trajectory)
+    variables, later = found["predictions"], found["predictions_constant_data"]
+    name = of if of in variables else f"measured_{of}"
+    if name not in variables:
+        raise UsageError(f"no forecast of {of!r}; there are {', '.join(map(str, variables.data_vars))}")
+    axes = axes if axes is not None else plt.subplots(figsize=(7, 3), layout="constrained")[1]
+    time = found["constant_data"]["time"].sel(trajectory=trajectory)
+    draws = variables[name].sel(trajectory=trajectory, chain=0)
+    there = np.isfinite(draws.values).all(0)
+    low, median, high = np.quantile(draws.values[:, there], [0.05, 0.5, 0.95], axis=0)
+    axes.fill_between(time[there], low, high, color=color, alpha=0.25, lw=0, label="forecast, 90 %")
+    axes.plot(time[there], median, color=color, lw=1.4, label="forecast, median")
+    if name in found["observed_data"]:
+        axes.plot(time, found["observed_data"][name].sel(trajectory=trajectory), ".", color=TRUTH, ms=3, label="used")
+        after = later[name].sel(trajectory=trajectory).values[there]
+        if np.isfinite(after).any():
+            after = nearest_turn(after, median) if variables[name].attrs["circular"] else after
+            axes.plot(time[there], after, "x", color=TRUTH, ms=4, label="measured later")
+    elif f"true_{of}" in found["constant_data"]:
+        axes.plot(
+            time, found["constant_data"][f"true_{of}"].sel(trajectory=trajectory), "--", color=TRUTH, label="truth"
+        )
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel(with_unit(of, variables[name]))
+    axes.legend(fontsize=8)
+    return axes

@@ -5,12 +5,15 @@ from __future__ import annotations
 import textwrap
 from typing import TYPE_CHECKING, Any
 
+import matplotlib.pyplot as plt
 import numpy as np
+import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from steady_ppl.criticism.baselines import Reference
 from steady_ppl.criticism.result import unit_of, verdict
+from steady_ppl.errors import UsageError
 from steady_ppl.model.program import names, units
 
 if TYPE_CHECKING:
@@ -188,3 +191,31 @@ def _relative(error: Any, there: Any, floor: np.ndarray) -> float:
     means = square.sum((0, 1)) / np.maximum(there.sum((0, 1)), 1)
     known = (there.sum((0, 1)) > 0) & (floor > 0)
     return float(np.sqrt((means[known] / floor[known] ** 2).mean())) if known.any() else np.nan
+
+
+def innovations(found: Check, trajectory: str, *, axes: Axes | None = None) -> Axes:
+    """Measured less predicted one step ahead, in standard deviations of the prediction; 95 % belong into the grey.
+
+    Args:
+        found: by `check`.
+        trajectory: its label.
+        axes: drawn on; new ones when not given.
+
+    Raises:
+        UsageError: no such trajectory.
+    """
+    if trajectory not in found.data.labels:
+        raise UsageError(f"no trajectory {trajectory!r}; there are {', '.join(found.data.labels)}")
+    axes = axes if axes is not None else plt.subplots(figsize=(7, 3), layout="constrained")[1]
+    drive, prediction = found.data.labels.index(trajectory), found.predictions[1]
+    time = found.data.elapsed[1:, drive].numpy(force=True)
+    scores = torch.where(prediction.observed, prediction.standardised, torch.nan)[:, drive].numpy(force=True)
+    axes.axhspan(-1.96, 1.96, color="0.9", lw=0)
+    for component, (name, mark) in enumerate(zip(names(found.program.measurements), "os^Dvx+*" * 99, strict=False)):
+        axes.plot(time, scores[:, component], mark, ms=3, label=name)
+    axes.axhline(0, color="black", lw=0.6)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("innovation [standard deviations]")
+    axes.set_title(f"trajectory {trajectory}", parse_math=False)
+    axes.legend(fontsize=7, ncols=4)
+    return axes

@@ -2,26 +2,75 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from latex2mathml.converter import convert
 from markupsafe import Markup, escape
 from plotly.offline import get_plotlyjs
 
-from steady_ppl.criticism.result import strongest
+from steady_ppl.comparison.result import Proof
+from steady_ppl.criticism.result import Check, strongest
+from steady_ppl.effects import Effect, attached, written_class
 from steady_ppl.errors import ComputationError
-from steady_ppl.reporting.program_page import program_page
-from steady_ppl.runs.fit import versions
+from steady_ppl.plotting.notebook import parameter_rows
+from steady_ppl.reporting.drives import Shown
+from steady_ppl.runs.fit import Fit, versions
 from steady_ppl.utils.files import whole_file
 
-if TYPE_CHECKING:
-    from steady_ppl.reporting.gathering import Report
+
+@dataclass(frozen=True)
+class Report:
+    """A page and what it is made of.
+
+    Attributes:
+        title: of the page.
+        fits, checks: by the runs' labels.
+        proof: of the runs against the first one, or why there is none.
+        discovery: the figures of `discover`, if there are any.
+        shown: the drives that the page has row by row.
+        drives: what is shown of them, and of each run's predictions and states.
+        how: lines that say how to repeat it.
+        notes: what a reader must know before believing it.
+    """
+
+    title: str
+    fits: Mapping[str, Fit]
+    checks: Mapping[str, Check]
+    proof: Proof | str
+    discovery: Mapping[str, Any] | None
+    shown: Shown
+    drives: Mapping[str, Any]
+    how: Sequence[str]
+    notes: Sequence[str] = field(default_factory=list)
+
+    @property
+    def html(self) -> str:
+        """The page, whole: style, scripts and data are in it."""
+        return html(self)
+
+    def write(self, path: str | Path) -> None:
+        """Write the page whole or not at all.
+
+        Raises:
+            UsageError: the file cannot be written.
+        """
+        write_page(self.html, Path(path))
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        style = "width:100%;height:40em;border:0"
+        return f'<iframe title="{escape(self.title)}" srcdoc="{escape(self.html)}" style="{style}"></iframe>'
+
 
 SCRIPTS = ("page.js", "curves.js", "maps.js", "choosing.js")
 
@@ -153,3 +202,42 @@ def said(sentence: str) -> Markup:
 def interval(pair: Any, digits: int = 3) -> str:
     """Both ends, or nothing."""
     return "" if pair is None else f"[{number(pair[0], digits)}, {number(pair[1], digits)}]"
+
+
+def program_page(label: str, fit: Fit) -> dict[str, Any]:
+    """Name, equations of its effects as MathML, values of its parameters, its class as it is written."""
+    program = fit.program
+    kind = written_class(program)
+    try:
+        text = inspect.getsource(kind)
+    except (TypeError, OSError):
+        text = ""
+    return {
+        "label": label,
+        "name": kind.__name__,
+        "about": inspect.cleandoc(kind.__doc__ or ""),
+        "effects": [
+            {
+                "name": variant.label,
+                "equation": _equation(variant.effect),
+                "text": variant.effect.text,
+                "feels": variant.effect.feels,
+            }
+            for variant in attached(program)
+        ],
+        "parameters": [{"name": name, "value": value} for name, value in parameter_rows(program)],
+        "text": text,
+        "recipe": fit.recipe,
+        "settings": {name: value for name, value in fit.settings.items() if value is not None},
+        "seed": fit.seed,
+        "known_start": fit.known_start,
+        "notes": fit.notes,
+    }
+
+
+def _equation(effect: Effect) -> Markup:
+    """As MathML; in words where somebody's own LaTeX is none."""
+    try:
+        return Markup(convert(effect.equation))
+    except Exception:  # the converter raises many kinds
+        return escape(effect.text)

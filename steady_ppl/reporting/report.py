@@ -3,66 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from steady_ppl.comparison.prove import prove, unfinished
 from steady_ppl.comparison.result import Proof
 from steady_ppl.criticism.check import check
-from steady_ppl.criticism.result import Check
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import SteadyError, UsageError
-from steady_ppl.reporting.drives import Shown, chosen, given, of_run
-from steady_ppl.reporting.maps import maps
-from steady_ppl.reporting.writing import html, write_page
+from steady_ppl.reporting.drives import chosen, given, maps, of_run
+from steady_ppl.reporting.html import Report
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.progress import stages
-
-
-@dataclass(frozen=True)
-class Report:
-    """A page and what it is made of.
-
-    Attributes:
-        title: of the page.
-        fits, checks: by the runs' labels.
-        proof: of the runs against the first one, or why there is none.
-        discovery: the figures of `discover`, if there are any.
-        shown: the drives that the page has row by row.
-        drives: what is shown of them, and of each run's predictions and states.
-        how: lines that say how to repeat it.
-        notes: what a reader must know before believing it.
-    """
-
-    title: str
-    fits: Mapping[str, Fit]
-    checks: Mapping[str, Check]
-    proof: Proof | str
-    discovery: Mapping[str, Any] | None
-    shown: Shown
-    drives: Mapping[str, Any]
-    how: Sequence[str]
-    notes: Sequence[str] = field(default_factory=list)
-
-    @property
-    def html(self) -> str:
-        """The page, whole: style, scripts and data are in it."""
-        return html(self)
-
-    def write(self, path: str | Path) -> None:
-        """Write the page whole or not at all.
-
-        Raises:
-            UsageError: the file cannot be written.
-        """
-        write_page(self.html, Path(path))
-
-    def _repr_html_(self) -> str:
-        from html import escape
-
-        style = "width:100%;height:40em;border:0"
-        return f'<iframe title="{escape(self.title)}" srcdoc="{escape(self.html)}" style="{style}"></iframe>'
 
 
 def report(
