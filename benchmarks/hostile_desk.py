@@ -15,7 +15,7 @@ import torch
 from hostile_bags import write_bags, write_logs
 
 from steady_ppl import load_program, simulate, write_table
-from steady_ppl.command_line import main
+from steady_ppl.cli.main import main
 from steady_ppl.model.program import Program
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -46,7 +46,7 @@ y = ["log_likelihood", "seconds"]
 labels = {seconds = "s"}
 published = {log_likelihood = {hand = [[50, -5.0], [60, -4.0]]}}
 """
-_STEADY = "import sys; from steady_ppl.command_line import main; sys.exit(main(sys.argv[1:]))"
+_STEADY = "import sys; from steady_ppl.cli.main import main; sys.exit(main(sys.argv[1:]))"
 
 
 def lay(folder: Path) -> None:

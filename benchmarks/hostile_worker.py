@@ -25,8 +25,8 @@ from typing import Any
 from hostile_bytes import restore
 from hostile_trials import Trial, trials
 
-from steady_ppl import command_line
-from steady_ppl.command_line import main
+from steady_ppl.cli import main as command_line
+from steady_ppl.cli.main import main
 
 command_line.as_refusal = lambda error: None  # what main puts into words at the last moment nobody has thought of
 ROOM = 4 << 30  # bytes of address space beside what the process has when it begins

@@ -11,7 +11,7 @@ import torch
 from examples import MODELS, example
 
 from steady_ppl import Trajectories, simulate, write_table
-from steady_ppl.command_line import main
+from steady_ppl.cli.main import main
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", FutureWarning)  # arviz announces its next version whenever it is imported

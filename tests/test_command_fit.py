@@ -124,7 +124,7 @@ def test_without_a_terminal_every_validation_is_a_line(tmp_path: Path, work: Pat
 def test_a_fit_in_a_shell_says_its_result_and_nothing_else(tmp_path: Path, work: Path) -> None:
     command = ("fit", HOVERCRAFT, work / "train.csv", "--recipe", "hand", "--out", tmp_path / "run")
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}  # where arviz notes that it has announced itself
-    program = (sys.executable, "-m", "steady_ppl.command_line")
+    program = (sys.executable, "-m", "steady_ppl.cli.main")
     done = subprocess.run([*program, *command], capture_output=True, text=True, check=False, env=environment)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout == f"{tmp_path / 'run'}: Hovercraft(mass=1.5, inertia=1.5, noise=[0.2, 0.2, 0.1])\n"

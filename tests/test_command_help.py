@@ -13,9 +13,9 @@ import pytest
 import typer
 from small import TRUTH, steady, written
 
-from steady_ppl import command_line, progress_line
-from steady_ppl.command_line import COMMANDS, app, main
-from steady_ppl.progress_line import in_words
+from steady_ppl.cli import main as command_line, progress as progress_line
+from steady_ppl.cli.main import COMMANDS, app, main
+from steady_ppl.cli.progress import in_words
 from steady_ppl.utils.progress import listening, stages
 
 LINES, COLUMNS = 24, 80

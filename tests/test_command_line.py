@@ -13,7 +13,7 @@ from small import HOVERCRAFT, TRUTH, simulated, steady, written
 from test_alpha_truck import command_log, pose_log, write as write_logs
 
 from steady_ppl import read_table
-from steady_ppl.command_line import run
+from steady_ppl.cli.main import run
 from steady_ppl.data.table import to_frame
 
 # --- simulate ---------------------------------------------------------------------------------------------------------
@@ -90,7 +90,7 @@ def test_every_command_explains_itself(capsys, command: tuple[str, ...], flag: s
 
 def test_help_does_not_wait_for_torch() -> None:
     code = (
-        "import sys; from steady_ppl.command_line import main\n"
+        "import sys; from steady_ppl.cli.main import main\n"
         "assert main(['fit', '--help']) == 0\n"
         "assert main(['nothing']) == 2\n"
         "print(sorted({'torch', 'pyro', 'pandas', 'arviz'} & sys.modules.keys()))"

@@ -4,14 +4,18 @@ import json
 from pathlib import Path
 
 import pytest
+import typer
 from small import steady
 
-from steady_ppl import Fit, RunError, command_tour, demonstration, load_program, read_table
-from steady_ppl.demonstration import RECORD, Size, demonstrate
+from steady_ppl import Fit, RunError, load_program, read_table
+from steady_ppl.cli import demo
+from steady_ppl.cli.demo import RECORD, Size, demonstrate
+from steady_ppl.cli.main import app
 from steady_ppl.effects import attached
 from steady_ppl.errors import ComputationError
 from steady_ppl.runs.folder import write_record
 
+STEADY = typer.main.get_command(app)
 QUICK = Size(train=6, valid=6, test=8, steps=25, simulations=50)
 FILES = [f"{name}.{kind}" for name in ("check", "discovery", "proof") for kind in ("json", "png", "txt")]
 
@@ -20,7 +24,7 @@ FILES = [f"{name}.{kind}" for name in ("check", "discovery", "proof") for kind i
 def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     """The folder of a small demonstration and what it said."""
     out, lines = tmp_path_factory.mktemp("demo") / "out", list[str]()
-    demonstrate(out, size=QUICK, say=lines.append)
+    demonstrate(out, STEADY, size=QUICK, say=lines.append)
     return out, lines
 
 
@@ -67,15 +71,15 @@ def test_a_search_that_finds_nothing_to_add_is_its_end(tmp_path: Path, monkeypat
     (tmp_path / "discovery.json").write_text('{"sentence": "No effect is missing."}')
     write_record(tmp_path / "runs" / "found", {"program": None, "recipe": "discover", "status": "", "effects": []})
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(command_tour, "run", lambda arguments: "")
+    monkeypatch.setattr(demo, "run", lambda command, arguments: "")
     with pytest.raises(ComputationError, match="nothing to add.*No effect is missing"):
-        demonstration.discover(command_tour.Tour([].append), QUICK)
+        demo.discover(demo.Tour(STEADY, [].append), QUICK)
 
 
 def test_it_goes_over_its_own_folder_only(told: tuple[Path, list[str]], tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(RunError, match="is no demo's"):
-        demonstrate(tmp_path, size=QUICK)
+        demonstrate(tmp_path, STEADY, size=QUICK)
     assert steady("demo", "--out", tmp_path) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 

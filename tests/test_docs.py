@@ -14,7 +14,7 @@ import typer
 from small import simulated
 
 import steady_ppl as st
-from steady_ppl.command_line import COMMANDS, EVERYWHERE, app, main
+from steady_ppl.cli.main import COMMANDS, EVERYWHERE, app, main
 from steady_ppl.effects import catalogue
 
 ROOT = Path(__file__).parents[1]

@@ -15,8 +15,8 @@ import torch
 from small import FEW, HOVERCRAFT, QUICK, steady, tree, written
 
 from steady_ppl import read_table
+from steady_ppl.cli.common import as_refusal
 from steady_ppl.errors import ComputationError, UsageError
-from steady_ppl.outside import as_refusal
 from steady_ppl.utils.files import whole_file
 
 THIRTY = "9" * 30
@@ -133,7 +133,7 @@ shift; exec "$@" """
 def test_a_file_system_that_is_read_only_is_one_line(tmp_path: Path) -> None:
     place = tmp_path / "ro"
     place.mkdir()
-    program = "import sys; from steady_ppl.command_line import main; sys.exit(main(sys.argv[1:]))"
+    program = "import sys; from steady_ppl.cli.main import main; sys.exit(main(sys.argv[1:]))"
     words = ["simulate", HOVERCRAFT, "--trajectories", "2", "--out", place / "a.csv"]
     command = ["unshare", "-m", "sh", "-c", READ_ONLY, "sh", place, sys.executable, "-c", program, *words]
     try:

@@ -18,7 +18,7 @@ from small import HOVERCRAFT, steady, written
 
 import steady_ppl as st
 from steady_ppl.runs.folder import LOCK, run_folder
-from steady_ppl.utils.files import read_tensors
+from steady_ppl.utils.tensor_files import read_tensors
 
 HOLDER = """
 import sys
@@ -109,7 +109,7 @@ def desk(tmp_path_factory) -> Path:
 
 def started(desk: Path, *words: object, room: int = -1) -> subprocess.Popen:
     """A command in a process of its own, none of whose files grows beyond `room` bytes."""
-    program = f"""import resource, sys; from steady_ppl.command_line import main
+    program = f"""import resource, sys; from steady_ppl.cli.main import main
 resource.setrlimit(resource.RLIMIT_FSIZE, ({room}, {room}))
 sys.exit(main(sys.argv[1:]))"""
     with (desk / "errors").open("w") as errors:

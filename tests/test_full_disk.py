@@ -102,7 +102,7 @@ def test_an_overwritten_run_comes_back_when_the_disk_is_full(size: int, work: Pa
 
 def test_the_last_good_checkpoint_stays_when_the_disk_is_full(work: Path, tmp_path: Path, capsys) -> None:
     from steady_ppl.errors import RunError
-    from steady_ppl.utils.files import read_tensors, write_tensors
+    from steady_ppl.utils.tensor_files import read_tensors, write_tensors
 
     tensors, said = read_tensors(work / "steady" / "checkpoint.safetensors")
     file = tmp_path / "checkpoint.safetensors"

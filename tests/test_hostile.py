@@ -190,7 +190,7 @@ def test_a_hundred_thousand_rows_are_handled_in_bounded_memory(tmp_path: Path, c
     frame.to_csv(tmp_path / "long.csv", index=False)
     code = (
         "import resource, sys\n"
-        "from steady_ppl.command_line import main\n"
+        "from steady_ppl.cli.main import main\n"
         "done = main(sys.argv[1:])\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, file=sys.stderr)\n"
         "sys.exit(done)"

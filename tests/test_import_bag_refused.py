@@ -239,7 +239,7 @@ def test_a_mapping_built_in_python_is_judged_like_a_file() -> None:
 
 def test_help_waits_for_neither_torch_nor_rosbags() -> None:
     code = (
-        "import sys; from steady_ppl.command_line import main\n"
+        "import sys; from steady_ppl.cli.main import main\n"
         "assert main(['import-bag', '--help']) == 0\n"
         "print(sorted({'torch', 'rosbags', 'pandas', 'numpy'} & sys.modules.keys()))"
     )

@@ -15,7 +15,7 @@ from small import contents, steady
 from test_docs import commands
 
 from steady_ppl import read_table
-from steady_ppl.command_init import NEXT
+from steady_ppl.cli.make import NEXT
 
 ROOT = MODELS.parent
 

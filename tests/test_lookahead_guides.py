@@ -32,7 +32,7 @@ from steady_ppl import (
 from steady_ppl.comparison.evaluate import evaluate
 from steady_ppl.gaussian.smoother import find_and_smooth, find_path, means_as_path, smooth, smoother_paths
 from steady_ppl.model.handlers import AtMean, Recording, Replaying, Standardised, running
-from steady_ppl.utils.files import read_tensors
+from steady_ppl.utils.tensor_files import read_tensors
 
 GUIDES = (GaussianGuide, LookaheadGuide)
 REMEMBERED = ("states", "noise", "searched")

@@ -31,5 +31,5 @@ def test_an_unknown_name_is_an_ordinary_error() -> None:
 
 
 def test_importing_the_package_loads_no_torch() -> None:
-    code = "import steady_ppl, steady_ppl.command_line, sys; print('torch' in sys.modules)"
+    code = "import steady_ppl, steady_ppl.cli.main, sys; print('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"

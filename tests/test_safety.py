@@ -31,13 +31,11 @@ CALLS = {
 METHODS = {"exec_module", "load_module", "to_pickle", "read_pickle"}
 ALLOWED = {
     ("steady_ppl/model/loading.py", "exec_module"): "a program or recipe that the person names is code",
-    ("steady_ppl/__init__.py", "importlib.import_module"): "the package's own names, from a list in the file",
-    ("steady_ppl/__init__.py", "import_module"): "the package's own names, from a list in the file",
     (
         "steady_ppl/studies/executors.py",
         "joblib",
     ): "hands jobs to its own processes, or to a cluster that is named",
-    ("steady_ppl/command_study.py", "joblib"): "counts the cores",
+    ("steady_ppl/cli/learn.py", "joblib"): "counts the cores",
     ("benchmarks/vmapped.py", "runpy.run_path"): "runs the script that the person names",
     ("benchmarks/report_page.py", "urllib"): "asks the browser that it started on this machine",
 }
@@ -137,7 +135,7 @@ import pickle, torch
 def refuse(*arguments, **named):
     raise RuntimeError("torch.load")
 torch.load = torch.save = refuse
-from steady_ppl.command_line import main
+from steady_ppl.cli.main import main
 for line in open(sys.argv[1]).read().splitlines():
     code = main(line.split(" "))
     assert code == 0, (line, code)

@@ -34,9 +34,9 @@ from steady_ppl import (
     seeded,
     simulate,
     stack,
-    step_size,
     write_table,
 )
+from steady_ppl.criticism import step_size
 from steady_ppl.criticism.step_size import check_step
 from steady_ppl.gaussian.smoother import find_path
 from steady_ppl.likelihood.maximize import Maximum

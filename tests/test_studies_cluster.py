@@ -75,7 +75,7 @@ settings = {{seconds = {seconds}}}
 @contextmanager
 def begun(file: Path, dask: Dask, out: Path) -> Iterator[subprocess.Popen]:
     """`steady study` in a process, when its first results are there."""
-    program = "import sys; from steady_ppl.command_line import main; sys.exit(main(sys.argv[1:]))"
+    program = "import sys; from steady_ppl.cli.main import main; sys.exit(main(sys.argv[1:]))"
     words = ["study", str(file), "--cluster", dask.address, "--out", str(out)]
     with (out.parent / "said").open("w") as said:
         process = subprocess.Popen([sys.executable, "-c", program, *words], stdout=said, stderr=said)

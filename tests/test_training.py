@@ -27,7 +27,7 @@ from steady_ppl import (
     stack,
     train,
 )
-from steady_ppl.utils.files import read_tensors
+from steady_ppl.utils.tensor_files import read_tensors
 
 Cart = type(example("linear_gaussian"))
 QUICK = Optimization(steps=6, validate_every=2, learning_rate=0.05)

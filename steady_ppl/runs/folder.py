@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
 from steady_ppl.errors import RunError
-from steady_ppl.utils.files import read_json, read_tensors, require_file, whole_file
+from steady_ppl.utils.files import read_json, require_file, whole_file
 from steady_ppl.utils.schema import (
     ANYTHING,
     LINES,
@@ -29,6 +27,8 @@ from steady_ppl.utils.schema import (
     misfit,
     refuse_newer,
 )
+from steady_ppl.utils.tensor_files import read_tensors
+from steady_ppl.utils.text import command_line
 
 PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY = (
     "parameters.safetensors",
@@ -293,21 +293,3 @@ FOUND = {
     "notes": LINES,
     "next_run": Maybe({"between": LINES, "way": TEXT, "separation": NUMBER, "usual": NUMBER}),
 }
-
-
-_command: ContextVar[str | None] = ContextVar("command", default=None)
-
-
-@contextmanager
-def commanded(words: Sequence[str]) -> Iterator[None]:
-    """Let the record of every run that the block makes say which command line made it."""
-    token = _command.set(shlex.join(words))
-    try:
-        yield
-    finally:
-        _command.reset(token)
-
-
-def command_line() -> str | None:
-    """The words of it as a shell takes them; None in Python."""
-    return _command.get()

@@ -19,7 +19,7 @@ from steady_ppl.runs.diagnostics import doubts_of_fit, doubts_of_units
 from steady_ppl.runs.fit import Fit, program_source, sha256, versions
 from steady_ppl.runs.folder import CHECKPOINT, require_same, run_folder, write_record
 from steady_ppl.runs.workbench import workbench
-from steady_ppl.utils.files import read_tensors
+from steady_ppl.utils.tensor_files import read_tensors
 
 Recipe = Callable[..., Fit]
 

@@ -23,7 +23,7 @@ def workbench() -> Path:
     Raises:
         UsageError: this installation has neither.
     """
-    here = Path(__file__).resolve().parent
+    here = Path(__file__).resolve().parents[1]  # the package
     for folder in (here.parent, here / "workbench"):
         if all((folder / room).is_dir() for room in ROOMS) and (folder / "inference" / "steady.py").is_file():
             return folder

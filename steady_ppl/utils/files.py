@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import stat
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
-from safetensors import SafetensorError
-from safetensors.torch import load, save_file
-from torch import Tensor
-
-from steady_ppl.errors import RunError, SteadyError, UsageError
+from steady_ppl.errors import SteadyError, UsageError
 from steady_ppl.utils.text import harmless
 
 if TYPE_CHECKING:
@@ -131,57 +125,3 @@ def read_json(path: Path, refused: type[SteadyError]) -> Any:
         raise refused(f"{path} is damaged: {error}") from error
     except RecursionError:
         raise refused(f"{path} is damaged: it is nested too deeply") from None
-
-
-HASH = "sha256"  # of tensors and text, in the file's own text
-
-
-def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: Mapping[str, str] | None = None) -> None:
-    """Write tensors and text to a safetensors file, whole or not at all, with their hash, by which damage is told."""
-    kept = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
-    with whole_file(path, RunError) as beside:
-        try:
-            save_file(kept, beside, {**(text or {}), HASH: _hash(kept, text or {})})
-        except SafetensorError as error:  # what the file system refuses comes as its own
-            raise RunError(f"{path} cannot be written: {error}") from error
-
-
-def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read a file of `write_tensors`, or one from before there was a hash in it.
-
-    Raises:
-        RunError: the file is missing or damaged.
-    """
-    require_file(path, RunError)
-    try:
-        content = path.read_bytes()  # not by name: safetensors reads none that is not UTF-8
-        tensors = load(content)
-    except FileNotFoundError:
-        raise RunError(f"no file {path.name} in {path.parent}") from None
-    except SafetensorError as error:
-        raise RunError(f"{path.name} in {path.parent} is damaged ({error})") from error
-    except OSError as error:
-        raise RunError(f"{path.name} in {path.parent} cannot be read: {error.strerror or error}") from error
-    text = _text(content)
-    written = text.pop(HASH, None)
-    if written is not None and written != _hash(tensors, text):
-        raise damaged(path, "its numbers are not those that were written")
-    return tensors, text
-
-
-def _text(content: bytes) -> dict[str, str]:
-    """The text beside the tensors of a safetensors file that is whole: its header's length comes first."""
-    end = 8 + int.from_bytes(content[:8], "little")
-    return json.loads(content[8:end]).get("__metadata__") or {}
-
-
-def _hash(tensors: Mapping[str, Tensor], text: Mapping[str, str]) -> str:
-    digest = hashlib.sha256(json.dumps(sorted(text.items())).encode())
-    for name, value in sorted(tensors.items()):
-        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode(errors="surrogatepass"))
-        digest.update(value.contiguous().reshape(-1).view(torch.uint8).numpy(force=True).tobytes())
-    return digest.hexdigest()
-
-
-def damaged(path: Path, why: str) -> RunError:
-    return RunError(f"{path.name} in {path.parent} is damaged ({why})")

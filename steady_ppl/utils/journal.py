@@ -22,8 +22,8 @@ import torch
 from torch import Tensor
 
 from steady_ppl.errors import FilterError, RunError
-from steady_ppl.utils.files import read_tensors, write_tensors
 from steady_ppl.utils.schema import ANYTHING, TEXT, Among, misfit
+from steady_ppl.utils.tensor_files import read_tensors, write_tensors
 
 Piece = tuple[Mapping[str, Tensor], Mapping[str, Any]]
 RANDOM = "random state"  # of torch, after the piece

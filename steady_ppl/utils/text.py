@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 
@@ -74,3 +75,21 @@ def say(line: str, *, always: bool = False) -> None:
     if always or not is_quiet():
         lines = [shown(part, LONGEST) for part in line.splitlines()]
         tell("\n".join([f"steady: {part}" for part in lines[:1]] + lines[1:]), aside=True)
+
+
+_command: ContextVar[str | None] = ContextVar("command", default=None)
+
+
+@contextmanager
+def commanded(words: Sequence[str]) -> Iterator[None]:
+    """Let the record of every run that the block makes say which command line made it."""
+    token = _command.set(shlex.join(words))
+    try:
+        yield
+    finally:
+        _command.reset(token)
+
+
+def command_line() -> str | None:
+    """The words of it as a shell takes them; None in Python."""
+    return _command.get()

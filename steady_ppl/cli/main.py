@@ -13,28 +13,12 @@ from typing import Annotated, NamedTuple
 
 import typer
 
-from steady_ppl import (
-    command_check,
-    command_data,
-    command_demo,
-    command_discover,
-    command_effects,
-    command_evaluate,
-    command_fit,
-    command_import_bag,
-    command_init,
-    command_prove,
-    command_report,
-    command_simulate,
-    command_states,
-    command_study,
-)
+from steady_ppl.cli import demo, judge, learn, make
+from steady_ppl.cli.common import as_refusal
+from steady_ppl.cli.progress import progress_line
 from steady_ppl.errors import SteadyError
-from steady_ppl.outside import as_refusal
-from steady_ppl.progress_line import progress_line
-from steady_ppl.runs.folder import commanded
 from steady_ppl.utils.progress import listening
-from steady_ppl.utils.text import hushed, say, tell
+from steady_ppl.utils.text import commanded, hushed, say, tell
 
 INTERRUPTED = 130  # what typer returns for Ctrl-C
 # left out of the help, which then fits one screen; as --debug, which the line of an unexpected error names
@@ -58,10 +42,10 @@ class Command(NamedTuple):
 
 
 COMMANDS = (
-    Command(command_demo.demo, "Show the whole loop on drives with a hidden effect.", ("steady demo --out demo",)),
-    Command(command_init.init, "Make a folder to work in, with first drives.", ("steady init lab",)),
+    Command(demo.demo, "Show the whole loop on drives with a hidden effect.", ("steady demo --out demo",)),
+    Command(make.init, "Make a folder to work in, with first drives.", ("steady init lab",)),
     Command(
-        command_import_bag.import_bag,
+        make.import_bag,
         "Turn ROS 1 or 2 bags and MCAP files into a table.",
         (
             "steady import-bag drive.bag > mapping.toml",
@@ -71,7 +55,7 @@ COMMANDS = (
         ),
     ),
     Command(
-        command_simulate.simulate,
+        make.simulate,
         "Simulate drives of a program.",
         (
             "steady simulate models/hovercraft.py --trajectories 16 --out train.csv",
@@ -80,7 +64,7 @@ COMMANDS = (
         ),
     ),
     Command(
-        command_fit.fit,
+        learn.fit,
         "Learn a program's parameters from measurements.",
         (
             "steady fit mine.py train.csv --valid valid.csv --recipe likelihood --out runs/first",
@@ -89,7 +73,7 @@ COMMANDS = (
         ),
     ),
     Command(
-        command_check.check,
+        judge.check,
         "Say where and when a run fails, and who is at fault.",
         (
             "steady check runs/first test.csv --picture check.png",
@@ -97,7 +81,7 @@ COMMANDS = (
         ),
     ),
     Command(
-        command_discover.discover,
+        learn.discover,
         "Learn which physical effect a program lacks, or none.",
         (
             "steady discover runs/first train.csv --valid valid.csv --out runs/found",
@@ -105,7 +89,7 @@ COMMANDS = (
         ),
     ),
     Command(
-        command_effects.add,
+        learn.add,
         "Write a program with physical effects.",
         (
             "steady add runs/found --out models/with_drag.py",
@@ -113,22 +97,22 @@ COMMANDS = (
         ),
     ),
     Command(
-        command_prove.prove,
+        judge.prove,
         "Prove on other drives that runs are better than the first.",
         ("steady prove runs/before runs/after test.csv --picture proof.png",),
     ),
     Command(
-        command_evaluate.evaluate,
+        judge.evaluate,
         "Errors of runs, against true states where they exist.",
         ("steady evaluate runs/first runs/svi test.csv --json errors.json",),
     ),
     Command(
-        command_report.report,
+        judge.report,
         "Write all of it on one page of HTML.",
         ("steady report runs/before runs/after test.csv --discovery runs/found --out report.html",),
     ),
     Command(
-        command_states.states,
+        judge.states,
         "Write where the vehicle probably was.",
         (
             "steady states runs/after test.csv --out states.csv",
@@ -136,7 +120,7 @@ COMMANDS = (
         ),
     ),
     Command(
-        command_study.study,
+        learn.study,
         "Compute a grid of fits or searches, here or on a cluster.",
         (
             "steady study studies/observation-noise.toml --data logs --out noise",
@@ -144,13 +128,13 @@ COMMANDS = (
         ),
     ),
     Command(
-        command_study.plot_study,
+        learn.plot_study,
         "Draw what a study has found so far.",
         ("steady plot-study noise --out noise.png",),
         hidden=True,
     ),
     Command(
-        command_effects.effects,
+        learn.effects,
         "List the physical effects that a program may lack.",
         ("steady effects", "steady effects models/hovercraft.py"),
     ),
@@ -170,7 +154,7 @@ for command in COMMANDS:
         epilog="\n".join(["\b", title, *(f"  {line}" for line in command.examples)]),
         hidden=command.hidden,
     )(command.function)
-app.add_typer(command_data.app, name="data", short_help="Published logs to tables; long drives in pieces.")
+app.add_typer(make.app, name="data", short_help="Published logs to tables; long drives in pieces.")
 
 
 def say_version(asked: bool) -> None:

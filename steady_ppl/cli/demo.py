@@ -5,21 +5,89 @@ Every step is a command as one could type it. That command is what runs, and the
 
 from __future__ import annotations
 
+import io
 import json
 import shlex
 import shutil
+import sys
 import textwrap
+import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import chdir
-from dataclasses import dataclass
+from contextlib import chdir, nullcontext, redirect_stderr, redirect_stdout
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from steady_ppl.command_tour import WIDTH, Tour
+import typer
+
 from steady_ppl.errors import ComputationError, RunError
-from steady_ppl.model.loading import load_program
-from steady_ppl.runs.folder import read_record
 from steady_ppl.runs.workbench import TRUTH, empty_again, workbench
+from steady_ppl.utils.text import tell
+
+WIDTH = 100
+
+
+@dataclass
+class Tour:
+    """Runs commands, tells of them, and remembers what they said.
+
+    Attributes:
+        command: `steady`, as typer makes it.
+        say: told every line.
+        force: the commands overwrite what is there.
+        steps: title, commands, result and seconds of every step.
+    """
+
+    command: Any
+    say: Callable[[str], None]
+    force: bool = False
+    steps: list[dict[str, Any]] = field(default_factory=list)
+    began: float = field(default_factory=time.perf_counter)
+
+    def step(self, title: str) -> None:
+        """Begin a step."""
+        self.steps.append({"title": title, "commands": [], "began": time.perf_counter()})
+        self.say(f"\n{len(self.steps)}. {title}")
+
+    def steady(self, command: str, *, keep: str = "") -> str:
+        """Run `steady COMMAND`; what it prints is returned, and written to the file `keep`."""
+        overwrites = self.force and command.split()[0] in ("fit", "discover", "add")
+        line = f"steady {command}{' --force' * overwrites}"
+        self.steps[-1]["commands"].append(line)
+        self.say(f"   $ {line}")
+        said = run(self.command, shlex.split(line)[1:])
+        if keep:
+            Path(keep).write_text(said, encoding="utf-8")
+        return said
+
+    def result(self, text: str) -> None:
+        """End a step with what came out."""
+        step = self.steps[-1]
+        step["seconds"], step["result"] = round(time.perf_counter() - step.pop("began"), 1), text
+        said = f"{text} ({step['seconds']:.0f} s)"
+        self.say(textwrap.fill(said, WIDTH, initial_indent="   → ", subsequent_indent="     "))
+
+    @property
+    def seconds(self) -> float:
+        """Since it began."""
+        return time.perf_counter() - self.began
+
+
+def run(command: Any, arguments: Sequence[str]) -> str:
+    """What the command `steady ARGUMENTS` prints; its bars are shown on a terminal only.
+
+    Raises:
+        KeyboardInterrupt: it was interrupted.
+        SteadyError: as the command raises it.
+    """
+    said = io.StringIO()
+    quiet = nullcontext() if sys.stderr.isatty() else redirect_stderr(io.StringIO())
+    with redirect_stdout(said), quiet:
+        code = command.main(list(arguments), prog_name="steady", standalone_mode=False)
+    if code:
+        raise KeyboardInterrupt
+    return said.getvalue()
+
 
 RECORD = "demo.json"  # of a demonstration; a folder without one is not a demonstration's
 OWNERS = "models/hovercraft.py"
@@ -52,12 +120,13 @@ class Size:
 
 
 def demonstrate(
-    out: Path, *, size: Size | None = None, force: bool = False, say: Callable[[str], None] = print
+    out: Path, command: Any, *, size: Size | None = None, force: bool = False, say: Callable[[str], None] = print
 ) -> list[dict[str, Any]]:
     """Go through the loop and keep everything in a folder: tables of drives, programs, runs, figures, pictures.
 
     Args:
         out: the folder; an earlier demonstration there is overwritten.
+        command: `steady`, as typer makes it.
         size: of the job.
         force: write into a folder that is no demonstration's.
         say: told every line.
@@ -69,8 +138,10 @@ def demonstrate(
         RunError: the folder exists and is no demonstration's.
         ComputationError: the search ended with nothing that can be added.
     """
+    from steady_ppl.model.loading import load_program
+
     size = size or Size()
-    tour = Tour(say, force=out.exists())
+    tour = Tour(command, say, force=out.exists())
     _open(out, force)
     say(textwrap.fill(BEGINNING, WIDTH))
     say(f"\n   $ cd {shlex.quote(str(out))}")
@@ -137,6 +208,8 @@ def discover(tour: Tour, size: Size) -> list[str]:
     )
     sentence = _read("discovery.json")["sentence"]
     tour.result(sentence)
+    from steady_ppl.runs.folder import read_record
+
     effects = read_record(Path("runs/found"))["effects"]
     if not effects:
         raise ComputationError(f"there is nothing to add, and the demonstration ends here: {sentence}")
@@ -229,3 +302,15 @@ def _write_record(content: Mapping[str, Any]) -> None:
 
 def _read(file: str) -> dict[str, Any]:
     return json.loads(Path(file).read_text(encoding="utf-8"))
+
+
+def demo(
+    context: typer.Context,
+    out: Annotated[Path, typer.Option("--out", help="Folder to write.")] = Path("out/demo"),
+    force: Annotated[bool, typer.Option("--force", help="Write into a folder that is no demo's.")] = False,
+) -> None:
+    """Show the whole loop: check, discover, add, fit again, prove, on a hovercraft whose program has no drag.
+
+    It prints the commands that it runs, with what they found, and keeps drives, programs, runs and pictures.
+    """
+    demonstrate(out, context.find_root().command, force=force, say=tell)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from steady_ppl.errors import ComputationError, UsageError
+import typer
+
+from steady_ppl.errors import ComputationError, SteadyError, UsageError
 from steady_ppl.utils.files import whole_file
-from steady_ppl.utils.text import tell
+from steady_ppl.utils.text import shown, tell
 
 
 def program_from(model: str, seed: int, substeps: int | None = None) -> Any:
@@ -95,3 +98,38 @@ def used_before(runs: Mapping[str, Path], table: str) -> list[str]:
             if record.get(key) == table:
                 notes.append(f"{label} was {how} this very table: take drives that were not used, this proves nothing")
     return notes
+
+
+MOST = 10**9
+
+
+def count(help: str, least: int = 1) -> Any:
+    """An option that says how many, `least` or more."""
+    return typer.Option(help=help, min=least, max=MOST)
+
+
+def random_seed() -> Any:
+    """The option of a random seed, which a run's record holds in 63 bits."""
+    return typer.Option(help="Random seed.", min=0, max=2**63 - 1)
+
+
+FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+
+
+MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "Storage size calculation overflowed")
+
+
+def as_refusal(error: Exception) -> SteadyError | None:
+    """A file that the system refuses, or more memory than there is; None for anything else, a defect perhaps.
+
+    Example:
+        >>> as_refusal(FileNotFoundError(2, "No such file or directory", "drives.csv"))
+        UsageError('drives.csv: No such file or directory')
+    """
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return UsageError(f"{shown(str(error.filename), 100)}: {error.strerror}")
+    if isinstance(error, OSError) and error.errno in FULL:  # numba says no name of its cache
+        return UsageError(f"a file cannot be written: {error.strerror}")
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(w in str(error) for w in MEMORY)):
+        return ComputationError("this needs more memory than there is: take fewer or shorter drives, or less of each")
+    return None

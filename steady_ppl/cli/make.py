@@ -1,0 +1,182 @@
+"""`steady init`: a folder to work in."""
+
+from __future__ import annotations
+
+import shlex
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from steady_ppl.cli.common import count, random_seed
+from steady_ppl.errors import UsageError
+from steady_ppl.utils.text import tell
+
+NEXT = (
+    "steady fit models/hovercraft.py train.csv --valid valid.csv --known-start --recipe likelihood --out runs/first",
+    "steady check runs/first test.csv",
+    "steady discover runs/first train.csv --valid valid.csv --out runs/found",
+    "steady report runs/first runs/found test.csv --out report.html",
+)
+
+
+def init(folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to make.")]) -> None:
+    """Make a folder to work in: programs, recipes and first tables of drives to try them on."""
+    from steady_ppl.runs.workbench import ROOMS, furnish
+
+    tables = furnish(folder)
+    tell(f"{folder}: {', '.join(f'{room}/' for room in ROOMS)}, {', '.join(table.name for table in tables)}")
+    tell("\n".join(["", "next:", f"  cd {shlex.quote(str(folder))}", *(f"  {line}" for line in NEXT)]))
+
+
+def import_bag(
+    arguments: Annotated[
+        list[Path],
+        typer.Argument(metavar="BAG... [MAPPING.toml]", help="ROS 1 .bag, ROS 2 folder or .mcap; then what to take."),
+    ],
+    out: Annotated[Path | None, typer.Option("--out", help="Table to write, .csv or .parquet.")] = None,
+    column: Annotated[
+        list[str] | None,
+        typer.Option("--map", metavar="COLUMN=TOPIC:FIELD[,KEY=VALUE...]", help="One more column; as often as needed."),
+    ] = None,
+    step: Annotated[float | None, typer.Option(help="Seconds between rows; before that of MAPPING.toml.")] = None,
+) -> None:
+    """Turn ROS bags into a table; without a mapping, list what is in them and print one to start from."""
+    from steady_ppl.data.rosbag.read import open_bag, read_bags
+    from steady_ppl.data.rosbag.reader import listing
+    from steady_ppl.data.table import require_table_file, write_table
+
+    bags = [path for path in arguments if path.suffix != ".toml"]
+    files = [path for path in arguments if path.suffix == ".toml"]
+    if not bags or len(files) > 1:
+        raise UsageError("import-bag needs at least one BAG and at most one MAPPING.toml")
+    if not files and not column:
+        if out is not None or step is not None:
+            raise UsageError("name what to take from the bag, by MAPPING.toml or --map; without --out it is listed")
+        with ExitStack() as opened:
+            tell(listing([opened.enter_context(open_bag(path)) for path in bags]))
+        return
+    if out is None:
+        raise UsageError("name the table to write: --out TABLE")
+    mapping = _mapping(files[0] if files else None, column or [], step)
+    require_table_file(out)
+    data = read_bags(bags, mapping)
+    write_table(data, out)
+    rows, many = int(data.lengths.sum()), len(data)
+    tell(f"{out}: {many} trajector{'y' if many == 1 else 'ies'}, {rows} rows, {_share(data)}")
+
+
+def _mapping(file: Path | None, maps: list[str], step: float | None) -> Any:
+    """What a file, `--map` and `--step` say together."""
+    from steady_ppl.data.rosbag.mapping import BagMapping, parse_map, read_toml
+
+    content: dict[str, Any] = read_toml(file) if file else {}
+    if step is not None:
+        content["step"] = step
+    columns = content.get("columns", {})
+    added: dict[str, Any] = {}
+    for text in maps:
+        name, said = parse_map(text)
+        if name in added or (isinstance(columns, dict) and name in columns):
+            raise UsageError(f"--map {text}: column {name} is given twice")
+        added[name] = said
+    if added and isinstance(columns, dict):
+        content["columns"] = columns | added
+    return BagMapping.parse(content, file.name if file else "--map")
+
+
+def _share(data: Any) -> str:
+    """How much of each measurement there is."""
+    counts = data.observed.sum((0, 1)).tolist()
+    return ", ".join(f"y.{name} in {count}" for name, count in zip(data.measurement_names, counts, strict=True))
+
+
+app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+
+
+@app.command("alpha-truck", epilog="Example:  steady data alpha-truck alpha_truck/train --out train.csv")
+def alpha_truck(
+    folder: Annotated[Path, typer.Argument(help="One split: holds vrpn-pose.csv and vesc_drive.csv.")],
+    out: Annotated[Path, typer.Option("--out", help="Table to write, .csv or .parquet.")],
+    sigma_deg: Annotated[float, typer.Option(help="Standard deviation of the simulated bearings, degrees.")] = 5.0,
+    centred: Annotated[
+        bool, typer.Option("--centred", help="Velocities of each row itself, not the authors' of half a row later.")
+    ] = False,
+    seed: Annotated[int, random_seed()] = 0,
+) -> None:
+    """One split of the AlphaTruck logs to a table, resampled as the authors do.
+
+    The logs are published in datasets/alpha_truck of the repository MrVPlusOne/STEADY on GitHub. They are real motion
+    capture and commands; the bearings are simulated from the true poses. True states are kept in the x. columns.
+    """
+    from steady_ppl.data.table import write_table
+    from steady_ppl.datasets.alpha_truck import read_alpha_truck
+
+    write_table(read_alpha_truck(folder, sigma_degrees=sigma_deg, seed=seed, centred=centred), out)
+
+
+@app.command("cut", epilog="Example:  steady data cut log.csv --seconds 60 --out drives.csv")
+def cut(
+    table: Annotated[Path, typer.Argument(help="Drives.")],
+    seconds: Annotated[float, typer.Option(help="Length of a piece, s.")],
+    out: Annotated[Path, typer.Option("--out", help="Table to write, .csv or .parquet.")],
+) -> None:
+    """Long drives in pieces, `…-1`, `…-2`, … of the drive's name.
+
+    Each begins at its first row that has a measurement; pieces of one row or without a measurement are left out.
+    """
+    from steady_ppl.data.table import cut, read_table, require_table_file, write_table
+    from steady_ppl.utils.text import say
+
+    require_table_file(out)
+    drives = read_table(table)
+    pieces = cut(drives, seconds)
+    write_table(pieces, out)
+    tell(f"{out}: {len(pieces)} drives")
+    left_out = int(drives.lengths.sum() - pieces.lengths.sum())
+    if left_out:
+        say(f"{left_out} rows left out: before a piece's first measurement, or in pieces that have none or one row")
+
+
+@app.callback()
+def data() -> None:
+    """Published logs to tables; long drives in pieces."""
+
+
+def simulate(
+    model: Annotated[str, typer.Argument(help="Program: models/hovercraft.py, or mine.py:Boat.")],
+    out: Annotated[Path, typer.Option("--out", help="Table to write, .csv or .parquet.")],
+    trajectories: Annotated[int | None, count("How many drives, 16 when not given.")] = None,
+    seed: Annotated[int, random_seed()] = 0,
+    controls: Annotated[Path | None, typer.Option(help="Take time, controls and gaps from this table.")] = None,
+    substeps: Annotated[
+        int | None,
+        typer.Option(help="Steps of the program in each row; so many that they are 5 ms or less when not given."),
+    ] = None,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME[=VALUE]", help="Add a physical effect, see `steady effects`; as often as needed."),
+    ] = None,
+) -> None:
+    """Simulate drives of a program, with measurements and true states."""
+    from steady_ppl.cli.common import program_from
+    from steady_ppl.data.table import read_table, write_table
+    from steady_ppl.effects.attach import with_effects
+    from steady_ppl.model.substeps import with_substeps
+    from steady_ppl.model.validate import probe
+    from steady_ppl.smc.simulate import simulate as run, simulated_in
+    from steady_ppl.utils.progress import stages
+    from steady_ppl.utils.text import say
+
+    if controls and trajectories:
+        raise UsageError("--controls has as many drives as its table: leave --trajectories out")
+    program = with_effects(program_from(model, seed), effect or [], say)
+    if substeps is not None:
+        probe(with_substeps(program, substeps))
+    like = read_table(controls) if controls else None
+    with stages(("simulating", 1)) as begin:
+        begin()
+        drives = run(program, trajectories or 16, seed=seed, like=like, substeps=substeps)
+    write_table(drives, out)
+    say(simulated_in(program, drives, substeps))
