@@ -7,10 +7,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import pyro
+import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from steady_ppl import Trajectories, load_program, seeded, simulate
+from steady_ppl import Trajectories, load_program, seeded, simulate, stack
 from steady_ppl.model.program import Program, for_program
 
 MODELS = Path(__file__).parent.parent / "models"
@@ -73,3 +75,12 @@ def elsewhere(program: Program, data: Trajectories, turn: float) -> tuple[Progra
     states = data.states
     parts = [place(states[..., :2]), states[..., 2:3] + turn, states[..., 3:5] @ rotation.T, states[..., 5:]]
     return Elsewhere().double(), replace(data, states=torch.cat(parts, -1)), place
+
+
+class HeavyTailed(type(load_program(MODELS / "hovercraft.py"))):
+    """Accelerations of Student's distribution."""
+
+    def transition(self, state, control, time, step):
+        pushed = stack(control.sum(-1), torch.zeros_like(time), control[..., 1] - control[..., 0])
+        acceleration = pyro.sample("acceleration", dist.StudentT(4.0, pushed / self.mass, self.noise).to_event(1))
+        return self.integrate(state, acceleration, step)

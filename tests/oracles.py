@@ -8,11 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from statistics import NormalDist
 
+import pyro
 import torch
+from pyro import poutine
+from pyro.infer import Trace_ELBO
 from torch import Tensor
+
+from steady_ppl import Joint, PathGuide, Paths, Program, Trajectories
 
 START_MEAN = torch.tensor([0.0, 0.5], dtype=torch.float64)
 START_SD = torch.tensor([0.5, 0.5], dtype=torch.float64)
@@ -182,3 +188,37 @@ def assert_mean(samples: Tensor, exact: Tensor | float, *, false_alarm: float = 
     limit = NormalDist().inv_cdf(1 - false_alarm / (2 * score.numel()))
     worst = score.abs().max()
     assert worst < limit, f"{worst:.2f} standard errors off (limit {limit:.2f}): {score}"
+
+
+def all_at_once(program: Program, data: Trajectories, paths: Paths, *, known_start: bool = False) -> Tensor:
+    """log p(paths, measurements), summed over draws and trajectories, by `Joint`."""
+    guide, joint = Stored(paths), Joint(program, known_start=known_start)
+    with ExitStack() as stack:
+        if guide.draws > 1:
+            stack.enter_context(pyro.plate("draw", guide.draws, dim=-3))
+        guided = poutine.trace(guide).get_trace(data)
+        return poutine.trace(poutine.replay(joint, guided)).get_trace(data).log_prob_sum()
+
+
+def joint_density(program, paths, data):
+    elbo = Trace_ELBO(max_plate_nesting=3)
+    with pyro.settings.context(module_local_params=True), pyro.validation_enabled(False):
+        loss = elbo.differentiable_loss(Joint(program), Kept(paths), data)
+        loss.backward()
+    return loss.detach(), {name: value.grad.clone() for name, value in program.named_parameters()}
+
+
+class Stored(PathGuide):
+    """The guide of given paths."""
+
+    def __init__(self, paths: Paths) -> None:
+        super().__init__(len(paths.states))
+        self.paths = paths
+
+
+class Kept(PathGuide):
+    """Paths that are given."""
+
+    def __init__(self, paths) -> None:
+        super().__init__(len(paths.states))
+        self.paths = paths

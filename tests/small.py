@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+import shlex
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -78,3 +80,18 @@ def rewritten(path: Path, old: str, new: str, count: int = 1) -> Path:
     assert old in text
     path.write_text(text.replace(old, new, count))
     return path
+
+
+def commands(page: Path) -> list[list[str]]:
+    """The words of every `steady` command in the shell blocks of a page."""
+    text = "\n".join(text for language in ("sh", "bash") for _, text in blocks(page, language))
+    lines = [line.split("  #")[0].split(" > ")[0].split(" | ")[0] for line in text.replace("\\\n", " ").splitlines()]
+    return [shlex.split(line)[1:] for line in lines if line.startswith("steady ")]
+
+
+def blocks(page: Path, language: str) -> list[tuple[str, str]]:
+    """What stands behind the language of each block, and the block."""
+    return [(about, text) for found, about, text in BLOCK.findall(page.read_text()) if found == language]
+
+
+BLOCK = re.compile(r"^```(\w+)([^\n]*)\n(.*?)^```", re.MULTILINE | re.DOTALL)

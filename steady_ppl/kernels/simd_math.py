@@ -1,7 +1,7 @@
 """Elementary functions without branches, for kernels.
 
 Range reduction and minimax polynomials after Cephes (Moshier 1989), in single precision; errors stay within a few units
-in the last place, and what is not a number stays so (`tests/test_kernels.py`).
+in the last place, and what is not a number stays so (`tests/kernels/test_kernels.py`).
 """
 
 from __future__ import annotations

@@ -1,0 +1,140 @@
+"""The recipe `likelihood`, and what a fit says that should be doubted."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from examples import MODELS, HeavyTailed, example
+from pyro.distributions import constraints
+from pyro.nn import PyroParam
+from small import HOVERCRAFT, steady, written
+
+import steady_ppl as st
+from steady_ppl.runs.diagnostics import doubts_of_fit, doubts_of_units
+from steady_ppl.runs.recipes import find_recipe
+from steady_ppl.training.loop import Trained
+
+NEURAL = f"{MODELS / 'neural_vehicle.py'}:NeuralHovercraft"
+
+
+@pytest.fixture(scope="module")
+def drives() -> tuple[st.Trajectories, st.Trajectories]:
+    """A hovercraft that is lighter and less noisy than its file says."""
+    truth = example("hovercraft", torch.float32)
+    truth.mass, truth.noise = torch.tensor(1.2), torch.tensor([0.08, 0.08, 0.05])
+    truth.duration = 6.0
+    return st.simulate(truth, 10, seed=1), st.simulate(truth, 6, seed=2)
+
+
+@pytest.fixture(scope="module")
+def fitted(drives) -> st.Fit:
+    return find_recipe("likelihood")(st.load_program(HOVERCRAFT), *drives, known_start=True)
+
+
+def test_it_finds_what_made_the_drives(fitted):
+    assert float(fitted.program.mass.detach()) == pytest.approx(1.2, rel=0.05)
+    assert float(fitted.program.noise[0].detach()) == pytest.approx(0.08, rel=0.4)
+    assert fitted.recipe == "likelihood" and not fitted.notes
+    first, last = fitted.trained.history
+    assert first["step"] == 0 and last["step"] == fitted.trained.kept
+    assert last["log_likelihood"] > first["log_likelihood"] + 1 and fitted.trained.still_rising is None
+
+
+def test_long_training_does_not_get_further(fitted, drives):
+    program = st.load_program(HOVERCRAFT)
+    long = find_recipe("steady")(program, drives[0], known_start=True, steps=150, progress=False).program
+    ours, theirs = (likelihood(one, drives[0]) for one in (fitted.program, long))
+    assert ours > theirs - 0.1
+
+
+def likelihood(program, table) -> float:
+    """Log p(y) of the linearised program."""
+    from steady_ppl.gaussian.smoother import find_path, smooth
+
+    data = st.for_program(program, table)
+    with st.seeded(0, "paths"):
+        path = find_path(program, data, known_start=True)
+    return float(smooth(program, data, path, known_start=True, passes=4).log_likelihood.sum())
+
+
+def test_it_is_a_recipe_of_the_command_line(tmp_path: Path, drives, capsys):
+    tables = [written(tmp_path / f"{name}.csv", data) for name, data in zip(("train", "valid"), drives, strict=True)]
+    command = ("fit", HOVERCRAFT, tables[0], "--valid", tables[1], "--recipe", "likelihood", "--known-start")
+    assert steady(*command, "--out", tmp_path / "run") == 0
+    assert "held-out log p(y) of a drive" in capsys.readouterr().out
+    assert json.loads((tmp_path / "run/run.json").read_text())["recipe"] == "likelihood"
+    assert float(st.Fit.load(tmp_path / "run").program.mass.detach()) == pytest.approx(1.2, rel=0.05)
+
+
+def test_what_it_cannot_fit_is_refused(drives):
+    for program, says in ((st.load_program(NEURAL), "a network cannot be looked at"), (HeavyTailed(), "StudentT")):
+        with pytest.raises(st.UsageError, match=says):
+            find_recipe("likelihood")(program, drives[0], known_start=True)
+
+
+def trained(*values: float, kept: int | None = None, interrupted: bool = False) -> Trained:
+    history = [{"step": 25.0 * (k + 1), "log_likelihood": value} for k, value in enumerate(values)]
+    return Trained(history, 25 * len(values) if kept is None else kept, interrupted)
+
+
+@pytest.mark.parametrize(
+    ("found", "rising"),
+    [
+        (trained(-20.0, -6.0, -5.0, -2.0), 3.0),
+        (trained(-20.0, -6.0, -5.0, -4.9), None),
+        (trained(-20.0, -6.0, -5.0, -2.0, kept=75), None),
+        (trained(-20.0, -6.0, -5.0, -2.0, interrupted=True), None),
+        (trained(-20.0, -2.0), None),
+        (Trained([{"step": 25.0, "loss": 1.0}], 25), None),
+    ],
+)
+def test_a_training_that_still_rises_says_so(found: Trained, rising: float | None):
+    assert found.still_rising == (None if rising is None else pytest.approx(rising))
+    program = st.load_program(HOVERCRAFT)
+    notes = doubts_of_fit(st.Fit(program, "steady", {"steps": 100}, trained=found), program.state_dict())
+    assert [note.startswith("not converged") and "--steps 400" in note for note in notes] == [True] * bool(rising)
+
+
+def test_a_proof_says_what_may_be_training(drives):
+    program = st.load_program(HOVERCRAFT)
+    rows = {
+        "before": st.Fit(program, "steady", known_start=True, trained=trained(-20.0, -6.0, -5.0, -2.0)),
+        "after": st.Fit(program, "steady", known_start=True, trained=trained(-20.0, -6.0, -5.0, -4.9)),
+    }
+    notes = st.prove(rows, drives[1], with_constant_velocity=False).notes
+    assert [note.split()[0] for note in notes if "had not converged" in note] == ["before"]
+
+
+def test_a_number_that_a_fit_takes_away_is_named():
+    class Named(type(st.load_program(HOVERCRAFT))):
+        def __init__(self):
+            super().__init__()
+            self.gains = PyroParam(torch.tensor([1.0, 2.0]), constraints.positive)
+
+    program = Named()
+    declared = {name: value.clone() for name, value in program.state_dict().items()}
+    assert doubts_of_fit(st.Fit(program, "hand"), declared) == []
+    program.gains, program.noise = torch.tensor([1.0, 0.05]), torch.tensor([1e-3, 1e-3, 1e-3])  # noise is a guess
+    (said,) = doubts_of_fit(st.Fit(program, "hand"), declared)
+    assert said.startswith("gains[1] fell from 2 to 0.05")
+    program.guesses = ()
+    assert len(doubts_of_fit(st.Fit(program, "hand"), declared)) == 4
+
+
+def test_degrees_are_asked_for(tmp_path: Path, drives, capsys):
+    program = st.load_program(HOVERCRAFT)
+    data = st.for_program(program, drives[0])
+    assert doubts_of_units(program, data) == []
+    degrees = replace(drives[0], measurements=torch.rad2deg(drives[0].measurements))
+    found = doubts_of_units(program, st.for_program(program, degrees))
+    assert len(found) == 4 and all("are these degrees?" in said for said in found)
+    many_turns = replace(data, measurements=data.measurements + 4 * math.pi)
+    assert doubts_of_units(program, many_turns) == []  # an angle that counts its turns
+    table = written(tmp_path / "degrees.csv", degrees)
+    assert steady("fit", HOVERCRAFT, table, "--recipe", "hand", "--out", tmp_path / "run") == 0
+    assert "y.bearing_0 is between" in capsys.readouterr().err

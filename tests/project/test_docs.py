@@ -1,0 +1,109 @@
+"""The documentation: its examples run, its commands parse, its generated pages are those of the code."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+from small import blocks, commands, simulated
+
+import steady_ppl as st
+from steady_ppl.cli.main import COMMANDS, EVERYWHERE, app, main
+from steady_ppl.effects import catalogue
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = [*sorted(DOCS.glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+RUN = ("own-data", "own-program", "own-effect", "own-sensor", "own-recipe", "control")
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda page: page.stem)
+def test_every_command_parses(page: Path) -> None:
+    group = typer.main.get_command(app)
+    for words in commands(page):
+        name, *rest = [word for word in words if word not in EVERYWHERE]
+        command = group.commands[name]
+        while hasattr(command, "commands"):
+            name, *rest = rest
+            command = command.commands[name]
+        command.make_context(name, rest)
+
+
+def test_the_readme_shows_every_command_or_points_at_it() -> None:
+    text = (ROOT / "README.md").read_text()
+    assert [command.name for command in COMMANDS if f"steady {command.name}" not in text] == []
+
+
+@pytest.mark.parametrize("name", RUN)
+def test_the_examples_of_a_page_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a folder as `steady init` makes it, a namespace for the page; blocks with a title are files."""
+    (tmp_path / "models").symlink_to(ROOT / "models")
+    for seed, table in enumerate(("train", "valid", "test")):
+        st.write_table(simulated(rows=21, seed=seed), tmp_path / f"{table}.csv")
+    monkeypatch.chdir(tmp_path)
+    program = []
+    for about, text in blocks(DOCS / f"{name}.md", "python"):
+        titled = re.search(r'title="([^"]+)"', about)
+        if titled:
+            (tmp_path / titled[1]).write_text(text)
+        else:
+            program.append(text)
+    (tmp_path / "page.py").write_text("\n".join(program))
+    done = subprocess.run([sys.executable, "page.py"], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_the_study_of_the_page_is_computed_and_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With fewer drives and seeds."""
+    ((about, text),) = blocks(DOCS / "studies.md", "toml")
+    for many, few in (("[1, 2, 3]", "[1, 2]"), ("[2, 8, 32]", "[2, 4]"), ("= 16", "= 2"), ("test = 32", "test = 2")):
+        assert many in text
+        text = text.replace(many, few)
+    assert 'title="drives.toml"' in about
+    (tmp_path / "drives.toml").write_text(text)
+    (tmp_path / "models").symlink_to(ROOT / "models")
+    monkeypatch.chdir(tmp_path)
+    here = [words for words in commands(DOCS / "studies.md") if "--cluster" not in words]
+    assert [main(words) for words in here] == [0, 0] and Path("drives/study.png").is_file()
+    for page in ("studies", "cluster"):
+        ((_, looked),) = blocks(DOCS / f"{page}.md", "python")
+        done = subprocess.run([sys.executable, "-c", looked], capture_output=True, text=True, timeout=60)
+        assert done.returncode == 0 and (page != "cluster" or "hours of one core" in done.stdout), done.stderr
+
+
+def test_a_recipe_of_the_page_fits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ((_, text),) = [one for one in blocks(DOCS / "own-recipe.md", "python") if "several_starts.py" in one[0]]
+    (tmp_path / "several_starts.py").write_text(text)
+    (tmp_path / "models").symlink_to(ROOT / "models")
+    st.write_table(simulated(rows=21), tmp_path / "train.csv")
+    monkeypatch.chdir(tmp_path)
+    (words,) = commands(DOCS / "own-recipe.md")
+    assert main(words) == 0
+    assert st.Fit.load("runs/several").recipe == "several-starts"
+
+
+def test_the_gallery_is_that_of_the_catalogue() -> None:
+    """`python docs/gallery.py` brings it up to date."""
+    spec = importlib.util.spec_from_file_location("gallery", DOCS / "gallery.py")
+    gallery = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(gallery)
+    assert (DOCS / "gallery.md").read_text() == gallery.page()
+    assert {f"{gallery.slug(effect)}.png" for effect in catalogue()} == {
+        file.name for file in (DOCS / "gallery").glob("*.png")
+    }
+
+
+def test_every_effect_says_where_it_is_met() -> None:
+    assert [effect.name for effect in catalogue() if not effect.occurs] == []
+
+
+def test_links_lead_somewhere() -> None:
+    for page in PAGES:
+        for link in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text()):
+            assert link.startswith("http") or (page.parent / link).exists(), f"{page.name}: {link}"
