@@ -11,7 +11,7 @@ from pyro.infer import Trace_ELBO
 from torch import Tensor
 
 from steady_ppl import Constant, Joint, LookaheadGuide, Program, Trajectories, for_program, seeded
-from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import standard_noise
 from steady_ppl.guides.base import true_paths
 
@@ -43,7 +43,7 @@ def information_bound(
         one = data.subset([drive])
         guide = LookaheadGuide(program, particles=2 * draws, draws=draws, tempering=Constant(), known_start=True)
         true = true_paths(program, one)
-        guide.remember(Path(true.states[0], standard_noise(program, one, true)[0]), one)
+        guide.remember(ReferencePath(true.states[0], standard_noise(program, one, true)[0]), one)
         for half in halves:
             with seeded("bound", drive, len(half), half is halves[0]), pyro.settings.context(module_local_params=True):
                 guide.refresh(one, 0.0)

@@ -14,11 +14,10 @@ from torch import Tensor
 from steady_ppl import Program, Trajectories
 from steady_ppl.discovery.effect_scores import Column, columns_of
 from steady_ppl.effects import Variant, attached, catalogue
-from steady_ppl.gaussian.linearize import Path, linearize
+from steady_ppl.gaussian.linearize import ReferencePath, linearize
 from steady_ppl.likelihood.parameters import elements, moved
 from steady_ppl.likelihood.scores import channel_moments
 from steady_ppl.model.interventions import by_channel
-from steady_ppl.model.program import names
 from steady_ppl.model.substeps import acting_controls
 
 REGRESSED = ("push", "command", "history")  # forms of effects that change an acceleration
@@ -63,7 +62,7 @@ def evidence(program: Program, data: Trajectories, states: Tensor, variants: Seq
         states: believed, `(T + 1, B, D)`.
         variants: of the catalogue.
     """
-    path = Path(states, states.new_zeros((*data.steps.shape, len(program.channels))))
+    path = ReferencePath(states, states.new_zeros((*data.steps.shape, len(program.channels))))
     linear = linearize(program, data, path, kernels=False)
     mean, spread = _moments(program, data, states)
     found, called, labels = [], [], []
@@ -123,7 +122,7 @@ def _changed(program: Program, data: Trajectories, states: Tensor, mean: Tensor,
     """The channels' means with an effect, `(T, B, C)`."""
     controls, times = acting_controls(program, data), data.elapsed
     if variant.effect.form == "push":
-        means = dict(zip(names(program.channels), mean.unbind(-1), strict=True))
+        means = dict(zip(program.channel_names, mean.unbind(-1), strict=True))
         pushes = variant.push(program, states[:-1], controls[:-1], times[:-1], data.steps, c, means)
         return mean + by_channel(program, pushes, 0.0, mean)
     if variant.effect.form == "command":

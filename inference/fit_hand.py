@@ -6,7 +6,7 @@ import torch
 
 from steady_ppl import Fit, Trajectories, UsageError, choose_filter, for_program, load_program, run_filter, seeded
 from steady_ppl.errors import require
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 
 from . import fit_truth
 
@@ -54,7 +54,7 @@ def fit(
         hand = load_program(hand)
     require(isinstance(hand, Program), "hand", hand, "a program, or where it is (MODEL.py)")
     settings["hand"] = type(hand).__name__
-    if names(hand.states) != names(program.states):
+    if hand.state_names != program.state_names:
         raise UsageError(f"fit-hand: {type(hand).__name__} and {type(program).__name__} have different states")
     data = for_program(hand, table)
     choice = choose_filter(hand, data, known_start=known_start, particles=particles)

@@ -15,7 +15,6 @@ import torch
 from steady_ppl import DataError, Fit, Trajectories, UnknownMap, UsageError, for_program, seeded
 from steady_ppl.errors import ComputationError, require
 from steady_ppl.gaussian import single_row_map as fixes
-from steady_ppl.model.program import names
 
 from . import fit_truth
 
@@ -87,7 +86,7 @@ def differentiated(program, data: Trajectories, poses: torch.Tensor, regularizat
         UsageError: a component is no pose's derivative, or is told by no row.
         ComputationError: a derivative is not finite.
     """
-    order = names(program.states)
+    order = program.state_names
     rates = program.derivatives
     missing = [name for name in order if name not in rates and name not in rates.values()]
     if missing:

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from steady_ppl import Program, Trajectories, stack
 from steady_ppl.model.handlers import Observing, Recording, Standardised, running
-from steady_ppl.model.program import names
 
 FOLDER = Path(__file__).parent / "reference"
 
@@ -125,9 +124,9 @@ def reference(name: str) -> Reference:
     program = PROBLEMS[name]().double().requires_grad_(False)
     program.load_state_dict(numbers(stored["program"]))
     columns = {
-        "control_names": names(program.controls),
-        "measurement_names": names(program.measurements),
-        "state_names": names(program.states),
+        "control_names": program.control_names,
+        "measurement_names": program.measurement_names,
+        "state_names": program.state_names,
     }
     data = Trajectories(**numbers(stored["data"]), **columns)
     return Reference(program, data, **numbers(stored["posterior"]), a_draw=numbers(stored["a_draw"]))

@@ -143,8 +143,8 @@ def _judged_map(program: Program, surveyed: Program) -> dict[str, Any]:
 def _form(program: Program) -> tuple[tuple[str, ...], ...]:
     """States, controls and measurements, without the states that an added effect brings."""
     resting = names(program.resting)
-    states = tuple(name for name in names(program.states) if name not in resting)
-    return states, names(program.controls), names(program.measurements)
+    states = tuple(name for name in program.state_names if name not in resting)
+    return states, program.control_names, program.measurement_names
 
 
 def incomparable(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> list[str]:

@@ -15,7 +15,7 @@ from steady_ppl.errors import UsageError
 from steady_ppl.likelihood.evidence import in_parts, run_filter
 from steady_ppl.model.handlers import AtMean, Recording, as_vector, residual, running
 from steady_ppl.model.planar_vehicle import PlanarVehicle
-from steady_ppl.model.program import Program, error_groups, names
+from steady_ppl.model.program import Program, error_groups
 from steady_ppl.model.substeps import acting_controls
 from steady_ppl.smc.filter import particle_filter, roll_out
 from steady_ppl.smc.resampling import systematic, take
@@ -27,7 +27,7 @@ Errors = dict[str, float]
 def squared_errors(program: Program, states: Tensor, truth: Tensor) -> dict[str, Tensor]:
     """Squared errors `(...)` of each of the program's error groups, angles on the circle; NaN where unknown."""
     difference = states - truth
-    order = names(program.states)
+    order = program.state_names
     for name in program.angles:
         index = order.index(name)
         difference[..., index] = wrap(difference[..., index])

@@ -28,7 +28,7 @@ from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.predict import named_horizons
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 from steady_ppl.runs.diagnostics import doubts_of_units
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.progress import stages
@@ -146,11 +146,11 @@ def _require(programs: Mapping[str, Program], reference: str, truth: str | None,
             raise UsageError(f"there is no row {name!r}; the rows are {', '.join(programs)}")
     for taken in {FLOOR, COASTING} & programs.keys():
         raise UsageError(f"a row cannot be called {taken!r}: that is the name of a row of its own")
-    ours = names(programs[reference].measurements)
+    ours = programs[reference].measurement_names
     for name, program in programs.items():
-        if names(program.measurements) != ours:
+        if program.measurement_names != ours:
             raise UsageError(
-                f"{reference} measures {', '.join(ours)} and {name} measures {', '.join(names(program.measurements))}: "
+                f"{reference} measures {', '.join(ours)} and {name} measures {', '.join(program.measurement_names)}: "
                 "log p(y) of different measurements cannot be compared"
             )
     if len(data) < FEWEST:

@@ -12,7 +12,6 @@ from torch import Tensor
 from steady_ppl.comparison.bootstrap import LEVEL, RESAMPLES, Change, paired
 from steady_ppl.comparison.scores import BANDS, Key, Row
 from steady_ppl.effects import attached
-from steady_ppl.model.program import names, units
 from steady_ppl.utils.late import Displayed
 
 
@@ -89,7 +88,7 @@ def figures(found: Proof) -> dict[str, Any]:
 def units_of_states(found: Proof) -> dict[str, str]:
     """Error group of states → unit, empty where its components have several."""
     program = found.rows[found.reference].program
-    order, unit = names(program.states), units(program.states)
+    order, unit = program.state_names, program.state_units
     groups = program.error_groups or {name: (name,) for name in order}
     of = {group: {unit[order.index(name)] for name in members} for group, members in groups.items()}
     return {group: kinds.pop() if len(kinds) == 1 else "" for group, kinds in of.items()}

@@ -17,12 +17,12 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, UsageError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.kalman import Tracked, track
-from steady_ppl.gaussian.linearize import Path, why_not_linear
+from steady_ppl.gaussian.linearize import ReferencePath, why_not_linear
 from steady_ppl.gaussian.predict import Prediction, named_horizons, predict, simulate_again, states_ahead
 from steady_ppl.gaussian.smoother import find_and_smooth, smooth
 from steady_ppl.likelihood.evidence import neglected
 from steady_ppl.likelihood.scores import measured, substep_spreads
-from steady_ppl.model.program import Program, error_groups, for_program, units
+from steady_ppl.model.program import Program, error_groups, for_program
 from steady_ppl.utils.random import seeded
 
 SECONDS = (1.0, 3.0, 10.0)
@@ -144,7 +144,7 @@ def keeping_velocity(before: Judged, known_start: bool) -> Judged | str:
     coasting = ConstantVelocity(program, found.scales)
     coasting.error_groups = program.error_groups  # type: ignore[misc]
     path = tracked.path(run)
-    still = Path(path.states, torch.zeros_like(path.noise))
+    still = ReferencePath(path.states, torch.zeros_like(path.noise))
     ahead = smooth(coasting, run, still, known_start=known_start, kernels=False)
     if not bool(torch.isfinite(ahead.log_likelihood).all()):
         return "it blows up on these drives"
@@ -171,7 +171,7 @@ def as_row(judged: Judged, counted: Mapping[int, Tensor]) -> Row:
     """Sum over each drive the cells that count, `(T + 1 − horizon, B, K)` for each horizon."""
     likely = judged.ahead.log_likelihood.numpy(force=True)
     sums = {Key("log_likelihood", "", 0): Sums(likely, np.ones_like(likely))}
-    unit = units(judged.program.measurements)
+    unit = judged.program.measurement_units
     for horizon, ahead in judged.predictions.items():
         seen = counted[horizon]
         for of in dict.fromkeys(unit):

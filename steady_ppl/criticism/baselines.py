@@ -14,7 +14,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked, track
-from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, on_a_circle, predict
 from steady_ppl.model.handlers import AtMean, Recording, Standardised, as_vector, normal_moments, running
 from steady_ppl.model.program import Program
@@ -137,7 +137,7 @@ def constant_velocity(
     best: tuple[float, ConstantVelocity, Tracked] | None = None
     for multiple in MULTIPLES:
         coasting = ConstantVelocity(program, (multiple * sizes).tolist())
-        start = Path(path.states, (values / (multiple * sizes)).to(values.dtype))
+        start = ReferencePath(path.states, (values / (multiple * sizes)).to(values.dtype))
         found = track(coasting, data, start, known_start=known_start, passes=3, kernels=False)
         likely = float(found.log_likelihood.sum())
         if math.isfinite(likely) and (best is None or likely > best[0]):

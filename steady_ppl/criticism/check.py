@@ -30,7 +30,7 @@ from steady_ppl.gaussian.kalman import track
 from steady_ppl.gaussian.linearize import why_not_linear
 from steady_ppl.gaussian.predict import named_horizons, predict
 from steady_ppl.gaussian.smoother import find_and_smooth
-from steady_ppl.model.program import Program, for_program, names
+from steady_ppl.model.program import Program, for_program
 from steady_ppl.runs.diagnostics import doubts_of_units
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.progress import stages
@@ -152,8 +152,8 @@ def _pairs(program: Program, residuals: Residuals) -> list[tuple[str, str]]:
     groups = [tuple(group) for group in program.error_groups.values() if len(group) == 2]
     moving = [name for name in residuals.variables if name.endswith(" velocity")]
     phases = [tuple(pair) for pair in program.motion.values()]
-    if len(names(program.states)) <= 3 and not groups + phases:
-        phases = list(itertools.combinations(names(program.states), 2))
+    if len(program.state_names) <= 3 and not groups + phases:
+        phases = list(itertools.combinations(program.state_names, 2))
     chosen: Sequence[Any] = groups + list(itertools.combinations(moving, 2)) + phases
     return [pair for pair in dict.fromkeys(chosen) if all(name in residuals.variables for name in pair)]
 
@@ -171,7 +171,7 @@ def _scatter(real: Residuals, simulated: Residuals) -> dict[str, np.ndarray]:
 
 
 def _controls(program: Program, data: Trajectories) -> dict[str, np.ndarray]:
-    return {name: _array(data.controls[:-1, :, i].double()) for i, name in enumerate(names(program.controls))}
+    return {name: _array(data.controls[:-1, :, i].double()) for i, name in enumerate(program.control_names)}
 
 
 def _array(values: Tensor) -> np.ndarray:

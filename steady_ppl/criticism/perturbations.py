@@ -16,11 +16,11 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
-from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import errors, on_a_circle
 from steady_ppl.model.actuation import lagged
 from steady_ppl.model.handlers import AtMean, running
-from steady_ppl.model.program import Program, names, units
+from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance, row_controls
 from steady_ppl.utils.angles import wrap, wrap_angles
 
@@ -84,7 +84,7 @@ class _Scores:
         return (change * self.reading).sum((0, 2))
 
 
-def _parameters(program: Program, data: Trajectories, path: Path, scores: _Scores) -> Named:
+def _parameters(program: Program, data: Trajectories, path: ReferencePath, scores: _Scores) -> Named:
     """The program's own parameters, where they move the mean."""
     scalars = [(name, value, i) for name, value in program.named_parameters() for i in range(value.numel())]
     if len(scalars) > MANY:
@@ -114,8 +114,8 @@ def _parameters(program: Program, data: Trajectories, path: Path, scores: _Score
             yield "parameter", word if value.numel() == 1 else f"{word}[{index}]", score
 
 
-def _sensor(program: Program, data: Trajectories, path: Path, scores: _Scores) -> Named:
-    components, unit = names(program.measurements), units(program.measurements)
+def _sensor(program: Program, data: Trajectories, path: ReferencePath, scores: _Scores) -> Named:
+    components, unit = program.measurement_names, program.measurement_units
     unity = torch.ones_like(scores.reading)
     predicted = torch.where(data.observed, data.measurements, 0.0).double() - scores.linear.residual
     predicted = torch.where(on_a_circle(program, data, path.states), wrap(predicted), predicted)
@@ -133,12 +133,12 @@ def _sensor(program: Program, data: Trajectories, path: Path, scores: _Scores) -
                 yield "sensor", f"{word} of {of}", scores.shift(change * mask)
 
 
-def _actuator(program: Program, data: Trajectories, path: Path, scores: _Scores) -> Named:
+def _actuator(program: Program, data: Trajectories, path: ReferencePath, scores: _Scores) -> Named:
     """Other controls than those commanded, as the program would answer to them: one's, and all together."""
     controls = acting_controls(program, data)
     speed = next(iter(program.velocities(path.states[:-1]).values()), None)
     together: dict[str, list[Tensor]] = {}
-    for index, name in enumerate(names(program.controls)):
+    for index, name in enumerate(program.control_names):
         answer = _answer(program, data, path, controls, index, scores.linear.angles)
         if answer is None:
             continue
@@ -172,11 +172,11 @@ def _miscarried(command: Tensor, data: Trajectories, speed: Tensor | None) -> di
     return shapes
 
 
-def _dynamics(program: Program, data: Trajectories, path: Path, scores: _Scores) -> Named:
+def _dynamics(program: Program, data: Trajectories, path: ReferencePath, scores: _Scores) -> Named:
     states = path.states[:-1]
     speeds = {f"{name} velocity": value.double() for name, value in program.velocities(states).items()}
     places = {f"{name} position": value.double() for name, value in program.positions(states).items()}
-    order = names(program.states)
+    order = program.state_names
     shapes: dict[str, Tensor] = {"always": torch.ones_like(data.steps).double()}
     shapes |= {f"with {name}": value for name, value in (speeds | places).items()}
     shapes |= {f"with the square of {name}": value * value.abs() for name, value in speeds.items()}
@@ -187,7 +187,7 @@ def _dynamics(program: Program, data: Trajectories, path: Path, scores: _Scores)
         value = states[..., order.index(angle)].double()
         shapes |= {f"with the sine of {angle}": value.sin(), f"with the cosine of {angle}": value.cos()}
     channels = scores.noise.shape[-1]
-    called = names(program.channels) if len(program.channels) == channels else [f"{i + 1}" for i in range(channels)]
+    called = program.channel_names if len(program.channels) == channels else [f"{i + 1}" for i in range(channels)]
     for index, channel in enumerate(called):
         for word, shape in shapes.items():
             yield "dynamics", f"{channel} acceleration {word}", scores.channel(index, shape)
@@ -200,7 +200,9 @@ def _dynamics(program: Program, data: Trajectories, path: Path, scores: _Scores)
     yield from _couplings(program, data, path, scores, called)
 
 
-def _couplings(program: Program, data: Trajectories, path: Path, scores: _Scores, called: Sequence[str]) -> Named:
+def _couplings(
+    program: Program, data: Trajectories, path: ReferencePath, scores: _Scores, called: Sequence[str]
+) -> Named:
     """Controls acting on channels that they do not move in the program."""
     controls = acting_controls(program, data)
     along = scores.linear.noise / scores.linear.noise.norm(dim=-2, keepdim=True).clamp(min=1e-300)
@@ -212,8 +214,8 @@ def _couplings(program: Program, data: Trajectories, path: Path, scores: _Scores
                 members.append(index)
     commands, name, unit = (
         row_controls(program, controls)[:-1].double(),
-        names(program.controls),
-        units(program.controls),
+        program.control_names,
+        program.control_units,
     )
     for channel, members in unmoved.items():
         for one in members:
@@ -226,7 +228,7 @@ def _couplings(program: Program, data: Trajectories, path: Path, scores: _Scores
 
 
 def _answer(
-    program: Program, data: Trajectories, path: Path, controls: Tensor, index: int, angles: tuple[int, ...]
+    program: Program, data: Trajectories, path: ReferencePath, controls: Tensor, index: int, angles: tuple[int, ...]
 ) -> Tensor | None:
     """How the next state changes with a control, `(T, B, D)`; None where it does not."""
     size = 0.05 * float(row_controls(program, controls)[..., index].abs().amax()) or 0.05
@@ -238,7 +240,7 @@ def _answer(
     return answer if bool((answer.abs() > 1e-9).any()) else None
 
 
-def _moved(program: Program, data: Trajectories, path: Path, controls: Tensor) -> Tensor:
+def _moved(program: Program, data: Trajectories, path: ReferencePath, controls: Tensor) -> Tensor:
     """The program's mean step from every row, `(T, B, D)`."""
     states = path.states[:-1]
     with running(*states.shape[:-1]), AtMean():

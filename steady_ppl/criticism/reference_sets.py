@@ -18,10 +18,10 @@ from steady_ppl.criticism.residual_maps import Residuals
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.kalman import Tracked, track
-from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, predict, simulate_again
 from steady_ppl.gaussian.smoother import smooth
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 
 FEWEST = 20  # sets
 ROWS = 500_000  # of all drives of a block
@@ -91,7 +91,7 @@ def _block(
             return None
         kept = whole.repeat_interleave(len(data)).nonzero().flatten()
         again, sets = again.subset(kept), int(whole.sum())
-        near = Path(near.states[:, kept], near.noise[:, kept])
+        near = ReferencePath(near.states[:, kept], near.noise[:, kept])
         copies = track(program, again, near, known_start=known_start, passes=1)
     simulated = predict(program, again, copies, horizons, bands=[1])
     return SimulatedSets(
@@ -131,17 +131,17 @@ def residuals(program: Program, data: Trajectories, tracked: Tracked, ahead: Pre
     values = torch.cat([ahead.standardised, tracked.noise], -1)
     there = torch.cat([ahead.observed, data.transitions.unsqueeze(-1).expand_as(tracked.noise)], -1)
     states = tracked.path(data).states[:-1]
-    variables = {name: states[..., i] for i, name in enumerate(names(program.states))}
+    variables = {name: states[..., i] for i, name in enumerate(program.state_names)}
     for angle in program.angles:
         variables[angle] = torch.remainder(variables[angle] + torch.pi, 2 * torch.pi) - torch.pi
     for name, velocity in program.velocities(states).items():
         if not any(torch.equal(velocity, value) for value in variables.values()):
             variables[f"{name} velocity"] = velocity
-    channels = names(program.channels)
+    channels = program.channel_names
     if len(channels) != tracked.noise.shape[-1]:
         channels = tuple(f"channel {i + 1}" for i in range(tracked.noise.shape[-1]))
     return Residuals(
-        names=[*names(program.measurements), *channels],
+        names=[*program.measurement_names, *channels],
         values=_by_set(torch.where(there, values, 0.0), sets),
         there=_by_set(there, sets),
         variables={name: _by_set(value, sets) for name, value in variables.items()},

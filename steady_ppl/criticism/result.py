@@ -101,7 +101,7 @@ def figures(found: Check) -> dict[str, Any]:
         "program": type(found.program).__name__,
         "trajectories": len(found.data),
         "simulations": len(misfit.simulated),
-        "measurements": {name: _component(found, i) for i, name in enumerate(names(found.program.measurements))},
+        "measurements": {name: _component(found, i) for i, name in enumerate(found.program.measurement_names)},
         "constant_velocity": about | {"loses_to_it": loses},
         "findings": [
             {
@@ -168,7 +168,7 @@ def _component(found: Check, index: int) -> dict[str, Any]:
             "coverage_90": float(prediction.covered()[..., index].sum()) / count,
             "count": count,
         }
-    return {"unit": units(found.program.measurements)[index], "horizons": horizons}
+    return {"unit": found.program.measurement_units[index], "horizons": horizons}
 
 
 def _rms(error: Tensor, there: Tensor) -> float | None:
@@ -260,7 +260,7 @@ def sentence(found: Check, finding: Finding) -> str:
     cell = finding.cell
     name, more = found.residuals[cell.residual], finding.z > 0
     where = place(found, cell)
-    measurements = names(found.program.measurements)
+    measurements = found.program.measurement_names
     if cell.residual >= len(measurements):
         name = f"{name} acceleration"
     if cell.map == "memory":
@@ -269,7 +269,7 @@ def sentence(found: Check, finding: Finding) -> str:
         return f"the misfit of {name} goes {'with' if more else 'against'} {where}"
     if cell.residual >= len(measurements):
         return f"{name} {'above' if more else 'below'} the program's{where}"
-    unit = units(found.program.measurements)[cell.residual]
+    unit = found.program.measurement_units[cell.residual]
     size = f"{abs(cell.mean or 0.0):.2g} {unit} ".replace("  ", " ")
     return f"{name} measured {size}{'above' if (cell.mean or 0.0) > 0 else 'below'} its prediction{where}"
 
@@ -301,8 +301,8 @@ def unit_of(found: Check, variable: str) -> str:
         if variable in names(declared):
             return units(declared)[names(declared).index(variable)]
     channel = variable.removesuffix(" velocity")
-    if channel in names(program.channels):
-        return units(program.channels)[names(program.channels).index(channel)].replace("/s²", "/s")
+    if channel in program.channel_names:
+        return program.channel_units[program.channel_names.index(channel)].replace("/s²", "/s")
     return ""
 
 

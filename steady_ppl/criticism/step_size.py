@@ -15,7 +15,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, UsageError
-from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.likelihood.fit import roomy_path
 from steady_ppl.likelihood.maximize import Maximum, maximise
@@ -52,7 +52,7 @@ class StepTrial:
     log_likelihood: float
     decrement: float
     program: Program
-    path: Path
+    path: ReferencePath
     names: tuple[str, ...] = ()
     values: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
     covariance: Tensor = field(default_factory=lambda: torch.zeros(0, 0, dtype=torch.float64))
@@ -180,7 +180,7 @@ def _differs(trial: StepTrial, finer: StepTrial, max_shift: float) -> bool:
 def check_step(
     program: Program,
     data: Trajectories,
-    at: Maximum | Path | None = None,
+    at: Maximum | ReferencePath | None = None,
     *,
     known_start: bool = False,
     watched: Sequence[str] | None = None,
@@ -221,7 +221,7 @@ def check_step(
         watched = [part.name.split("[")[0] for part, noise in zip(parts, wider, strict=True) if not noise]
     names = watched or ()
 
-    def trial(substeps: int, like: Program, path: Path, steps: int) -> StepTrial:
+    def trial(substeps: int, like: Program, path: ReferencePath, steps: int) -> StepTrial:
         changed = with_substeps(like, substeps)
         if not refits:
             ahead = smooth(changed, data, path, known_start=known_start, kernels=False)

@@ -16,7 +16,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
-from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.likelihood.maximize import Maximum, Term, climb
 from steady_ppl.likelihood.parameters import elements, moved, set_values, values_of
 from steady_ppl.likelihood.scores import channel_moments, substep_spreads
@@ -85,7 +85,7 @@ def with_common_noise(
 
 
 @torch.no_grad()
-def noise_numbers(program: Program, data: Trajectories, path: Path) -> set[int]:
+def noise_numbers(program: Program, data: Trajectories, path: ReferencePath) -> set[int]:
     """Return which learnable numbers say how large the process noise is, or how it goes on, and nothing else.
 
     Those of the program itself multiply standard deviations of channels, in all rows alike, and leave their means.
@@ -109,7 +109,7 @@ def noise_numbers(program: Program, data: Trajectories, path: Path) -> set[int]:
     return found
 
 
-def _moments(program: Program, data: Trajectories, path: Path) -> tuple[Tensor, Tensor]:
+def _moments(program: Program, data: Trajectories, path: ReferencePath) -> tuple[Tensor, Tensor]:
     """Return means of rows' channels and standard deviations of substeps' along a path, `(1, rows, C)` each."""
     states = path.states[:-1].unsqueeze(0)
     mean, spread = channel_moments(program, data, states)

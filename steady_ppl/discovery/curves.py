@@ -51,11 +51,11 @@ def curves(program: Program, data: Trajectories, spread: Tensor, sharpness: Tens
         knots = knots_of(seen, variable in program.angles)
         if knots is None:
             continue
-        for index, channel in enumerate(names(program.channels)):
+        for index, channel in enumerate(program.channel_names):
             for times in (ALONE, COMMANDED) if variable == "time" else (ALONE,):
                 size = _size(data, multiplier(mean, channel, times))
                 if size > 0 and float(spread[index]) / size > LOWEST:
-                    unit = "1" if times else units(program.channels)[index]
+                    unit = "1" if times else program.channel_units[index]
                     height = float(spread[index]) / size
                     effect = _effect("push", variable, knots, height, unit, variable in program.angles)
                     at = f"{channel}~{variable}{f' × {times}' if times else ''}"
@@ -80,13 +80,13 @@ def variables(
 ) -> dict[str, Tensor]:
     """Everything that a curve may depend on, by name, each `(...)`: state components, velocities in the channels' own
     frame and their products, controls, what the program makes of them, and time."""
-    found = {name: state[..., i] for i, name in enumerate(names(program.states)) if name not in program.resting}
+    found = {name: state[..., i] for i, name in enumerate(program.state_names) if name not in program.resting}
     moving = {f"{channel} velocity": value for channel, value in program.velocities(state).items()}
     named = {f"{channel} velocity": velocity for channel, (_, velocity) in program.motion.items()}
     found |= {name: value for name, value in moving.items() if name not in named and name != "yaw velocity"}
     for one, other in itertools.combinations(moving, 2):
         found[f"{one} × {other}"] = moving[one] * moving[other]
-    found |= {name: control[..., i] for i, name in enumerate(names(program.controls))}
+    found |= {name: control[..., i] for i, name in enumerate(program.control_names)}
     found |= {f"commanded {channel}": value for channel, value in mean.items()}
     return found | {"time": time}
 
@@ -98,7 +98,7 @@ def unit_of(program: Program, variable: str) -> str:
             return units(declared)[names(declared).index(variable)]
     if variable == "time":
         return "s"
-    of_channel = dict(zip(names(program.channels), units(program.channels), strict=True))
+    of_channel = dict(zip(program.channel_names, program.channel_units, strict=True))
     parts = [part.strip() for part in variable.split("×")]
     found = [of_channel.get(part.removeprefix("commanded ").removesuffix(" velocity"), "") for part in parts]
     if variable.startswith("commanded "):
@@ -156,7 +156,7 @@ def over_state(self, state, control, time, step, c, mean, channel, variable, kno
 def over_reading(self, state, measured, c, chosen, circular, knots):
     """A curve that adds to measurements, of what they read."""
     change = height(measured, knots, circular, c)
-    return measured + change * torch.tensor([float(name in chosen) for name in names(self.measurements)]).to(measured)
+    return measured + change * torch.tensor([float(name in chosen) for name in self.measurement_names]).to(measured)
 
 
 def _effect(form: str, variable: str, knots: Sequence[float], spread: float, unit: str, circular: bool) -> Effect:
@@ -188,7 +188,7 @@ def _correlation(knots: Sequence[float], circular: bool) -> Tensor:
 def _of_readings(program: Program, data: Trajectories, sharpness: Tensor) -> list[Variant]:
     """Curves over what is read, of each measurement alone and, if all are angles, of all together."""
     assert data.states is not None
-    found, order = [], names(program.measurements)
+    found, order = [], program.measurement_names
     turning = on_a_circle(program, data, data.states)
     groups = [(name,) for name in order] + ([order] if len(order) > 1 and bool(turning.all()) else [])
     for group in groups:
@@ -198,7 +198,7 @@ def _of_readings(program: Program, data: Trajectories, sharpness: Tensor) -> lis
         if knots is None:
             continue
         at = group[0] if len(group) == 1 else "all"
-        unit = units(program.measurements)[index]
+        unit = program.measurement_units[index]
         effect = _effect("measured", f"reading of {at}", knots, float(sharpness[index]), unit, circular)
         found.append(effect.variant(at=f"{at}~reading", chosen=group, circular=circular, knots=knots))
     return found

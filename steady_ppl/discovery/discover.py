@@ -22,7 +22,7 @@ from steady_ppl.effects import of_name, record, restore, written_class
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.linearize import why_not_linear
 from steady_ppl.likelihood.parameters import elements
-from steady_ppl.model.program import Program, for_program, names
+from steady_ppl.model.program import Program, for_program
 from steady_ppl.runs.diagnostics import doubts_of_units
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.progress import stages
@@ -237,7 +237,7 @@ def require(program: Program, train: Trajectories, valid: Trajectories, known_st
     if simulations < FEWEST_SETS:
         raise UsageError(f"got {simulations} simulations: the calibration needs at least {FEWEST_SETS}, 200 are better")
     elements(program)
-    if not names(program.channels):
+    if not program.channel_names:
         raise UsageError("the program declares no noise channels, through which effects act")
     for name, drives in (("training", train), ("validation", valid)):
         if len(drives) < FEWEST_DRIVES:
@@ -260,7 +260,7 @@ def require(program: Program, train: Trajectories, valid: Trajectories, known_st
     if why is not None:
         raise UsageError(f"discover needs a program that can be linearised: {why.split(': looking')[0]}")
     constant = unexcited(program, train)
-    if constant and len(constant) == len(names(program.controls)):
+    if constant and len(constant) == len(program.control_names):
         raise DataError(
             f"the controls never change ({', '.join(constant)}): these drives cannot tell what the controls do from "
             "what happens anyway, and no verdict is given; record drives with changing controls"
@@ -287,4 +287,4 @@ def unexcited(program: Program, data: Trajectories) -> list[str]:
     """Controls that have one value everywhere."""
     controls = data.controls[:-1][data.transitions]
     same = (controls == controls[:1]).all(0) if len(controls) else torch.ones(data.controls.shape[-1], dtype=torch.bool)
-    return [name for name, constant in zip(names(program.controls), same.tolist(), strict=True) if constant]
+    return [name for name, constant in zip(program.control_names, same.tolist(), strict=True) if constant]

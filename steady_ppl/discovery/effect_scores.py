@@ -14,7 +14,7 @@ from steady_ppl.discovery.curves import by_height, multiplier, over_reading, ove
 from steady_ppl.effects import Variant
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
-from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood.parameters import Element
@@ -27,7 +27,7 @@ from steady_ppl.likelihood.scores import (
     substep_spreads,
 )
 from steady_ppl.model.interventions import by_channel
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, row_controls
 from steady_ppl.utils.random import seeded
 
@@ -110,7 +110,7 @@ class Scoring:
         if odd:
             values, width = values[:1], width / 2
         total = self.at.states.new_zeros(len(self.data))
-        for index, channel in enumerate(names(self.program.channels)):
+        for index, channel in enumerate(self.program.channel_names):
             if channel not in self._channels(variant, values[0]):
                 continue
             pushes = [self._pushed(variant, value, index)[channel] for value in values]
@@ -124,7 +124,7 @@ class Scoring:
         at, knots, circular = self.at.measurements, variant.options["knots"], variant.options["circular"]
         count = self.reading.shape[-1]
         found = []
-        for index, name in enumerate(names(self.program.measurements)):
+        for index, name in enumerate(self.program.measurement_names):
             if name in variant.options["chosen"]:
                 values = self.reading[[0, 1 + index, 1 + count + index], ..., index]
                 found.append(by_height(values, at.weights(index) * self.at.sharpness[..., index], knots, circular))
@@ -132,7 +132,7 @@ class Scoring:
 
     def _curve_of_channel(self, variant: Variant) -> Tensor:
         """Scores of the heights at the knots of a curve that is added to a channel, `(B, K)`."""
-        index = names(self.program.channels).index(variant.options["channel"])
+        index = self.program.channel_names.index(variant.options["channel"])
         variable, knots = variant.options["variable"], variant.options["knots"]
         times = multiplier(self._means_around(index), variant.options["channel"], variant.options["times"])
         weights = self.at.channels.weights(index) / self.substep_spread[..., index] * times
@@ -151,7 +151,7 @@ class Scoring:
     def _means_around(self, index: int) -> dict[str, Tensor]:
         count = self.means.shape[-1]
         at = [0, 1 + index, 1 + count + index]
-        return {name: self.means[at, ..., k] for k, name in enumerate(names(self.program.channels))}
+        return {name: self.means[at, ..., k] for k, name in enumerate(self.program.channel_names)}
 
     def _pushed(self, variant: Variant, value: Tensor, index: int, few: bool = False) -> dict[str, Tensor]:
         """At the points of one channel; of `few`, of the first drive only."""
@@ -248,7 +248,7 @@ class Scoring:
         product = at.mean[1:] * at.mean[:-1] + self.at.lag[1:]
         ratio = self.substep_spread[:-1] / self.substep_spread[1:]
         chosen = self.substep_spread.new_tensor(
-            [float(n in variant.options["channels"]) for n in names(self.program.channels)]
+            [float(n in variant.options["channels"]) for n in self.program.channel_names]
         )
         return torch.where(at.present[1:], product * ratio * chosen, 0.0).sum((0, -1))
 
@@ -328,7 +328,11 @@ def simulate_scores(
         index = torch.arange(first, min(first + PART, len(drives)))
         part = drives.subset(index)
         ahead = smooth(
-            program, part, Path(path.states[:, index], path.noise[:, index]), known_start=known_start, passes=passes
+            program,
+            part,
+            ReferencePath(path.states[:, index], path.noise[:, index]),
+            known_start=known_start,
+            passes=passes,
         )
         scores.append(scores_along(program, part, ahead, parts, columns))
         likely.append(ahead.log_likelihood)

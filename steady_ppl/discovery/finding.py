@@ -17,7 +17,7 @@ from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.screening import Tested
 from steady_ppl.discovery.search import MARGIN, Found, Search
 from steady_ppl.effects import Variant, attached
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 
 INTERVAL = 0.9
 RESAMPLES = 2000
@@ -157,7 +157,7 @@ def shape_of(search: Search, program: Program) -> Shape | None:
     wide = float(stats.norm.isf((1 - INTERVAL) / 2 / len(heights))) * math.sqrt(share)
     channel = variant.at.partition("~")[0]
     variable = variant.options.get("variable", "reading")
-    about = names(program.measurements)[0] if channel == "all" else channel
+    about = program.measurement_names[0] if channel == "all" else channel
     return Shape(
         channel=channel,
         variable=variable,

@@ -19,7 +19,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
-from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.guides.base import Constant
 from steady_ppl.guides.linearized import LookaheadGuide
@@ -39,7 +39,7 @@ class Judged:
     """Drives under a program: log p(y), `(B,)`, and the posterior means along which it was linearised."""
 
     log_likelihood: Tensor
-    path: Path
+    path: ReferencePath
 
 
 class Fitting(Protocol):
@@ -49,7 +49,7 @@ class Fitting(Protocol):
         self,
         program: Program,
         drives: Trajectories,
-        path: Path | None = None,
+        path: ReferencePath | None = None,
         *,
         known_start: bool,
         information: Tensor | None = None,
@@ -67,7 +67,7 @@ class Fitting(Protocol):
         """
         ...
 
-    def judge(self, program: Program, drives: Trajectories, path: Path, *, known_start: bool) -> Judged:
+    def judge(self, program: Program, drives: Trajectories, path: ReferencePath, *, known_start: bool) -> Judged:
         """Log p(y) of drives, linearised along a path that is improved from here."""
         ...
 
@@ -80,7 +80,7 @@ class ByLikelihood:
         self,
         program: Program,
         drives: Trajectories,
-        path: Path | None = None,
+        path: ReferencePath | None = None,
         *,
         known_start: bool,
         information: Tensor | None = None,
@@ -88,7 +88,7 @@ class ByLikelihood:
     ) -> Maximum:
         return maximise(program, drives, path, known_start=known_start, information=information, hopeless=hopeless)
 
-    def judge(self, program: Program, drives: Trajectories, path: Path, *, known_start: bool) -> Judged:
+    def judge(self, program: Program, drives: Trajectories, path: ReferencePath, *, known_start: bool) -> Judged:
         ahead = _at_rest(program, drives, path, known_start)
         return Judged(ahead.log_likelihood, resting_path(ahead, drives))
 
@@ -112,7 +112,7 @@ class ByDraws:
         self,
         program: Program,
         drives: Trajectories,
-        path: Path | None = None,
+        path: ReferencePath | None = None,
         *,
         known_start: bool,
         information: Tensor | None = None,
@@ -120,7 +120,7 @@ class ByDraws:
     ) -> Maximum:
         return kept_maximum(program, lambda: self._climb(program, drives, path, known_start))
 
-    def _climb(self, program: Program, drives: Trajectories, path: Path | None, known_start: bool) -> Maximum:
+    def _climb(self, program: Program, drives: Trajectories, path: ReferencePath | None, known_start: bool) -> Maximum:
         path = path or find_path(program, drives, known_start=known_start)
         before = self.judge(program, drives, path, known_start=known_start)
         guide = LookaheadGuide(
@@ -146,14 +146,14 @@ class ByDraws:
             gained=float((after.log_likelihood - before.log_likelihood).sum()),
         )
 
-    def judge(self, program: Program, drives: Trajectories, path: Path, *, known_start: bool) -> Judged:
+    def judge(self, program: Program, drives: Trajectories, path: ReferencePath, *, known_start: bool) -> Judged:
         ahead = _at_rest(program, drives, path, known_start)
         with seeded(0, "judge"):
             more = neglected(program, drives, known_start=known_start, particles=JUDGING, ahead=ahead)
         return Judged(ahead.log_likelihood + more, resting_path(ahead, drives))
 
 
-def is_doubtful(program: Program, drives: Trajectories, path: Path, known_start: bool) -> bool:
+def is_doubtful(program: Program, drives: Trajectories, path: ReferencePath, known_start: bool) -> bool:
     """Whether the linearised program's log p(y) is off by more than half a nat a drive, or no particle filter that it
     leads can follow these drives to say so."""
     ahead = _at_rest(program, drives, path, known_start)
@@ -164,7 +164,7 @@ def is_doubtful(program: Program, drives: Trajectories, path: Path, known_start:
         return True
 
 
-def _at_rest(program: Program, drives: Trajectories, path: Path, known_start: bool) -> Lookahead:
+def _at_rest(program: Program, drives: Trajectories, path: ReferencePath, known_start: bool) -> Lookahead:
     ahead = smooth(program, drives, path, known_start=known_start, passes=15, tolerance=0.02, kernels=False)
     require_found(ahead, program, drives)
     return ahead

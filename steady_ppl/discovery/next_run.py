@@ -13,10 +13,10 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.refits import Refit, wide, wide_drives
 from steady_ppl.discovery.search import Found
-from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.gaussian.smoother import smooth
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 from steady_ppl.utils.random import seeded
 
 DRIVES = 24  # simulated for each proposal
@@ -67,7 +67,7 @@ def next_run(found: Found, known_start: bool, seed: int) -> NextRun | None:
     if not better:
         return None
     separation, way, controls = max(better, key=lambda one: one[0])
-    order = names(members[0].refit.program.controls)  # type: ignore[union-attr]
+    order = members[0].refit.program.control_names  # type: ignore[union-attr]
     return NextRun(
         between=[member.variant.name for member in members],
         way=way,
@@ -96,10 +96,10 @@ def _separation(members: list[Candidate], controls: Tensor, data: Trajectories, 
     return min(apart) if all(map(math.isfinite, apart)) else math.nan
 
 
-def _log_likelihood(program: Program, drives: Trajectories, path: Path, known_start: bool) -> Tensor:
+def _log_likelihood(program: Program, drives: Trajectories, path: ReferencePath, known_start: bool) -> Tensor:
     states = path.states[..., : len(program.states)]
     fitting = replace(drives, states=None if drives.states is None else drives.states[..., : len(program.states)])
-    near = wide(Path(states, path.noise), program)
+    near = wide(ReferencePath(states, path.noise), program)
     return smooth(program, wide_drives(fitting, program), near, known_start=known_start, passes=4).log_likelihood
 
 

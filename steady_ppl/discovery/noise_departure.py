@@ -14,7 +14,7 @@ from steady_ppl.discovery.refits import Fold, Refit, as_declared
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.likelihood.parameters import Element, moved
 from steady_ppl.likelihood.scores import measured, substep_spreads
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 
 
 @dataclass(frozen=True)
@@ -108,8 +108,8 @@ SPREADS: dict[str, Spread] = {"process_noise": _of_channels, "measurement_noise"
 def _columns(program: Program, variant: Variant) -> list[int]:
     """Of the standard deviations that an effect multiplies."""
     if "channels" not in variant.options:
-        return list(range(len(names(program.measurements))))
-    return [names(program.channels).index(channel) for channel in variant.options["channels"]]
+        return list(range(len(program.measurement_names)))
+    return [program.channel_names.index(channel) for channel in variant.options["channels"]]
 
 
 def _guessed(program: Program, parts: Sequence[Element], slope: Tensor) -> bool:

@@ -15,7 +15,7 @@ from steady_ppl.discovery.common_noise import Judges, with_common_noise
 from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, Fitting, is_doubtful
 from steady_ppl.effects import Variant, attach, attached, coefficient
 from steady_ppl.errors import FilterError, SteadyError
-from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path
 from steady_ppl.likelihood.fit import fit_by_likelihood, led_back
 from steady_ppl.likelihood.maximize import Maximum, maximise
@@ -33,9 +33,9 @@ class Fold:
     """Drives to fit and drives to judge, with the paths along which they were last linearised."""
 
     drives: Trajectories
-    path: Path
+    path: ReferencePath
     held_out: Trajectories
-    held_out_path: Path
+    held_out_path: ReferencePath
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class Start:
     """Where a fit by draws may begin: a program, a path of its drives and what log p(y) a filter finds for them all."""
 
     program: Program
-    path: Path
+    path: ReferencePath
     log_likelihood: float
 
 
@@ -315,9 +315,9 @@ def _there(program: Program, variant: Variant) -> Variant:
     return next(known for known in attached(program) if known.name == variant.name)
 
 
-def wide(path: Path, program: Program) -> Path:
+def wide(path: ReferencePath, program: Program) -> ReferencePath:
     """A path for a program that has further, resting states."""
-    return Path(_with_resting(path.states, program), path.noise)
+    return ReferencePath(_with_resting(path.states, program), path.noise)
 
 
 def wide_drives(drives: Trajectories, program: Program) -> Trajectories:

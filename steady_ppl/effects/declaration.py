@@ -29,7 +29,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError
-from steady_ppl.model.program import Program, names, units
+from steady_ppl.model.program import Program
 
 VERDICTS = {
     "push": "dynamics",
@@ -259,11 +259,11 @@ def _unit(program: Program, variant: Variant) -> str:
     """The coefficient's unit in a program whose controls, measurements and channels have units of their own."""
     unit, options = variant.effect.unit, variant.options
     if unit == "of the control" and "controls" in options:
-        return units(program.controls)[names(program.controls).index(options["controls"][0])] or unit
+        return program.control_units[program.control_names.index(options["controls"][0])] or unit
     if unit == "of the measurement" and "component" in options:
-        return units(program.measurements)[options["component"]] or unit
+        return program.measurement_units[options["component"]] or unit
     if "channels" in options and variant.effect.form == "push":
-        of_channel = units(program.channels)[names(program.channels).index(options["channels"][0])]
+        of_channel = program.channel_units[program.channel_names.index(options["channels"][0])]
         moved = of_channel.removesuffix("/s²")
         if moved and moved != of_channel and not unit.startswith(("rad", "1/rad")):
             return re.sub(r"(?<![a-z])m(?![a-z])", moved, unit)

@@ -17,7 +17,7 @@ from numba import njit
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.gaussian.linearize import Linearization, Path, linearize
+from steady_ppl.gaussian.linearize import Linearization, ReferencePath, linearize
 from steady_ppl.model.program import Program
 
 
@@ -44,10 +44,10 @@ class Tracked:
     reading: Tensor
     log_likelihood: Tensor
 
-    def path(self, data: Trajectories) -> Path:
+    def path(self, data: Trajectories) -> ReferencePath:
         """The posterior mean as a path to linearise along, the padding filled with the first row."""
         kind = data.controls.dtype
-        return Path(
+        return ReferencePath(
             states=torch.where(data.rows[..., None], self.smoothed, self.smoothed[:1]).to(kind),
             noise=torch.where(data.transitions[..., None], self.noise, 0.0).to(kind),
         )
@@ -71,7 +71,7 @@ class Tracked:
 def track(
     program: Program,
     data: Trajectories,
-    path: Path,
+    path: ReferencePath,
     *,
     known_start: bool,
     passes: int = 2,

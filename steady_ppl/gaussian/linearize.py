@@ -29,14 +29,14 @@ from steady_ppl.model.handlers import (
     running,
     tangent_normal,
 )
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance
 from steady_ppl.model.validate import start_size, step_size
 from steady_ppl.utils.angles import wrap
 
 
 @dataclass(frozen=True)
-class Path:
+class ReferencePath:
     """States and the standard normal noise that goes with them.
 
     Attributes:
@@ -81,7 +81,7 @@ class Linearization(Sensors):
         state, noise: F `(T, B, D, D)` and G `(T, B, D, C)`.
     """
 
-    path: Path
+    path: ReferencePath
     angles: tuple[int, ...]
     start_offset: Tensor
     start_turn: Tensor
@@ -95,7 +95,7 @@ class Linearization(Sensors):
 def linearize(
     program: Program,
     data: Trajectories,
-    path: Path,
+    path: ReferencePath,
     *,
     known_start: bool = False,
     observation_weight: float = 1.0,
@@ -178,7 +178,7 @@ def why_not_linear(program: Program, data: Trajectories, *, known_start: bool = 
     with running(rows - 1, 1):
         state = broadcast_event(program.initial(), torch.Size((rows - 1, 1)), 1)
     channels = step_size(program)
-    path = Path(state[:1].expand(rows, -1, -1), state.new_zeros((rows - 1, 1, channels)))
+    path = ReferencePath(state[:1].expand(rows, -1, -1), state.new_zeros((rows - 1, 1, channels)))
     try:
         linearize(program, head, path, known_start=known_start)
     except ProgramError as error:
@@ -240,7 +240,7 @@ def _measurement(program: Program, data: Trajectories, states: Tensor, kernels: 
 def _on_a_circle(program: Program, data: Trajectories, state: Tensor) -> tuple[int, ...]:
     """The declared angles of which a whole turn changes neither what is measured nor where the program goes; an angle
     that a plain normal measures counts its turns. Looked at from one state, `(1, D)`."""
-    angles = [names(program.states).index(angle) for angle in program.angles]
+    angles = program.angle_indices
     turns = state.new_zeros((len(angles) + 1, state.shape[-1]))
     turns[range(1, len(turns)), angles] = 2 * math.pi
     states = (state + turns).unsqueeze(1)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
-from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.model.handlers import AtMean, Observing, Recording, as_vector, residual, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance
@@ -95,7 +95,9 @@ def errors(program: Program, states: Tensor, measurements: Tensor, observed: Ten
 
 
 @torch.no_grad()
-def simulate_again(program: Program, data: Trajectories, starts: Tensor, channels: int) -> tuple[Trajectories, Path]:
+def simulate_again(
+    program: Program, data: Trajectories, starts: Tensor, channels: int
+) -> tuple[Trajectories, ReferencePath]:
     """Drives that the program makes of the same controls, with the same gaps in the measurements.
 
     Args:
@@ -121,7 +123,7 @@ def simulate_again(program: Program, data: Trajectories, starts: Tensor, channel
     known = torch.full_like(path, torch.nan)
     known[0] = path[0]
     again = replace(again, measurements=torch.where(again.observed, drawn, 0.0), states=known)
-    return again, Path(path, torch.stack(noises).flatten(1, 2))
+    return again, ReferencePath(path, torch.stack(noises).flatten(1, 2))
 
 
 @torch.no_grad()

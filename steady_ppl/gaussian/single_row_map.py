@@ -18,7 +18,7 @@ from steady_ppl.errors import DataError
 from steady_ppl.gaussian.linearize import linearize_sensors
 from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.model.handlers import broadcast_event, running
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 from steady_ppl.model.validate import step_size
 
 DAMPING = 1e-2  # of the first step, relative to the curvature
@@ -46,7 +46,7 @@ def fixes(program: Program, data: Trajectories, *, places: int = 32, passes: int
     guesses = _guesses(program, data, places)
     told = _told(program, data, guesses[:, 0])
     _require_enough(program, data, told)
-    angles = [names(program.states).index(name) for name in program.angles]
+    angles = program.angle_indices
     prior = _Prior.of(guesses[data.rows[:, None].expand(guesses.shape[:3])], angles)
     drives = max(1, AT_ONCE // (places * len(data.time)))
     parts = torch.arange(len(data)).split(drives)
@@ -77,7 +77,7 @@ def _require_enough(program: Program, data: Trajectories, told: Tensor) -> None:
         raise DataError("nothing is measured: every y. cell of the table is empty")
     if bool(poor.any()):
         label = data.labels[int(poor.nonzero()[0])]
-        dependent = ", ".join(name for name, tells in zip(names(program.states), told.tolist(), strict=True) if tells)
+        dependent = ", ".join(name for name, tells in zip(program.state_names, told.tolist(), strict=True) if tells)
         raise DataError(
             f"trajectory {label}: in fewer than two rows there are measurements enough, {int(told.sum())}, to tell "
             f"{dependent} from that row alone; leave such drives out",

@@ -16,7 +16,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
-from steady_ppl.gaussian.linearize import Path, linearize
+from steady_ppl.gaussian.linearize import ReferencePath, linearize
 from steady_ppl.kernels.jit import on_all_rows
 from steady_ppl.model.handlers import (
     KnownStart,
@@ -43,7 +43,7 @@ RESTS = 0.05  # a trajectory is at rest where no noise moves by more, in standar
 def smooth(
     program: Program,
     data: Trajectories,
-    path: Path,
+    path: ReferencePath,
     *,
     known_start: bool = False,
     observation_weight: float = 1.0,
@@ -69,7 +69,7 @@ def smooth(
         The lookahead along the last path that was accepted, so that its linearization and its means agree.
     """
 
-    def look(path: Path) -> Lookahead:
+    def look(path: ReferencePath) -> Lookahead:
         return look_ahead(
             linearize(
                 program, data, path, known_start=known_start, observation_weight=observation_weight, kernels=kernels
@@ -78,7 +78,7 @@ def smooth(
 
     if passes == 1:
         return look(path)
-    accepted = path = Path(path.states, torch.where(data.transitions[..., None], path.noise, 0.0))
+    accepted = path = ReferencePath(path.states, torch.where(data.transitions[..., None], path.noise, 0.0))
     penalty = torch.zeros_like(path.states, dtype=torch.float64)
     most = torch.full((len(data),), torch.inf, dtype=torch.float64, device=path.states.device)
     for index in range(passes):
@@ -88,7 +88,7 @@ def smooth(
         accepted = _either(worse, accepted, path)
         if index == passes - 1:
             break
-        halfway = Path((accepted.states + path.states) / 2, (accepted.noise + path.noise) / 2)
+        halfway = ReferencePath((accepted.states + path.states) / 2, (accepted.noise + path.noise) / 2)
         moved = _either(worse, halfway, means_as_path(ahead, data))
         change = torch.nan_to_num((moved.noise - path.noise).abs(), nan=0.0).max()  # of those that have not blown up
         penalty = torch.where(worse[:, None], penalty, _penalty(ahead, moved))
@@ -136,7 +136,7 @@ def _merit(ahead: Lookahead) -> _Merit:
     return _Merit(seen + drawn - ahead.log_likelihood, defect)
 
 
-def _penalty(ahead: Lookahead, moved: Path) -> Tensor:
+def _penalty(ahead: Lookahead, moved: ReferencePath) -> Tensor:
     """Twice the pull of a row's measurements and of the later ones at its state after a step, `(T + 1, B, D)`: what a
     unit of a defect must cost for none to be worth it."""
     linear = ahead.linearization
@@ -147,10 +147,10 @@ def _penalty(ahead: Lookahead, moved: Path) -> Tensor:
     return 2 * (now + later).squeeze(-1).abs()
 
 
-def _either(which: Tensor, one: Path, other: Path) -> Path:
+def _either(which: Tensor, one: ReferencePath, other: ReferencePath) -> ReferencePath:
     """Some trajectories of one path and the rest of another."""
     chosen = which[:, None]
-    return Path(torch.where(chosen, one.states, other.states), torch.where(chosen, one.noise, other.noise))
+    return ReferencePath(torch.where(chosen, one.states, other.states), torch.where(chosen, one.noise, other.noise))
 
 
 def find_and_smooth(
@@ -191,17 +191,17 @@ def require_found(ahead: Lookahead, program: Program, data: Trajectories) -> Non
         raise FilterError(f"trajectory {label}: {why}", trajectory=label)
 
 
-def means_as_path(ahead: Lookahead, data: Trajectories) -> Path:
+def means_as_path(ahead: Lookahead, data: Trajectories) -> ReferencePath:
     """The posterior mean as a path to linearise along, the padding filled with the first row."""
     states, noise = ahead.means()
     kind = data.controls.dtype
-    return Path(
+    return ReferencePath(
         states=torch.where(data.rows[..., None], states, states[:1]).to(kind),
         noise=torch.where(data.transitions[..., None], noise, 0.0).to(kind),
     )
 
 
-def resting_path(ahead: Lookahead, data: Trajectories) -> Path:
+def resting_path(ahead: Lookahead, data: Trajectories) -> ReferencePath:
     """`means_as_path` after several passes, to go on from. What has not come to rest stays where it was linearised.
 
     How good a path is a step further is not known there. After a single pass it would never move.
@@ -221,7 +221,7 @@ def find_path(
     particles: int = 250,
     tempering: Sequence[float] = (1.0, 0.1, 0.01, 0.001),
     passes: int = 3,
-) -> Path:
+) -> ReferencePath:
     """A path near the posterior's best mode, from the measurements alone.
 
     Smooths from a path each of several bootstrap filters, whose start comes from the program's prior and the first
@@ -244,7 +244,7 @@ def find_path(
     ahead = smooth(
         program,
         copies,
-        Path(found.states[0], standard_noise(program, copies, found)[0]),
+        ReferencePath(found.states[0], standard_noise(program, copies, found)[0]),
         known_start=known_start,
         observation_weight=observation_weight,
         passes=passes,
@@ -252,7 +252,7 @@ def find_path(
     likely = torch.nan_to_num(ahead.log_likelihood, nan=-torch.inf).view(len(tempering), len(data))
     chosen = likely.argmax(0) * len(data) + torch.arange(len(data), device=likely.device)
     best = ahead.linearization.path  # whose likelihood is known; a step further may be too far
-    return Path(best.states[:, chosen], best.noise[:, chosen])
+    return ReferencePath(best.states[:, chosen], best.noise[:, chosen])
 
 
 @torch.no_grad()

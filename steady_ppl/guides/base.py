@@ -16,7 +16,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, FilterError, ProgramError, require
 from steady_ppl.model.handlers import Recording, Replaying, masked, running
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, sample_row
 from steady_ppl.smc.filter import STEPS_WORTH_COMPILING, Proposal, particle_filter
 from steady_ppl.smc.genealogy import Paths
@@ -217,7 +217,7 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
 
     _, probe = run({})
     noise = {site: value.new_zeros(value.shape) for site, value in probe.values.items()}
-    angles = [names(program.states).index(angle) for angle in program.angles]
+    angles = program.angle_indices
     for _ in range(PASSES):
         noise, moved = _improved(run, noise, after, angles)
         if not moved:

@@ -10,7 +10,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, require
 from steady_ppl.gaussian.information_filter import Lookahead
-from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import (
     find_and_try,
     means_as_path,
@@ -94,10 +94,10 @@ class LinearizedGuide(PathGuide):
         better = ahead.log_likelihood > (-torch.inf if known is None else known[trajectories])  # not where it is a nan
         kept = better.nonzero().flatten().tolist()
         if kept:
-            self.remember(Path(found.states[:, kept], found.noise[:, kept]), part.subset(kept))
+            self.remember(ReferencePath(found.states[:, kept], found.noise[:, kept]), part.subset(kept))
 
     def _smooth(self, data: Trajectories, progress: float) -> Lookahead:
-        path = Path(self._recall("states", data), self._recall("noise", data))
+        path = ReferencePath(self._recall("states", data), self._recall("noise", data))
         return smooth(
             self.program,
             data,
@@ -114,7 +114,7 @@ class LinearizedGuide(PathGuide):
             raise ValueError("this guide remembers other drives of the same labels: make a new one for these")
         return torch.stack(known, 1).to(data.controls)
 
-    def remember(self, path: Path, data: Trajectories) -> None:
+    def remember(self, path: ReferencePath, data: Trajectories) -> None:
         """Begin the next `refresh` at this path of the trajectories of `data` instead of searching for one."""
         for i, label in enumerate(data.labels):
             self.memory.setdefault(f"searched/{label}", torch.tensor(0.0, dtype=torch.float64))

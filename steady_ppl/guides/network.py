@@ -21,7 +21,7 @@ from steady_ppl.gaussian.predict import on_a_circle
 from steady_ppl.gaussian.smoother import find_and_smooth, means_as_path
 from steady_ppl.guides.variational import VariationalGuide, log_ratio, times
 from steady_ppl.likelihood.scores import channel_moments
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 from steady_ppl.model.validate import start_size, step_size
 
 HIDDEN, BOUND = 16, 3.0  # units beside the affine mean, and how many times the usual size it reaches
@@ -50,7 +50,7 @@ class InferenceNetwork(VariationalGuide):
         self.width, self.centred = width, centred
         path = means_as_path(find_and_smooth(program, data, known_start=self.known_start), data)
         states = path.states
-        self.angles = [names(program.states).index(angle) for angle in program.angles]
+        self.angles = program.angle_indices
         self.register_buffer("circular", on_a_circle(program, data, states))
         mean, spread = (moment[0][data.transitions] for moment in channel_moments(program, data, states[None, :-1]))
         values = mean + spread * path.noise[data.transitions]

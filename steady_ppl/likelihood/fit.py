@@ -13,7 +13,7 @@ import torch
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import Lookahead
-from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path, resting_path, smooth
 from steady_ppl.likelihood.maximize import Maximum, maximise
 from steady_ppl.likelihood.parameters import elements
@@ -69,12 +69,14 @@ def led_back(program: Program, data: Trajectories, maximum: Maximum, known_start
         found = resting_path(there, part)
         states[:, strays[better]], noise[:, strays[better]] = found.states[:, better], found.noise[:, better]
         before = maximum.gained - maximum.objective
-        maximum = maximise(program, data, Path(states, noise), known_start=known_start)
+        maximum = maximise(program, data, ReferencePath(states, noise), known_start=known_start)
         maximum = replace(maximum, gained=maximum.objective + before)
     return maximum
 
 
-def roomy_path(program: Program, data: Trajectories, known_start: bool, path: Path | None = None) -> Path:
+def roomy_path(
+    program: Program, data: Trajectories, known_start: bool, path: ReferencePath | None = None
+) -> ReferencePath:
     """Find paths; where the drives are much rougher than the program says, widen its noise first, in place.
 
     A program that lacks a strong effect explains nothing at its declared noise: scores there lead nowhere. A path that

@@ -17,7 +17,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
-from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.likelihood.parameters import Element, elements, moved, set_values, values_of
 from steady_ppl.likelihood.scores import parameter_scores, smoothed
@@ -51,7 +51,7 @@ class Maximum:
 
     log_likelihood: Tensor
     objective: float
-    path: Path
+    path: ReferencePath
     names: tuple[str, ...]
     information: Tensor
     steps: int
@@ -68,7 +68,7 @@ class Maximum:
 def maximise(
     program: Program,
     data: Trajectories,
-    path: Path | None = None,
+    path: ReferencePath | None = None,
     *,
     known_start: bool = False,
     information: Tensor | None = None,
@@ -120,7 +120,7 @@ def kept_maximum(program: Program, find: Callable[[], Maximum]) -> Maximum:
 
     tensors, values = piece(compute)
     program.load_state_dict({name: tensors[f"program/{name}"] for name in program.state_dict()})
-    path = Path(tensors["states"], tensors["noise"])
+    path = ReferencePath(tensors["states"], tensors["noise"])
     values = {**values, "names": tuple(values["names"])}
     return Maximum(log_likelihood=tensors["log_likelihood"], information=tensors["information"], path=path, **values)
 
@@ -140,7 +140,7 @@ class Term:
 
     program: Program
     data: Trajectories
-    path: Path
+    path: ReferencePath
     parts: list[Element]
     columns: Sequence[int]
 
@@ -251,7 +251,7 @@ def _firm(information: Tensor) -> Tensor:
 @dataclass(frozen=True)
 class _TermHere:
     ahead: Lookahead
-    path: Path
+    path: ReferencePath
     objective: float
 
 
@@ -308,7 +308,7 @@ def _scored(terms: Sequence[Term], found: list[_TermHere]) -> _Here:
     return _Here(found, torch.cat(by_drive), gradient)
 
 
-def posterior_score(program: Program, data: Trajectories, path: Path, known_start: bool) -> Tensor:
+def posterior_score(program: Program, data: Trajectories, path: ReferencePath, known_start: bool) -> Tensor:
     """The slope of log p(y) and the log prior where the program is, `(P,)`, along the best path near `path`.
 
     Raises:

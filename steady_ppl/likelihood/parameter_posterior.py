@@ -22,7 +22,7 @@ from torch.distributions import transform_to
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, require
-from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood.maximize import PASSES, REACH, TOLERANCE, log_prior, maximise, posterior_score
 from steady_ppl.likelihood.parameters import Element, elements, moved, set_values, values_of
@@ -139,7 +139,7 @@ class Shape:
         return tail - torch.linalg.slogdet(self.root)[1]
 
 
-def about_maximum(program: Program, data: Trajectories, path: Path, known_start: bool = False) -> Shape:
+def about_maximum(program: Program, data: Trajectories, path: ReferencePath, known_start: bool = False) -> Shape:
     """By the curvature where the program is; what the data do not tell is open by as much as a fit moves it at once."""
     parts = elements(program)
     reach = torch.tensor([REACH * part.step for part in parts], dtype=torch.float64)
@@ -180,7 +180,7 @@ def _shaped(shape: Shape, values: Tensor, log_weights: Tensor) -> Shape:
 
 
 def observed_information(
-    program: Program, data: Trajectories, path: Path, parts: list[Element], known_start: bool
+    program: Program, data: Trajectories, path: ReferencePath, parts: list[Element], known_start: bool
 ) -> Tensor:
     """Minus the second derivatives of log p(y) and the log prior, `(P, P)`, by differences of exact scores."""
     columns = []
@@ -194,7 +194,7 @@ def observed_information(
     return (found + found.T) / 2
 
 
-def linearised(data: Trajectories, path: Path, known_start: bool = False) -> LogLikelihood:
+def linearised(data: Trajectories, path: ReferencePath, known_start: bool = False) -> LogLikelihood:
     """log p(y) of the linearised program as it stands, summed over drives."""
 
     def judge(program: Program) -> Tensor:

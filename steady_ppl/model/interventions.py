@@ -17,7 +17,7 @@ from torch import Tensor
 
 from steady_ppl.model.distributions import WrappedNormal, WrappedStudentT
 from steady_ppl.model.handlers import AtMean, Recording, as_vector, normal_moments, unwrapped
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import row_ends
 
 Change = Callable[[Any, slice], Any]
@@ -52,7 +52,7 @@ def pushed(program: Program, pushes: Mapping[str, Tensor]) -> Altering:
     Args:
         pushes: channel → what is added, `(...)`, in the channel's unit.
     """
-    order = names(program.channels)
+    order = program.channel_names
 
     def change(fn: Any, columns: slice) -> Any:
         mean, _ = normal_moments(fn, "channel")
@@ -67,7 +67,7 @@ def widened(program: Program, factors: Mapping[str, Tensor]) -> Altering:
     Args:
         factors: channel → factor, `(...)`.
     """
-    order = names(program.channels)
+    order = program.channel_names
 
     def change(fn: Any, columns: slice) -> Any:
         mean, _ = normal_moments(fn, "channel")
@@ -127,7 +127,7 @@ class Coloured(Altering):
     """
 
     def __init__(self, program: Program, shares: Mapping[str, Tensor], last: Tensor) -> None:
-        order = names(program.channels)
+        order = program.channel_names
         share = torch.stack(torch.broadcast_tensors(*(shares.get(name, last.new_zeros(())) for name in order)), -1)
         super().__init__(self._change)
         self.last, self.pushes, self.factors = last, share * last, (1 - share.square()).sqrt()
@@ -159,12 +159,12 @@ def channel_means(program: Program, transition: Callable[..., Tensor], *argument
     with poutine.block(), seen, AtMean():
         transition(*arguments)
     parts = [as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()]
-    return dict(zip(names(program.channels), torch.cat(parts, -1).unbind(-1), strict=True))
+    return dict(zip(program.channel_names, torch.cat(parts, -1).unbind(-1), strict=True))
 
 
 def by_channel(program: Program, values: Mapping[str, Tensor], missing: float, like: Tensor) -> Tensor:
     """Values by channel side by side, `(..., C)` as `like`."""
-    return _columns(values, names(program.channels), missing, 1, like).expand_as(like)
+    return _columns(values, program.channel_names, missing, 1, like).expand_as(like)
 
 
 def _moved(fn: Any, change: Callable[[Tensor], Tensor]) -> Any:

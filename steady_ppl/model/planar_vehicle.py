@@ -60,7 +60,7 @@ class PlanarVehicle(Program):
     @property
     def sees_bearings(self) -> bool:
         """Whether a bearing to each landmark, and nothing else, is measured; not where a subclass has other sensors."""
-        return len(self.landmarks) > 0 and names(self.measurements) == names(self._bearings)
+        return len(self.landmarks) > 0 and self.measurement_names == names(self._bearings)
 
     @property
     def _bearings(self) -> tuple[str, ...]:
@@ -123,7 +123,7 @@ class PlanarVehicle(Program):
 
     def velocities(self, state: Tensor) -> dict[str, Tensor]:
         """Velocity in the body frame and yaw rate by channel, each `(...)`."""
-        return dict(zip(names(self.channels), self.body_velocity(state), strict=True))
+        return dict(zip(self.channel_names, self.body_velocity(state), strict=True))
 
     def positions(self, state: Tensor) -> dict[str, Tensor]:
         """None: no channel of the body frame has a position in it."""
@@ -143,7 +143,7 @@ class PlanarVehicle(Program):
         forward, lateral, yaw_rate = self.body_velocity(state)
         turns = 0.0 if self.settling is None else yaw_rate
         parts = (-lateral * turns, forward * turns, torch.zeros_like(forward))
-        return dict(zip(names(self.channels), parts, strict=True))
+        return dict(zip(self.channel_names, parts, strict=True))
 
     def ranges(self, state: Tensor) -> Tensor:
         """Distances from the landmarks, `(..., K)` m."""

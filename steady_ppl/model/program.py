@@ -8,7 +8,7 @@ all times at once.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import wraps
+from functools import cache, wraps
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import pyro
@@ -135,6 +135,51 @@ class Program(PyroModule):
         return control
 
     @property
+    def state_names(self) -> tuple[str, ...]:
+        """Of the state's components, without units."""
+        return names(self.states)
+
+    @property
+    def state_units(self) -> tuple[str, ...]:
+        """Of the state's components, empty where none is given."""
+        return units(self.states)
+
+    @property
+    def control_names(self) -> tuple[str, ...]:
+        """Of the controls, without units."""
+        return names(self.controls)
+
+    @property
+    def control_units(self) -> tuple[str, ...]:
+        """Of the controls, empty where none is given."""
+        return units(self.controls)
+
+    @property
+    def measurement_names(self) -> tuple[str, ...]:
+        """Of the measurement's components, without units."""
+        return names(self.measurements)
+
+    @property
+    def measurement_units(self) -> tuple[str, ...]:
+        """Of the measurement's components, empty where none is given."""
+        return units(self.measurements)
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Of the noise channels, without units."""
+        return names(self.channels)
+
+    @property
+    def channel_units(self) -> tuple[str, ...]:
+        """Of the noise channels, empty where none is given."""
+        return units(self.channels)
+
+    @property
+    def angle_indices(self) -> tuple[int, ...]:
+        """Which state components live on a circle."""
+        return tuple(self.state_names.index(name) for name in names(self.angles))
+
+    @property
     def derivatives(self) -> Mapping[str, str]:
         """State component → the one that is its rate of change."""
         return {position: velocity for position, velocity in self.motion.values() if position and velocity}
@@ -147,21 +192,21 @@ class Program(PyroModule):
 
     def velocities(self, state: Tensor) -> dict[str, Tensor]:
         """The velocity that each channel accelerates, `(...)`."""
-        order = names(self.states)
+        order = self.state_names
         return {
             channel: state[..., order.index(velocity)] for channel, (_, velocity) in self.motion.items() if velocity
         }
 
     def positions(self, state: Tensor) -> dict[str, Tensor]:
         """The position that each channel moves, `(...)`, where it has one."""
-        order = names(self.states)
+        order = self.state_names
         return {
             channel: state[..., order.index(position)] for channel, (position, _) in self.motion.items() if position
         }
 
     def earlier(self, state: Tensor, ago: Tensor) -> Tensor:
         """The state `ago` seconds before, at its velocity, `(..., D)`."""
-        order = names(self.states)
+        order = self.state_names
         moved = list(state.unbind(-1))
         for position, velocity in self.motion.values():
             if position and velocity:
@@ -170,11 +215,11 @@ class Program(PyroModule):
 
     def control_index(self, name: str) -> int:
         """Which column of `control` a control has."""
-        return names(self.controls).index(name)
+        return self.control_names.index(name)
 
     def chosen_controls(self, chosen: Sequence[str], like: Tensor) -> Tensor:
         """One for the controls that are named and zero for the others, `(U,)`."""
-        return like.new_tensor([float(name in chosen) for name in names(self.controls)])
+        return like.new_tensor([float(name in chosen) for name in self.control_names])
 
     def with_effect(self, effect: Any, value: Any = None, **where: Any) -> Program:
         """A copy with a physical effect added, its coefficient a learnable parameter; see `effects.attach`."""
@@ -204,26 +249,32 @@ def _rounded(value: Tensor) -> Any:
 
 def names(declared: Sequence[str]) -> tuple[str, ...]:
     """The names in a declaration such as `("left [N]", "right [N]")`."""
-    return tuple(component.split("[")[0].strip() for component in declared)
+    return _parsed(tuple(declared))[0]
 
 
 def units(declared: Sequence[str]) -> tuple[str, ...]:
     """The units in a declaration, empty where none is given."""
-    return tuple(component.partition("[")[2].rstrip("] ") for component in declared)
+    return _parsed(tuple(declared))[1]
+
+
+@cache
+def _parsed(declared: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    parts = [component.partition("[") for component in declared]
+    return tuple(name.strip() for name, _, _ in parts), tuple(unit.rstrip("] ") for _, _, unit in parts)
 
 
 def error_groups(program: Program) -> dict[str, tuple[int, ...]]:
     """What errors are reported for: name → indices of the state components; each component alone by default."""
-    order = names(program.states)
+    order = program.state_names
     groups = program.error_groups or {name: (name,) for name in order}
     return {group: tuple(order.index(name) for name in members) for group, members in groups.items()}
 
 
 def for_program(program: Program, data: Trajectories) -> Trajectories:
     """The columns that the program reads, in its order, its precision and on its device."""
-    chosen = data.select(names(program.controls), names(program.measurements), names(program.states))
+    chosen = data.select(program.control_names, program.measurement_names, program.state_names)
     if chosen.states is not None and program.resting:
-        resting = [names(program.states).index(name) for name in names(program.resting)]
+        resting = [program.state_names.index(name) for name in names(program.resting)]
         chosen.states[0][..., resting] = 0.0
     parameter = next(program.parameters(), None)
     if parameter is None:

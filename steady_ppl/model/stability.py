@@ -11,7 +11,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError
 from steady_ppl.model.handlers import broadcast_event, running
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import MAX_SUBSTEPS, Held, advance, with_substeps, within_row
 from steady_ppl.utils.random import seeded
 
@@ -203,7 +203,7 @@ def require_convergence(program: Program, state: Tensor, control: Tensor, time: 
     beyond = fine - 0.7 * coarse - 1e-4 * (1 + _largest(ends(8)))
     beyond = torch.where(fine.isfinite(), beyond, torch.inf)
     if bool((beyond > 0).any()):
-        component = names(program.states)[int(beyond.argmax())]
+        component = program.state_names[int(beyond.argmax())]
         raise ProgramError(
             f"program {type(program).__name__}: transition is no step in `step`: at K and 2 K substeps {component} "
             "goes apart as K grows; move the state in proportion to `step`, with noise that does not depend on it",

@@ -93,7 +93,7 @@ def _check_declarations(program: Program, name: str) -> None:
     if not program.states or not program.measurements:
         missing = "states" if not program.states else "measurements (for a planar vehicle: landmarks)"
         raise ProgramError(f"program {name} declares no {missing}; name another class of the file as FILE.py:NAME")
-    known = names(program.states)
+    known = program.state_names
     for what, members in (("angles", program.angles), *(("error_groups", g) for g in program.error_groups.values())):
         for member in members:
             if member not in known:

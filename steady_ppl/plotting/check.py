@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from steady_ppl.criticism.baselines import Reference
 from steady_ppl.criticism.result import unit_of, verdict
 from steady_ppl.errors import UsageError
-from steady_ppl.model.program import names, units
 
 if TYPE_CHECKING:
     from steady_ppl.criticism.result import Check
@@ -26,7 +25,7 @@ WIDTH = 165  # letters of a line over the whole width
 
 def check_picture(found: Check) -> Figure:
     """One figure of everything; made without pyplot's list of figures, so that nothing needs to be closed."""
-    shown = min(COMPONENTS, len(names(found.program.measurements)))
+    shown = min(COMPONENTS, len(found.program.measurement_names))
     figure = Figure(figsize=(13, 2.2 * max(shown, 3) + 1.3), layout="constrained")
     left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1.25, 1), squeeze=False))
     drive = representative(found)
@@ -66,7 +65,7 @@ def predictions(found: Check, drive: int, component: int, axes: Axes) -> None:
         axes.fill_between(at, middle - half, middle + half, color=color, alpha=0.18, lw=0)
         axes.plot(at, middle, color=color, lw=1, label=f"{name} ahead, 90 % band")
     axes.plot(time, measured(found)[:, drive, component], ".", color=MEASURED, ms=3, label="measured")
-    name, unit = names(found.program.measurements)[component], units(found.program.measurements)[component]
+    name, unit = found.program.measurement_names[component], found.program.measurement_units[component]
     axes.set_ylabel(f"{name} [{unit}]" if unit else name, fontsize=8)
 
 
@@ -155,7 +154,7 @@ def regime_panel(found: Check, axes: Axes) -> None:
 def subject(found: Check, residual: int) -> str:
     """What a residual is of, in words."""
     name = found.residuals[residual]
-    return name if residual < len(names(found.program.measurements)) else f"{name} acceleration"
+    return name if residual < len(found.program.measurement_names) else f"{name} acceleration"
 
 
 def against_references(found: Check, axes: Axes) -> None:
@@ -211,7 +210,7 @@ def innovations(found: Check, trajectory: str, *, axes: Axes | None = None) -> A
     time = found.data.elapsed[1:, drive].numpy(force=True)
     scores = torch.where(prediction.observed, prediction.standardised, torch.nan)[:, drive].numpy(force=True)
     axes.axhspan(-1.96, 1.96, color="0.9", lw=0)
-    for component, (name, mark) in enumerate(zip(names(found.program.measurements), "os^Dvx+*" * 99, strict=False)):
+    for component, (name, mark) in enumerate(zip(found.program.measurement_names, "os^Dvx+*" * 99, strict=False)):
         axes.plot(time, scores[:, component], mark, ms=3, label=name)
     axes.axhline(0, color="black", lw=0.6)
     axes.set_xlabel("time [s]")

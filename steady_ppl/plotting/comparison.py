@@ -11,7 +11,6 @@ from matplotlib.ticker import FuncFormatter
 
 from steady_ppl.comparison.result import FLOOR, units_of_states
 from steady_ppl.errors import UsageError
-from steady_ppl.model.program import units
 
 if TYPE_CHECKING:
     from steady_ppl.comparison.result import Proof
@@ -33,7 +32,7 @@ def open_loop_picture(found: Proof, *, of: str | None = None, axes: Axes | None 
         UsageError: the proof has no such error.
     """
     states = units_of_states(found)
-    of = units(found.rows[found.reference].program.measurements)[0] if of is None else of
+    of = found.rows[found.reference].program.measurement_units[0] if of is None else of
     curves = {name: _curve(found, name, of) for name in found.rows}
     if not curves[found.reference]:
         have = {key.of for key in found.rows[found.reference].sums if key.kind in ("measurement", "state")}

@@ -22,7 +22,7 @@ from steady_ppl.discovery.screening import Tested
 from steady_ppl.effects import Variant
 from steady_ppl.errors import UsageError
 from steady_ppl.model.interventions import channel_means
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, row_controls
 from steady_ppl.plotting.comparison import open_loop_picture
 
@@ -302,7 +302,7 @@ def _visited(program: Program, variant: Variant, fold: Fold) -> np.ndarray:
     """Values of what a curve depends on, on the drives of a fold."""
     data = fold.drives
     if "chosen" in variant.options:
-        index = [names(program.measurements).index(name) for name in variant.options["chosen"]]
+        index = [program.measurement_names.index(name) for name in variant.options["chosen"]]
         return data.measurements[..., index][data.observed[..., index]].double().numpy(force=True)
     states = fold.path.states[..., : len(program.states)]
     given = (states[:-1], row_controls(program, acting_controls(program, data))[:-1], data.elapsed[:-1])

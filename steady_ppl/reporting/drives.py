@@ -108,7 +108,7 @@ def _rows(found: Check, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _variable(found: Check, name: str) -> np.ndarray:
-    controls = names(found.program.controls)
+    controls = found.program.control_names
     if name in controls:
         return found.data.controls[:-1, :, controls.index(name)].double().numpy(force=True)
     return found.standardised.variables[name][0]
@@ -189,7 +189,7 @@ def chosen(checks: list[Check], numbers: int = NUMBERS) -> Shown:
     """As many drives as there is room for, those whose strips stand out most in any run first."""
     first = checks[0]
     rows, count = first.data.time.shape
-    columns = sum(_columns(one) for one in checks) + 1 + len(names(first.program.controls))
+    columns = sum(_columns(one) for one in checks) + 1 + len(first.program.control_names)
     every = max(1, -(-rows * columns // numbers))
     room = max(1, numbers // (-(-rows // every) * columns))
     worst = np.zeros(count)
@@ -204,8 +204,8 @@ def chosen(checks: list[Check], numbers: int = NUMBERS) -> Shown:
 
 def _columns(found: Check) -> int:
     """Numbers of a row of a drive that a run adds."""
-    horizons, states = min(2, len(found.horizons)), len(names(found.program.states))
-    return 2 * horizons * len(found.residuals) + len(names(found.program.measurements)) + 4 * states + 2 * PATHS
+    horizons, states = min(2, len(found.horizons)), len(found.program.state_names)
+    return 2 * horizons * len(found.residuals) + len(found.program.measurement_names) + 4 * states + 2 * PATHS
 
 
 def given(found: Check, shown: Shown) -> dict[str, Any]:
@@ -227,7 +227,7 @@ def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: 
     horizons = list(dict.fromkeys(["one step", list(found.horizons)[-1]]))
     data = found.data.subset(shown.drives)
     posterior = fit.posterior(data, draws=draws, seed=seed)["posterior"]
-    states = names(found.program.states)
+    states = found.program.state_names
     quantiles = np.stack([posterior[name].quantile(QUANTILES, ("chain", "draw")).values for name in states], -1)
     all_of_them = Shown(list(range(len(data))), shown.every, len(data))
     low, middle, high = (all_of_them.of(quantile.swapaxes(0, 1)) for quantile in quantiles)
@@ -252,7 +252,7 @@ def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: 
 
 def plane(program: Program) -> list[int]:
     """Two state components that make a map: a pair that errors are counted together for, else a phase plane."""
-    order = names(program.states)
+    order = program.state_names
     pairs = [tuple(group) for group in program.error_groups.values() if len(group) == 2]
     pairs += [tuple(pair) for pair in program.motion.values()] + [order[:2]]
     return [order.index(name) for name in next(pair for pair in pairs if all(name in order for name in pair))]
@@ -265,11 +265,11 @@ def _components(declared: Any) -> list[dict[str, str]]:
 def _truth(program: Program, table: Trajectories, middle: np.ndarray) -> np.ndarray | None:
     """The true states `(B, rows, D)`, angles on the turn of the posterior's median; None where the table has no more
     than starts."""
-    truth = table.select(names(program.controls), names(program.measurements), names(program.states)).states
+    truth = table.select(program.control_names, program.measurement_names, program.state_names).states
     if truth is None or not bool(torch.isfinite(truth[1:]).any()):
         return None
     found = truth.transpose(0, 1).double().numpy(force=True).copy()
-    for index in (names(program.states).index(angle) for angle in program.angles):
+    for index in program.angle_indices:
         found[..., index] = nearest_turn(found[..., index], middle[..., index])
     return found
 

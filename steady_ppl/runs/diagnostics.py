@@ -10,7 +10,7 @@ from pyro.distributions import constraints
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.model.program import Program, names, units
+from steady_ppl.model.program import Program
 
 if TYPE_CHECKING:
     from steady_ppl.runs.fit import Fit
@@ -67,13 +67,13 @@ def doubts_of_units(program: Program, data: Trajectories) -> list[str]:
         data: as returned by `for_program`.
     """
     found = []
-    for index, (name, unit) in enumerate(zip(names(program.measurements), units(program.measurements), strict=True)):
+    for index, (name, unit) in enumerate(zip(program.measurement_names, program.measurement_units, strict=True)):
         if unit == "rad":
             found += _degrees(f"y.{name}", unit, data.measurements[..., index][data.observed[..., index]])
-    for index, (name, unit) in enumerate(zip(names(program.controls), units(program.controls), strict=True)):
+    for index, (name, unit) in enumerate(zip(program.control_names, program.control_units, strict=True)):
         if unit == "rad" or (unit == "rad/s" and program.angles):
             found += _degrees(f"u.{name}", unit, data.controls[..., index][data.rows])
-    for index, name in enumerate(names(program.states)):
+    for index, name in enumerate(program.state_names):
         if data.states is not None and name in program.angles:
             start = data.states[0, :, index]
             found += _degrees(f"x.{name}", "rad", start[start.isfinite()])

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from steady_ppl.errors import UsageError
 from steady_ppl.gaussian.predict import errors
 from steady_ppl.model.handlers import AtMean, running
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting, advance
 
 PROBED, PUSHES = 200, (1e-3, 1.0, -1e3)  # rows and sizes of a command that is looked for in what acts later
@@ -39,8 +39,8 @@ class Dynamics(nn.Module):
             raise UsageError(f"a step of {step} s leads nowhere")
         self.program = program
         self.step = step
-        self.state_names, self.control_names = names(program.states), names(program.controls)
-        self.measurement_names = names(program.measurements)
+        self.state_names, self.control_names = program.state_names, program.control_names
+        self.measurement_names = program.measurement_names
 
     @property
     @torch.no_grad()

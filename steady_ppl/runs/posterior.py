@@ -19,7 +19,7 @@ from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.predict import on_a_circle
 from steady_ppl.likelihood.evidence import choose_filter, in_parts, run_filter
 from steady_ppl.model.handlers import as_vector
-from steady_ppl.model.program import Program, for_program, names, units
+from steady_ppl.model.program import Program, for_program
 from steady_ppl.smc.simulate import measure
 from steady_ppl.utils.angles import draws_on_one_turn, paths_on_one_turn
 from steady_ppl.utils.files import whole_file
@@ -102,9 +102,9 @@ def posterior(
     inside = run.rows.t().numpy(force=True)
     variables: dict[str, tuple] = {}
     path = _draws(torch.cat(states, 2))
-    for index in () if known_start else (names(program.states).index(angle) for angle in program.angles):
+    for index in () if known_start else program.angle_indices:
         path[0, ..., index] = paths_on_one_turn(path[0, ..., index], inside)
-    for index, (name, unit) in enumerate(zip(names(program.states), units(program.states), strict=True)):
+    for index, (name, unit) in enumerate(zip(program.state_names, program.state_units, strict=True)):
         values = np.where(inside, path[..., index], np.nan)
         variables[name] = (DIMENSIONS, values, {"units": unit})
     for site, parts in noise.items():
@@ -113,10 +113,10 @@ def posterior(
         values = np.concatenate([values, missing], 3)
         values[:, :, ~np.roll(inside, -1, 1) | ~inside] = np.nan
         dimension = f"{site}_channel"
-        labels = names(program.channels)
+        labels = program.channel_names
         known = len(labels) == values.shape[-1]
         coordinates[dimension] = list(labels) if known else [f"{site}_{i}" for i in range(values.shape[-1])]
-        attributes = {"units": list(units(program.channels))} if known else {}
+        attributes = {"units": list(program.channel_units)} if known else {}
         variables[site if site not in variables else f"{site}_noise"] = ((*DIMENSIONS, dimension), values, attributes)
     about = {"program": type(program).__name__, "particles": choice.particles, "filter": choice.name}
     return arviz.InferenceData(
@@ -154,9 +154,7 @@ def _observed(program: Program, data: Trajectories, coordinates: dict) -> xarray
     return xarray.Dataset(
         {
             f"measured_{name}": (("trajectory", "row"), _by_trajectory(measured[..., index]), {"units": unit})
-            for index, (name, unit) in enumerate(
-                zip(names(program.measurements), units(program.measurements), strict=True)
-            )
+            for index, (name, unit) in enumerate(zip(program.measurement_names, program.measurement_units, strict=True))
         },
         shown,
     )
@@ -169,10 +167,10 @@ def _constants(program: Program, data: Trajectories, coordinates: dict, evidence
         "time": (both, _by_trajectory(data.elapsed), {"units": "s"}),
         "log_likelihood": (("trajectory",), evidence.numpy(force=True), {"units": "nat"}),
     }
-    for index, (name, unit) in enumerate(zip(names(program.controls), units(program.controls), strict=True)):
+    for index, (name, unit) in enumerate(zip(program.control_names, program.control_units, strict=True)):
         variables[f"control_{name}"] = (both, _by_trajectory(data.controls[..., index]), {"units": unit})
     if data.states is not None:
-        for index, (name, unit) in enumerate(zip(names(program.states), units(program.states), strict=True)):
+        for index, (name, unit) in enumerate(zip(program.state_names, program.state_units, strict=True)):
             variables[f"true_{name}"] = (both, _by_trajectory(data.states[..., index]), {"units": unit})
     return xarray.Dataset(variables, shown)
 
@@ -286,7 +284,7 @@ def forecast(
             raise DataError(f"trajectory {label} begins after {float(last[drive]):g} s", trajectory=label)
     known = replace(table, observed=table.observed & ~future[..., None].to(table.observed.device))
     found = posterior(program, known, draws=draws, particles=particles, known_start=known_start, seed=seed)
-    states = np.stack([found["posterior"][name].values[0] for name in names(program.states)], -1)
+    states = np.stack([found["posterior"][name].values[0] for name in program.state_names], -1)
     path = torch.from_numpy(states).to(run.controls).nan_to_num(0.0).transpose(1, 2)
     with seeded(seed, "forecast"):
         measured = measure(program, path).transpose(1, 2).numpy(force=True)
@@ -296,10 +294,10 @@ def forecast(
     time = np.where(there, run.elapsed.double().t().numpy(force=True), np.nan)
     constants: dict[str, tuple] = {"time": (of_row, time, {"units": "s"})}
     variables: dict[str, tuple] = {}
-    for index, (name, unit) in enumerate(zip(names(program.states), units(program.states), strict=True)):
+    for index, (name, unit) in enumerate(zip(program.state_names, program.state_units, strict=True)):
         variables[name] = (DIMENSIONS, np.where(there, states[None, ..., index], np.nan), {"units": unit})
     circular = on_a_circle(program, run, path[0]).tolist()
-    for index, (name, unit) in enumerate(zip(names(program.measurements), units(program.measurements), strict=True)):
+    for index, (name, unit) in enumerate(zip(program.measurement_names, program.measurement_units, strict=True)):
         values = draws_on_one_turn(measured[..., index]) if circular[index] else measured[..., index]
         about = {"units": unit, "circular": int(circular[index])}
         variables[f"measured_{name}"] = (DIMENSIONS, np.where(there, values[None], np.nan), about)

@@ -10,7 +10,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError, SteadyError
 from steady_ppl.model.handlers import Recording, as_vector, broadcast_event, running
-from steady_ppl.model.program import Program, for_program, names
+from steady_ppl.model.program import Program, for_program
 from steady_ppl.model.stability import counts_rows, is_step
 from steady_ppl.model.substeps import MAX_SUBSTEPS, acting_controls, with_substeps
 from steady_ppl.smc.filter import roll_out
@@ -55,9 +55,9 @@ def simulate(
                 observed=torch.ones((*time.shape, len(program.measurements)), dtype=torch.bool),
                 lengths=torch.full((time.shape[1],), rows),
                 labels=tuple(str(i + 1) for i in range(time.shape[1])),
-                control_names=names(program.controls),
-                measurement_names=names(program.measurements),
-                state_names=names(program.states),
+                control_names=program.control_names,
+                measurement_names=program.measurement_names,
+                state_names=program.state_names,
             )
         else:
             data = like
@@ -88,7 +88,7 @@ def simulate(
         labels=run.labels,
         control_names=run.control_names,
         measurement_names=run.measurement_names,
-        state_names=names(program.states),
+        state_names=program.state_names,
     )
 
 

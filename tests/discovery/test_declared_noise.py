@@ -12,7 +12,7 @@ from steady_ppl.discovery.common_noise import Judges
 from steady_ppl.discovery.noise_departure import departures
 from steady_ppl.discovery.refits import Fold, Refit
 from steady_ppl.discovery.search import Found
-from steady_ppl.gaussian.linearize import Path
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.likelihood.parameters import elements
 
 
@@ -21,7 +21,7 @@ def fitted(*programs) -> Refit:
     folds = []
     for program, count in zip(programs, (4, 2), strict=True):
         data = drives(program, count, 9)
-        path = Path(data.states, torch.zeros(8, count, 3).double())
+        path = ReferencePath(data.states, torch.zeros(8, count, 3).double())
         folds.append(Fold(data, path, data, path))
     return Refit(list(programs), Judges(list(programs), []), [], folds, torch.zeros(6), torch.zeros(6))
 

@@ -101,7 +101,7 @@ def test_several_effects_act_in_their_order(folder: Path, name: str, effects: tu
     write_program(program, folder / "all_of_them.py")
     again = load_program(folder / "all_of_them.py")
     assert [v.name for v in attached(again)] == [v.name for v in attached(program)]
-    assert names(again.states) == names(program.states) and names(again.resting) == names(program.resting)
+    assert again.state_names == program.state_names and names(again.resting) == names(program.resting)
     assert same_drives(program, again)
     is_clean(folder)
 

@@ -20,7 +20,6 @@ from steady_ppl.effects.registry import page
 from steady_ppl.guides.base import true_paths
 from steady_ppl.likelihood.evidence import log_likelihood
 from steady_ppl.model.handlers import Recording, Replaying
-from steady_ppl.model.program import names
 from steady_ppl.model.substeps import acting_controls, sample_row
 from steady_ppl.model.validate import probe
 
@@ -100,7 +99,7 @@ def means(program, state=STATE, control=THRUSTS, time=3.0) -> torch.Tensor:
     clock = torch.tensor([[time], [time + 0.1]], dtype=torch.float64)
     control = program.actuators(control.expand(2, 1, -1), clock)[0, 0]
     found = channel_means(program, program.transition, state, control, clock[0, 0], STEP)
-    return torch.stack([found[channel] for channel in names(program.channels)]).detach()
+    return torch.stack([found[channel] for channel in program.channel_names]).detach()
 
 
 @pytest.mark.parametrize(
@@ -259,7 +258,7 @@ def test_coloured_noise_has_the_spread_and_the_memory_that_it_claims() -> None:
 def test_coloured_noise_of_two_axes_starts_where_a_drive_is_known_to() -> None:
     program = short("hovercraft").with_effect("coloured_noise:translation", 0.5).with_effect("coloured_noise:yaw", 0.5)
     probe(program)
-    assert len(set(names(program.states))) == 6 + 2 * 3
+    assert len(set(program.state_names)) == 6 + 2 * 3
     table = simulate(example("hovercraft"), 2, seed=0)
     data = for_program(program, table)
     assert (data.known_start[:, 6:] == 0).all()

@@ -12,16 +12,16 @@ from oracles import CartPosterior, assert_mean, cart_parameters, cart_system, ka
 
 from steady_ppl import seeded
 from steady_ppl.gaussian.kalman import filter_and_smooth, track
-from steady_ppl.gaussian.linearize import Path, linearize
+from steady_ppl.gaussian.linearize import ReferencePath, linearize
 from steady_ppl.gaussian.predict import on_a_circle, predict, simulate_again
 from steady_ppl.gaussian.smoother import find_and_smooth, means_as_path
 
 
-def anywhere(data) -> Path:
+def anywhere(data) -> ReferencePath:
     """A path that has nothing to do with the drives."""
     rows, trajectories = data.time.shape
     states = torch.randn(rows, trajectories, 2, dtype=torch.float64)
-    return Path(states, torch.randn(rows - 1, trajectories, 1, dtype=torch.float64))
+    return ReferencePath(states, torch.randn(rows - 1, trajectories, 1, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("known_start", [False, True])

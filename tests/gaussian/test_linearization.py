@@ -15,7 +15,7 @@ from pyro import poutine
 from torch import Tensor
 
 from steady_ppl import Program, ProgramError, seeded, stack
-from steady_ppl.gaussian.linearize import Linearization, Path, linearize, why_not_linear
+from steady_ppl.gaussian.linearize import Linearization, ReferencePath, linearize, why_not_linear
 from steady_ppl.model.handlers import Standardised, running
 from steady_ppl.model.substeps import advance
 
@@ -40,12 +40,12 @@ def prepared(name: str) -> Program:
     return program
 
 
-def near_the_truth(program: Program, data) -> Path:
+def near_the_truth(program: Program, data) -> ReferencePath:
     """The true states and no noise, both shaken; finite also past a trajectory's end."""
     states = torch.where(data.rows[..., None], data.states, data.states[:1])
     with seeded("shaken"):
         noise = 0.5 * torch.randn(*data.steps.shape, len(program.channels), dtype=torch.float64)
-        return Path(states + 0.1 * torch.randn_like(states), noise)
+        return ReferencePath(states + 0.1 * torch.randn_like(states), noise)
 
 
 def arrived(program: Program, data, states: Tensor, noise: Tensor) -> Tensor:
@@ -250,7 +250,7 @@ def test_single_precision_gives_the_same_in_double():
     program, single = prepared("hovercraft"), example("hovercraft", torch.float32).requires_grad_(False)
     data = drives(program, 3, 12, gaps=True)
     path = near_the_truth(program, data)
-    rough = linearize(single, data.to(torch.float32), Path(path.states.float(), path.noise.float()))
+    rough = linearize(single, data.to(torch.float32), ReferencePath(path.states.float(), path.noise.float()))
     exact = linearize(program, data, path)
     for name in vars(exact).keys() - {"path", "angles", "in_plain_torch"}:
         found, wanted = getattr(rough, name), getattr(exact, name)

@@ -16,17 +16,17 @@ from torch import Tensor
 from steady_ppl import particle_filter, seeded, stack
 from steady_ppl.gaussian import twisted_proposal
 from steady_ppl.gaussian.information_filter import look_ahead
-from steady_ppl.gaussian.linearize import Path, linearize
+from steady_ppl.gaussian.linearize import ReferencePath, linearize
 from steady_ppl.gaussian.smoother import smooth, smoother_paths
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.model.handlers import Standardised, running
 
 
-def anywhere(program, data) -> Path:
+def anywhere(program, data) -> ReferencePath:
     """A path that has nothing to do with the drives."""
     with seeded("anywhere"):
         states = 3 * torch.randn(*data.time.shape, len(program.states), dtype=torch.float64)
-        return Path(states, torch.randn(*data.steps.shape, len(program.channels), dtype=torch.float64))
+        return ReferencePath(states, torch.randn(*data.steps.shape, len(program.channels), dtype=torch.float64))
 
 
 def estimates(program, data, runs: int, particles: int, twist=Twist, *, aim=None, **settings) -> Tensor:
@@ -288,9 +288,11 @@ def test_several_noise_sites_are_steered_together(uneven, known_start):
     assert_mean(both, posterior.latent_mean[2:])
 
 
-def anywhere_of(data, channels: int) -> Path:
+def anywhere_of(data, channels: int) -> ReferencePath:
     rows, trajectories = data.time.shape
-    return Path(torch.zeros(rows, trajectories, 2).double(), torch.zeros(rows - 1, trajectories, channels).double())
+    return ReferencePath(
+        torch.zeros(rows, trajectories, 2).double(), torch.zeros(rows - 1, trajectories, channels).double()
+    )
 
 
 def test_one_after_the_other_and_in_parallel_particles_are_steered_the_same() -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from steady_ppl import FilterError, for_program, particle_filter, seeded, simulate
 from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
-from steady_ppl.gaussian.linearize import Path, linearize
+from steady_ppl.gaussian.linearize import ReferencePath, linearize
 from steady_ppl.gaussian.smoother import find_and_smooth, find_path, smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.likelihood.evidence import neglected, run_filter
@@ -21,10 +21,10 @@ from steady_ppl.model.handlers import Standardised, running
 from steady_ppl.utils.angles import wrap
 
 
-def near_the_truth(program, data) -> Path:
+def near_the_truth(program, data) -> ReferencePath:
     """The true states, with no noise; finite also past a trajectory's end."""
     states = torch.where(data.rows[..., None], data.states, data.states[:1])
-    return Path(states, states.new_zeros((*data.steps.shape, len(program.channels))))
+    return ReferencePath(states, states.new_zeros((*data.steps.shape, len(program.channels))))
 
 
 # --- against a large bootstrap filter ---------------------------------------------------------------------------------
@@ -185,7 +185,7 @@ def test_a_broad_start_counts_the_neighbouring_turns(hovercraft, bearings):
 def test_whole_turns_of_the_path_change_nothing_from_a_broad_start(hovercraft, bearings):
     path = smoothed(hovercraft, bearings, known_start=False).linearization.path
     turn = 2 * math.pi * (torch.arange(6) == 2).double()
-    turned = Path(path.states + turn, path.noise)
+    turned = ReferencePath(path.states + turn, path.noise)
     here, there = (look_ahead(linearize(hovercraft, bearings, p)).log_likelihood for p in (path, turned))
     # a turn that is left out on one side has a thousandth of the mass: more than 4 prior deviations off
     torch.testing.assert_close(here, there, rtol=0, atol=0.002)
@@ -282,7 +282,7 @@ def test_a_path_smooths_alike_alone_and_padded_whatever_its_padding_holds(hoverc
     rows = int(bearings.lengths[short])
     assert rows < len(path.states)
     path.noise[rows - 1 :, short] = 1e3
-    path = Path(path.states + 0.2, path.noise)
+    path = ReferencePath(path.states + 0.2, path.noise)
     together = smooth(hovercraft, bearings, path, known_start=True, passes=3, tolerance=0)
     path.noise[rows - 1 :, short] = 0.0
     alone = smooth(hovercraft, bearings.subset([short]), of(path, [short]), known_start=True, passes=3, tolerance=0)
@@ -292,7 +292,7 @@ def test_a_path_smooths_alike_alone_and_padded_whatever_its_padding_holds(hoverc
 def test_steps_on_a_linear_program_never_cost_more(cart, uneven):
     """Whole steps are taken there from any path: one pass more is the exact mean."""
     path = find_path(cart, uneven)
-    far = Path(path.states + 5.0, path.noise - 3.0)
+    far = ReferencePath(path.states + 5.0, path.noise - 3.0)
     once, settled = (smooth(cart, uneven, far, passes=passes) for passes in (2, 20))
     torch.testing.assert_close(once.means()[0], settled.means()[0], rtol=0, atol=1e-8)
 
@@ -323,8 +323,8 @@ def test_one_trajectory_that_blows_up_does_not_stop_the_passes_of_the_others(hov
     torch.testing.assert_close(together.log_likelihood[1:], alone.log_likelihood, rtol=0, atol=1e-9)
 
 
-def of(path: Path, trajectories: list[int]) -> Path:
-    return Path(path.states[:, trajectories], path.noise[:, trajectories])
+def of(path: ReferencePath, trajectories: list[int]) -> ReferencePath:
+    return ReferencePath(path.states[:, trajectories], path.noise[:, trajectories])
 
 
 def test_a_program_that_blows_up_names_the_trajectory(hovercraft, bearings):

@@ -20,7 +20,7 @@ from steady_ppl import (
     particle_filter,
     seeded,
 )
-from steady_ppl.gaussian.linearize import Path, linearize
+from steady_ppl.gaussian.linearize import ReferencePath, linearize
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.guides import linearized
@@ -85,9 +85,9 @@ def test_a_kernels_jacobians_are_those_of_torch(name, monkeypatch):
     data = drives(program, 3, 9, gaps=True)
     torch.manual_seed(1)
     states, noise = 2 * torch.randn(9, 3, len(program.states)), torch.randn(8, 3, len(program.channels))
-    by_torch = linearize(program, data, Path(states, noise))
+    by_torch = linearize(program, data, ReferencePath(states, noise))
     monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", 1)
-    by_kernel = linearize(program, data, Path(states, noise))
+    by_kernel = linearize(program, data, ReferencePath(states, noise))
     assert by_kernel.in_plain_torch is None and jit._COMPILED[program]
     for part in ("offset", "state", "noise", "residual", "measurement", "precision", "log_scale"):
         torch.testing.assert_close(getattr(by_kernel, part), getattr(by_torch, part), rtol=1e-4, atol=2e-5)
@@ -97,7 +97,7 @@ def test_a_program_has_kernels_for_the_filter_and_for_its_jacobians(monkeypatch)
     monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", 1)
     program = single("hovercraft")
     data = drives(program, 2, 9)
-    path = Path(torch.randn(9, 2, 6), torch.randn(8, 2, 3))
+    path = ReferencePath(torch.randn(9, 2, 6), torch.randn(8, 2, 3))
     for _ in range(2):
         assert linearize(program, data, path).in_plain_torch is None
         assert particle_filter(program, data, particles=32, kernels=True).in_plain_torch is None
@@ -120,7 +120,7 @@ def test_jacobians_that_have_fallen_behind_their_program_are_found_out(monkeypat
     monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", 1)
     program = Stale()
     data = drives(example("hovercraft", torch.float32), 2, 31)
-    path = Path(torch.randn(31, 2, 6), torch.randn(30, 2, 3))
+    path = ReferencePath(torch.randn(31, 2, 6), torch.randn(30, 2, 3))
     assert linearize(program, data, path).in_plain_torch is None
     with torch.no_grad():
         for parameter in program.parameters():

@@ -15,7 +15,6 @@ from examples import MODELS, example
 from steady_ppl import for_program, seeded, simulate, with_substeps
 from steady_ppl.effects import catalogue, chosen_variant
 from steady_ppl.model.handlers import AtMean
-from steady_ppl.model.program import names
 from steady_ppl.model.substeps import acting_controls
 from steady_ppl.smc.filter import roll_out
 
@@ -51,12 +50,12 @@ def ends(program, state, data, rows, count, handler=None, draws=1):
 def worst(program) -> float:
     """The largest share of the noise's spread by which roll-outs at K, 2 K and 4 K substeps differ."""
     data = for_program(program, simulate(program, DRIVES, seed=1))
-    if {"speed", "turn"} <= set(names(program.controls)):  # what is commanded in speeds drives twice as fast
+    if {"speed", "turn"} <= set(program.control_names):  # what is commanded in speeds drives twice as fast
         data.controls.mul_(2)
     count = round(1 / program.step)
     rows = torch.arange(0, len(data.steps) - count + 1, EVERY)
     state = data.states[rows].clone()
-    for index, name in enumerate(names(program.states)):
+    for index, name in enumerate(program.state_names):
         if name in program.derivatives.values():
             state[..., index] *= 2
     finer = [with_substeps(program, program.substeps * factor) for factor in (1, 2, 4)]

@@ -255,7 +255,7 @@ def test_columns_are_read_by_name_in_the_programs_order() -> None:
     chosen = for_program(program, back)
     for field in ("controls", "measurements", "observed", "states"):
         assert torch.equal(getattr(chosen, field), getattr(data, field)), field
-    assert chosen.control_names == ("left", "right") and chosen.state_names == names(program.states)
+    assert chosen.control_names == ("left", "right") and chosen.state_names == program.state_names
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -59,9 +59,9 @@ def test_the_programs_are_those_of_the_paper_and_two_of_other_systems() -> None:
 def test_the_program_is_well_formed(name: str) -> None:
     program = load_program(MODELS / name)
     probe(program)
-    assert set(program.angles) <= set(names(program.states))
+    assert set(program.angles) <= set(program.state_names)
     named = [component for group in program.error_groups.values() for component in group]
-    assert sorted(named) == sorted(names(program.states)) or not program.error_groups
+    assert sorted(named) == sorted(program.state_names) or not program.error_groups
 
 
 @every_program
@@ -308,7 +308,7 @@ def test_a_vehicle_may_see_fewer_landmarks_and_worse() -> None:
         program.observe(torch.from_numpy(some_states()[0]))
     stddev = recording.distributions["bearing"].stddev.detach()
     np.testing.assert_allclose(stddev, np.full((len(stddev), 2), math.radians(20)))
-    assert names(program.measurements) == ("bearing_0", "bearing_1")
+    assert program.measurement_names == ("bearing_0", "bearing_1")
 
 
 def test_the_hovercraft_starts_as_in_the_paper() -> None:

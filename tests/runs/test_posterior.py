@@ -13,7 +13,6 @@ from small import simulated
 
 from steady_ppl import Fit, Trajectories
 from steady_ppl.model.handlers import Replaying
-from steady_ppl.model.program import names
 from steady_ppl.model.substeps import sample_row
 from steady_ppl.runs.posterior import posterior
 
@@ -92,7 +91,7 @@ def test_times_controls_and_truth_are_those_of_the_drives(hovercraft) -> None:
 def test_the_noise_of_a_row_leads_from_its_state_to_the_next(name: str) -> None:
     program, data = example(name), uneven(name)
     result = posterior(program, data, draws=4, particles=50)["posterior"]
-    states = torch.from_numpy(np.stack([result[n].values[0] for n in names(program.states)], -1)).transpose(1, 2)
+    states = torch.from_numpy(np.stack([result[n].values[0] for n in program.state_names], -1)).transpose(1, 2)
     noise = torch.from_numpy(result["acceleration"].values[0]).transpose(1, 2)[:, :-1]
     noise = noise if len(program.channels) > 1 else noise[..., 0]
     with Replaying({"acceleration": noise.nan_to_num()}):
@@ -122,7 +121,7 @@ def test_the_same_seed_gives_the_same_draws_and_leaves_the_random_numbers_alone(
 def test_a_known_start_is_the_first_state_of_every_draw() -> None:
     program, data = example("hovercraft"), uneven("hovercraft")
     result = posterior(program, data, draws=3, particles=30, known_start=True)["posterior"]
-    for index, name in enumerate(names(program.states)):
+    for index, name in enumerate(program.state_names):
         first = result[name].isel(chain=0, row=0).values
         assert np.array_equal(first, np.broadcast_to(data.states[0, :, index].numpy(), first.shape))
 
@@ -161,10 +160,7 @@ def test_the_draws_of_the_cart_have_the_exact_posterior_mean() -> None:
         rows = len(exact.states_mean)
         means = [
             np.stack(
-                [
-                    run[name].sel(trajectory=label).mean(("chain", "draw")).values[:rows]
-                    for name in names(program.states)
-                ],
+                [run[name].sel(trajectory=label).mean(("chain", "draw")).values[:rows] for name in program.state_names],
                 -1,
             )
             for run in runs

@@ -12,12 +12,12 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.catalogue.planar_forces import not_planar
 from steady_ppl.effects.declaration import Effect, power_of_two_below
 from steady_ppl.model.actuation import delayed, lagged
-from steady_ppl.model.program import Program, names, units
+from steady_ppl.model.program import Program
 
 
 def _has(*wanted: str) -> Any:
     def lacks(program: Program) -> str | None:
-        if set(wanted) <= set(names(program.controls)):
+        if set(wanted) <= set(program.control_names):
             return None
         return f"there are no controls {' and '.join(wanted)}"
 
@@ -30,9 +30,9 @@ def _no_controls(program: Program) -> str | None:
 
 def _groups(program: Program) -> list[dict[str, Any]]:
     """All controls together and, where their units differ, each alone."""
-    order = names(program.controls)
+    order = program.control_names
     together = [{"controls": order}]
-    if len(set(units(program.controls))) == 1:
+    if len(set(program.control_units)) == 1:
         return together
     return together + [{"controls": (name,), "at": name} for name in order]
 
@@ -71,11 +71,11 @@ def _knees(program: Program, data: Trajectories | None) -> Sequence[Mapping[str,
 
 
 def _single(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
-    return [{"controls": (name,), "at": name} for name in names(program.controls)]
+    return [{"controls": (name,), "at": name} for name in program.control_names]
 
 
 def _lacks_single(program: Program) -> str | None:
-    if {"left", "right"} == set(names(program.controls)):
+    if {"left", "right"} == set(program.control_names):
         return "of two thrusts it is the asymmetry, up to mass and inertia"
     return _no_controls(program)
 

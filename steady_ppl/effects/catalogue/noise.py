@@ -10,12 +10,12 @@ from steady_ppl.effects.catalogue.planar_forces import no_bearings
 from steady_ppl.effects.catalogue.wheels import needs_commanded_speed
 from steady_ppl.effects.declaration import Effect
 from steady_ppl.model.planar_vehicle import PlanarVehicle
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 
 
 def _groups(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
     if len(program.axes) <= 1:
-        return [{"channels": names(program.channels)}]
+        return [{"channels": program.channel_names}]
     return [{"channels": channels, "at": name} for name, channels in program.axes.items()]
 
 

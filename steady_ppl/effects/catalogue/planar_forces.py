@@ -12,7 +12,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.declaration import Effect
 from steady_ppl.model.handlers import broadcast_event, running
 from steady_ppl.model.planar_vehicle import PlanarVehicle
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 from steady_ppl.utils.random import seeded
 
 STARTS = 500  # drawn, where nothing else says where a vehicle goes
@@ -44,7 +44,7 @@ def needs_grip(program: Program) -> str | None:
 
 
 def _needs_two_thrusters(program: Program) -> str | None:
-    if {"left", "right"} <= set(names(program.controls)):
+    if {"left", "right"} <= set(program.control_names):
         return not_planar(program)
     return "the controls are not a left and a right thrust"
 

@@ -9,11 +9,11 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.catalogue.planar_forces import no_bearings
 from steady_ppl.effects.declaration import Effect, power_of_two_below
 from steady_ppl.model.planar_vehicle import PlanarVehicle
-from steady_ppl.model.program import Program, names, units
+from steady_ppl.model.program import Program
 
 
 def _each(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
-    return [{"component": index, "at": name} for index, name in enumerate(names(program.measurements))]
+    return [{"component": index, "at": name} for index, name in enumerate(program.measurement_names)]
 
 
 def _each_of_its_size(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
@@ -40,7 +40,7 @@ def _bearings(program: Program) -> str | None:
 
 
 def _units_differ(program: Program) -> str | None:
-    same = len(set(units(program.measurements))) == 1
+    same = len(set(program.measurement_units)) == 1
     return None if same else "the measurements have different units"
 
 

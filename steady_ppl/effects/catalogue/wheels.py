@@ -10,12 +10,12 @@ import torch
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.catalogue.planar_forces import needs_grip, not_planar
 from steady_ppl.effects.declaration import Effect
-from steady_ppl.model.program import Program, names
+from steady_ppl.model.program import Program
 
 
 def needs_commanded_speed(program: Program) -> str | None:
     """Why an effect on vehicles that are told a speed and a turn rate does not apply."""
-    if {"speed", "turn"} <= set(names(program.controls)):
+    if {"speed", "turn"} <= set(program.control_names):
         return not_planar(program)
     return "the controls are not a speed and a turn rate, which the state could be compared with"
 
@@ -25,7 +25,7 @@ def _needs_wheels(program: Program) -> str | None:
 
 
 def _each_channel(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
-    return [{"channels": (name,), "at": name} for name in names(program.channels)]
+    return [{"channels": (name,), "at": name} for name in program.channel_names]
 
 
 def response_time(self, state, control, time, step, c, channels, mean):
