@@ -240,7 +240,7 @@ def _measurement(program: Program, data: Trajectories, states: Tensor, kernels: 
 def _on_a_circle(program: Program, data: Trajectories, state: Tensor) -> tuple[int, ...]:
     """The declared angles of which a whole turn changes neither what is measured nor where the program goes; an angle
     that a plain normal measures counts its turns. Looked at from one state, `(1, D)`."""
-    angles = program.angle_indices
+    angles = list(program.angle_indices)
     turns = state.new_zeros((len(angles) + 1, state.shape[-1]))
     turns[range(1, len(turns)), angles] = 2 * math.pi
     states = (state + turns).unsqueeze(1)
