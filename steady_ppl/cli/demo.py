@@ -22,6 +22,7 @@ import typer
 
 from steady_ppl.errors import ComputationError, RunError
 from steady_ppl.runs.workbench import TRUTH, empty_again, workbench
+from steady_ppl.utils.tables import aligned
 from steady_ppl.utils.text import tell
 
 WIDTH = 100
@@ -273,9 +274,7 @@ def summary(figures: Mapping[str, Any]) -> list[str]:
         values = [*errors, row["state"][group].get(far), row["scales"]["channels"].get(channel)]
         shown = ["–" if value is None else f"{value:.3g}" for value in values]
         lines.append([row["row"], f"{row['log_likelihood']:.1f}", *shown])
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    cells = [[line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])] for line in lines]
-    return ["  ".join(row) for row in cells]
+    return aligned(lines)
 
 
 def _fit(tour: Tour, program: str, run: str, size: Size) -> str:

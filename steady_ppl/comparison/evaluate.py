@@ -17,6 +17,7 @@ from steady_ppl.model.program import Program, for_program, names
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
+from steady_ppl.utils.tables import aligned
 
 
 def evaluate(
@@ -195,14 +196,7 @@ def table_of(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> str
             line += [_figure(result[name].get(group)) for group in groups]
         line += [_figure(result["measurement"].get(name)) for name in measured]
         lines.append(line)
-    widths = [max(len(line[column]) for line in lines) for column in range(len(header))]
-    return "\n".join(
-        "  ".join(
-            cell.ljust(width) if column == 0 else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    )
+    return "\n".join(aligned(lines))
 
 
 def _figure(value: float | None) -> str:

@@ -13,6 +13,7 @@ from steady_ppl.comparison.bootstrap import LEVEL, RESAMPLES, Change, paired
 from steady_ppl.comparison.scores import BANDS, Key, Row
 from steady_ppl.effects import attached
 from steady_ppl.utils.late import Displayed
+from steady_ppl.utils.tables import aligned
 
 
 @dataclass(frozen=True, repr=False)
@@ -269,10 +270,7 @@ def _table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
         used += 2 + width
     else:
         below = []
-    aligned = (
-        "  ".join([line[0].ljust(widths[0]), *(line[i].rjust(widths[i]) for i in kept[1:])]).rstrip() for line in cut
-    )
-    return [*aligned, *(["", *below] if below else [])]
+    return [*aligned([[line[i] for i in kept] for line in cut]), *(["", *below] if below else [])]
 
 
 def _cut(name: str) -> str:

@@ -20,6 +20,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.predict import Prediction
 from steady_ppl.model.program import Program, names, units
 from steady_ppl.utils.late import Displayed
+from steady_ppl.utils.tables import aligned
 
 
 @dataclass(frozen=True, repr=False)
@@ -321,12 +322,7 @@ def as_text(content: Mapping[str, Any]) -> str:
             cells = ["–" if row[key] is None else f"{row[key]:.4g}" for key in keys]
             label = f"{name} [{component['unit']}]" if component["unit"] else name
             table.append([label, horizon, *cells, f"{row['coverage_90']:.1%}"])
-    widths = [max(len(row[i]) for row in table) for i in range(len(header))]
-    for row in table:
-        first, *rest = (
-            cell.ljust(w) if i < 2 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))
-        )
-        lines.append("  ".join([first, *rest]).rstrip())
+    lines += aligned(table, left=(0, 1))
     scatter = content["evidence"]["scatter"]
     lines += ["", "mean squares over those of simulated drives (nearly blind to a missing effect): "]
     lines[-1] += ", ".join(f"{name} {value:.2f}" for name, value in scatter.items())

@@ -19,6 +19,7 @@ from steady_ppl.discovery.screening import LEVEL, Tested
 from steady_ppl.discovery.search import Search
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.late import Displayed
+from steady_ppl.utils.tables import aligned
 
 
 @dataclass(frozen=True, repr=False)
@@ -307,10 +308,9 @@ def _next(found: Discovery) -> str:
 def _table(found: Discovery) -> list[str]:
     header = ["candidate", "kind", "test", "p", "held-out gain", "one step", "± sd", "limit", "unit"]
     rows = [header, *(_line(found, tested) for tested in ranked(found)[:SHOWN])]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
     rest = ranked(found)[SHOWN:]
     more = _limits(found, rest) if found.verdict == "none" else [f"and {len(rest)} more"] * bool(rest)
-    return [_aligned(row, widths) for row in rows] + more
+    return aligned(rows, left=(0, 1, len(header) - 1)) + more
 
 
 def _limits(found: Discovery, tested: Sequence[Tested]) -> list[str]:
@@ -336,12 +336,6 @@ def _line(found: Discovery, tested: Tested) -> list[str]:
         return [name, one["kind"], statistic, p_value, gain, "", "", "", ""]
     numbers = [_short(one[key]) for key in ("coefficient", "sd", "detection_limit")]
     return [name, one["kind"], statistic, p_value, gain, *numbers, one["unit"]]
-
-
-def _aligned(row: list[str], widths: list[int]) -> str:
-    left = (0, 1, len(row) - 1)
-    cells = (c.ljust(w) if i in left else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
-    return "  ".join(cells).rstrip()
 
 
 def _short(value: Any) -> str:

@@ -47,25 +47,64 @@ class Program(PyroModule):
     A subclass declares its components as "name [unit]" and writes three methods. `...` is any shape, the same for all
     arguments: times and steps are `(...)`, states `(..., D)`, controls `(..., U)`.
 
-    Attributes:
+    Example:
+        A cart on a rail, pushed and braked, whose place is measured.
+
+        >>> import pyro, torch
+        >>> import pyro.distributions as dist
+        >>> from pyro.distributions import constraints
+        >>> from pyro.nn import PyroParam
+        >>> from steady_ppl import Program, simulate, stack
+        >>> class Cart(Program):
+        ...     states = ("place [m]", "velocity [m/s]")
+        ...     controls = ("force [N]",)
+        ...     measurements = ("place [m]",)
+        ...     channels = ("acceleration [m/s²]",)
+        ...     motion = {"acceleration": ("place", "velocity")}
+        ...
+        ...     def __init__(self):
+        ...         super().__init__()
+        ...         self.mass = PyroParam(torch.tensor(2.0), constraints.positive)
+        ...
+        ...     def initial(self):
+        ...         start = dist.Normal(torch.zeros(2), torch.tensor([1.0, 0.1]))
+        ...         return pyro.sample("start", start.to_event(1))
+        ...
+        ...     def transition(self, state, control, time, step):
+        ...         place, velocity = state.unbind(-1)
+        ...         mean = control[..., 0] / self.mass
+        ...         acceleration = pyro.sample("acceleration", dist.Normal(mean, 0.1))
+        ...         faster = velocity + step * acceleration
+        ...         return stack(place + step * (velocity + faster) / 2, faster)
+        ...
+        ...     def observe(self, state):
+        ...         pyro.sample("place", dist.Normal(state[..., :1], 0.05).to_event(1))
+        >>> drives = simulate(Cart(), trajectories=3, seed=0)
+        >>> len(drives), drives.measurement_names
+        (3, ('place',))
+
+    What it is made of:
         states: names and units of the state's components.
         controls: names and units of the controls.
         measurements: names and units of the measurement's components, in the order of the observed sites.
         channels: names and units of the noise channels.
         angles: the state components that live on a circle.
-        error_groups: what an error is reported for: name → components whose Euclidean norm it is.
         motion: channel → the state components that are its position and its velocity; the generic effects go by it.
+        error_groups: what an error is reported for: name → components whose Euclidean norm it is.
+        resting: state components that start at zero in every drive; a table need not have them.
         effects: effects that the program has besides what it writes out: `("linear_drag=0.1", "slope=0.05,-0.03")`.
         attached: coefficient's name → the effect that has it.
-        guesses: beginnings of the names of parameters whose declared value is a guess, from which a fit may depart.
-        priors: parameter's name → its prior, a Pyro distribution over the parameter's value.
-        rates: learning rates relative to the recipe's, by the beginning of a parameter's name.
-        decays: weight decay relative to the recipe's, by the beginning of a parameter's name; only the matrices of
-            `torch.nn.Linear` decay.
-        resting: state components that start at zero in every drive; a table need not have them.
         substeps: in how many steps of `transition` the program takes a row; see `steady_ppl.model.substeps`.
-        duration, step: of a simulated trajectory, s.
-        simulated_step: the longest substep of a simulated trajectory, s.
+
+    Hints for a fit, by the names of parameters or their beginnings:
+        priors: parameter's name → its prior, a Pyro distribution over the parameter's value.
+        guesses: those whose declared value is a guess, from which a fit may depart.
+        rates: learning rates relative to the recipe's.
+        decays: weight decay relative to the recipe's; only the matrices of `torch.nn.Linear` decay.
+
+    Of a simulated trajectory:
+        duration, step: s.
+        simulated_step: the longest substep, s.
     """
 
     states: Sequence[str] = ()
@@ -73,16 +112,18 @@ class Program(PyroModule):
     measurements: Sequence[str] = ()
     channels: Sequence[str] = ()
     angles: ClassVar[Sequence[str]] = ()
-    error_groups: ClassVar[Mapping[str, Sequence[str]]] = {}
     motion: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    error_groups: ClassVar[Mapping[str, Sequence[str]]] = {}
+    resting: Sequence[str] = ()
     effects: ClassVar[Sequence[str]] = ()
     attached: ClassVar[Mapping[str, Any]] = {}
-    guesses: ClassVar[Sequence[str]] = ()
+    substeps: int = 1
+
     priors: ClassVar[Mapping[str, Any]] = {}
+    guesses: ClassVar[Sequence[str]] = ()
     rates: ClassVar[Mapping[str, float]] = {}
     decays: ClassVar[Mapping[str, float]] = {}
-    resting: Sequence[str] = ()
-    substeps: int = 1
+
     duration: float = 10.0
     step: float = 0.1
     simulated_step: float = 0.005

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import doctest
 import math
 import sys
 import textwrap
@@ -15,6 +16,7 @@ from pyro.nn import PyroParam
 from small import HOVERCRAFT
 
 from steady_ppl import DataError, Program, ProgramError, load_program, simulate
+from steady_ppl.model import program as form
 from steady_ppl.model.program import error_groups, for_program, names, units
 from steady_ppl.model.validate import probe
 
@@ -338,3 +340,7 @@ def test_the_bearings_noise_can_be_learned_and_can_be_a_constant_of_the_class() 
         bearing_sd = math.radians(1)
 
     assert Sharp().bearing_sd == math.radians(1)
+
+
+def test_the_example_of_the_class_runs() -> None:
+    assert doctest.testmod(form).attempted > 5 and not doctest.testmod(form).failed
