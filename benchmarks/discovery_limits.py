@@ -24,7 +24,7 @@ from steady_ppl import Program, for_program, load_program, simulate
 from steady_ppl.discovery.candidates import Screening, Settings, screen_program
 from steady_ppl.discovery.effect_scores import columns_of
 from steady_ppl.discovery.refits import Refit, first_refit
-from steady_ppl.discovery.screening import GONE, Screened
+from steady_ppl.discovery.screening import MIN_SHARE_OF_INFORMATION, Screened
 from steady_ppl.effects import Variant, attached, catalogue, chosen_variant, parsed
 
 Array = np.ndarray
@@ -158,7 +158,7 @@ def _deviation(information: Tensor, fitted: int) -> Array | None:
     """A coefficient's standard deviations, the fitted parameters let free; None where these explain it."""
     own, across, whole = information[:fitted, :fitted], information[:fitted, fitted:], information[fitted:, fitted:]
     left = whole - across.T @ torch.linalg.solve(own, across)
-    if bool((left.diagonal() <= GONE * whole.diagonal()).any()):
+    if bool((left.diagonal() <= MIN_SHARE_OF_INFORMATION * whole.diagonal()).any()):
         return None
     return left.inverse().diagonal().sqrt().numpy()
 

@@ -100,12 +100,12 @@ def used_before(runs: Mapping[str, Path], table: str) -> list[str]:
     return notes
 
 
-MOST = 10**9
+MAX_COUNT = 10**9
 
 
 def count(help: str, least: int = 1) -> Any:
     """An option that says how many, `least` or more."""
-    return typer.Option(help=help, min=least, max=MOST)
+    return typer.Option(help=help, min=least, max=MAX_COUNT)
 
 
 def random_seed() -> Any:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from steady_ppl.cli.common import MOST, count, random_seed
+from steady_ppl.cli.common import MAX_COUNT, count, random_seed
 from steady_ppl.errors import RunError, UsageError
 from steady_ppl.utils.text import shown, tell
 
@@ -120,8 +120,8 @@ def _settings(pairs: list[str], options: dict[str, Any]) -> dict[str, Any]:
             options[name] = ast.literal_eval(word)
         except (ValueError, SyntaxError):
             options[name] = WORDS.get(word, word)
-        if isinstance(options[name], int) and abs(options[name]) > MOST:
-            raise UsageError(f"--set {shown(pair, 60)}: expected a whole number up to {MOST}")
+        if isinstance(options[name], int) and abs(options[name]) > MAX_COUNT:
+            raise UsageError(f"--set {shown(pair, 60)}: expected a whole number up to {MAX_COUNT}")
     return options
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from scipy import special
 
 RESAMPLES = 2000
-LEVEL = 0.95
-FEWEST = 5  # drives
+COVERAGE = 0.95
+MIN_DRIVES = 5  # drives
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def paired(ours: Sums, theirs: Sums, *, seed: int) -> Change | None:
         None where fewer than 5 drives have such a figure, or where it is not finite.
     """
     both = (ours.count > 0) & (theirs.count > 0)
-    if both.sum() < FEWEST:
+    if both.sum() < MIN_DRIVES:
         return None
     ours, theirs = ours.among(both), theirs.among(both)
     drives = int(both.sum())
@@ -102,7 +102,7 @@ def paired(ours: Sums, theirs: Sums, *, seed: int) -> Change | None:
 
 
 def _interval(values: np.ndarray, drives: int) -> tuple[float, float]:
-    student = special.stdtrit(drives - 1, (1 - LEVEL) / 2)
+    student = special.stdtrit(drives - 1, (1 - COVERAGE) / 2)
     tail = special.ndtr(student * math.sqrt(drives / (drives - 1)))
     low, high = np.quantile(values, [tail, 1 - tail])
     return float(low), float(high)

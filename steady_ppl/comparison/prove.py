@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from steady_ppl.comparison.bootstrap import FEWEST
+from steady_ppl.comparison.bootstrap import MIN_DRIVES
 from steady_ppl.comparison.result import FLOOR, Proof
 from steady_ppl.comparison.scores import (
     SECONDS,
@@ -153,9 +153,9 @@ def _require(programs: Mapping[str, Program], reference: str, truth: str | None,
                 f"{reference} measures {', '.join(ours)} and {name} measures {', '.join(program.measurement_names)}: "
                 "log p(y) of different measurements cannot be compared"
             )
-    if len(data) < FEWEST:
+    if len(data) < MIN_DRIVES:
         raise DataError(
-            f"got {len(data)} trajectories: intervals over trajectories need at least {FEWEST}, and 16 are better"
+            f"got {len(data)} trajectories: intervals over trajectories need at least {MIN_DRIVES}, and 16 are better"
         )
     if data.time.shape[0] < 2 or not bool(data.observed[1:].any()):
         raise DataError("nothing to compare: no trajectory has a measurement after its first row")

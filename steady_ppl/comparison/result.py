@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from steady_ppl.comparison.bootstrap import LEVEL, RESAMPLES, Change, paired
+from steady_ppl.comparison.bootstrap import COVERAGE, RESAMPLES, Change, paired
 from steady_ppl.comparison.scores import BANDS, Key, Row
 from steady_ppl.effects import attached
 from steady_ppl.utils.late import Displayed
@@ -72,7 +72,7 @@ def figures(found: Proof) -> dict[str, Any]:
         "trajectories": found.trajectories,
         "known_start": found.known_start,
         "resamples": RESAMPLES,
-        "level": LEVEL,
+        "level": COVERAGE,
         "horizons": {name: rows * found.step for name, rows in found.horizons.items()},
         "units": units_of_states(found),
         "rows": [

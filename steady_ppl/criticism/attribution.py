@@ -15,17 +15,18 @@ from typing import Any
 import numpy as np
 
 from steady_ppl.criticism.perturbations import Direction
-from steady_ppl.criticism.residual_maps import LEVEL, standardise, tail_p_value
+from steady_ppl.criticism.residual_maps import ALPHA, standardise, tail_p_value
 
 Array = np.ndarray[Any, Any]
 KINDS = ("sensor", "actuator", "dynamics")
-TESTS = 4  # of the mean, the parameters, the scatter and the maps; each at a fourth of the level
-CLEARLY = 3.0  # nats of log p(y) between the best kind and the next
+TEST_COUNT = 4  # of the mean, the parameters, the scatter and the maps; each at a fourth of the level
+MIN_GAIN_OF_KIND = 3.0  # nats of log p(y) between the best kind and the next
 SCATTER = "scatter of "  # begins the names of mean squares
 STEPS = 4
-FAR = 100.0  # standard deviations; so far off the scores say nothing of what would be nearest to the drives
-MOST = 5.0  # standard deviations of one drive's score, more where most drives' are large
-PRICE = 2.0  # nats that another direction of the same kind must bring
+MAX_INFORMATIVE_SD = 100.0
+"""Standard deviations; so far off the scores say nothing of what would be nearest to the drives."""
+MAX_SCORE_SD = 5.0  # standard deviations of one drive's score, more where most drives' are large
+MIN_GAIN_OF_DIRECTION = 2.0  # nats that another direction of the same kind must bring
 
 
 @dataclass(frozen=True)
@@ -59,13 +60,13 @@ class Blame:
     @property
     def parameters_misfit(self) -> bool:
         """Whether the program's parameters do not suit these drives, whatever else is wrong."""
-        return self.parameters_p_value <= LEVEL / TESTS
+        return self.parameters_p_value <= ALPHA / TEST_COUNT
 
     @property
     def closest_parameters(self) -> list[tuple[str, float]]:
         """The parameter that explains most alone, and those that explain nearly as much, with their z."""
         order = sorted(self.parameters.items(), key=lambda item: -abs(item[1]))
-        least = order[0][1] ** 2 - 2 * CLEARLY * max(1.0, self.dispersion) if order else 0.0
+        least = order[0][1] ** 2 - 2 * MIN_GAIN_OF_KIND * max(1.0, self.dispersion) if order else 0.0
         return [(name, z) for name, z in order if z**2 >= least]
 
 
@@ -173,7 +174,7 @@ def _held(each: Array) -> Array:
     the linearised program's are, by chance."""
     each = each - each[1:].mean(0)
     sd = np.maximum(each[1:].std(0), 1e-300)
-    most = MOST * sd * np.median(np.abs(each) / sd, axis=1, keepdims=True).clip(1.0)
+    most = MAX_SCORE_SD * sd * np.median(np.abs(each) / sd, axis=1, keepdims=True).clip(1.0)
     return each.clip(-most, most)
 
 
@@ -188,7 +189,7 @@ def _dispersion(each: Array, correlation: Array) -> Array:
         return np.full((sets, each.shape[-1]), np.inf)
     variance = np.maximum(each[1:].var(0), 1e-300)
     size = each.sum(1, keepdims=True) / variance.sum(0)
-    apart = ((each - size * variance) / np.sqrt(variance)).clip(-MOST, MOST)
+    apart = ((each - size * variance) / np.sqrt(variance)).clip(-MAX_SCORE_SD, MAX_SCORE_SD)
     squares = (apart**2).mean(1)
     weight = correlation**2
     return (squares / np.maximum(squares[1:].mean(0), 1e-300)) @ weight / np.maximum(weight.sum(0), 1e-300)
@@ -221,19 +222,19 @@ def blame(scores: Scored, noise: dict[str, Array], maps_p_value: float) -> Blame
     others = [nats for kind, nats in explained.items() if kind != best]
     every = [True] * len(scores.parameter_names)
     of_own = sum(_explaining(scores.parameters[0] / widened, scores.parameters_correlation, every)[1])
-    each = LEVEL / TESTS
+    each = ALPHA / TEST_COUNT
     if own_p <= each and (mean_p > each or of_own > explained[best]):
         kind = "parameters"
     elif mean_p <= each:
-        near = np.abs(scores.z[0]).max() <= FAR
-        kind = best if near and explained[best] - max(others, default=0.0) >= CLEARLY else "cannot tell"
+        near = np.abs(scores.z[0]).max() <= MAX_INFORMATIVE_SD
+        kind = best if near and explained[best] - max(others, default=0.0) >= MIN_GAIN_OF_KIND else "cannot tell"
     elif noise_p <= each:
         kind = "noise"
     else:
         kind = "cannot tell" if maps_p_value <= each else "nothing found"
     return Blame(
         kind=kind,
-        p_value=min(1.0, TESTS * min(mean_p, own_p, noise_p, maps_p_value)),
+        p_value=min(1.0, TEST_COUNT * min(mean_p, own_p, noise_p, maps_p_value)),
         mean_p_value=mean_p,
         noise_p_value=noise_p,
         parameters_p_value=own_p,
@@ -254,7 +255,7 @@ def _explaining(z: Array, correlation: Array, members: Sequence[bool]) -> tuple[
         free = np.array(members) & (spread > 0.02)
         left = np.where(free, z**2 / np.maximum(spread, 0.02), 0.0)
         j = int(left.argmax())
-        gain = 0.5 * float(left[j]) - (PRICE if step else 0.0)
+        gain = 0.5 * float(left[j]) - (MIN_GAIN_OF_DIRECTION if step else 0.0)
         if gain <= 0:
             break
         picked.append(j)

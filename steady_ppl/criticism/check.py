@@ -18,7 +18,7 @@ from torch import Tensor
 from steady_ppl.criticism.attribution import SCATTER, blame, scored
 from steady_ppl.criticism.baselines import constant_velocity, last_measurement
 from steady_ppl.criticism.perturbations import directions
-from steady_ppl.criticism.reference_sets import FEWEST, residuals, simulate_sets
+from steady_ppl.criticism.reference_sets import MIN_SETS, residuals, simulate_sets
 from steady_ppl.criticism.residual_maps import Residuals, judge
 from steady_ppl.criticism.result import Check
 from steady_ppl.criticism.step_size import check_step
@@ -37,7 +37,8 @@ from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
 SECONDS = (1.0, 3.0)
-MOST = 4.0  # standard deviations of a single residual; beside a landmark the linearised program knows no more
+MAX_RESIDUAL_SD = 4.0
+"""Standard deviations of a single residual; beside a landmark the linearised program knows no more."""
 
 
 @torch.no_grad()
@@ -118,8 +119,8 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
 
 
 def _require(program: Program, data: Trajectories, known_start: bool, simulations: int) -> None:
-    if simulations < FEWEST:
-        raise UsageError(f"got {simulations} simulations: bands need at least {FEWEST}, and 100 are better")
+    if simulations < MIN_SETS:
+        raise UsageError(f"got {simulations} simulations: bands need at least {MIN_SETS}, and 100 are better")
     if data.time.shape[0] < 2 or not bool(data.observed[1:].any()):
         raise DataError("nothing to compare: no trajectory has a measurement after its first row")
     refuse_long(data)
@@ -143,7 +144,13 @@ def _in_own_spreads(real: Residuals, simulated: Residuals) -> tuple[Residuals, R
     found = []
     for part in (real, simulated):
         there = part.there & told
-        found.append(replace(part, values=np.where(there, part.values / scale, 0.0).clip(-MOST, MOST), there=there))
+        found.append(
+            replace(
+                part,
+                values=np.where(there, part.values / scale, 0.0).clip(-MAX_RESIDUAL_SD, MAX_RESIDUAL_SD),
+                there=there,
+            )
+        )
     return found[0], found[1]
 
 

@@ -27,7 +27,7 @@ from steady_ppl.utils.angles import wrap, wrap_angles
 LAG = 0.3  # s
 DEAD, KNEE = 0.2, 0.6  # of the largest command
 ALONE = ("offset of", "curvature in")  # in the controls' own units
-MANY = 40  # parameters; a network's are not looked at one by one
+MAX_PARAMETERS = 40  # parameters; a network's are not looked at one by one
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class _Scores:
 def _parameters(program: Program, data: Trajectories, path: ReferencePath, scores: _Scores) -> Named:
     """The program's own parameters, where they move the mean."""
     scalars = [(name, value, i) for name, value in program.named_parameters() for i in range(value.numel())]
-    if len(scalars) > MANY:
+    if len(scalars) > MAX_PARAMETERS:
         return
     states = path.states
 

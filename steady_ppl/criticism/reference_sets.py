@@ -23,9 +23,10 @@ from steady_ppl.gaussian.predict import Prediction, predict, simulate_again
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.model.program import Program
 
-FEWEST = 20  # sets
-ROWS = 500_000  # of all drives of a block
-PASSES = 4  # linearisations: beside a landmark the truth is far from the mode, where the measured drives' paths lie
+MIN_SETS = 20  # sets
+MAX_ROWS_OF_BLOCK = 500_000  # of all drives of a block
+LINEARISATIONS = 4
+"""Linearisations: beside a landmark the truth is far from the mode, where the measured drives' paths lie."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +63,14 @@ def simulate_sets(
     Raises:
         FilterError: too many sets blew up.
     """
-    at_once = max(1, ROWS // data.time.numel())
+    at_once = max(1, MAX_ROWS_OF_BLOCK // data.time.numel())
     found = [
         one
         for block in starts.split(at_once)
         if (one := _block(program, data, block, channels, horizons, known_start)) is not None
     ]
     whole = sum(one.sets for one in found)
-    if whole < FEWEST:
+    if whole < MIN_SETS:
         raise FilterError(
             f"{len(starts) - whole} of {len(starts)} simulated sets blew up: the fitted program does not even explain "
             "drives of its own"
@@ -83,7 +84,7 @@ def _block(
     """None where every set blew up."""
     sets = len(starts)
     again, truth = simulate_again(program, data, starts, channels)
-    near = smooth(program, again, truth, known_start=known_start, passes=PASSES).linearization.path
+    near = smooth(program, again, truth, known_start=known_start, passes=LINEARISATIONS).linearization.path
     copies = track(program, again, near, known_start=known_start, passes=1)
     whole = torch.isfinite(copies.log_likelihood).view(sets, -1).all(1)
     if not bool(whole.all()):

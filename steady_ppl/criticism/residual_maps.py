@@ -22,10 +22,10 @@ from scipy import special
 from steady_ppl.errors import DataError
 
 STRIPS, BINS, BINS_OF_PAIRS = 10, 5, 4
-FEWEST = 8  # residuals in a cell
+MIN_RESIDUALS = 8  # residuals in a cell
 LAGS = (0, 1, 2, 5, 10)  # rows
-SHARE = 0.5  # of the simulated sets that must have a cell, too
-LEVEL = 0.05
+MIN_SHARE_OF_SETS = 0.5  # of the simulated sets that must have a cell, too
+ALPHA = 0.05
 
 Array = np.ndarray[Any, Any]
 
@@ -152,7 +152,7 @@ def judge(
     z /= widened
     p_values = 2 * special.stdtr(freedom, -np.abs(z))
     simes = np.array([_simes(row) for row in p_values])
-    level = min(LEVEL, float(np.quantile(simes[1:], LEVEL, method="lower")))  # the tails of t are a model, too
+    level = min(ALPHA, float(np.quantile(simes[1:], ALPHA, method="lower")))  # the tails of t are a model, too
     chosen = _benjamini_hochberg(p_values[0], level)
     findings = [Finding(cells[i], float(z[0, i]), float(p_values[0, i])) for i in np.flatnonzero(chosen)]
     return Misfit(
@@ -256,11 +256,11 @@ def _sums(data: Residuals, kind: str, labels: Array, where: list[dict[str, Any]]
         at = index[there]
         count = np.bincount(at, minlength=size).reshape(sets, -1)
         total = np.bincount(at, data.values[..., residual][there], minlength=size).reshape(sets, -1)
-        enough = count >= FEWEST
+        enough = count >= MIN_RESIDUALS
         average = np.where(enough, total / np.sqrt(np.maximum(count, 1)), np.nan)
         mean = _means(data, residual, index[0], count[0])
         for cell, place in enumerate(where):
-            if enough[0, cell] and enough[1:, cell].mean() > SHARE:
+            if enough[0, cell] and enough[1:, cell].mean() > MIN_SHARE_OF_SETS:
                 yield Cell(kind, residual, place, int(count[0, cell]), mean[cell] if mean else None), average[:, cell]
 
 
@@ -289,6 +289,6 @@ def _correlations(data: Residuals, inside: Array, controls: dict[str, Array]) ->
                     product = (regressor[before] * values[:, now]).sum((1, 2)) / np.sqrt(np.maximum(square, 1e-12))
                     yield Cell("lag", residual, {name: lag}, int(there[0, now].sum())), product
             both = there[:, now] & there[:, before]
-            if lag and both[0].sum() >= FEWEST:
+            if lag and both[0].sum() >= MIN_RESIDUALS:
                 product = (values[:, now] * values[:, before]).sum((1, 2)) / np.sqrt(np.maximum(both.sum((1, 2)), 1))
                 yield Cell("memory", residual, {"lag": lag}, int(both[0].sum())), product

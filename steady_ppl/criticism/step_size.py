@@ -30,7 +30,8 @@ MIN_GAIN = 3.0  # nats, of all drives together, from which a finer step counts
 MAX_SHIFT = 2.0  # nats that watched parameters of another step lie below the maximum: two standard deviations
 MAX_DECREMENT = 1.0  # nats that a scoring step may promise; beyond it more steps may gain far more
 PRECISION = 0.005  # nats, of refits
-FINEST = 32  # substeps of a trial, at most, unless more are asked for; a program may always be tried at twice its own
+MAX_SUBSTEPS_TRIED = 32
+"""Substeps of a trial, at most, unless more are asked for; a program may always be tried at twice its own."""
 REFITS = 25  # scoring steps of a fit
 UNKNOWN = "whether the time step suits is not known"
 
@@ -185,7 +186,7 @@ def check_step(
     known_start: bool = False,
     watched: Sequence[str] | None = None,
     max_shift: float = MAX_SHIFT,
-    finest: int = FINEST,
+    finest: int = MAX_SUBSTEPS_TRIED,
 ) -> StepCheck:
     """Compare a program with itself at twice, four times … the substeps, refitted to the same drives.
 

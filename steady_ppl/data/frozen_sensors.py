@@ -15,8 +15,8 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 
-FEWEST = 12  # rows of a stretch
-STRAIGHT = 1e-6  # of the column's range over all drives, by which a row may be beside the line
+MIN_ROWS = 12  # rows of a stretch
+MAX_DEVIATION = 1e-6  # of the column's range over all drives, by which a row may be beside the line
 
 
 @dataclass(frozen=True)
@@ -106,10 +106,10 @@ def _columns(data: Trajectories) -> list[tuple[str, Tensor, Tensor]]:
 
 def _runs(time: Tensor, values: Tensor, there: Tensor) -> list[tuple[int, int, int]]:
     """Drive, first and last row of every stretch on a line over time."""
-    if len(values) < FEWEST or int(there.sum()) < FEWEST:
+    if len(values) < MIN_ROWS or int(there.sum()) < MIN_ROWS:
         return []
     seen = values[there]
-    reach = STRAIGHT * float(seen.max() - seen.min())
+    reach = MAX_DEVIATION * float(seen.max() - seen.min())
     share = ((time[1:-1] - time[:-2]) / (time[2:] - time[:-2])).to(values)
     whole = _turned(values[2:] - values[:-2])
     bend = _turned(values[1:-1] - values[:-2] - share * whole).abs()
@@ -118,7 +118,7 @@ def _runs(time: Tensor, values: Tensor, there: Tensor) -> list[tuple[int, int, i
     for drive in straight.any(0).nonzero().flatten().tolist():
         edges = torch.diff(straight[:, drive].int(), prepend=torch.zeros(1).int(), append=torch.zeros(1).int())
         begins, ends = (edges == 1).nonzero().flatten().tolist(), (edges == -1).nonzero().flatten().tolist()
-        runs += [(drive, b, e + 1) for b, e in zip(begins, ends, strict=True) if e + 2 - b >= FEWEST]
+        runs += [(drive, b, e + 1) for b, e in zip(begins, ends, strict=True) if e + 2 - b >= MIN_ROWS]
     return runs
 
 

@@ -14,7 +14,7 @@ from steady_ppl.discovery.curves import curves
 from steady_ppl.discovery.effect_scores import Column, Simulated, columns_of, scores_along, simulate_scores
 from steady_ppl.discovery.noise_departure import departures
 from steady_ppl.discovery.refits import ALWAYS, BY_LIKELIHOOD, Refit, Worth, refit_with
-from steady_ppl.discovery.screening import LEVEL, Screened, Tested, screen
+from steady_ppl.discovery.screening import ALPHA, Screened, Tested, screen
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
@@ -28,7 +28,7 @@ from steady_ppl.utils.random import seeded
 LEADERS, ALIKE = 6, 0.85  # how many are refitted at least, and whose columns correlate so much with the first
 NATS = 2.0  # of held-out log p(y) within which two candidates cannot be told apart
 NO_DOUBT = 10.0  # nats of held-out log p(y) for which a test need only be near the family's level
-NEARLY = LEVEL / 5  # p-value of a single test that is near it
+NEARLY = ALPHA / 5  # p-value of a single test that is near it
 PROMISING = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
 LINEAR = ("push", "command", "history", "measured", "viewpoint")
 

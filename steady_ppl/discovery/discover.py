@@ -17,7 +17,7 @@ from steady_ppl.discovery.finding import Finding, findings, shape_of
 from steady_ppl.discovery.fitting import ByDraws
 from steady_ppl.discovery.next_run import next_run
 from steady_ppl.discovery.result import Discovery
-from steady_ppl.discovery.search import MOST, Found, Search, search
+from steady_ppl.discovery.search import MAX_EFFECTS, Found, Search, search
 from steady_ppl.effects import of_name, record, restore, written_class
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.linearize import why_not_linear
@@ -202,8 +202,8 @@ def _notes(found: Search) -> list[str]:
     if found.broke:
         effects = " and ".join(found.broke)
         notes.append(f"{effects}: taken back, with it the program blows up on drives of its own")
-    if len(found.found) == MOST:
-        notes.append(f"the search stops at {MOST} effects: add them, fit, and discover again from there")
+    if len(found.found) == MAX_EFFECTS:
+        notes.append(f"the search stops at {MAX_EFFECTS} effects: add them, fit, and discover again from there")
     if not found.is_complete:
         notes.append("something is left that no effect of the catalogue brings: the tests were not quiet at the end")
     notes += [f"{one.candidate.variant.label}: {said}" for one in found.found if (said := _of_one_drive(one))]

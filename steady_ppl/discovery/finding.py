@@ -15,7 +15,7 @@ from steady_ppl.discovery.curves import unit_of
 from steady_ppl.discovery.profile import variance_of_places
 from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.screening import Tested
-from steady_ppl.discovery.search import MARGIN, Found, Search
+from steady_ppl.discovery.search import MIN_GAIN_OF_CURVE, Found, Search
 from steady_ppl.effects import Variant, attached
 from steady_ppl.model.program import Program
 
@@ -122,10 +122,11 @@ def _spread(search: Search, variant: Variant, count: int) -> np.ndarray:
 
 
 def _confidence(search: Search, found: Found, alike: Sequence[Candidate]) -> float:
-    """Posterior probability of the class; all candidates and none are alike before, the best curve by `MARGIN` less."""
+    """Posterior probability of the class; all candidates and none are alike before, a curve is less likely by
+    `MIN_GAIN_OF_CURVE`."""
     totals = {id(c): c.total for c in found.candidates if isinstance(c.refit, Refit)}
     curve = max((c.total for c in search.curves if isinstance(c.refit, Refit)), default=-math.inf)
-    rivals = [0.0, found.candidate.total + curve - search.gain - MARGIN]
+    rivals = [0.0, found.candidate.total + curve - search.gain - MIN_GAIN_OF_CURVE]
     whole = np.logaddexp.reduce([*totals.values(), *rivals])
     return float(np.exp(np.logaddexp.reduce([totals[id(c)] for c in alike]) - whole))
 

@@ -30,7 +30,7 @@ from steady_ppl.training.loop import Optimization, train
 from steady_ppl.training.validation import Validation
 from steady_ppl.utils.random import seeded
 
-DOUBTFUL = 0.5  # nats a drive by which the linearised log p(y) may be off
+MAX_LINEARISATION_ERROR = 0.5  # nats a drive by which the linearised log p(y) may be off
 PARTICLES, JUDGING = 100, 400  # of the guide and of the judge: see docs/discovery.md, step 4
 
 
@@ -159,7 +159,10 @@ def is_doubtful(program: Program, drives: Trajectories, path: ReferencePath, kno
     ahead = _at_rest(program, drives, path, known_start)
     try:
         with seeded(0, "judge"):
-            return float(neglected(program, drives, known_start=known_start, ahead=ahead).abs().mean()) > DOUBTFUL
+            return (
+                float(neglected(program, drives, known_start=known_start, ahead=ahead).abs().mean())
+                > MAX_LINEARISATION_ERROR
+            )
     except FilterError:
         return True
 

@@ -13,9 +13,9 @@ from steady_ppl.discovery.candidates import Candidate, Settings, gain_of_fits, j
 from steady_ppl.discovery.refits import Refit, refit_near, refit_with
 from steady_ppl.effects import Variant
 
-BETTER = 0.3  # nats by which another knee or place has to be likelier
+MIN_GAIN_OF_PLACE = 0.3  # nats by which another knee or place has to be likelier
 PASSES = 4  # along all knees and places in turns, with steps of one size
-NEAR = 0.25  # of the grid's spacing, at which a place's likelihood is compared with its neighbours'
+NEIGHBOUR_SHARE = 0.25  # of the grid's spacing, at which a place's likelihood is compared with its neighbours'
 
 
 def at_its_best_place(now: Refit, candidate: Candidate, settings: Settings) -> Candidate:
@@ -34,7 +34,7 @@ def at_its_best_place(now: Refit, candidate: Candidate, settings: Settings) -> C
         for variant in variants:
             assert isinstance(fit, Refit)
             other = refit_near(now, fit, [variant], known_start=settings.known_start)
-            if isinstance(other, Refit) and gain_of_fits(now, other) > gain_of_fits(now, fit) + BETTER:
+            if isinstance(other, Refit) and gain_of_fits(now, other) > gain_of_fits(now, fit) + MIN_GAIN_OF_PLACE:
                 at, fit = variant, other
 
     try_all(variant for variant in grid if variant.label != candidate.variant.label)
@@ -74,7 +74,9 @@ def variance_of_places(now: Refit, candidate: Candidate, known_start: bool) -> T
     variance, ways = torch.zeros_like(here), list[_Way]()
     for name in at.profiled:
         sides = [
-            (sign, v, fit) for sign, v in zip((1, -1), _beside(at, grid, name, NEAR), strict=True) if (fit := fitted(v))
+            (sign, v, fit)
+            for sign, v in zip((1, -1), _beside(at, grid, name, NEIGHBOUR_SHARE), strict=True)
+            if (fit := fitted(v))
         ]
         if not sides:
             variance = variance + here.square()
@@ -83,7 +85,7 @@ def variance_of_places(now: Refit, candidate: Candidate, known_start: bool) -> T
         bend = sum(2 * fall for *_, (_, fall) in sides) / len(sides)
         count = len({variant.profiled[name] for variant in grid})
         sign, variant, (_, fall) = sides[0]
-        ways.append(_Way(name, sign, variant, fall, slope, bend, (2 * NEAR / max(1, count - 1)) ** 2))
+        ways.append(_Way(name, sign, variant, fall, slope, bend, (2 * NEIGHBOUR_SHARE / max(1, count - 1)) ** 2))
     if not ways:
         return variance
     curvature = torch.diag(torch.tensor([way.bend for way in ways], dtype=torch.float64))

@@ -15,7 +15,7 @@ from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.finding import Finding, Shape, gain_interval
 from steady_ppl.discovery.next_run import NextRun
 from steady_ppl.discovery.refits import Refit
-from steady_ppl.discovery.screening import LEVEL, Tested
+from steady_ppl.discovery.screening import ALPHA, Tested
 from steady_ppl.discovery.search import Search
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.late import Displayed
@@ -91,7 +91,7 @@ def figures(found: Discovery) -> dict[str, Any]:
         "verdict": found.verdict,
         "sentence": sentence(found),
         "p_value": found.p_value,
-        "level": LEVEL,
+        "level": ALPHA,
         "effect": first.variant.name if first else None,
         "class": first.alike if first else [],
         "confidence": first.confidence if first else None,

@@ -21,8 +21,9 @@ from steady_ppl.discovery.effect_scores import Column, Simulated
 from steady_ppl.discovery.noise_departure import Departure
 from steady_ppl.effects import Variant
 
-LEVEL, POWER = 0.05, 0.95
-GONE = 1e-4  # share of a column's information that the fitted parameters must leave for it to be tested
+ALPHA, POWER = 0.05, 0.95
+MIN_SHARE_OF_INFORMATION = 1e-4
+"""Share of a column's information that the fitted parameters must leave for it to be tested."""
 CONTAINED = "the fitted parameters already explain it"
 UNEXCITED = "these drives never excite it"
 
@@ -149,7 +150,7 @@ def screen(
 
 def _critical(simulated: np.ndarray) -> float:
     """The largest p-value below which the family's own p-value, (1 + sets as extreme) / (1 + sets), keeps the level."""
-    allowed = int(LEVEL * (len(simulated) + 1)) - 1
+    allowed = int(ALPHA * (len(simulated) + 1)) - 1
     return float(np.nextafter(np.sort(simulated)[max(0, allowed)], 0.0))
 
 
@@ -210,7 +211,7 @@ def _test(column: Column, at: slice, projected: Tensor, left: Tensor, before: Te
     own, scores = left[at, at], projected[:, at]
     if column.variant.effect.name == CURVE:
         return _test_of_curve(column, at, scores, own) if bool((own.diagonal() > 0).any()) else None
-    if not bool((before[at] > 0).all()) or not bool((own.diagonal() > GONE * before[at]).all()):
+    if not bool((before[at] > 0).all()) or not bool((own.diagonal() > MIN_SHARE_OF_INFORMATION * before[at]).all()):
         return None
     steps = torch.linalg.solve(own, scores.T).T
     statistics = (scores * steps).sum(-1).numpy()

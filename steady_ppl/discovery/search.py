@@ -27,14 +27,14 @@ from steady_ppl.discovery.candidates import (
 )
 from steady_ppl.discovery.profile import at_its_best_place
 from steady_ppl.discovery.refits import Refit, Worth, first_refit, refit_near, refit_with
-from steady_ppl.discovery.screening import LEVEL, Tested
+from steady_ppl.discovery.screening import ALPHA, Tested
 from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import with_substeps
 from steady_ppl.utils.progress import stages
 
-MARGIN = 3.0  # nats by which a curve must be better than named effects
+MIN_GAIN_OF_CURVE = 3.0  # nats by which a curve must be better than named effects
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Round:
     @property
     def quiet(self) -> bool:
         """Whether the tests found nothing."""
-        return self.screening.tests.p_value > LEVEL
+        return self.screening.tests.p_value > ALPHA
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class Search:
         """The curve that explains the drives better than all effects that were found; where the noise alone may be what
         the tests found, one that is significant itself."""
         best = next((curve for curve in self.curves if isinstance(curve.refit, Refit)), None)
-        if best is None or best.total <= self.gain + MARGIN:
+        if best is None or best.total <= self.gain + MIN_GAIN_OF_CURVE:
             return None
         tests = self.rounds[0].screening.tests
         of_all = min(tested.p_value for tested in tests.tested if tested.is_curve)
@@ -142,10 +142,11 @@ class Search:
         return float((self.final.held_out - self.base.held_out[: len(self.final.held_out)]).sum())
 
 
-BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
+MAX_NATS_BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
 MAX_SHIFT_OF_SIZES = 0.08  # nats by which twice the substeps may move what is reported: 0.4 standard deviations
-FINEST = 128  # substeps at which a program is fitted, at most: what a coarser step leaves would be named as an effect
-MOST, CURVES = 5, 3  # effects in a program, and adding curves that are fitted
+MAX_SUBSTEPS_OF_FIT = 128
+"""Substeps at which a program is fitted, at most: what a coarser step leaves would be named as an effect."""
+MAX_EFFECTS, MAX_CURVES = 5, 3  # effects in a program, and adding curves that are fitted
 
 
 def search(
@@ -204,7 +205,7 @@ def _step_of(refit: Refit, known_start: bool, found: Sequence[Found] = ()) -> St
     found must not go with the step."""
     drives, maximum = refit.folds[0].drives, refit.maxima[0]
     if not found:
-        return check_step(refit.program, drives, maximum, known_start=known_start, finest=FINEST)
+        return check_step(refit.program, drives, maximum, known_start=known_start, finest=MAX_SUBSTEPS_OF_FIT)
     return check_step(
         refit.program,
         drives,
@@ -212,7 +213,7 @@ def _step_of(refit: Refit, known_start: bool, found: Sequence[Found] = ()) -> St
         known_start=known_start,
         watched=[variant.parameter for variant in attached(refit.program)],
         max_shift=MAX_SHIFT_OF_SIZES,
-        finest=FINEST,
+        finest=MAX_SUBSTEPS_OF_FIT,
     )
 
 
@@ -220,7 +221,7 @@ def _rounds(found: Search, declared: Program, settings: Settings, sets: int, lat
     """Test, fit and add until nothing is left."""
     with stages(("", 7), ("looking again", 1)) as begin:
         begin()
-        rounds = range(MOST + 1)
+        rounds = range(MAX_EFFECTS + 1)
         shares = [part for index in rounds for part in (("testing every effect", 1 / 2**index), ("", 1 / 2**index))]
         with stages(*shares) as begin_part:
             for index in rounds:
@@ -242,7 +243,7 @@ def _rounds(found: Search, declared: Program, settings: Settings, sets: int, lat
             before, final = list(found.found), found.final
             look_again(found, settings)
             if set(labels(found.final)) != set(labels(final)):  # the same in another order has been tested
-                last = seed + MOST + 1
+                last = seed + MAX_EFFECTS + 1
                 try:
                     screening = screen_program(found.final, declared, settings, sets=later_sets, seed=last)
                     found.rounds.append(Round(screening, [], None))
@@ -259,7 +260,7 @@ def _add_best(found: Search, screening: Screening, settings: Settings, index: in
         return False
     if index == 1 and not found.curves:
         found.curves = _curves(found.base, found.rounds[0].screening, settings)
-    if index == MOST:
+    if index == MAX_EFFECTS:
         return False
     candidates = _refits(found.final, screening, settings, index == 0)
     able = [c for c in candidates if c.is_judged and not c.against_its_sign]
@@ -287,7 +288,7 @@ def _refits(now: Refit, screening: Screening, settings: Settings, first: bool) -
             candidates.append(fitted(now, tested, screening, settings, _worth(candidates)))
     best = max((c for c in candidates if c.is_judged), key=lambda c: c.total, default=None)
     candidates = [c if c.is_judged else replace(c, behind=best) for c in candidates]
-    close = max((candidate.total for candidate in candidates), default=0.0) - RIVALS
+    close = max((candidate.total for candidate in candidates), default=0.0) - MAX_NATS_OF_RIVAL
     found = [at_its_best_place(now, c, settings) if c.total > close else c for c in candidates]
     return sorted(found, key=lambda candidate: -candidate.total)
 
@@ -297,7 +298,7 @@ def _worth(candidates: Sequence[Candidate]) -> Worth:
     fits = [c.refit for c in candidates if isinstance(c.refit, Refit)]
     drives = [float(fit.maxima[0].log_likelihood.sum()) for fit in fits]
     held_out = [float(fit.held_out_alone[: len(fit.folds[0].held_out)].sum()) for fit in fits]
-    return Worth(max(drives, default=-math.inf) - BEHIND, max(held_out, default=-math.inf) - NATS)
+    return Worth(max(drives, default=-math.inf) - MAX_NATS_BEHIND, max(held_out, default=-math.inf) - NATS)
 
 
 def _curves(base: Refit, screening: Screening, settings: Settings) -> list[Candidate]:
@@ -305,20 +306,22 @@ def _curves(base: Refit, screening: Screening, settings: Settings) -> list[Candi
     adding = [tested for tested in every if not tested.variant.options.get("times")]
     multiplying = [tested for tested in every if tested.variant.options.get("times")]
     found = []
-    for tested in [*adding[:CURVES], *multiplying[:1]]:
+    for tested in [*adding[:MAX_CURVES], *multiplying[:1]]:
         found.append(fitted(base, tested, screening, settings))
 
     def worth(candidate: Candidate) -> float:
         """The simpler one, unless the other brings clearly more."""
-        return candidate.total - (MARGIN if candidate.variant.options.get("times") else 0.0)
+        return candidate.total - (MIN_GAIN_OF_CURVE if candidate.variant.options.get("times") else 0.0)
 
     return sorted(found, key=worth, reverse=True)
 
 
-RIVALS = 12.0  # nats behind the best in its round, with which a candidate is looked at again beside other effects
+MAX_NATS_OF_RIVAL = 12.0
+"""Nats behind the best in its round, with which a candidate is looked at again beside other effects."""
 
 
-RUNAWAY = 25.0  # nats above every fit that it is a part of, from which a fit's likelihood is not to be believed
+MIN_NATS_OF_RUNAWAY = 25.0
+"""Nats above every fit that it is a part of, from which a fit's likelihood is not to be believed."""
 
 
 def labels(refit: Refit) -> list[str]:
@@ -333,7 +336,9 @@ def look_again(search: Search, settings: Settings) -> None:
         if isinstance(without, str):
             continue
         rivals = [found.candidate] + [
-            c for c in found.candidates if c is not found.candidate and c.total > found.candidate.total - RIVALS
+            c
+            for c in found.candidates
+            if c is not found.candidate and c.total > found.candidate.total - MAX_NATS_OF_RIVAL
         ]
         there = {variant.name for variant in attached(without.program)}
         again = []
@@ -366,7 +371,7 @@ def _without(search: Search, found: Found, settings: Settings) -> Refit | str:
     if isinstance(afresh, str) or isinstance(near, str):
         return afresh if isinstance(near, str) else near
     most = (
-        max(_objective(search.final), _objective(afresh)) + RUNAWAY
+        max(_objective(search.final), _objective(afresh)) + MIN_NATS_OF_RUNAWAY
     )  # above all that it is a part of: it has run away
     return near if _objective(afresh) < _objective(near) < most else afresh
 

@@ -21,8 +21,12 @@ from steady_ppl.likelihood.scores import smoothed, widens
 from steady_ppl.model.program import Program
 from steady_ppl.utils.progress import stages
 
-ROUGH = 1.5  # mean square deviation, in the program's own, from which its noise is widened before anything is fitted
-FAR, SEARCHES = 6.0, 3  # standard deviations by which a drive strays from the others, and searches for its path
+MAX_ROUGHNESS = 1.5
+"""Mean square deviation, in the program's own, from which its noise is widened before anything is fitted."""
+MAX_STRAY_SD, SEARCHES = (
+    6.0,
+    3,
+)  # standard deviations by which a drive strays from the others, and searches for its path
 
 
 def fit_by_likelihood(program: Program, data: Trajectories, *, known_start: bool = False) -> Maximum:
@@ -56,7 +60,7 @@ def led_back(program: Program, data: Trajectories, maximum: Maximum, known_start
         each = maximum.log_likelihood / cells
         middle = each.median()
         usual = 1.5 * (each - middle).abs().median()
-        strays = (~(each >= middle - FAR * usual)).nonzero().flatten()
+        strays = (~(each >= middle - MAX_STRAY_SD * usual)).nonzero().flatten()
         if not len(strays):
             break
         part = data.subset(strays)
@@ -86,7 +90,7 @@ def roomy_path(
     ahead = smooth(program, data, path, known_start=known_start, kernels=False)
     every = elements(program)
     parts = [part for part, wider in zip(every, widens(program, every, data), strict=True) if wider]
-    while parts and _roughness(ahead, data) > ROUGH:
+    while parts and _roughness(ahead, data) > MAX_ROUGHNESS:
         before = [part.parameter.data.clone() for part in parts]
         for part in parts:
             part.move(math.log(3.0))

@@ -13,8 +13,8 @@ from steady_ppl.effects import attached
 from steady_ppl.errors import UsageError
 from steady_ppl.model.program import Program
 
-LARGEST = 60  # parameters that are screened one by one; networks have more
-RELATIVE = 1e-3  # of a number, by which differences move it at least: single precision has seven digits
+MAX_PARAMETERS = 60  # parameters that are screened one by one; networks have more
+MIN_RELATIVE_MOVE = 1e-3  # of a number, by which differences move it at least: single precision has seven digits
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ def elements(program: Program) -> list[Element]:
         name = name.removesuffix("_unconstrained")
         for index, value in enumerate(parameter.detach().flatten().tolist()):
             label = f"{name}[{index}]" if parameter.numel() > 1 else name
-            found.append(Element(label, parameter, index, max(steps.get(name, 0.01), RELATIVE * abs(value))))
-    if len(found) > LARGEST:
+            found.append(Element(label, parameter, index, max(steps.get(name, 0.01), MIN_RELATIVE_MOVE * abs(value))))
+    if len(found) > MAX_PARAMETERS:
         raise UsageError(
             f"program {type(program).__name__} has {len(found)} learnable numbers: a network cannot be looked at "
             "parameter by parameter. Fit it with the recipe steady; discover the effects that are missing from a "

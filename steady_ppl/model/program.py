@@ -323,7 +323,7 @@ def for_program(program: Program, data: Trajectories) -> Trajectories:
     return _within(chosen.to(parameter.dtype, parameter.device))
 
 
-SHORTEST, LONGEST = 1e-10, 1e9  # s between two rows; beyond these the time has another unit
+MIN_STEP, MAX_STEP = 1e-10, 1e9  # s between two rows; beyond these the time has another unit
 
 
 def _within(data: Trajectories) -> Trajectories:
@@ -341,11 +341,11 @@ def _within(data: Trajectories) -> Trajectories:
             raise _beyond(
                 data, f"{prefix}.{columns[index]}", drive, row, f"the number is beyond {most:.2g}, the largest"
             )
-    odd = data.transitions & ((data.steps < SHORTEST) | (data.steps > LONGEST))
+    odd = data.transitions & ((data.steps < MIN_STEP) | (data.steps > MAX_STEP))
     for row, drive in odd.nonzero()[:1].tolist():
         step = float(data.time[row + 1, drive] - data.time[row, drive])
         said = (
-            f"time goes on by {step:.3g} s, expected {SHORTEST:g} to {LONGEST:g} s from row to row: is it in seconds?"
+            f"time goes on by {step:.3g} s, expected {MIN_STEP:g} to {MAX_STEP:g} s from row to row: is it in seconds?"
         )
         raise _beyond(data, "time", drive, row + 1, said)
     return data

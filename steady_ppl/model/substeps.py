@@ -34,8 +34,10 @@ from steady_ppl.model.handlers import Recording, as_vector, unwrapped
 from steady_ppl.model.program import Program
 
 MAX_SUBSTEPS = 1000  # of a row
-LEAST = 0.1  # share of a channel's standard deviation in a substep that it has on average over a row, at least
-VISIBLE = 1e-3  # share of a channel's location that is pushed at least, for what it changes to be seen in 32 bits
+MIN_SHARE_OF_SD = 0.1
+"""Share of a channel's standard deviation in a substep that it has on average over a row, at least."""
+MIN_SHARE_OF_PUSH = 1e-3
+"""Share of a channel's location that is pushed at least, for what it changes to be seen in 32 bits."""
 _ROW_ENDS: ContextVar[bool] = ContextVar("row ends", default=True)
 
 
@@ -271,13 +273,13 @@ def _on_average(program: Program, state: Tensor, control: Tensor, time: Tensor, 
         return kinds
     moments = {site: location_and_scale(fn, site) for site, fn in kinds.items()}
     loc, scale = (_joined({site: both[i] for site, both in moments.items()}, kinds, left) for i in range(2))
-    reach = 1 + VISIBLE * (loc / torch.where(scale > 0, scale, torch.ones_like(scale))).abs().detach()
+    reach = 1 + MIN_SHARE_OF_PUSH * (loc / torch.where(scale > 0, scale, torch.ones_like(scale))).abs().detach()
     count = scale.shape[-1]
     units = torch.cat([scale.new_zeros(1, count), torch.eye(count).to(scale)]).view(1 + count, *[1] * len(left), count)
     rows = _recorded(program, state.expand(1 + count, *state.shape), *given, _parted(units * reach, kinds))
     still, *pushed = _mean([_joined(row.values, kinds, (1 + count, *left)) for row in rows])
     change = torch.stack([one[..., index] - still[..., index] for index, one in enumerate(pushed)], -1) / reach
-    locs, scales = _parted(still, kinds), _parted(torch.maximum(change, LEAST * scale), kinds)
+    locs, scales = _parted(still, kinds), _parted(torch.maximum(change, MIN_SHARE_OF_SD * scale), kinds)
     return {site: _like(fn, locs[site], scales[site]) for site, fn in kinds.items()}
 
 

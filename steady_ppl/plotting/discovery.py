@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from steady_ppl.discovery.result import Discovery
 
 ALIKE, OTHER, LIMIT = "#e69f00", "#0072b2", "#009e73"  # Okabe and Ito
-MOST = 9  # candidates of a group
-REST = 20  # effects that were not found, beside those that were
+MAX_CANDIDATES = 9  # candidates of a group
+MAX_OTHERS = 20  # effects that were not found, beside those that were
 WIDTH = 125  # letters of a line over the whole width
 
 
@@ -105,7 +105,7 @@ def before_and_after(found: Discovery, axes: Axes) -> Axes:
     return titled(axes, "predictions of the validation drives", axes.get_xlabel())
 
 
-def coefficients(found: Discovery, axes: Axes, rest: int = REST) -> Axes:
+def coefficients(found: Discovery, axes: Axes, rest: int = MAX_OTHERS) -> Axes:
     """Coefficients in units of what could have been seen: those that were found, then those of the last tests."""
     rows = [row for finding in found.findings for row in _of_finding(found, finding)]
     rows += [row for tested in _remaining(found)[:rest] for row in _of_test(found, tested)]
@@ -183,7 +183,7 @@ def _of_group(group: Group, seed: int) -> list[Row]:
 
 
 def _fitted(candidates: Sequence[Candidate]) -> list[Candidate]:
-    return sorted((c for c in candidates if math.isfinite(c.total)), key=lambda c: -c.total)[:MOST]
+    return sorted((c for c in candidates if math.isfinite(c.total)), key=lambda c: -c.total)[:MAX_CANDIDATES]
 
 
 def _remaining(found: Discovery) -> list[Tested]:

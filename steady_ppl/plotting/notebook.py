@@ -23,7 +23,7 @@ from steady_ppl.plotting.comparison import proof_picture
 from steady_ppl.plotting.discovery import discovery_picture
 from steady_ppl.runs.fit import Fit
 
-MOST = 12  # numbers of a parameter that are shown one by one
+MAX_NUMBERS = 12  # numbers of a parameter that are shown one by one
 DOTS = 90  # an inch, of pictures
 
 
@@ -102,7 +102,7 @@ def parameter_rows(program: Program) -> list[tuple[str, str]]:
             value = getattr(value, part)
         numbers = value.flatten().tolist()
         said = ", ".join(f"{number:.4g}" for number in numbers)
-        if len(numbers) > MOST:
+        if len(numbers) > MAX_NUMBERS:
             said = f"{' × '.join(map(str, value.shape))} numbers from {min(numbers):.4g} to {max(numbers):.4g}"
         rows.append((name, said))
     return rows

@@ -17,7 +17,7 @@ from scipy import stats
 
 from steady_ppl.errors import UsageError
 from steady_ppl.plotting.comparison import COLORS, MARKS
-from steady_ppl.studies.plan import IN_LIMITS, LARGEST, Picture, Plan
+from steady_ppl.studies.plan import IN_LIMITS, MAX_NUMBER, Picture, Plan
 from steady_ppl.utils.text import harmless
 
 SIZES = (-1.0, 0.0, *(1.25 ** (place - 0.5) for place in range(-6, 12)), math.inf)
@@ -83,7 +83,7 @@ def _numbers(rows: pd.DataFrame, name: str) -> pd.Series:
     if not there.map(lambda value: isinstance(value, int | float | np.number)).all():
         raise UsageError(f"column {name} of the table holds no numbers")
     numbers = values.astype(float)
-    return numbers.where(numbers.abs() <= LARGEST)
+    return numbers.where(numbers.abs() <= MAX_NUMBER)
 
 
 def chosen(picture: Picture, rows: pd.DataFrame) -> pd.DataFrame:

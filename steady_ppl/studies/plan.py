@@ -26,7 +26,7 @@ FIGURES = {
 """Columns of numbers that a task fills, or how they begin."""
 
 MOST_PANELS, MOST_PUBLISHED, LONGEST = 12, 100, 1000  # of a picture; characters of its title and labels
-LARGEST = 1e100  # a number beyond cannot be drawn
+MAX_NUMBER = 1e100  # a number beyond cannot be drawn
 
 POINTS = {str: {str: [[NUMBER]]}}
 FORMAT = 1
@@ -158,7 +158,7 @@ def undrawable(title: str, picture: Mapping[str, Any]) -> str | None:
             return f"picture.published: {column} has {len(lines)} lines, expected at most {MOST_PUBLISHED}"
         for name, points in lines.items():
             for point in points:
-                if len(point) != 2 or max(map(abs, point)) > LARGEST:
+                if len(point) != 2 or max(map(abs, point)) > MAX_NUMBER:
                     return f"picture.published: {column}, {name}: {shown(str(point), 40)} is no point, expected [x, y]"
     return None
 

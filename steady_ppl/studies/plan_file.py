@@ -43,7 +43,7 @@ from steady_ppl.studies.fingerprints import JobFiles, is_program
 from steady_ppl.studies.plan import (
     FIGURES,
     HELD_OUT,
-    LARGEST,
+    MAX_NUMBER,
     POINTS,
     TASKS,
     Job,
@@ -305,7 +305,7 @@ def _is_plain(value: Any, depth: int = 0) -> bool:
         return True
     if isinstance(value, int):
         return abs(value) < 2**63
-    return isinstance(value, float) and math.isfinite(value) and abs(value) <= LARGEST
+    return isinstance(value, float) and math.isfinite(value) and abs(value) <= MAX_NUMBER
 
 
 def _beside(folder: Path, name: str) -> str:

@@ -49,7 +49,7 @@ def one_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
-LONGEST = 1000  # characters of a line that is said; a file that somebody gives can put more into it
+MAX_LINE_LENGTH = 1000  # characters of a line that is said; a file that somebody gives can put more into it
 
 
 _quiet: ContextVar[bool] = ContextVar("quiet", default=False)
@@ -73,7 +73,7 @@ def is_quiet() -> bool:
 def say(line: str, *, always: bool = False) -> None:
     """A word to the person, beside what a script reads; errors are said `always`."""
     if always or not is_quiet():
-        lines = [shown(part, LONGEST) for part in line.splitlines()]
+        lines = [shown(part, MAX_LINE_LENGTH) for part in line.splitlines()]
         tell("\n".join([f"steady: {part}" for part in lines[:1]] + lines[1:]), aside=True)
 
 

@@ -34,7 +34,7 @@ def test_blocks_are_the_sets_they_are_made_of(cart, even, starts, monkeypatch):
     data = for_program(cart, even)
     few = arrays(made(cart, data, starts[:25]))
     at_once = made(cart, data, starts)
-    monkeypatch.setattr(simulated, "ROWS", 25 * data.time.numel())
+    monkeypatch.setattr(simulated, "MAX_ROWS_OF_BLOCK", 25 * data.time.numel())
     blocks = made(cart, data, starts)
     assert blocks.sets == at_once.sets == 40
     found = arrays(blocks)
@@ -59,7 +59,7 @@ def test_sets_that_blow_up_are_left_out_and_counted(cart, even, starts):
 
 def test_too_few_that_did_not_blow_up_is_an_error(cart, even, starts, monkeypatch):
     data = for_program(cart, even)
-    monkeypatch.setattr(simulated, "ROWS", 10 * data.time.numel())
+    monkeypatch.setattr(simulated, "MAX_ROWS_OF_BLOCK", 10 * data.time.numel())
     starts[:21] = torch.inf
     with pytest.raises(FilterError, match="21 of 40 simulated sets blew up"):
         made(cart, data, starts, known_start=False)

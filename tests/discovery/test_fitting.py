@@ -90,7 +90,7 @@ def test_a_program_whose_linearised_likelihood_is_off_is_fitted_by_draws(monkeyp
     train, valid = drives(truth, 6, 61, seed=1), drives(truth, 6, 61, seed=2)
     program = example("paper.py:PaperTruck", torch.float32)
     assert is_doubtful(program, train, find_path(program, train, known_start=True), known_start=True)
-    monkeypatch.setattr("steady_ppl.discovery.fitting.DOUBTFUL", 0.0)
+    monkeypatch.setattr("steady_ppl.discovery.fitting.MAX_LINEARISATION_ERROR", 0.0)
     base = first_refit(program, train, valid, known_start=True, seed=0)
     assert isinstance(base.fitting, ByDraws)
     found = refit_with(base, chosen_variant(program, "lever_arm"), 0.1, known_start=True)

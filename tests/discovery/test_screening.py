@@ -12,7 +12,7 @@ from scipy import stats
 
 from steady_ppl.discovery.curves import between, by_height, height, knots_of, variables
 from steady_ppl.discovery.effect_scores import Column, Simulated
-from steady_ppl.discovery.screening import LEVEL, _critical, screen
+from steady_ppl.discovery.screening import ALPHA, _critical, screen
 from steady_ppl.effects import chosen_variant
 
 DRIVES, PARAMETERS = 16, 3
@@ -134,4 +134,4 @@ def test_a_single_tests_level_and_the_familys_say_the_same(sets):
     critical = _critical(family)
     for observed in (*np.sort(family), critical, *np.nextafter(np.sort(family)[:12], 0.0)):
         whole = (1 + int((family <= observed).sum())) / (1 + sets)
-        assert (whole <= LEVEL) == (observed <= critical)
+        assert (whole <= ALPHA) == (observed <= critical)
