@@ -9,14 +9,13 @@ from typing import Any
 
 import pyro.distributions as dist
 import torch
-from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked, track
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, on_a_circle, predict
-from steady_ppl.model.handlers import AtMean, Recording, Standardised, as_vector, normal_moments, running
+from steady_ppl.model.handlers import AtMean, ByColumn, Recording, Standardised, as_vector, normal_moments, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance, sample_channels
 from steady_ppl.utils.angles import wrap
@@ -28,7 +27,7 @@ ABOUT = (
 )
 
 
-class Coasting(Messenger):
+class Coasting(ByColumn):
     """Give latent sites mean zero and other standard deviations, in the order in which they are met.
 
     Args:
@@ -38,21 +37,13 @@ class Coasting(Messenger):
     def __init__(self, scales: Sequence[float]) -> None:
         super().__init__()
         self.scales = scales
-        self.column = 0
-
-    def __enter__(self) -> Coasting:
-        self.column = 0
-        super().__enter__()
-        return self
 
     def _pyro_sample(self, message: Any) -> None:
         if message["is_observed"]:
             return
         fn = message["fn"]
         mean, _ = normal_moments(fn, message["name"])
-        width = mean.shape[-1] if fn.event_dim else 1
-        scale = mean.new_tensor(self.scales[self.column : self.column + width])
-        self.column += width
+        scale = mean.new_tensor(self.scales[self.take(fn)])
         zero = torch.zeros_like(mean)
         message["fn"] = (
             dist.Normal(zero, scale.expand_as(zero)).to_event(1) if fn.event_dim else dist.Normal(zero, scale[0])

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, require
 from steady_ppl.guides.base import Constant, Tempering, sample_known
-from steady_ppl.model.handlers import KnownStart, Recording, Replaying, Standardised, broadcast_event, running
+from steady_ppl.model.handlers import ByColumn, KnownStart, Recording, Replaying, Standardised, broadcast_event, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, sample_channels, sample_row
 from steady_ppl.model.validate import start_size, step_size
@@ -138,7 +138,7 @@ class VariationalGuide(nn.Module):
         return paths, at_start, later
 
 
-class Taking(Messenger):
+class Taking(ByColumn):
     """Give latent sites the columns of some values in the order in which the sites are met.
 
     Args:
@@ -147,12 +147,10 @@ class Taking(Messenger):
 
     def __init__(self, values: Tensor) -> None:
         super().__init__()
-        self.values, self.column = values, 0
+        self.values = values
 
     def _pyro_sample(self, message: Any) -> None:
-        width = message["fn"].event_shape.numel()
-        taken = self.values[..., self.column : self.column + width]
-        self.column += width
+        taken = self.values[..., self.take(message["fn"])]
         message["value"] = taken if message["fn"].event_dim else taken[..., 0]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, cast
+from typing import Any, Self, cast
 
 import pyro
 import pyro.distributions as dist
@@ -18,7 +18,25 @@ from torch import Tensor
 from steady_ppl.errors import ProgramError
 
 
-class Observing(Messenger):
+class ByColumn(Messenger):
+    """A handler whose sites take the columns of something in the order in which they are met, from the first whenever
+    it is entered."""
+
+    column = 0
+
+    def __enter__(self) -> Self:
+        self.column = 0
+        super().__enter__()
+        return self
+
+    def take(self, fn: Any) -> slice:
+        """The columns of the site that has this distribution."""
+        columns = slice(self.column, self.column + fn.event_shape.numel())
+        self.column = columns.stop
+        return columns
+
+
+class Observing(ByColumn):
     """Condition the sites of `observe` on measurements, cell by cell, and temper them.
 
     The sites take the measurement's columns in the order in which they are met. A missing cell contributes nothing.
@@ -33,12 +51,6 @@ class Observing(Messenger):
     def __init__(self, measurements: Tensor, observed: Tensor, weight: float | Tensor = 1.0) -> None:
         super().__init__()
         self.measurements, self.observed, self.weight = measurements, observed, weight
-        self.column = 0
-
-    def __enter__(self) -> Observing:
-        self.column = 0
-        super().__enter__()
-        return self
 
     def __exit__(self, *exception: Any) -> None:
         super().__exit__(*exception)
@@ -53,9 +65,7 @@ class Observing(Messenger):
         fn, name = message["fn"], message["name"]
         if message["is_observed"]:
             raise ProgramError(f"site {name!r} of observe has obs=: leave it out, the engine conditions", site=name)
-        width = fn.event_shape.numel()
-        columns = slice(self.column, self.column + width)
-        self.column += width
+        columns = self.take(fn)
         if fn.event_dim > 1 or self.column > self.measurements.shape[-1]:
             raise ProgramError(
                 f"site {name!r} of observe has event shape {tuple(fn.event_shape)}; expected a scalar or a vector, and "
@@ -170,7 +180,7 @@ class AtMean(Messenger):
             message["value"] = message["fn"].mean
 
 
-class Standardised(Messenger):
+class Standardised(ByColumn):
     """Give latent sites `mean + sd · noise`: the program as a function of standard normal noise.
 
     The sites take the columns of the noise in the order in which they are met.
@@ -182,24 +192,13 @@ class Standardised(Messenger):
     def __init__(self, noise: Tensor) -> None:
         super().__init__()
         self.noise = noise
-        self.column = 0
-
-    def __enter__(self) -> Standardised:
-        self.column = 0
-        super().__enter__()
-        return self
 
     def _pyro_sample(self, message: Any) -> None:
         if message["is_observed"]:
             return
         mean, sd = normal_moments(message["fn"], message["name"])
-        if message["fn"].event_dim == 0:
-            noise = self.noise[..., self.column]
-            self.column += 1
-        else:
-            noise = self.noise[..., self.column : self.column + mean.shape[-1]]
-            self.column += mean.shape[-1]
-        message["value"] = mean + sd * noise
+        noise = self.noise[..., self.take(message["fn"])]
+        message["value"] = mean + sd * (noise if message["fn"].event_dim else noise[..., 0])
 
 
 class Recording(Messenger):

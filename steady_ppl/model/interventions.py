@@ -12,18 +12,17 @@ from typing import Any
 import pyro.distributions as dist
 import torch
 from pyro import poutine
-from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.model.distributions import WrappedNormal, WrappedStudentT
-from steady_ppl.model.handlers import AtMean, Recording, as_vector, normal_moments, unwrapped
+from steady_ppl.model.handlers import AtMean, ByColumn, Recording, as_vector, normal_moments, unwrapped
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import row_ends
 
 Change = Callable[[Any, slice], Any]
 
 
-class Altering(Messenger):
+class Altering(ByColumn):
     """Replace the distribution of each site that a method of a program samples.
 
     Args:
@@ -32,18 +31,10 @@ class Altering(Messenger):
 
     def __init__(self, change: Change) -> None:
         super().__init__()
-        self.change, self.column = change, 0
-
-    def __enter__(self) -> Altering:
-        self.column = 0
-        super().__enter__()
-        return self
+        self.change = change
 
     def _pyro_sample(self, message: Any) -> None:
-        width = message["fn"].event_shape.numel()
-        columns = slice(self.column, self.column + width)
-        self.column += width
-        message["fn"] = self.change(message["fn"], columns)
+        message["fn"] = self.change(message["fn"], self.take(message["fn"]))
 
 
 def pushed(program: Program, pushes: Mapping[str, Tensor]) -> Altering:
