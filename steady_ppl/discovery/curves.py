@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import pyro.distributions as dist
 import torch
@@ -147,13 +148,25 @@ def by_height(values: Tensor, weights: Tensor, knots: Sequence[float], circular:
     return found.view(drives, count)
 
 
-def over_state(self, state, control, time, step, c, mean, channel, variable, knots, times):
+def over_state(
+    self: Any,
+    state: Tensor,
+    control: Tensor,
+    time: Tensor,
+    step: Tensor,
+    c: Tensor,
+    mean: Mapping[str, Tensor],
+    channel: Any,
+    variable: Any,
+    knots: Any,
+    times: Any,
+) -> Any:
     """A curve that adds to a channel."""
     value = variables(self, state, control, time, mean)[variable]
     return {channel: height(value, knots, variable in self.angles, c) * multiplier(mean, channel, times)}
 
 
-def over_reading(self, state, measured, c, chosen, circular, knots):
+def over_reading(self: Any, state: Tensor, measured: Tensor, c: Tensor, chosen: Any, circular: Any, knots: Any) -> Any:
     """A curve that adds to measurements, of what they read."""
     change = height(measured, knots, circular, c)
     return measured + change * torch.tensor([float(name in chosen) for name in self.measurement_names]).to(measured)

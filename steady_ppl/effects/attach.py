@@ -158,8 +158,8 @@ def coefficient(program: Program, variant: Variant) -> Tensor:
 
 
 def _push(base: Any, variant: Variant) -> Methods:
-    def transition(self, state, control, time, step):
-        def below():
+    def transition(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
+        def below() -> Tensor:
             return base.transition(self, state, control, time, step)
 
         mean = channel_means(self, below) if variant.needs_mean else {}
@@ -170,7 +170,7 @@ def _push(base: Any, variant: Variant) -> Methods:
 
 
 def _command(base: Any, variant: Variant) -> Methods:
-    def transition(self, state, control, time, step):
+    def transition(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
         return base.transition(
             self, state, variant(self, state, control, time, c=coefficient(self, variant)), time, step
         )
@@ -179,14 +179,14 @@ def _command(base: Any, variant: Variant) -> Methods:
 
 
 def _history(base: Any, variant: Variant) -> Methods:
-    def actuators(self, control, time):
+    def actuators(self: Any, control: Tensor, time: Tensor) -> Tensor:
         return variant(self, base.actuators(self, control, time), time, c=coefficient(self, variant))
 
     return {"actuators": actuators}
 
 
 def _measured(base: Any, variant: Variant) -> Methods:
-    def observe(self, state):
+    def observe(self: Any, state: Tensor) -> None:
         with misread(self, lambda measured: variant(self, state, measured, c=coefficient(self, variant))):
             return base.observe(self, state)
 
@@ -194,14 +194,14 @@ def _measured(base: Any, variant: Variant) -> Methods:
 
 
 def _viewpoint(base: Any, variant: Variant) -> Methods:
-    def observe(self, state):
+    def observe(self: Any, state: Tensor) -> None:
         return base.observe(self, variant(self, state, c=coefficient(self, variant)))
 
     return {"observe": observe}
 
 
 def _spread(base: Any, variant: Variant) -> Methods:
-    def transition(self, state, control, time, step):
+    def transition(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
         factors = variant(self, state, control, time, step, c=coefficient(self, variant))
         with widened(self, factors):
             return base.transition(self, state, control, time, step)
@@ -210,7 +210,7 @@ def _spread(base: Any, variant: Variant) -> Methods:
 
 
 def _blur(base: Any, variant: Variant) -> Methods:
-    def observe(self, state):
+    def observe(self: Any, state: Tensor) -> None:
         with blurred(variant(self, state, c=coefficient(self, variant))):
             return base.observe(self, state)
 
@@ -218,7 +218,7 @@ def _blur(base: Any, variant: Variant) -> Methods:
 
 
 def _tails(base: Any, variant: Variant) -> Methods:
-    def observe(self, state):
+    def observe(self: Any, state: Tensor) -> None:
         with heavy_tailed(variant(self, c=coefficient(self, variant))):
             return base.observe(self, state)
 
@@ -228,22 +228,22 @@ def _tails(base: Any, variant: Variant) -> Methods:
 def _colour(base: Any, variant: Variant) -> Methods:
     """The deviations of the last step are states, zero at the start."""
 
-    def split(self, state):
+    def split(self: Any, state: Tensor) -> tuple[Tensor, Tensor]:
         channels = len(self.channels)
         return state[..., :-channels], state[..., -channels:]
 
-    def initial(self):
+    def initial(self: Any) -> Tensor:
         start = base.initial(self)
         return torch.cat([start, start.new_zeros((*start.shape[:-1], len(self.channels)))], -1)
 
-    def transition(self, state, control, time, step):
+    def transition(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
         state, last = split(self, state)
         colouring = Coloured(self, variant(self, c=coefficient(self, variant)), last)
         with colouring:
             state = base.transition(self, state, control, time, step)
         return colouring.beside(state)
 
-    def observe(self, state):
+    def observe(self: Any, state: Tensor) -> None:
         return base.observe(self, split(self, state)[0])
 
     deviations = deviation_names(names(base.channels), names(base.states), variant)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.catalogue.planar_forces import not_planar
@@ -80,39 +81,41 @@ def _lacks_single(program: Program) -> str | None:
     return _no_controls(program)
 
 
-def thrust_asymmetry(self, control, time, c):
+def thrust_asymmetry(self: Any, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     return control * (1 + c * self.chosen_controls(("right",), control))
 
 
-def one_gain(self, control, time, c, controls):
+def one_gain(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Sequence[str]) -> Tensor:
     return control * (1 + c * self.chosen_controls(controls, control))
 
 
-def speed_dependent_gain(self, state, control, time, c):
+def speed_dependent_gain(self: Any, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     forward, lateral, _ = self.body_velocity(state)
     speed = (forward**2 + lateral**2 + 1e-12).sqrt()
     return control * (1 - c * speed).unsqueeze(-1)
 
 
-def thrust_saturation(self, control, time, c, controls, knee):
+def thrust_saturation(
+    self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Sequence[str], knee: Any
+) -> Tensor:
     beyond = control.sign() * (control.abs() - knee).relu()
     return control - c * self.chosen_controls(controls, control) * beyond
 
 
-def dead_zone(self, control, time, c, controls):
+def dead_zone(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Sequence[str]) -> Tensor:
     lost = torch.minimum(torch.maximum(control, -c), c)
     return control - self.chosen_controls(controls, control) * lost
 
 
-def actuator_lag(self, control, time, c, controls):
+def actuator_lag(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Sequence[str]) -> Tensor:
     return control + self.chosen_controls(controls, control) * (lagged(control, time, c) - control)
 
 
-def actuator_delay(self, control, time, c, controls):
+def actuator_delay(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Sequence[str]) -> Tensor:
     return control + self.chosen_controls(controls, control) * (delayed(control, time, c) - control)
 
 
-def battery_sag(self, control, time, c):
+def battery_sag(self: Any, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     return control * (1 - c * time / self.duration).unsqueeze(-1)
 
 

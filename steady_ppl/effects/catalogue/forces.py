@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.declaration import Effect
@@ -42,38 +43,52 @@ def _no_springs(program: Program) -> str | None:
     return None if any(p for p, _ in program.motion.values()) else "no channel has a position (`motion`)"
 
 
-def linear_drag(self, state, control, time, step, c, channels):
+def linear_drag(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, channels: Sequence[str]
+) -> dict[str, Tensor]:
     velocity = self.velocities(state)
     return {channel: -c * velocity[channel] for channel in channels}
 
 
-def quadratic_drag(self, state, control, time, step, c, channels):
+def quadratic_drag(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, channels: Sequence[str]
+) -> dict[str, Tensor]:
     velocity = self.velocities(state)
     return {channel: -c * velocity[channel] * velocity[channel].abs() for channel in channels}
 
 
-def coulomb_friction(self, state, control, time, step, c, channels):
+def coulomb_friction(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, channels: Sequence[str]
+) -> dict[str, Tensor]:
     velocity = self.velocities(state)
     return {channel: -c * velocity[channel] * (velocity[channel] ** 2 + 0.05**2).rsqrt() for channel in channels}
 
 
-def constant(self, state, control, time, step, c, channels):
+def constant(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, channels: Sequence[str]
+) -> dict[str, Tensor]:
     still = torch.zeros_like(state[..., 0])
     return dict.fromkeys(channels, c + still)
 
 
-def body_constant(self, state, control, time, step, c):
+def body_constant(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor
+) -> dict[str, Tensor]:
     forward, lateral = c.unbind(-1)
     still = torch.zeros_like(state[..., 0])
     return {"forward": forward + still, "lateral": lateral + still}
 
 
-def stiffness(self, state, control, time, step, c, channels):
+def stiffness(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, channels: Sequence[str]
+) -> dict[str, Tensor]:
     position = self.positions(state)
     return {channel: -c * position[channel] for channel in channels}
 
 
-def cubic_stiffness(self, state, control, time, step, c, channels):
+def cubic_stiffness(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, channels: Sequence[str]
+) -> dict[str, Tensor]:
     position = self.positions(state)
     return {channel: -c * position[channel] ** 3 for channel in channels}
 

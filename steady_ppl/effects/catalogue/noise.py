@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from torch import Tensor
+
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.catalogue.planar_forces import no_bearings
 from steady_ppl.effects.catalogue.wheels import needs_commanded_speed
@@ -33,30 +35,34 @@ def _nothing_measured(program: Program) -> str | None:
     return None if program.measurements else "the program measures nothing"
 
 
-def heavy_tails(self, c):
+def heavy_tails(self: Any, c: Tensor) -> Tensor:
     return c.clamp(0.005, 0.49)
 
 
-def measurement_noise(self, state, c):
+def measurement_noise(self: Any, state: Tensor, c: Tensor) -> Tensor:
     return c.expand(*state.shape[:-1], len(self.measurements))
 
 
-def range_dependent_noise(self, state, c):
+def range_dependent_noise(self: Any, state: Tensor, c: Tensor) -> Tensor:
     return (1 + c * self.ranges(state)).clamp(min=0.05)
 
 
-def process_noise(self, state, control, time, step, c, channels):
+def process_noise(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, channels: Sequence[str]
+) -> dict[str, Tensor]:
     return dict.fromkeys(channels, c)
 
 
-def command_noise(self, state, control, time, step, c):
+def command_noise(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor
+) -> dict[str, Tensor]:
     forward, _, yaw_rate = self.body_velocity(state)
     speed, turn = control[..., self.control_index("speed")], control[..., self.control_index("turn")]
     slow, askew = (speed - forward).abs(), (turn - yaw_rate).abs()
     return {"forward": (1 + c * slow).clamp(min=0.05), "yaw": (1 + c * askew).clamp(min=0.05)}
 
 
-def coloured_noise(self, c, channels):
+def coloured_noise(self: Any, c: Tensor, channels: Sequence[str]) -> dict[str, Tensor]:
     return {channel: c.clamp(-0.99, 0.99) for channel in channels}
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.declaration import Effect
@@ -82,13 +83,15 @@ def _starts(program: Program) -> torch.Tensor:
         return broadcast_event(program.initial(), torch.Size((1, STARTS)), 1)
 
 
-def slope(self, state, control, time, step, c):
+def slope(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor) -> dict[str, Tensor]:
     x, y = c.unbind(-1)
     cos, sin = state[..., 2].cos(), state[..., 2].sin()
     return {"forward": cos * x + sin * y, "lateral": cos * y - sin * x}
 
 
-def wind(self, state, control, time, step, c, drag):
+def wind(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, drag: Any
+) -> dict[str, Tensor]:
     x, y = c.unbind(-1)
     cos, sin = state[..., 2].cos(), state[..., 2].sin()
     forward, lateral, _ = self.body_velocity(state)
@@ -99,38 +102,55 @@ def wind(self, state, control, time, step, c, drag):
     }
 
 
-def lateral_coupling(self, state, control, time, step, c):
+def lateral_coupling(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor
+) -> dict[str, Tensor]:
     left, right = control[..., self.control_index("left")], control[..., self.control_index("right")]
     return {"lateral": c * (left - right)}
 
 
-def weathervane(self, state, control, time, step, c):
+def weathervane(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor) -> dict[str, Tensor]:
     forward, lateral, _ = self.body_velocity(state)
     return {"yaw": -c * forward * lateral}
 
 
-def magnus(self, state, control, time, step, c):
+def magnus(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor) -> dict[str, Tensor]:
     forward, _, yaw_rate = self.body_velocity(state)
     return {"lateral": -c * forward * yaw_rate}
 
 
-def lever_arm(self, state, control, time, step, c, mean):
+def lever_arm(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
     yaw_rate = state[..., 5]
     return {"forward": c * yaw_rate**2, "lateral": -c * mean["yaw"]}
 
 
-def side_slip(self, state, control, time, step, c, lead):
+def side_slip(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, lead: Any
+) -> dict[str, Tensor]:
     _, lateral, yaw_rate = self.body_velocity(state)
     return {"lateral": -c * (lateral - lead * yaw_rate)}
 
 
-def sticky_patch(self, state, control, time, step, c, x, y, radius):
+def sticky_patch(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, x: Any, y: Any, radius: Any
+) -> dict[str, Tensor]:
     forward, lateral, _ = self.body_velocity(state)
     inside = (-((state[..., 0] - x) ** 2 + (state[..., 1] - y) ** 2) / (2 * radius**2)).exp()
     return {"forward": -c * forward * inside, "lateral": -c * lateral * inside}
 
 
-def acceleration_limit(self, state, control, time, step, c, channels, mean):
+def acceleration_limit(
+    self: Any,
+    state: Tensor,
+    control: Tensor,
+    time: Tensor,
+    step: Tensor,
+    c: Tensor,
+    channels: Sequence[str],
+    mean: Mapping[str, Tensor],
+) -> dict[str, Tensor]:
     return {channel: torch.minimum(torch.maximum(mean[channel], -c), c) - mean[channel] for channel in channels}
 
 

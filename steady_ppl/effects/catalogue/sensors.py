@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from torch import Tensor
+
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.catalogue.planar_forces import no_bearings
 from steady_ppl.effects.declaration import Effect, power_of_two_below
@@ -50,21 +52,21 @@ def _no_motion(program: Program) -> str | None:
     return "no state component is known to be the velocity of another (`motion`)"
 
 
-def common_bias(self, state, measured, c):
+def common_bias(self: Any, state: Tensor, measured: Tensor, c: Tensor) -> Tensor:
     return measured + c
 
 
-def one_bias(self, state, measured, c, component):
+def one_bias(self: Any, state: Tensor, measured: Tensor, c: Tensor, component: Any) -> Tensor:
     bias = measured.new_zeros(measured.shape[-1])
     bias[component] = 1.0
     return measured + c * bias
 
 
-def sensor_scale(self, state, measured, c):
+def sensor_scale(self: Any, state: Tensor, measured: Tensor, c: Tensor) -> Tensor:
     return measured * (1 + c)
 
 
-def clock_offset(self, state, c):
+def clock_offset(self: Any, state: Tensor, c: Tensor) -> Tensor:
     return self.earlier(state, c)
 
 

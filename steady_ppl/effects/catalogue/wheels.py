@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.catalogue.planar_forces import needs_grip, not_planar
@@ -28,54 +29,69 @@ def _each_channel(program: Program, data: Trajectories | None) -> Sequence[Mappi
     return [{"channels": (name,), "at": name} for name in program.channel_names]
 
 
-def response_time(self, state, control, time, step, c, channels, mean):
+def response_time(
+    self: Any,
+    state: Tensor,
+    control: Tensor,
+    time: Tensor,
+    step: Tensor,
+    c: Tensor,
+    channels: Sequence[str],
+    mean: Mapping[str, Tensor],
+) -> dict[str, Tensor]:
     slower, carried = c / (c + self.settles_in(step)), self.carried(state)
     return {channel: (carried[channel] - mean[channel]) * slower for channel in channels}
 
 
-def curvature_steering(self, state, control, time, c):
+def curvature_steering(self: Any, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     speed, turn = control[..., self.control_index("speed")], control[..., self.control_index("turn")]
     forward, _, _ = self.body_velocity(state)
     asked = turn * speed * forward / (speed**2 + 0.05**2)
     return control + c * (asked - turn).unsqueeze(-1) * self.chosen_controls(("turn",), control)
 
 
-def steering_offset(self, state, control, time, c):
+def steering_offset(self: Any, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     forward, _, _ = self.body_velocity(state)
     more = c * forward
     return control + more.unsqueeze(-1) * self.chosen_controls(("turn",), control)
 
 
-def understeer(self, state, control, time, c):
+def understeer(self: Any, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     forward, _, _ = self.body_velocity(state)
     lost = c * forward**2
     return control * (1 - lost.unsqueeze(-1) * self.chosen_controls(("turn",), control))
 
 
-def reverse_steering(self, state, control, time, c):
+def reverse_steering(self: Any, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     forward, _, _ = self.body_velocity(state)
     lost = c * torch.tanh(forward / 0.1)
     return control * (1 - lost.unsqueeze(-1) * self.chosen_controls(("turn",), control))
 
 
-def lever_arm(self, state, control, time, step, c, mean):
+def lever_arm(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
     yaw_rate = state[..., 5]
     return {"lateral": c * (yaw_rate / self.settles_in(step) + mean["yaw"])}
 
 
-def crab_angle(self, state, control, time, step, c, mean):
+def crab_angle(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
     forward, lateral, yaw_rate = self.body_velocity(state)
     change = mean["forward"] + lateral * yaw_rate
     return {"lateral": c * (forward / self.settles_in(step) + change)}
 
 
-def slip_angle(self, state, control, time, step, c, mean):
+def slip_angle(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
     forward, lateral, yaw_rate = self.body_velocity(state)
     change = (mean["forward"] + lateral * yaw_rate) * yaw_rate + forward * mean["yaw"]
     return {"lateral": -c * (forward * yaw_rate / self.settles_in(step) + change)}
 
 
-def caster(self, state, control, time, step, c):
+def caster(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor) -> dict[str, Tensor]:
     forward, _, yaw_rate = self.body_velocity(state)
     return {"yaw": -c * forward * yaw_rate}
 
