@@ -136,7 +136,7 @@ def evaluate(
     from steady_ppl.data.table import read_table
     from steady_ppl.model.loading import load_program
     from steady_ppl.model.program import for_program
-    from steady_ppl.runs.diagnostics import doubts_of_units
+    from steady_ppl.runs.diagnostics import diagnose_units
     from steady_ppl.runs.recipes import fingerprint
     from steady_ppl.smc.genealogy import FEW
     from steady_ppl.utils.files import require_place
@@ -160,7 +160,7 @@ def evaluate(
             lines.append(f"{label}: landmarks off by {error['rms']:.3g} m rms, {error['most']:.3g} m at most{how}")
     rows = [{"run": folder, **result} for folder, result in zip(folders, results, strict=True)]
     present("\n".join(lines), {"runs": rows}, json_file)
-    doubts = {doubt: None for fit in fits for doubt in doubts_of_units(fit.program, for_program(fit.program, drives))}
+    doubts = {doubt: None for fit in fits for doubt in diagnose_units(fit.program, for_program(fit.program, drives))}
     for reason in [
         *incomparable(results, folders),
         *used_before(labels, fingerprint(drives)),
@@ -199,7 +199,7 @@ def states(
     """
     from steady_ppl.data.table import read_table
     from steady_ppl.model.program import for_program
-    from steady_ppl.runs.diagnostics import doubts_of_units
+    from steady_ppl.runs.diagnostics import diagnose_units
     from steady_ppl.runs.fit import Fit
     from steady_ppl.runs.posterior import require_states_file, write_states
     from steady_ppl.smc.genealogy import few_starts
@@ -213,7 +213,7 @@ def states(
     write_states(posterior, out)
     tell(f"{out}: {len(drives)} drives, {draws} draws of each")
     scarce = few_starts(float(posterior["sample_stats"]["roots"].min()))
-    for doubt in [*doubts_of_units(fit.program, for_program(fit.program, drives)), *([scarce] if scarce else [])]:
+    for doubt in [*diagnose_units(fit.program, for_program(fit.program, drives)), *([scarce] if scarce else [])]:
         say(doubt)
 
 

@@ -18,7 +18,7 @@ from steady_ppl.cli.common import as_refusal
 from steady_ppl.cli.progress import progress_line
 from steady_ppl.errors import SteadyError
 from steady_ppl.utils.progress import listening
-from steady_ppl.utils.text import commanded, hushed, say, tell
+from steady_ppl.utils.text import commanded, quietly, say, tell
 
 INTERRUPTED = 130  # what typer returns for Ctrl-C
 # left out of the help, which then fits one screen; as --debug, which the line of an unexpected error names
@@ -185,7 +185,7 @@ def main(arguments: list[str] | None = None) -> int:
         if isinstance(option, typer.core.TyperOption) and option.name in COMPLETION:
             option.hidden = True
     words = ["steady", *(word for word in arguments if word not in ("--resume", "--force"))]
-    with hushed("quiet" in asked), commanded(words), progress_line() as line, listening(line):
+    with quietly("quiet" in asked), commanded(words), progress_line() as line, listening(line):
         try:
             code = command.main(arguments, prog_name="steady", standalone_mode=False) or 0
             if code == INTERRUPTED:

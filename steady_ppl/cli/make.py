@@ -23,10 +23,10 @@ NEXT = (
 
 def init(folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to make.")]) -> None:
     """Make a folder to work in: programs, recipes and first tables of drives to try them on."""
-    from steady_ppl.runs.workbench import ROOMS, furnish
+    from steady_ppl.runs.workbench import FOLDERS, make_workbench
 
-    tables = furnish(folder)
-    tell(f"{folder}: {', '.join(f'{room}/' for room in ROOMS)}, {', '.join(table.name for table in tables)}")
+    tables = make_workbench(folder)
+    tell(f"{folder}: {', '.join(f'{room}/' for room in FOLDERS)}, {', '.join(table.name for table in tables)}")
     tell("\n".join(["", "next:", f"  cd {shlex.quote(str(folder))}", *(f"  {line}" for line in NEXT)]))
 
 

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from steady_ppl.utils.text import harmless, is_quiet
+from steady_ppl.utils.text import is_quiet, printable
 
 PATIENCE = 2.0  # s, before anything is said
 CLEAR = "\r\x1b[K"
@@ -40,7 +40,7 @@ class _Line:
                 now = time.monotonic()
                 if self.doing and now - self.begun > PATIENCE:
                     said = in_words(self.doing, self.share, self.since - self.begun, now - self.begun)
-                    print(f"{CLEAR}{harmless(said)}", end="", file=sys.stderr, flush=True)
+                    print(f"{CLEAR}{printable(said)}", end="", file=sys.stderr, flush=True)
                     self.drawn = True
 
     def _clear(self) -> None:

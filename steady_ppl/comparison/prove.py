@@ -29,7 +29,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.predict import named_horizons
 from steady_ppl.model.program import Program
-from steady_ppl.runs.diagnostics import doubts_of_units
+from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.progress import stages
 
@@ -101,7 +101,7 @@ def prove(
     horizons = named_horizons(before.data, SECONDS)
     notes += (
         before.data.uneven_steps
-        + doubts_of_units(before.program, before.data)
+        + diagnose_units(before.program, before.data)
         + _few_starts(before.data, horizons, known_start)
     )
     return Proof(

@@ -31,7 +31,7 @@ from steady_ppl.gaussian.linearize import why_not_linear
 from steady_ppl.gaussian.predict import named_horizons, predict
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.model.program import Program, for_program
-from steady_ppl.runs.diagnostics import doubts_of_units
+from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
@@ -93,7 +93,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
             scores.dispersion.mean(-1),
         )
     notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
-    notes += run.uneven_steps + doubts_of_units(program, run)
+    notes += run.uneven_steps + diagnose_units(program, run)
     if step.note:
         notes.append(f"refitted to these drives, {step.note}")
     if step.uncompared:

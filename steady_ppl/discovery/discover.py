@@ -23,7 +23,7 @@ from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.linearize import why_not_linear
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.program import Program, for_program
-from steady_ppl.runs.diagnostics import doubts_of_units
+from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
@@ -138,7 +138,7 @@ def discover(
         before=fits[0],
         after=fits[1],
         doubts=_doubts(found, is_fitted),
-        notes=notes + doubts_of_units(program, drives[0]) + _notes(found) + far_off(proof.rows, drives[1]),
+        notes=notes + diagnose_units(program, drives[0]) + _notes(found) + far_off(proof.rows, drives[1]),
     )
 
 

@@ -28,7 +28,7 @@ COLLAPSED = (
 TURNS = 5 * math.pi  # rad; beyond it a reading on a circle looks like degrees
 
 
-def doubts_of_fit(fit: Fit, declared: Mapping[str, Tensor]) -> list[str]:
+def diagnose_fit(fit: Fit, declared: Mapping[str, Tensor]) -> list[str]:
     """That it had not converged, or that it has all but taken away what the program declares.
 
     Args:
@@ -57,7 +57,7 @@ def doubts_of_fit(fit: Fit, declared: Mapping[str, Tensor]) -> list[str]:
     return found
 
 
-def doubts_of_units(program: Program, data: Trajectories) -> list[str]:
+def diagnose_units(program: Program, data: Trajectories) -> list[str]:
     """What is read as radians and looks like degrees: beyond several turns, and all within a circle's degrees.
 
     Of measurements all are looked at, of known angles those of the first rows alone, since later ones may have counted

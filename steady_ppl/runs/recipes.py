@@ -15,7 +15,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, require
 from steady_ppl.model.loading import program_file, run_file
 from steady_ppl.model.program import Program, for_program
-from steady_ppl.runs.diagnostics import doubts_of_fit, doubts_of_units
+from steady_ppl.runs.diagnostics import diagnose_fit, diagnose_units
 from steady_ppl.runs.fit import Fit, program_source, sha256, versions
 from steady_ppl.runs.folder import CHECKPOINT, require_same, run_folder, write_record
 from steady_ppl.runs.workbench import workbench
@@ -135,7 +135,7 @@ def run_recipe(
     for part in (table, valid):
         if part is not None:
             columns = for_program(program, part)
-            doubts += [said for said in doubts_of_units(program, columns) if said not in doubts]
+            doubts += [said for said in diagnose_units(program, columns) if said not in doubts]
             if known_start:
                 _ = columns.known_start
     declared = {key: value.clone() for key, value in program.state_dict().items()}
@@ -168,7 +168,7 @@ def run_recipe(
         fitted = recipe(*call.args, **call.kwargs)
         if not isinstance(fitted, Fit):
             raise UsageError(f"recipe {name} returned {type(fitted).__name__}, not a Fit")
-        fitted.notes += doubts + doubts_of_fit(fitted, declared)
+        fitted.notes += doubts + diagnose_fit(fitted, declared)
         if valid is None and trains(recipe) and not (fitted.trained and fitted.trained.interrupted):
             fitted.notes.append("no --valid table: trained to the last step, nothing held out decides when to stop")
         fitted.save_into(folder, table, begun)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from steady_ppl.errors import UsageError
 
-ROOMS = ("models", "inference", "notebooks", "studies")
+FOLDERS = ("models", "inference", "notebooks", "studies")
 LEFT_OUT = {"__pycache__", ".ipynb_checkpoints"}
 DRIVES = {"train": 16, "valid": 16, "test": 32}
 TRUTH = "models/hovercraft.py:HovercraftTruth"
@@ -25,14 +25,14 @@ def workbench() -> Path:
     """
     here = Path(__file__).resolve().parents[1]  # the package
     for folder in (here.parent, here / "workbench"):
-        if all((folder / room).is_dir() for room in ROOMS) and (folder / "inference" / "steady.py").is_file():
+        if all((folder / room).is_dir() for room in FOLDERS) and (folder / "inference" / "steady.py").is_file():
             return folder
     raise UsageError(
         f"models, recipes, notebooks and studies are missing from this installation ({sysconfig.get_path('purelib')})"
     )
 
 
-def furnish(folder: Path) -> list[Path]:
+def make_workbench(folder: Path) -> list[Path]:
     """Copy the rooms into a folder and simulate first tables of drives there.
 
     Args:
@@ -81,7 +81,7 @@ def empty_again(folder: Path) -> Iterator[None]:
 
 def _copy_rooms(folder: Path) -> None:
     bench = workbench()
-    files = [file for room in ROOMS for file in sorted((bench / room).rglob("*")) if file.is_file()]
+    files = [file for room in FOLDERS for file in sorted((bench / room).rglob("*")) if file.is_file()]
     for file in files:
         place = file.relative_to(bench)
         if not LEFT_OUT & {*place.parts}:

@@ -18,7 +18,7 @@ from scipy import stats
 from steady_ppl.errors import UsageError
 from steady_ppl.plotting.comparison import COLORS, MARKS
 from steady_ppl.studies.plan import IN_LIMITS, MAX_NUMBER, Picture, Plan
-from steady_ppl.utils.text import harmless
+from steady_ppl.utils.text import printable
 
 SIZES = (-1.0, 0.0, *(1.25 ** (place - 0.5) for place in range(-6, 12)), math.inf)
 """Ends of ranges of what is missing, in detection limits: each a quarter wider than the one before, one of them around
@@ -57,7 +57,7 @@ def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
     if picture.chosen_by:
         own = chosen(picture, own)
     figure = Figure(figsize=(5.4 * len(picture.y), 5.4), layout="constrained")
-    figure.suptitle(harmless(plan.title), fontsize=11, parse_math=False)
+    figure.suptitle(printable(plan.title), fontsize=11, parse_math=False)
     lines = _lines(picture, own)
     panels = figure.subplots(1, len(picture.y), squeeze=False, sharex=picture.x == IN_LIMITS)[0]
     for panel, column in zip(panels, picture.y, strict=True):
@@ -126,7 +126,7 @@ def _panel(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str,
     published = {picture.labels.get(name, name): others for name, others in given.items()}
     crosses = Counter[float]()
     for index, (name, rows) in enumerate(lines):
-        look, said = _look(index), harmless(name, kept="")
+        look, said = _look(index), printable(name, kept="")
         found = points(rows, picture.x, column)
         if rows[picture.x].isna().all() and rows[column].notna().any():  # the same wherever x is
             axes.axhline(float(rows[column].astype(float).mean()), color=look["color"], lw=1.5, ls=":", label=said)
@@ -136,10 +136,10 @@ def _panel(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str,
         _published(axes, published.pop(name, []), look["color"], PUBLISHED)
         _failed(axes, rows, picture.x, look, said, crosses)
     for index, (name, others) in enumerate(published.items(), len(lines)):
-        _published(axes, others, _look(index)["color"], f"{harmless(name, kept='')}, {PUBLISHED}")
+        _published(axes, others, _look(index)["color"], f"{printable(name, kept='')}, {PUBLISHED}")
     _scale(axes, picture, column, lines)
-    axes.set_xlabel(harmless(picture.labels.get(picture.x, picture.x)), parse_math=False)
-    axes.set_ylabel(harmless(picture.labels.get(column, column)), parse_math=False)
+    axes.set_xlabel(printable(picture.labels.get(picture.x, picture.x)), parse_math=False)
+    axes.set_ylabel(printable(picture.labels.get(column, column)), parse_math=False)
     axes.grid(alpha=0.25)
 
 

@@ -22,7 +22,7 @@ from pyarrow import types
 from steady_ppl.errors import RunError
 from steady_ppl.runs.folder import only_writer
 from steady_ppl.utils.files import require_file, whole_file
-from steady_ppl.utils.text import harmless
+from steady_ppl.utils.text import printable
 
 TABLE, EARLIER, ARRIVED = "results.parquet", "earlier.parquet", "arrived"
 KINDS = (types.is_integer, types.is_floating, types.is_boolean, types.is_string, types.is_large_string, types.is_null)
@@ -45,7 +45,7 @@ class StudyTable:
         Raises:
             RunError: it cannot be written.
         """
-        seen = {name: harmless(value) if isinstance(value, str) else value for name, value in row.items()}
+        seen = {name: printable(value) if isinstance(value, str) else value for name, value in row.items()}
         _write(pd.DataFrame([seen]), self.folder / ARRIVED / f"{row['key']}.parquet")
         self.waiting += 1
         if self.waiting >= max(ENOUGH, self.rows // 10):

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from steady_ppl.errors import SteadyError, UsageError
-from steady_ppl.utils.text import harmless
+from steady_ppl.utils.text import printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -86,7 +86,7 @@ def write_picture(figure: Figure, path: Path) -> None:
     from matplotlib.text import Text
 
     for text in figure.findobj(Text):
-        text.set_text(harmless(text.get_text()))  # matplotlib draws no name that is not UTF-8
+        text.set_text(printable(text.get_text()))  # matplotlib draws no name that is not UTF-8
     with whole_file(path) as beside:
         figure.savefig(beside, format=path.suffix.lower()[1:], dpi=150)
 

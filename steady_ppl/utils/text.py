@@ -13,11 +13,11 @@ from contextvars import ContextVar
 UNSEEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # categories of Unicode: control, format, half of a pair, line separators
 
 
-def harmless(text: str, kept: str = "\t\n") -> str:
+def printable(text: str, kept: str = "\t\n") -> str:
     r"""The text with what is not seen spelt out, but for the characters that are `kept`.
 
     Example:
-        >>> harmless("drive \x1b[2J")
+        >>> printable("drive \x1b[2J")
         'drive \\x1b[2J'
     """
     if text.isprintable():
@@ -30,7 +30,7 @@ def harmless(text: str, kept: str = "\t\n") -> str:
 
 def tell(text: object, *, end: str = "\n", aside: bool = False) -> None:
     """Print for a person or a pipe; `aside` goes to stderr. Everything that a command prints goes through here."""
-    print(harmless(str(text)), end=end, file=sys.stderr if aside else sys.stdout, flush=True)
+    print(printable(str(text)), end=end, file=sys.stderr if aside else sys.stdout, flush=True)
 
 
 def shown(text: str, most: int | None = None) -> str:
@@ -40,7 +40,7 @@ def shown(text: str, most: int | None = None) -> str:
         >>> shown("drive\\x1b[2J", most=40)
         'drive\\\\x1b[2J'
     """
-    return harmless(text if most is None or len(text) <= most else f"{text[: most - 1]}…", kept="")
+    return printable(text if most is None or len(text) <= most else f"{text[: most - 1]}…", kept="")
 
 
 def one_line(error: BaseException) -> str:
@@ -56,7 +56,7 @@ _quiet: ContextVar[bool] = ContextVar("quiet", default=False)
 
 
 @contextmanager
-def hushed(quiet: bool) -> Iterator[None]:
+def quietly(quiet: bool) -> Iterator[None]:
     """Say nothing but errors and results, if asked for."""
     token = _quiet.set(quiet)
     try:

@@ -15,7 +15,7 @@ from pyro.nn import PyroParam
 from small import HOVERCRAFT, steady, written
 
 import steady_ppl as st
-from steady_ppl.runs.diagnostics import doubts_of_fit, doubts_of_units
+from steady_ppl.runs.diagnostics import diagnose_fit, diagnose_units
 from steady_ppl.runs.recipes import find_recipe
 from steady_ppl.training.loop import Trained
 
@@ -96,7 +96,7 @@ def trained(*values: float, kept: int | None = None, interrupted: bool = False) 
 def test_a_training_that_still_rises_says_so(found: Trained, rising: float | None):
     assert found.still_rising == (None if rising is None else pytest.approx(rising))
     program = st.load_program(HOVERCRAFT)
-    notes = doubts_of_fit(st.Fit(program, "steady", {"steps": 100}, trained=found), program.state_dict())
+    notes = diagnose_fit(st.Fit(program, "steady", {"steps": 100}, trained=found), program.state_dict())
     assert [note.startswith("not converged") and "--steps 400" in note for note in notes] == [True] * bool(rising)
 
 
@@ -118,23 +118,23 @@ def test_a_number_that_a_fit_takes_away_is_named():
 
     program = Named()
     declared = {name: value.clone() for name, value in program.state_dict().items()}
-    assert doubts_of_fit(st.Fit(program, "hand"), declared) == []
+    assert diagnose_fit(st.Fit(program, "hand"), declared) == []
     program.gains, program.noise = torch.tensor([1.0, 0.05]), torch.tensor([1e-3, 1e-3, 1e-3])  # noise is a guess
-    (said,) = doubts_of_fit(st.Fit(program, "hand"), declared)
+    (said,) = diagnose_fit(st.Fit(program, "hand"), declared)
     assert said.startswith("gains[1] fell from 2 to 0.05")
     program.guesses = ()
-    assert len(doubts_of_fit(st.Fit(program, "hand"), declared)) == 4
+    assert len(diagnose_fit(st.Fit(program, "hand"), declared)) == 4
 
 
 def test_degrees_are_asked_for(tmp_path: Path, drives, capsys):
     program = st.load_program(HOVERCRAFT)
     data = st.for_program(program, drives[0])
-    assert doubts_of_units(program, data) == []
+    assert diagnose_units(program, data) == []
     degrees = replace(drives[0], measurements=torch.rad2deg(drives[0].measurements))
-    found = doubts_of_units(program, st.for_program(program, degrees))
+    found = diagnose_units(program, st.for_program(program, degrees))
     assert len(found) == 4 and all("are these degrees?" in said for said in found)
     many_turns = replace(data, measurements=data.measurements + 4 * math.pi)
-    assert doubts_of_units(program, many_turns) == []  # an angle that counts its turns
+    assert diagnose_units(program, many_turns) == []  # an angle that counts its turns
     table = written(tmp_path / "degrees.csv", degrees)
     assert steady("fit", HOVERCRAFT, table, "--recipe", "hand", "--out", tmp_path / "run") == 0
     assert "y.bearing_0 is between" in capsys.readouterr().err
