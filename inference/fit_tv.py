@@ -12,9 +12,8 @@ import warnings
 import numpy as np
 import torch
 
-from steady_ppl import DataError, Fit, Trajectories, UnknownMap, UsageError, for_program, seeded
+from steady_ppl import DataError, Fit, Trajectories, UnknownMap, UsageError, fixes, for_program, seeded
 from steady_ppl.errors import ComputationError, require
-from steady_ppl.gaussian import single_row_map as fixes
 
 from . import fit_truth
 

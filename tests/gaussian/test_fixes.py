@@ -10,8 +10,7 @@ import torch
 from examples import drives, example
 from small import simulated
 
-from steady_ppl import DataError, for_program, seeded
-from steady_ppl.gaussian import single_row_map as fixes
+from steady_ppl import DataError, fixes, for_program, seeded
 from steady_ppl.runs.recipes import recipe_folder
 from steady_ppl.utils.angles import wrap
 
