@@ -18,8 +18,9 @@ from steady_ppl.errors import DataError, FilterError, ProgramError, require
 from steady_ppl.model.handlers import Recording, Replaying, masked, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, sample_row
-from steady_ppl.smc.filter import STEPS_WORTH_COMPILING, Proposal, particle_filter
+from steady_ppl.smc.filter import STEPS_WORTH_COMPILING, particle_filter
 from steady_ppl.smc.genealogy import Paths
+from steady_ppl.smc.proposal import Proposal
 from steady_ppl.utils.angles import wrap
 
 HUNDREDS = 100  # of E steps are in a training

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from functools import partial
-from typing import Any
+from typing import NamedTuple
 
 import torch
 from pyro.poutine.messenger import Messenger
@@ -25,10 +25,195 @@ from steady_ppl.model.stability import divergence
 from steady_ppl.model.substeps import advance, channel_values
 from steady_ppl.smc.backends import Stepping, stepping_for
 from steady_ppl.smc.genealogy import Filtered
-from steady_ppl.smc.resampling import effective_sample_size, normalise, systematic, take
+from steady_ppl.smc.proposal import Proposal
+from steady_ppl.smc.resampling import Resampler, effective_sample_size, normalise, systematic, take
 
 STEPS_WORTH_COMPILING = 1_000_000  # steps of particles, which take the program's own lines a second
 OnFrame = Callable[[int, Tensor, Tensor, Tensor], None]
+
+
+class FilterState(NamedTuple):
+    """The particles that have come to a row, whose measurements they have yet to meet; at the end, the last row's.
+
+    Attributes:
+        states: `(N, B, D)`.
+        log_weights: `(N, B)` in double precision. Their exponentials sum to one, unless a proposal's ratio has entered.
+        roots: `(N, B)`, the first row's particle that each descends from.
+        evidence: log p(y_t | y_0 … y_{t-1}) of every row before, `(B,)` each; with a lookahead these telescope.
+    """
+
+    states: Tensor
+    log_weights: Tensor
+    roots: Tensor
+    evidence: tuple[Tensor, ...] = ()
+
+    @property
+    def log_likelihood(self) -> Tensor:
+        """The estimate of log p(y) so far, `(B,)`."""
+        return torch.stack(self.evidence).sum(0) if self.evidence else torch.zeros_like(self.log_weights[0])
+
+
+class Step(NamedTuple):
+    """What a filter did at a row.
+
+    Attributes:
+        effective_sizes: `(B,)` ESS once the row is weighed; N where nothing was weighed.
+        blown_up: `(B,)` how many weights were not numbers; they count as zero.
+        ancestors: `(N, B)`, the particles that move on; None: each.
+        noise: value of each site of `transition` from this row, `(N, B, ...)`; empty at the last row.
+    """
+
+    effective_sizes: Tensor
+    blown_up: Tensor
+    ancestors: Tensor | None
+    noise: dict[str, Tensor]
+
+
+class _Weighed(NamedTuple):
+    """Particles with a row's measurements in their weights: `weights` `(N, B)` sum to one and know of the `future`."""
+
+    log_weights: Tensor
+    weights: Tensor
+    future: Tensor | None
+    evidence: Tensor
+    effective_sizes: Tensor
+    blown_up: Tensor
+
+
+class ParticleFilter:
+    """A particle filter that goes through a table row by row: `init`, then a `step` a row.
+
+    Args:
+        program, data, particles, observation_weight, known_start, resample_below, proposal, resampler, kernels,
+            on_frame: see `particle_filter`.
+
+    Attributes:
+        start: the sites of `initial`, known after `init`.
+        stepping: how the program's methods run, known after `init`.
+        in_plain_torch: why no kernels serve; None where they do or were not asked for.
+    """
+
+    start: Recording
+    stepping: Stepping
+    in_plain_torch: str | None = None
+
+    def __init__(
+        self,
+        program: Program,
+        data: Trajectories,
+        *,
+        particles: int,
+        observation_weight: float | Tensor = 1.0,
+        known_start: bool = False,
+        resample_below: float = 0.5,
+        proposal: Proposal | None = None,
+        resampler: Resampler = systematic,
+        kernels: bool | None = None,
+        on_frame: OnFrame | None = None,
+    ) -> None:
+        self.program, self.data, self.particles = program, data, particles
+        self.observation_weight, self.known_start, self.resample_below = observation_weight, known_start, resample_below
+        self.proposal, self.resampler, self.on_frame = proposal or Proposal(), resampler, on_frame
+        if self.proposal.looks_ahead and on_frame is not None:
+            raise ValueError(
+                "on_frame sees what is predicted: a filter that looks ahead has seen the later measurements"
+            )
+        self.bootstrap = type(self.proposal) is Proposal
+        self.kernels = particles * data.time.numel() >= STEPS_WORTH_COMPILING if kernels is None else kernels
+        rows, trajectories = data.time.shape
+        self.last, self.left = rows - 1, torch.Size((particles, 1, trajectories))
+        self.inside = data.rows
+        self.ended = (~self.inside).any(1).tolist()  # rows past a trajectory's end
+        self.observed = data.observed.any(-1).any(-1).tolist()
+
+    @torch.no_grad()
+    def init(self) -> FilterState:
+        """Draw the particles' starts.
+
+        Raises:
+            ProgramError: a known start, and `initial` returns another state than the one that it samples.
+        """
+        program, data, trajectories = self.program, self.data, self.left[-1]
+        noise, log_ratio = (None, 0.0) if self.known_start else self.proposal.start(self.particles)
+        drawing = KnownStart(data.known_start) if self.known_start else _given(noise)
+        self.start = Recording()
+        with running(*self.left), self.start, drawing:
+            states = program.initial()
+        states = broadcast_event(states, self.left, 1).squeeze(1)
+        if self.known_start and not bool((states == data.known_start).all()):
+            raise ProgramError(
+                "a known start needs initial() to return the sampled state as it is; it returns another", site="initial"
+            )
+        self.stepping = Stepping(program, data, self.observation_weight)
+        if self.kernels and self.last > 0:
+            self.stepping, self.in_plain_torch = stepping_for(program, data, states, self.observation_weight)
+        even = states.new_full((trajectories, self.particles), -math.log(self.particles), dtype=torch.float64).t()
+        self._unmoved = torch.arange(self.particles, device=states.device).expand(trajectories, -1).t()
+        self._none, self._all = even.new_zeros(trajectories), even.new_full((trajectories,), float(self.particles))
+        return FilterState(states=states, log_weights=even + log_ratio, roots=self._unmoved)
+
+    @torch.no_grad()
+    def step(self, state: FilterState, row: int) -> tuple[FilterState, Step]:
+        """Weigh the particles at a row, resample those trajectories that need it, and move on to the next row.
+
+        Args:
+            state: of this row.
+            row: in 0 … T; after the last one nothing moves.
+        """
+        weighed = self._weigh(state, row)
+        log_weights, roots, ancestors = weighed.log_weights, state.roots, None
+        if row < self.last:
+            log_weights, roots, ancestors = self._resample(weighed, roots)
+        if self.on_frame is not None:
+            self.on_frame(row, state.states, state.log_weights, weighed.log_weights)
+        states, noise = state.states, dict[str, Tensor]()
+        if row < self.last:
+            states, log_weights, noise = self._move(row, states, log_weights, ancestors)
+        return (
+            FilterState(states, log_weights, roots, (*state.evidence, weighed.evidence)),
+            Step(weighed.effective_sizes, weighed.blown_up, ancestors, noise),
+        )
+
+    def _weigh(self, state: FilterState, row: int) -> _Weighed:
+        observed, future = self.observed[row], None
+        if self.bootstrap and not observed:
+            return _Weighed(state.log_weights, state.log_weights, None, self._none, self._all, self._none)
+        log_weights = state.log_weights + (self.stepping.log_density(row, state.states) if observed else 0.0)
+        if self.proposal.looks_ahead:
+            future = self._within(row, self.proposal.log_future(row, state.states))
+        expected = log_weights if future is None else log_weights + future
+        broken = expected.isnan()  # a particle that blew up explains no measurement
+        log_weights = log_weights.masked_fill(broken, -math.inf)
+        weights, evidence = normalise(expected.masked_fill_(broken, -math.inf))
+        sizes = effective_sample_size(weights)
+        return _Weighed(log_weights - evidence, weights, future, evidence, sizes, broken.sum(0, dtype=torch.float64))
+
+    def _resample(self, weighed: _Weighed, roots: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Log-weights, roots and ancestors of the particles that move on."""
+        log_weights = weighed.log_weights
+        exhausted = weighed.effective_sizes < self.resample_below * self.particles
+        if self.resample_below <= 0 or (log_weights.device.type == "cpu" and not bool(exhausted.any())):
+            return log_weights, roots, None
+        ancestors = torch.where(exhausted, self.resampler(weighed.weights, self.particles), self._unmoved)
+        fresh = -math.log(self.particles) - (0.0 if weighed.future is None else take(weighed.future, ancestors))
+        return torch.where(exhausted, fresh, log_weights), take(roots, ancestors), ancestors
+
+    def _move(
+        self, row: int, states: Tensor, log_weights: Tensor, ancestors: Tensor | None
+    ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        """States at the next row, their log-weights, and the noise that led there."""
+        if self.bootstrap:  # a kernel picks the ancestors as it moves them
+            moved, values = self.stepping.transition(row, states, ancestors, None)
+            return moved, log_weights, values
+        if ancestors is not None:
+            states = take(states, ancestors)
+        noise, log_ratio = self.proposal.step(row, states)
+        moved, values = self.stepping.transition(row, states, None, noise)
+        return moved, log_weights + self._within(row + 1, torch.as_tensor(log_ratio, dtype=torch.float64)), values
+
+    def _within(self, row: int, values: Tensor) -> Tensor:
+        """The same, zero past a trajectory's end."""
+        return torch.where(self.inside[row], values, 0.0) if self.ended[row] else values
 
 
 @torch.no_grad()
@@ -41,6 +226,7 @@ def particle_filter(
     known_start: bool = False,
     resample_below: float = 0.5,
     proposal: Proposal | None = None,
+    resampler: Resampler = systematic,
     keep_history: bool = True,
     kernels: bool | None = None,
     on_frame: OnFrame | None = None,
@@ -54,8 +240,9 @@ def particle_filter(
         observation_weight: tempers the observations' log-density (w_obs in STEADY); `(B,)` for one a trajectory.
         known_start: start every particle at the true first state instead of drawing it from the prior.
         resample_below: resample a trajectory when its effective sample size falls below this share of N;
-            checked at its observed rows (at all rows when looking ahead), never at the table's last one.
+            checked at its observed rows (at all rows with a proposal), never at the table's last one.
         proposal: where the noise of start and steps comes from; the program itself when None (the bootstrap filter).
+        resampler: how; `systematic`, `stratified` or `multinomial` of `smc.resampling`, or another `Resampler`.
         keep_history: keep what `Filtered.paths` needs.
         kernels: run compiled methods where they can serve; None: if there is enough to do, see `STEPS_WORTH_COMPILING`.
         on_frame: called at every row with (row, states `(N, B, D)`, log-weights before, log-weights after), `(N, B)`;
@@ -67,98 +254,41 @@ def particle_filter(
     Raises:
         FilterError: every weight is zero; names trajectory and time.
     """
-    rows, trajectories = data.time.shape
-    proposal = proposal or Proposal()
-    if proposal.looks_ahead and on_frame is not None:
-        raise ValueError("on_frame sees what is predicted: a filter that looks ahead has seen the later measurements")
-    inside, last = data.rows, rows - 1
-    ended = (~inside).any(1).tolist()  # rows past a trajectory's end
-    observed_rows = data.observed.any(-1).any(-1).tolist()
-    start = Recording()
-    noise, log_ratio = (None, 0.0) if known_start else proposal.start(particles)
-    drawing = KnownStart(data.known_start) if known_start else nullcontext() if noise is None else _given(noise)
-    with running(particles, 1, trajectories), start, drawing:
-        state = program.initial()
-    left = torch.Size((particles, 1, trajectories))
-    state = broadcast_event(state, left, 1).squeeze(1)
-    if known_start and not bool((state == data.known_start).all()):
-        raise ProgramError(
-            "a known start needs initial() to return the sampled state as it is; it returns another", site="initial"
-        )
-    stepping, reason = Stepping(program, data, observation_weight), None
-    if kernels is None:
-        kernels = particles * data.time.numel() >= STEPS_WORTH_COMPILING
-    if kernels and rows > 1:
-        stepping, reason = stepping_for(program, data, state, observation_weight)
-    log_weights = state.new_full((trajectories, particles), -math.log(particles), dtype=torch.float64).t()
-    log_weights = log_weights + log_ratio
-    log_likelihood = log_weights.new_zeros((rows, trajectories))
-    effective_sizes = log_weights.new_full((rows, trajectories), float(particles))
-    blown_up = torch.zeros_like(log_likelihood)
-    unmoved = torch.arange(particles, device=state.device).expand(trajectories, -1).t()
-    roots = unmoved
-    history: list[Tensor] = []
-    noises: dict[str, list[Tensor]] = {}
-    all_ancestors: list[Tensor | None] = []
-
-    future: Any = 0.0
-    for row in range(rows):
+    along = ParticleFilter(
+        program,
+        data,
+        particles=particles,
+        observation_weight=observation_weight,
+        known_start=known_start,
+        resample_below=resample_below,
+        proposal=proposal,
+        resampler=resampler,
+        kernels=kernels,
+        on_frame=on_frame,
+    )
+    state = along.init()
+    history, steps = list[Tensor](), list[Step]()
+    for row in range(len(data.time)):
         if keep_history:
-            history.append(state)
-        predicted, ancestors = log_weights, None
-        if observed_rows[row]:
-            log_weights = log_weights + stepping.log_density(row, state)
-        if observed_rows[row] or proposal.looks_ahead:
-            if proposal.looks_ahead:
-                future = proposal.log_future(row, state)
-                if ended[row]:
-                    future = torch.where(inside[row], future, 0.0)
-            expected = log_weights + future
-            broken = expected.isnan()  # a particle that blew up explains no measurement
-            log_weights = log_weights.masked_fill(broken, -math.inf)
-            weights, log_likelihood[row] = normalise(expected.masked_fill_(broken, -math.inf))
-            blown_up[row] = broken.sum(0)
-            log_weights = log_weights - log_likelihood[row]
-            effective_sizes[row] = effective_sample_size(weights)
-            if row < last and resample_below > 0:
-                exhausted = effective_sizes[row] < resample_below * particles
-                if state.device.type != "cpu" or bool(exhausted.any()):
-                    ancestors = torch.where(exhausted, systematic(weights, particles), unmoved)
-        if on_frame is not None:
-            on_frame(row, state, predicted, log_weights)
-        if keep_history:
-            all_ancestors.append(ancestors)
-        if row == last:
-            break
-        if ancestors is not None:
-            fresh = -math.log(particles) - (take(future, ancestors) if proposal.looks_ahead else 0.0)
-            log_weights = torch.where(exhausted, fresh, log_weights)
-            roots = take(roots, ancestors)
-        if ancestors is not None and proposal.looks_ahead:
-            state, ancestors = take(state, ancestors), None
-        noise, log_ratio = proposal.step(row, state)
-        if proposal.looks_ahead:
-            log_weights = log_weights + (torch.where(inside[row + 1], log_ratio, 0.0) if ended[row + 1] else log_ratio)
-        state, values = stepping.transition(row, state, ancestors, noise)
-        if keep_history:
-            for site, value in values.items():
-                noises.setdefault(site, []).append(value)
-
-    event_dims = {"states": 1} | {site: fn.event_dim for site, fn in start.distributions.items()} | stepping.event_dims
-    _raise_if_broken(program, log_likelihood, blown_up, data)
-    survivors = torch.zeros_like(log_weights).scatter_(0, roots, 1.0).sum(0)
+            history.append(state.states)
+        state, step = along.step(state, row)
+        steps.append(step if keep_history else step._replace(ancestors=None, noise={}))
+    blown_up = torch.stack([step.blown_up for step in steps])
+    _raise_if_broken(program, torch.stack(state.evidence), blown_up, data)
+    start, left = along.start, along.left
+    event_dims = {site: fn.event_dim for site, fn in start.distributions.items()}
     return Filtered(
-        log_likelihood=log_likelihood.sum(0),
-        log_weights=log_weights,
-        effective_sizes=effective_sizes,
-        roots=survivors,
+        log_likelihood=state.log_likelihood,
+        log_weights=state.log_weights,
+        effective_sizes=torch.stack([step.effective_sizes for step in steps]),
+        roots=torch.zeros_like(state.log_weights).scatter_(0, state.roots, 1.0).sum(0),
         blown_up=blown_up.sum(0),
         states=history,
         start={site: broadcast_event(value, left, event_dims[site]).squeeze(1) for site, value in start.values.items()},
-        noise=noises,
-        ancestors=all_ancestors,
-        event_dims=event_dims,
-        in_plain_torch=reason,
+        noise={site: [step.noise[site] for step in steps[:-1]] for site in steps[0].noise},
+        ancestors=[step.ancestors for step in steps] if keep_history else [],
+        event_dims={"states": 1} | event_dims | along.stepping.event_dims,
+        in_plain_torch=along.in_plain_torch,
         channels=None if program.substeps == 1 else partial(_channels, program, data),
     )
 
@@ -169,8 +299,8 @@ def _channels(program: Program, data: Trajectories, states: Tensor, noise: dict[
         return channel_values(program, data, states, noise)
 
 
-def _given(noise: Tensor) -> Standardised:
-    return Standardised(noise.unsqueeze(1))
+def _given(noise: Tensor | None) -> Standardised | nullcontext[None]:
+    return nullcontext() if noise is None else Standardised(noise.unsqueeze(1))
 
 
 def _raise_if_broken(program: Program, log_likelihood: Tensor, blown_up: Tensor, data: Trajectories) -> None:
@@ -211,26 +341,3 @@ def roll_out(
         with running(*state.shape[:-1]), handler or nullcontext():
             state = advance(program, state, control, time, step)
         yield state
-
-
-class Proposal:
-    """The program's own noise: the bootstrap filter.
-
-    Attributes:
-        looks_ahead: whether weights know of later measurements, at measured rows and at others.
-    """
-
-    looks_ahead = False
-
-    def start(self, particles: int) -> tuple[Tensor | None, Tensor | float]:
-        """The standard normal noise of `initial`, `(N, B, C)`, and its log density less that of the proposal, `(N, B)`;
-        None lets the program draw."""
-        return None, 0.0
-
-    def step(self, row: int, state: Tensor) -> tuple[Tensor | None, Tensor | float]:
-        """The same for the `transition` after a row, from states `(N, B, D)`."""
-        return None, 0.0
-
-    def log_future(self, row: int, state: Tensor) -> Tensor:
-        """What is thought of all measurements after a row, `(N, B)` in double precision."""
-        return state.new_zeros(state.shape[:-1], dtype=torch.float64)

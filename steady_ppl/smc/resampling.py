@@ -1,8 +1,13 @@
-"""Resampling: pure functions of weights. Particles are the first dimension, trajectories the second."""
+"""Resampling: pure functions of weights. Particles are the first dimension, trajectories the second.
+
+Chopin and Papaspiliopoulos (2020), chapter 9, compare the three resamplers. All give particle i `draws · w_i` offspring
+on average. Systematic resampling takes one uniform a trajectory, stratified one a stratum, multinomial one a draw.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -22,6 +27,13 @@ def normalise(log_weights: Tensor) -> tuple[Tensor, Tensor]:
 def effective_sample_size(weights: Tensor) -> Tensor:
     """1 / Σ w² of normalised weights `(N, B)`: `(B,)`, between 1 and N (Kong, Liu and Wong 1994)."""
     return 1 / weights.square().sum(0)
+
+
+class Resampler(Protocol):
+    """Draws particles in proportion to their weights."""
+
+    def __call__(self, weights: Tensor, draws: int, /) -> Tensor:
+        """Indices `(draws, B)` in 0 … N − 1, in ascending order, by normalised weights `(N, B)`."""
 
 
 def systematic(weights: Tensor, draws: int, uniform: Tensor | None = None) -> Tensor:
@@ -75,16 +87,46 @@ def _systematic(weights: np.ndarray, uniform: np.ndarray, chosen: np.ndarray) ->
 def systematic_in_parallel(weights: Tensor, draws: int, uniform: Tensor) -> Tensor:
     """`systematic` without a loop over particles, for a device: `(B, N)` weights to `(B, draws)` indices."""
     trajectories, particles = weights.shape
-    cumulative = weights.cumsum(1)
-    cumulative = cumulative / cumulative[:, -1:]
+    cumulative = _shares(weights)
     born = (cumulative * draws - uniform[:, None]).ceil().long().clamp(0, draws)
     born.masked_fill_(cumulative >= 1, draws)
     born[:, -1] = draws
-    born = born.cummax(1).values  # a parallel sum may round one of its terms below the one before
     offspring = torch.diff(born, dim=1, prepend=born.new_zeros((trajectories, 1)))
     index = torch.arange(particles, device=weights.device).repeat(trajectories)
     chosen = torch.repeat_interleave(index, offspring.flatten(), output_size=trajectories * draws)
     return chosen.view(trajectories, draws)
+
+
+def stratified(weights: Tensor, draws: int) -> Tensor:
+    """Stratified resampling: an independent uniform point in each of `draws` equal parts of [0, 1) (Kitagawa 1996).
+
+    The number of offspring of particle i is less than two off `draws · w_i`. See `Resampler` for shapes.
+    """
+    within = torch.rand(weights.shape[1], draws, dtype=torch.float64, device=weights.device)
+    return _at(weights, (torch.arange(draws, device=weights.device) + within) / draws)
+
+
+def multinomial(weights: Tensor, draws: int) -> Tensor:
+    """Multinomial resampling: independent draws, sorted (Gordon, Salmond and Smith 1993).
+
+    The number of offspring of particle i is binomial. See `Resampler` for shapes.
+    """
+    points = torch.rand(weights.shape[1], draws, dtype=torch.float64, device=weights.device)
+    return _at(weights, points.sort(1).values)
+
+
+def _at(weights: Tensor, points: Tensor) -> Tensor:
+    """The particles at ascending points `(B, draws)` of the weights' cumulative sum, `(draws, B)`."""
+    points = points.clamp(max=1 - 2.0**-53)  # a sum may round to one
+    index = torch.searchsorted(_shares(weights.t().to(torch.float64)), points, right=True)
+    return index.clamp_(max=len(weights) - 1).t()  # where a weight is not a number: the filter says so at its end
+
+
+def _shares(weights: Tensor) -> Tensor:
+    """Cumulative sums of `(B, N)` weights over their total, ascending."""
+    cumulative = weights.cumsum(1)
+    cumulative = cumulative / cumulative[:, -1:]
+    return cumulative.cummax(1).values  # a parallel sum may round one of its terms below the one before
 
 
 def take(values: Tensor, index: Tensor) -> Tensor:

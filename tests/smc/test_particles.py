@@ -18,8 +18,9 @@ from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.model.handlers import AtMean, Replaying
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import sample_row
-from steady_ppl.smc.filter import Proposal
-from steady_ppl.smc.resampling import systematic
+from steady_ppl.smc.filter import ParticleFilter
+from steady_ppl.smc.proposal import Proposal
+from steady_ppl.smc.resampling import multinomial, stratified, systematic, take
 
 PROGRAMS = ("linear_gaussian", "hovercraft", "hovercraft:HovercraftTruth", "truck", "pendulum")
 
@@ -62,6 +63,72 @@ def test_evidence_from_a_known_start_is_unbiased(cart, uneven):
     runs = estimates(cart, uneven, 1000, 50, known_start=True)
     exact = kalman(uneven, cart_parameters(cart), known_start=True).log_likelihood
     assert_mean((runs - exact).exp(), torch.ones(3))
+
+
+class Shifted(Proposal):
+    """Normal noise that is moved and widened, on states as they come; keeps what it is shown."""
+
+    def __init__(self, trajectories: int, shift: float = 0.4, width: float = 1.2) -> None:
+        self.trajectories, self.shift, self.width = trajectories, shift, width
+        self.shown: list[torch.Tensor] = []
+
+    def start(self, particles):
+        return self._drawn(particles, 2)
+
+    def step(self, row, state):
+        self.shown.append(state)
+        return self._drawn(len(state), 1)
+
+    def _drawn(self, particles, channels):
+        white = torch.randn(particles, self.trajectories, channels, dtype=torch.float64)
+        noise = self.shift + self.width * white
+        return noise, (math.log(self.width) + (white.square() - noise.square()) / 2).sum(-1)
+
+
+@pytest.mark.parametrize("known_start", [False, True])
+@pytest.mark.parametrize("resample_below", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("drive", ["even", "uneven"])
+def test_a_proposal_that_does_not_look_ahead_is_unbiased(cart, drive, resample_below, known_start, request):
+    data, settings = request.getfixturevalue(drive), {"resample_below": resample_below, "known_start": known_start}
+    runs = estimates(cart, data, 1000, 50, proposal=Shifted(3 * 1000), **settings)
+    exact = kalman(data, cart_parameters(cart), known_start=known_start).log_likelihood
+    assert_mean((runs - exact).exp(), torch.ones(3))
+
+
+def test_a_proposals_weights_sum_to_one_where_the_last_row_is_not_measured(cart, even):
+    unseen = replace(even, observed=even.observed & (torch.arange(12) < 11)[:, None, None])
+    filtered = particle_filter(cart, unseen, particles=50, proposal=Shifted(3))
+    torch.testing.assert_close(filtered.log_weights.exp().sum(0), torch.ones(3, dtype=torch.float64))
+
+
+def test_a_proposal_is_shown_the_states_that_it_moves(cart, uneven):
+    proposal = Shifted(3)
+    filtered = particle_filter(cart, uneven, particles=50, proposal=proposal, resample_below=1.0)
+    assert len(proposal.shown) == 11
+    for shown, states, ancestors in zip(proposal.shown, filtered.states, filtered.ancestors, strict=False):
+        assert torch.equal(shown, take(states, ancestors))
+
+
+@pytest.mark.parametrize("resampler", [systematic, stratified, multinomial])
+def test_evidence_is_unbiased_with_every_resampler(cart, uneven, resampler):
+    runs = estimates(cart, uneven, 1000, 50, resample_below=1.0, resampler=resampler)
+    exact = kalman(uneven, cart_parameters(cart)).log_likelihood
+    assert_mean((runs - exact).exp(), torch.ones(3))
+
+
+def test_steps_by_hand_are_the_filter(cart, uneven):
+    with seeded("steps"):
+        filtered = particle_filter(cart, uneven, particles=50)
+    with seeded("steps"):
+        by_hand = ParticleFilter(cart, uneven, particles=50)
+        state = by_hand.init()
+        assert torch.equal(state.log_likelihood, torch.zeros(3, dtype=torch.float64))
+        for row, states in enumerate(filtered.states):
+            assert torch.equal(state.states, states)
+            state, step = by_hand.step(state, row)
+            assert torch.equal(step.effective_sizes, filtered.effective_sizes[row])
+    assert torch.equal(state.log_likelihood, filtered.log_likelihood)
+    assert torch.equal(state.log_weights, filtered.log_weights)
 
 
 def test_variance_falls_as_one_over_the_number_of_particles():
@@ -415,12 +482,10 @@ def test_the_order_of_the_particles_changes_nothing(hovercraft, bearings, resamp
     ahead = Twist(find_and_smooth(hovercraft, bearings), untwisted=0.3) if look_ahead else None
     order, runs = torch.randperm(60), []
     for proposal in (InOrder(torch.arange(60), ahead), InOrder(order, ahead)):
-        for module in ("particles", "paths"):
-            monkeypatch.setattr(f"steady_ppl.{module}.systematic", proposal.systematic)
+        monkeypatch.setattr("steady_ppl.smc.genealogy.systematic", proposal.systematic)
+        settings = {"resample_below": resample_below, "resampler": proposal.systematic}
         with seeded("particles"):
-            filtered = particle_filter(
-                hovercraft, bearings, particles=60, proposal=proposal, resample_below=resample_below
-            )
+            filtered = particle_filter(hovercraft, bearings, particles=60, proposal=proposal, **settings)
             runs.append((filtered, filtered.paths(25)))
     (ours, our_paths), (theirs, their_paths) = runs
     assert any(ancestors is not None for ancestors in ours.ancestors) == (resample_below > 0)

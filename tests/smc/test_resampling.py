@@ -1,4 +1,4 @@
-"""Systematic resampling is unbiased, ordered and within range, whatever the weights."""
+"""Resampling is unbiased, ordered and within range, whatever the weights."""
 
 from __future__ import annotations
 
@@ -10,11 +10,22 @@ from hypothesis import given, settings, strategies as st
 from oracles import assert_mean
 
 from steady_ppl import seeded
-from steady_ppl.smc.resampling import effective_sample_size, normalise, systematic, systematic_in_parallel, take
+from steady_ppl.smc.resampling import (
+    effective_sample_size,
+    multinomial,
+    normalise,
+    stratified,
+    systematic,
+    systematic_in_parallel,
+    take,
+)
 
 weights = st.lists(st.one_of(st.just(0.0), st.floats(1e-12, 1.0)), min_size=1, max_size=12).filter(any)
 draws = st.integers(1, 30)
 uniforms = st.floats(0, 1, exclude_max=True)
+
+
+every = pytest.mark.parametrize("resampler", [systematic, stratified, multinomial])
 
 
 def normalised(values: list[float]) -> torch.Tensor:
@@ -48,20 +59,52 @@ def test_the_mean_number_of_offspring_is_the_weight(values, draws):
     assert ((mean - draws * w[:, 0]).abs() <= 2 / grid).all()
 
 
-@given(weights, draws, uniforms)
+@every
+@given(values=weights, draws=draws)
 @settings(deadline=None, derandomize=True)
-def test_indices_ascend_and_stay_within_range(values, draws, uniform):
-    index = systematic(normalised(values), draws, torch.tensor([uniform], dtype=torch.float64))
-    assert index.shape == (draws, 1)
+def test_indices_ascend_stay_within_range_and_have_weight(resampler, values, draws):
+    index = resampler(normalised(values).expand(-1, 20), draws)
+    assert index.shape == (draws, 20)
     assert (index.diff(dim=0) >= 0).all()
     assert index.min() >= 0 and index.max() < len(values)
+    assert (torch.tensor(values)[index] > 0).all()
 
 
 @given(weights, draws, st.floats(0, 1 - 1e-9))
 @settings(deadline=None, derandomize=True)
-def test_a_particle_of_weight_zero_is_never_drawn(values, draws, uniform):
+def test_whatever_the_uniform_indices_ascend_stay_within_range_and_have_weight(values, draws, uniform):
     index = systematic(normalised(values), draws, torch.tensor([uniform], dtype=torch.float64))
+    assert index.shape == (draws, 1)
+    assert (index.diff(dim=0) >= 0).all()
+    assert index.min() >= 0 and index.max() < len(values)
     assert (torch.tensor(values)[index] > 0).all()
+
+
+@every
+@pytest.mark.parametrize("values", [[0.25, 0.35, 0.4], [0.0, 0.02, 0.0, 0.9, 0.08, 0.0], [1.0]])
+@pytest.mark.parametrize("draws", [1, 5])
+def test_the_mean_number_of_offspring_is_the_draws_times_the_weight(resampler, values, draws):
+    w = normalised(values)
+    with seeded("offspring"):
+        drawn = counts(resampler(w.expand(-1, 4000), draws), len(values))
+    assert_mean(drawn.double().T, draws * w[:, 0])
+
+
+def test_systematic_offspring_vary_least_and_multinomial_ones_as_the_binomial():
+    w, draws = normalised([0.05, 0.12, 0.33, 0.21, 0.29]), 10
+    with seeded("spread"):
+        drawn = [counts(r(w.expand(-1, 20_000), draws), 5).double() for r in (systematic, stratified, multinomial)]
+    share, spread = draws * w[:, 0], [offspring.var(1) for offspring in drawn]
+    assert_mean((drawn[2].T - share).square(), share * (1 - w[:, 0]))
+    assert ((drawn[1].T - share).abs() < 2).all()
+    assert spread[0].sum() < spread[1].sum() < spread[2].sum()
+
+
+@pytest.mark.parametrize("resampler", [stratified, multinomial])
+def test_a_point_that_rounds_to_one_draws_a_particle_of_weight(resampler, monkeypatch):
+    largest = 1 - 2.0**-53
+    monkeypatch.setattr(torch, "rand", lambda *size, **kind: torch.full(size, largest, dtype=torch.float64))
+    assert resampler(normalised([1.0, 0.0]), 3).max() == 0
 
 
 def test_a_particle_of_weight_zero_is_not_drawn_by_the_largest_uniform_either():
@@ -89,11 +132,11 @@ def test_each_trajectory_has_its_own_weights_and_uniform():
     assert torch.equal(systematic(both, 7, uniform), torch.cat(alone, 1))
 
 
-def test_drawn_uniforms_are_unbiased_and_independent_between_trajectories():
+@every
+def test_drawn_uniforms_are_independent_between_trajectories(resampler):
     w, runs = normalised([0.25, 0.35, 0.4]), 4000
     with seeded("resampling"):
-        drawn = counts(systematic(w.expand(-1, runs), 1), 3)
-    assert_mean(drawn[:2].T, w[:2, 0])
+        drawn = counts(resampler(w.expand(-1, runs), 1), 3)
     pairs = drawn[0, ::2] * drawn[0, 1::2]
     assert_mean(pairs, 0.25**2)
 
@@ -111,10 +154,11 @@ def test_200_000_float32_particles_never_give_an_index_out_of_range(spread):
             assert ((counts(index, particles) - share).abs() < 1 + 1e-6).all()
 
 
-def test_one_particle_may_hold_all_the_weight():
+@every
+def test_one_particle_may_hold_all_the_weight(resampler):
     w = torch.zeros(200_000, 3)
     w[0, 0], w[77_777, 1], w[-1, 2] = 1.0, 1.0, 1.0
-    index = systematic(w, 200_000)
+    index = resampler(w, 200_000)
     assert index.unique(dim=0).tolist() == [[0, 77_777, 199_999]]
 
 
