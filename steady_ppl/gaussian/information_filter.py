@@ -12,7 +12,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,6 +20,24 @@ from numba import njit
 from torch import Tensor
 
 from steady_ppl.gaussian.linearize import Linearization
+
+Array = np.ndarray[Any, np.dtype[np.float64]]
+
+
+class Potential(NamedTuple):
+    """exp(c − ½ δᵀ Λ δ + λᵀ δ) of every row: Λ `(T + 1, B, D, D)`, λ `(T + 1, B, D)` and c `(T + 1, B)`."""
+
+    precision: Array
+    information: Array
+    log_scale: Array
+
+
+class SteeringArrays(NamedTuple):
+    """`Steering` as the recursions fill it, `(..., C)`, `(..., C, D)` and `(..., C, C)`."""
+
+    shift: Array
+    gain: Array
+    factor: Array
 
 
 @dataclass(frozen=True)
@@ -35,6 +53,19 @@ class Steering:
     shift: Tensor
     gain: Tensor
     factor: Tensor
+
+    @staticmethod
+    def empty(noise: Tensor) -> Steering:
+        """Room in the host's memory for the steering of noise that enters by `(..., D, C)`."""
+        *left, dimension, channels = noise.shape
+        shapes = ((channels,), (channels, dimension), (channels, channels))
+        return Steering(*(torch.empty(*left, *shape, dtype=noise.dtype) for shape in shapes))
+
+    def arrays(self) -> SteeringArrays:
+        return SteeringArrays(_array(self.shift), _array(self.gain), _array(self.factor))
+
+    def to(self, device: torch.device) -> Steering:
+        return Steering(self.shift.to(device), self.gain.to(device), self.factor.to(device))
 
 
 @dataclass(frozen=True)
@@ -126,18 +157,19 @@ def look_ahead(linear: Linearization) -> Lookahead:
         _times(weighted.mT, linear.residual),
         linear.log_scale - 0.5 * (linear.precision * linear.residual.square()).sum(-1),
     )
-    futures, steps = tuple(torch.empty_like(part, device="cpu") for part in seen), _steering(linear.noise)
+    futures, steps = tuple(torch.empty_like(part, device="cpu") for part in seen), Steering.empty(linear.noise)
     state, noise, offset = _arrays((linear.state, linear.noise, linear.offset))
-    backward(_arrays(seen), state, noise, offset, _arrays(futures), _arrays(steps))
+    backward(Potential(*_arrays(seen)), state, noise, offset, Potential(*_arrays(futures)), steps.arrays())
     device = linear.offset.device
     precision, information, log_scale = (part.to(device) for part in futures)
     windings = _windings(linear)
     offsets = linear.start_offset - windings.unsqueeze(1)
-    starts = _steering(linear.start_noise.expand(len(windings), *linear.start_noise.shape))
+    starts = Steering.empty(linear.start_noise.expand(len(windings), *linear.start_noise.shape))
     masses = torch.empty(offsets.shape[:-1], dtype=offsets.dtype)
     ahead = (precision[0] + seen[0][0], information[0] + seen[1][0], log_scale[0] + seen[2][0])
-    integrate_starts(_arrays(ahead), _array(linear.start_noise), _array(offsets), _arrays(starts), masses.numpy())
-    spread = (linear.start_noise @ starts[2][0].to(device)).square().sum(-1)[:, list(linear.angles)]
+    first = Potential(*_arrays(ahead))
+    integrate_starts(first, _array(linear.start_noise), _array(offsets), starts.arrays(), masses.numpy())
+    spread = (linear.start_noise @ starts.factor[0].to(device)).square().sum(-1)[:, list(linear.angles)]
     vague = (spread > 1).any(-1).cpu()  # the measurements leave an angle open: one turn's integral covers the others
     masses[1:, vague] = -torch.inf
     log_likelihood = masses.logsumexp(0)
@@ -148,17 +180,10 @@ def look_ahead(linear: Linearization) -> Lookahead:
         log_scale=log_scale,
         windings=windings,
         winding_masses=(masses - log_likelihood).to(device),
-        starts=Steering(*(part.to(device) for part in starts)),
-        steps=Steering(*(part.to(device) for part in steps)),
+        starts=starts.to(device),
+        steps=steps.to(device),
         log_likelihood=log_likelihood.to(device),
     )
-
-
-def _steering(noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Room for the steering of noise that enters by `(..., D, C)`."""
-    *left, dimension, channels = noise.shape
-    shapes = ((channels,), (channels, dimension), (channels, channels))
-    return tuple(torch.empty(*left, *shape, dtype=noise.dtype) for shape in shapes)  # type: ignore[return-value]
 
 
 def _arrays(tensors: Sequence[Tensor]) -> Any:
@@ -186,9 +211,6 @@ def _times(matrix: Tensor, vectors: Tensor) -> Tensor:
     if vectors.dim() < matrix.dim():
         return (matrix @ vectors.unsqueeze(-1)).squeeze(-1)
     return (matrix @ vectors.movedim(0, -1)).movedim(-1, 0)
-
-
-Array = np.ndarray[Any, np.dtype[np.float64]]
 
 
 @njit(cache=True, error_model="numpy")
@@ -272,41 +294,38 @@ def integrate(
 
 
 @njit(cache=True, error_model="numpy")
-def integrate_starts(
-    ahead: tuple[Array, Array, Array], noise: Array, offset: Array, steering: tuple[Array, Array, Array], total: Array
-) -> None:
+def integrate_starts(ahead: Potential, noise: Array, offset: Array, steering: SteeringArrays, total: Array) -> None:
     """`integrate` for every start: of each trajectory, on each of several turns.
 
     Args:
         ahead: what all rows' measurements say of the first state: `(B, D, D)`, `(B, D)` and `(B,)`.
         noise, offset: `(B, D, C)` and `(W, B, D)`.
-        steering: filled: `(W, B, C)`, `(W, B, C, D)` and `(W, B, C, C)`.
+        steering: filled, `(W, B, ...)`.
         total: filled with the logarithm of the integral, `(W, B)`.
     """
     for w in range(offset.shape[0]):
         for b in range(offset.shape[1]):
-            out = (steering[0][w, b], steering[1][w, b], steering[2][w, b])
-            precision, information = ahead[0][b].copy(), ahead[1][b].copy()
-            total[w, b] = ahead[2][b] + integrate(precision, information, noise[b], offset[w, b], out)
+            out = (steering.shift[w, b], steering.gain[w, b], steering.factor[w, b])
+            precision, information = ahead.precision[b].copy(), ahead.information[b].copy()
+            total[w, b] = ahead.log_scale[b] + integrate(precision, information, noise[b], offset[w, b], out)
 
 
 @njit(cache=True, error_model="numpy")
 def backward(
-    seen: tuple[Array, Array, Array],
+    seen: Potential,
     state: Array,
     noise: Array,
     offset: Array,
-    futures: tuple[Array, Array, Array],
-    steering: tuple[Array, Array, Array],
+    futures: Potential,
+    steering: SteeringArrays,
 ) -> None:
     """The backward information filter of δ' = F δ + offset + G ε, for every trajectory.
 
     Args:
-        seen: what each row's own measurements say: Λ `(T + 1, B, D, D)`, λ `(T + 1, B, D)` and c `(T + 1, B)`.
+        seen: what each row's own measurements say.
         state, noise, offset: F `(T, B, D, D)`, G `(T, B, D, C)` and `(T, B, D)`.
-        futures: filled with what all later rows' measurements say of a row's state, as `seen`.
-        steering: filled with the noise that they ask for, ε ~ N(shift − gain δ, factor factorᵀ): `(T, B, C)`,
-            `(T, B, C, D)` and `(T, B, C, C)`.
+        futures: filled with what all later rows' measurements say of a row's state.
+        steering: filled with the noise that they ask for in each interval, `(T, B, ...)`.
     """
     intervals, trajectories, dimension = offset.shape
     channels = noise.shape[3]
@@ -316,14 +335,14 @@ def backward(
         precision[:] = 0.0
         information[:] = 0.0
         scale = 0.0
-        futures[0][intervals, b] = 0.0
-        futures[1][intervals, b] = 0.0
-        futures[2][intervals, b] = 0.0
+        futures.precision[intervals, b] = 0.0
+        futures.information[intervals, b] = 0.0
+        futures.log_scale[intervals, b] = 0.0
         for t in range(intervals - 1, -1, -1):
-            precision += seen[0][t + 1, b]
-            information += seen[1][t + 1, b]
-            out = (steering[0][t, b], steering[1][t, b], steering[2][t, b])
-            scale += seen[2][t + 1, b] + integrate(precision, information, noise[t, b], offset[t, b], out)
+            precision += seen.precision[t + 1, b]
+            information += seen.information[t + 1, b]
+            out = (steering.shift[t, b], steering.gain[t, b], steering.factor[t, b])
+            scale += seen.log_scale[t + 1, b] + integrate(precision, information, noise[t, b], offset[t, b], out)
             forward = state[t, b]
             for i in range(dimension):
                 for j in range(dimension):
@@ -331,22 +350,22 @@ def backward(
                     for k in range(dimension):
                         half[i, j] += precision[i, k] * forward[k, j]
             for i in range(dimension):
-                futures[1][t, b, i] = 0.0
+                futures.information[t, b, i] = 0.0
                 for k in range(dimension):
-                    futures[1][t, b, i] += forward[k, i] * information[k]
+                    futures.information[t, b, i] += forward[k, i] * information[k]
                 for j in range(dimension):
                     precision[i, j] = 0.0
                     for k in range(dimension):
                         precision[i, j] += forward[k, i] * half[k, j]
-            information[:] = futures[1][t, b]
+            information[:] = futures.information[t, b]
             for a in range(channels):
-                row_of_gain[:] = steering[1][t, b, a]
+                row_of_gain[:] = steering.gain[t, b, a]
                 for j in range(dimension):
-                    steering[1][t, b, a, j] = 0.0
+                    steering.gain[t, b, a, j] = 0.0
                     for k in range(dimension):
-                        steering[1][t, b, a, j] += row_of_gain[k] * forward[k, j]
-            futures[0][t, b] = precision
-            futures[2][t, b] = scale
+                        steering.gain[t, b, a, j] += row_of_gain[k] * forward[k, j]
+            futures.precision[t, b] = precision
+            futures.log_scale[t, b] = scale
 
 
 @njit(cache=True, error_model="numpy")

@@ -9,7 +9,7 @@ of its size.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -19,6 +19,63 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.linearize import Linearization, ReferencePath, linearize
 from steady_ppl.model.program import Program
+
+Array = np.ndarray[Any, np.dtype[np.float64]]
+
+
+class Moving(NamedTuple):
+    """δ' = F δ + offset + G ε of every interval.
+
+    Attributes:
+        offset: `(T, B, D)`.
+        state: F `(T, B, D, D)`.
+        noise: G `(T, B, D, C)`.
+    """
+
+    offset: Array
+    state: Array
+    noise: Array
+
+
+class Measuring(NamedTuple):
+    """residual = H δ + N(0, 1 / precision) of every row.
+
+    Attributes:
+        residual: `(T + 1, B, K)`.
+        by_state: H `(T + 1, B, K, D)`.
+        precision: `(T + 1, B, K)`; zero where a measurement is missing.
+    """
+
+    residual: Array
+    by_state: Array
+    precision: Array
+
+
+class Start(NamedTuple):
+    """The first state, N(mean, G₀ G₀ᵀ): `(B, D)` and `(B, D, C₀)`."""
+
+    mean: Array
+    noise: Array
+
+
+class Filtered(NamedTuple):
+    """The states given the measurements up to each row: `(T + 1, B, D)` and `(T + 1, B, D, D)`."""
+
+    means: Array
+    covariances: Array
+
+
+class Updates(NamedTuple):
+    """What each measured component changes, given those before it; zero, one and zero where it is missing.
+
+    Attributes:
+        innovation, variance: `(T + 1, B, K)`.
+        gain: `(T + 1, B, K, D)`.
+    """
+
+    innovation: Array
+    variance: Array
+    gain: Array
 
 
 @dataclass(frozen=True)
@@ -97,27 +154,27 @@ def track(
 def filter_and_smooth(linear: Linearization) -> Tracked:
     """Run the recursions along a linearization."""
     rows, drives, components, dimension = linear.measurement.shape
-    filtered = np.empty((rows, drives, dimension)), np.empty((rows, drives, dimension, dimension))
-    update = (
-        np.empty((rows, drives, components)),
-        np.empty((rows, drives, components)),
-        np.empty((rows, drives, components, dimension)),
+    filtered = Filtered(np.empty((rows, drives, dimension)), np.empty((rows, drives, dimension, dimension)))
+    updates = Updates(
+        innovation=np.empty((rows, drives, components)),
+        variance=np.empty((rows, drives, components)),
+        gain=np.empty((rows, drives, components, dimension)),
     )
-    by_state, precision = _array(linear.measurement), _array(linear.precision)
-    start = _array(linear.start_offset), _array(linear.start_noise)
-    moving = _moving(linear)
-    forward(start, moving, (_array(linear.residual), by_state, precision), filtered, update)
-    arrival, reading, smoothed = np.empty_like(filtered[0]), np.empty_like(update[0]), np.empty_like(filtered[0])
-    backward(filtered, update, moving, by_state, arrival, reading, smoothed)
-    innovation, variance, _ = update
+    measuring = Measuring(_array(linear.residual), _array(linear.measurement), _array(linear.precision))
+    start, moving = Start(_array(linear.start_offset), _array(linear.start_noise)), _moving(linear)
+    forward(start, moving, measuring, filtered, updates)
+    arrival, smoothed = np.empty_like(filtered.means), np.empty_like(filtered.means)
+    reading = np.empty_like(updates.innovation)
+    backward(filtered, updates, moving, measuring.by_state, arrival, reading, smoothed)
     with np.errstate(divide="ignore", invalid="ignore"):
-        misfit = innovation**2 / variance + np.log(np.where(precision > 0, variance * precision, 1.0))
+        excess = np.log(np.where(measuring.precision > 0, updates.variance * measuring.precision, 1.0))
+        misfit = updates.innovation**2 / updates.variance + excess
     pushes = torch.from_numpy(arrival)
     around = linear.path.states.double()
     return Tracked(
         linearization=linear,
-        states=around + torch.from_numpy(filtered[0]),
-        covariances=torch.from_numpy(filtered[1]),
+        states=around + torch.from_numpy(filtered.means),
+        covariances=torch.from_numpy(filtered.covariances),
         smoothed=around + torch.from_numpy(smoothed),
         noise=(linear.noise * pushes[1:].unsqueeze(-1)).sum(-2),
         arrival=pushes,
@@ -126,47 +183,29 @@ def filter_and_smooth(linear: Linearization) -> Tracked:
     )
 
 
-def _moving(linear: Linearization) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return _array(linear.offset), _array(linear.state), _array(linear.noise)
+def _moving(linear: Linearization) -> Moving:
+    return Moving(offset=_array(linear.offset), state=_array(linear.state), noise=_array(linear.noise))
 
 
-def _array(tensor: Tensor) -> np.ndarray:
+def _array(tensor: Tensor) -> Array:
     return tensor.contiguous().numpy(force=True)
 
 
-Array = np.ndarray[Any, np.dtype[np.float64]]
-
-
 @njit(cache=True, error_model="numpy")
-def forward(
-    start: tuple[Array, Array],
-    moving: tuple[Array, Array, Array],
-    measuring: tuple[Array, Array, Array],
-    filtered: tuple[Array, Array],
-    update: tuple[Array, Array, Array],
-) -> None:
-    """Kalman (1960), a measurement component at a time.
-
-    Args:
-        start: mean `(B, D)` and G₀ `(B, D, C₀)`.
-        moving: offset `(T, B, D)`, F `(T, B, D, D)` and G `(T, B, D, C)`.
-        measuring: residual `(T + 1, B, K)`, H `(T + 1, B, K, D)` and precision `(T + 1, B, K)`.
-        filtered: filled with the means `(T + 1, B, D)` and covariances `(T + 1, B, D, D)` given all up to a row.
-        update: filled with each component's innovation given those before it and its variance, `(T + 1, B, K)`, and its
-            gain `(T + 1, B, K, D)`; zero, one and zero where it is missing.
-    """
-    rows, trajectories, components = measuring[0].shape
-    dimension, channels = moving[2].shape[2:]
+def forward(start: Start, moving: Moving, measuring: Measuring, filtered: Filtered, updates: Updates) -> None:
+    """Kalman (1960), a measurement component at a time. Fills `filtered` and `updates`."""
+    rows, trajectories, dimension = filtered.means.shape
+    channels = moving.noise.shape[3]
     covariance, half = np.zeros((dimension, dimension)), np.zeros((dimension, dimension))
     mean, moved = np.zeros(dimension), np.zeros(dimension)
     for b in range(trajectories):
-        mean[:] = start[0][b]
-        _outer(start[1][b], covariance)
+        mean[:] = start.mean[b]
+        _outer(start.noise[b], covariance)
         for t in range(rows):
             if t > 0:
-                step, noise = moving[1][t - 1, b], moving[2][t - 1, b]
+                step, noise = moving.state[t - 1, b], moving.noise[t - 1, b]
                 for i in range(dimension):
-                    moved[i] = moving[0][t - 1, b, i]
+                    moved[i] = moving.offset[t - 1, b, i]
                     for j in range(dimension):
                         moved[i] += step[i, j] * mean[j]
                         half[i, j] = 0.0
@@ -182,34 +221,56 @@ def forward(
                             entry += noise[i, c] * noise[j, c]
                         covariance[i, j] = entry
                         covariance[j, i] = entry
-            for k in range(components):
-                gain = update[2][t, b, k]
-                gain[:] = 0.0
-                update[0][t, b, k] = 0.0
-                update[1][t, b, k] = 1.0
-                if measuring[2][t, b, k] == 0.0:
-                    continue
-                by_state = measuring[1][t, b, k]
-                variance, innovation = 1.0 / measuring[2][t, b, k], measuring[0][t, b, k]
-                for i in range(dimension):
-                    innovation -= by_state[i] * mean[i]
-                    for j in range(dimension):
-                        gain[i] += covariance[i, j] * by_state[j]
-                    variance += by_state[i] * gain[i]
-                for i in range(dimension):
-                    gain[i] /= variance
-                    mean[i] += gain[i] * innovation
-                for i in range(dimension):
-                    for j in range(dimension):
-                        covariance[i, j] -= gain[i] * gain[j] * variance
-                update[0][t, b, k] = innovation
-                update[1][t, b, k] = variance
-            filtered[0][t, b] = mean
-            filtered[1][t, b] = covariance
+            _update(
+                (measuring.residual[t, b], measuring.by_state[t, b], measuring.precision[t, b]),
+                mean,
+                covariance,
+                (updates.innovation[t, b], updates.variance[t, b], updates.gain[t, b]),
+            )
+            filtered.means[t, b] = mean
+            filtered.covariances[t, b] = covariance
+
+
+@njit(cache=True, error_model="numpy")
+def _update(
+    measuring: tuple[Array, Array, Array], mean: Array, covariance: Array, updates: tuple[Array, Array, Array]
+) -> None:
+    """Condition the mean and the covariance on a row's components, one after the other.
+
+    Args:
+        measuring, updates: a row of `Measuring` and of `Updates`; the latter is filled.
+        mean, covariance: `(D,)` and `(D, D)`, overwritten.
+    """
+    residuals, by_states, precisions = measuring
+    innovations, variances, gains = updates
+    components, dimension = by_states.shape
+    for k in range(components):
+        gain = gains[k]
+        gain[:] = 0.0
+        innovations[k] = 0.0
+        variances[k] = 1.0
+        if precisions[k] == 0.0:
+            continue
+        by_state = by_states[k]
+        variance, innovation = 1.0 / precisions[k], residuals[k]
+        for i in range(dimension):
+            innovation -= by_state[i] * mean[i]
+            for j in range(dimension):
+                gain[i] += covariance[i, j] * by_state[j]
+            variance += by_state[i] * gain[i]
+        for i in range(dimension):
+            gain[i] /= variance
+            mean[i] += gain[i] * innovation
+        for i in range(dimension):
+            for j in range(dimension):
+                covariance[i, j] -= gain[i] * gain[j] * variance
+        innovations[k] = innovation
+        variances[k] = variance
 
 
 @njit(cache=True, error_model="numpy")
 def _outer(factor: Array, out: Array) -> None:
+    """factor factorᵀ."""
     for i in range(factor.shape[0]):
         for j in range(factor.shape[0]):
             out[i, j] = 0.0
@@ -219,9 +280,9 @@ def _outer(factor: Array, out: Array) -> None:
 
 @njit(cache=True, error_model="numpy")
 def backward(
-    filtered: tuple[Array, Array],
-    update: tuple[Array, Array, Array],
-    moving: tuple[Array, Array, Array],
+    filtered: Filtered,
+    updates: Updates,
+    moving: Moving,
     by_state: Array,
     arrival: Array,
     reading: Array,
@@ -232,7 +293,7 @@ def backward(
     De Jong (1989): what is left of later innovations, carried back. Gᵀ arrival is the posterior mean of the noise.
 
     Args:
-        filtered, update, moving: of `forward`.
+        filtered, updates, moving: of `forward`.
         by_state: H `(T + 1, B, K, D)`.
         arrival: filled with the derivative by a push on the state that a row begins with, `(T + 1, B, D)`.
         reading: filled with the derivative by a shift of what is measured, `(T + 1, B, K)`; zero where it is missing.
@@ -244,12 +305,12 @@ def backward(
         later[:] = 0.0
         for t in range(rows - 1, -1, -1):
             for i in range(dimension):
-                smoothed[t, b, i] = filtered[0][t, b, i]
+                smoothed[t, b, i] = filtered.means[t, b, i]
                 for j in range(dimension):
-                    smoothed[t, b, i] += filtered[1][t, b, i, j] * later[j]
+                    smoothed[t, b, i] += filtered.covariances[t, b, i, j] * later[j]
             for k in range(components - 1, -1, -1):
-                gain = update[2][t, b, k]
-                score = update[0][t, b, k] / update[1][t, b, k]
+                gain = updates.gain[t, b, k]
+                score = updates.innovation[t, b, k] / updates.variance[t, b, k]
                 for i in range(dimension):
                     score -= gain[i] * later[i]
                 for i in range(dimension):
@@ -260,7 +321,7 @@ def backward(
                 for j in range(dimension):
                     moved[j] = 0.0
                     for i in range(dimension):
-                        moved[j] += moving[1][t - 1, b, i, j] * later[i]
+                        moved[j] += moving.state[t - 1, b, i, j] * later[i]
                 later[:] = moved
 
 
@@ -268,7 +329,7 @@ def backward(
 def spread_ahead(
     horizon: int,
     covariances: Array,
-    moving: tuple[Array, Array, Array],
+    moving: Moving,
     by_state: Array,
     precision: Array,
     variances: Array,
@@ -283,7 +344,7 @@ def spread_ahead(
         variances: filled, `(T + 1 − horizon, B, K)`; NaN where the precision is zero.
     """
     rows, trajectories, components, dimension = by_state.shape
-    channels = moving[2].shape[3]
+    channels = moving.noise.shape[3]
     along, moved = np.zeros(dimension), np.zeros(dimension)
     for b in range(trajectories):
         for t in range(rows - horizon):
@@ -294,7 +355,7 @@ def spread_ahead(
                 along[:] = by_state[t + horizon, b, k]
                 variance = 1.0 / precision[t + horizon, b, k]
                 for back in range(t + horizon - 1, t - 1, -1):
-                    noise, step = moving[2][back, b], moving[1][back, b]
+                    noise, step = moving.noise[back, b], moving.state[back, b]
                     for c in range(channels):
                         entry = 0.0
                         for i in range(dimension):

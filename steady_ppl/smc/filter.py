@@ -81,7 +81,7 @@ class _Weighed(NamedTuple):
 
 
 class ParticleFilter:
-    """A particle filter that goes through a table row by row: `init`, then a `step` a row.
+    """A particle filter that goes through a table row by row: `init`, then a `step` a row, under `torch.no_grad()`.
 
     Args:
         program, data, particles, observation_weight, known_start, resample_below, proposal, resampler, kernels,
@@ -126,7 +126,6 @@ class ParticleFilter:
         self.ended = (~self.inside).any(1).tolist()  # rows past a trajectory's end
         self.observed = data.observed.any(-1).any(-1).tolist()
 
-    @torch.no_grad()
     def init(self) -> FilterState:
         """Draw the particles' starts.
 
@@ -152,7 +151,6 @@ class ParticleFilter:
         self._none, self._all = even.new_zeros(trajectories), even.new_full((trajectories,), float(self.particles))
         return FilterState(states=states, log_weights=even + log_ratio, roots=self._unmoved)
 
-    @torch.no_grad()
     def step(self, state: FilterState, row: int) -> tuple[FilterState, Step]:
         """Weigh the particles at a row, resample those trajectories that need it, and move on to the next row.
 

@@ -26,7 +26,7 @@ def normalise(log_weights: Tensor) -> tuple[Tensor, Tensor]:
 
 def effective_sample_size(weights: Tensor) -> Tensor:
     """1 / Σ w² of normalised weights `(N, B)`: `(B,)`, between 1 and N (Kong, Liu and Wong 1994)."""
-    return 1 / weights.square().sum(0)
+    return weights.square().sum(0).reciprocal()
 
 
 class Resampler(Protocol):

@@ -119,7 +119,7 @@ def test_evidence_is_unbiased_with_every_resampler(cart, uneven, resampler):
 def test_steps_by_hand_are_the_filter(cart, uneven):
     with seeded("steps"):
         filtered = particle_filter(cart, uneven, particles=50)
-    with seeded("steps"):
+    with seeded("steps"), torch.no_grad():
         by_hand = ParticleFilter(cart, uneven, particles=50)
         state = by_hand.init()
         assert torch.equal(state.log_likelihood, torch.zeros(3, dtype=torch.float64))
