@@ -58,7 +58,7 @@ class Start(NamedTuple):
     noise: Array
 
 
-class Filtered(NamedTuple):
+class Moments(NamedTuple):
     """The states given the measurements up to each row: `(T + 1, B, D)` and `(T + 1, B, D, D)`."""
 
     means: Array
@@ -154,7 +154,7 @@ def track(
 def filter_and_smooth(linear: Linearization) -> Tracked:
     """Run the recursions along a linearization."""
     rows, drives, components, dimension = linear.measurement.shape
-    filtered = Filtered(np.empty((rows, drives, dimension)), np.empty((rows, drives, dimension, dimension)))
+    filtered = Moments(np.empty((rows, drives, dimension)), np.empty((rows, drives, dimension, dimension)))
     updates = Updates(
         innovation=np.empty((rows, drives, components)),
         variance=np.empty((rows, drives, components)),
@@ -192,7 +192,7 @@ def _array(tensor: Tensor) -> Array:
 
 
 @njit(cache=True, error_model="numpy")
-def forward(start: Start, moving: Moving, measuring: Measuring, filtered: Filtered, updates: Updates) -> None:
+def forward(start: Start, moving: Moving, measuring: Measuring, filtered: Moments, updates: Updates) -> None:
     """Kalman (1960), a measurement component at a time. Fills `filtered` and `updates`."""
     rows, trajectories, dimension = filtered.means.shape
     channels = moving.noise.shape[3]
@@ -280,7 +280,7 @@ def _outer(factor: Array, out: Array) -> None:
 
 @njit(cache=True, error_model="numpy")
 def backward(
-    filtered: Filtered,
+    filtered: Moments,
     updates: Updates,
     moving: Moving,
     by_state: Array,
