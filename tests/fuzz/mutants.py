@@ -1,0 +1,108 @@
+"""What can happen to any file: cut short, bits turned over, replaced by something else."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from hypothesis import strategies as st
+
+Change = Callable[[st.DrawFn, bytes], "bytes | str"]
+"""From a good file's bytes to others, or to the name of what takes the file's place."""
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A spoiled file.
+
+    Attributes:
+        how: the name of the change.
+        now: its bytes; or `a folder`, `a pipe`, or where a link leads that takes its place.
+    """
+
+    how: str
+    now: bytes | str
+
+    def lay(self, file: Path) -> None:
+        """Put it in the place of the good file."""
+        file.unlink()
+        if isinstance(self.now, bytes):
+            file.write_bytes(self.now)
+        elif self.now == "a folder":
+            file.mkdir()
+        elif self.now == "a pipe":
+            os.mkfifo(file)  # reading from it never ends, since nobody writes
+        else:
+            file.symlink_to(self.now.format(name=file.name))
+
+    def __repr__(self) -> str:
+        now = repr(self.now)
+        return f"<{self.how}: {now if len(now) < 2000 else f'{now[:2000]}… of {len(self.now)}'}>"
+
+
+def of_text(change: Callable[[st.DrawFn, str], str | bytes]) -> Change:
+    """A change of a file's text."""
+
+    def changed(draw: st.DrawFn, content: bytes) -> bytes:
+        now = change(draw, content.decode())
+        return now if isinstance(now, bytes) else now.encode()
+
+    return changed
+
+
+def spelt(spell: Callable[[str], str | bytes]) -> Change:
+    """A change of a file's text in which nothing is drawn."""
+    return of_text(lambda draw, text: spell(text))
+
+
+def _block(draw: st.DrawFn, content: bytes) -> tuple[bytes, bytes, bytes]:
+    """What lies before a block of at most 64 bytes, the block, and what lies behind it."""
+    start = draw(st.integers(0, len(content) - 1))
+    end = start + draw(st.integers(1, 64))
+    return content[:start], content[start:end], content[end:]
+
+
+def _around(change: Callable[[st.DrawFn, bytes], bytes]) -> Change:
+    def changed(draw: st.DrawFn, content: bytes) -> bytes:
+        before, block, behind = _block(draw, content)
+        return before + change(draw, block) + behind
+
+    return changed
+
+
+def _flipped(draw: st.DrawFn, content: bytes) -> bytes:
+    now = bytearray(content)
+    for bit in draw(st.lists(st.integers(0, 8 * len(now) - 1), min_size=1, max_size=16)):
+        now[bit // 8] ^= 1 << bit % 8
+    return bytes(now)
+
+
+def _overwritten(draw: st.DrawFn, content: bytes) -> bytes:
+    now = bytearray(content)
+    for at in draw(st.lists(st.integers(0, min(64, len(now)) - 1), min_size=1, max_size=4)):
+        now[at] = draw(st.integers(0, 255))
+    return bytes(now)
+
+
+BYTES: Mapping[str, Change] = {
+    "cut short": lambda draw, content: content[: draw(st.integers(1, len(content) - 1))],
+    "bits flipped": _flipped,
+    "its beginning overwritten": _overwritten,
+    "a block of zeros": _around(lambda draw, block: bytes(len(block))),
+    "a block lost": _around(lambda draw, block: b""),
+    "a block inserted": _around(lambda draw, block: draw(st.binary(min_size=1, max_size=64)) + block),
+    "a block twice": _around(lambda draw, block: block + block),
+    "empty": lambda draw, content: b"",
+    "one byte": lambda draw, content: draw(st.binary(min_size=1, max_size=1)),
+    "junk": lambda draw, content: draw(st.randoms(use_true_random=False)).randbytes(5000),
+    "NUL bytes": lambda draw, content: bytes(5000),
+    "ten megabytes of zeros behind it": lambda draw, content: content + bytes(10_000_000),
+    "UTF-16": lambda draw, content: content.decode("utf-8", "replace").encode("utf-16"),
+    "a folder": lambda draw, content: "a folder",
+    "a pipe": lambda draw, content: "a pipe",
+    "a link to nothing": lambda draw, content: "nothing.{name}",
+    "a link to itself": lambda draw, content: "{name}",
+    "a link to endless zeros": lambda draw, content: "/dev/zero",
+}
