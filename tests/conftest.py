@@ -11,7 +11,9 @@ from examples import drives, example
 from hypothesis import HealthCheck, settings
 from small import FEW, HOVERCRAFT, contents, simulated, steady, tree, written
 
-settings.register_profile("repeated", derandomize=True, database=None, deadline=None, suppress_health_check=HealthCheck)
+settings.register_profile(
+    "repeated", derandomize=True, database=None, deadline=None, suppress_health_check=list(HealthCheck)
+)
 settings.register_profile("long", settings.get_profile("repeated"), derandomize=False, max_examples=200)
 settings.load_profile("repeated")
 

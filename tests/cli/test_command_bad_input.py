@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from examples import MODELS
 from small import FEW, HOVERCRAFT, impossible, only_start, rewritten, simulated, steady, written
 
 
@@ -172,3 +173,23 @@ def test_an_impossible_measurement_names_trajectory_and_time_and_leaves_no_run(t
     table = written(tmp_path / "t.csv", impossible(simulated(), trajectory=1, row=3))
     says = "trajectory 2 at 0.3 s: every particle's weight is zero"
     refused(1, says, "fit", HOVERCRAFT, table, *FEW, "--out", tmp_path / "run")
+
+
+def test_no_landmarks_is_no_program(tmp_path: Path, refused) -> None:
+    blind = tmp_path / "blind.py"
+    blind.write_text("from steady_ppl import PlanarVehicle\n\n\nclass Blind(PlanarVehicle):\n    landmarks = ()\n")
+    says = "declares no measurements (for a planar vehicle: landmarks)"
+    refused(2, says, "fit", blind, written(tmp_path / "t.csv"), "--out", tmp_path / "run")
+
+
+def test_example_controls_of_another_shape_are_the_programs_fault(tmp_path: Path, refused) -> None:
+    text = (MODELS / "linear_gaussian.py").read_text().replace("LinearGaussian", "Cart")
+    assert "time.sin().unsqueeze(-1)" in text
+    for controls, says in (
+        ("time.sine()", "example_controls failed: AttributeError"),
+        ("time.sin()", "example_controls gave shape"),
+        ("None", "example_controls gave NoneType"),
+        ("time.sin().unsqueeze(-1) / 0", "not finite"),
+    ):
+        (tmp_path / "cart.py").write_text(text.replace("time.sin().unsqueeze(-1)", controls))
+        refused(2, says, "simulate", tmp_path / "cart.py", "--out", tmp_path / "t.csv")

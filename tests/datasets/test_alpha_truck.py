@@ -243,3 +243,17 @@ def test_the_published_drives_follow_their_commands() -> None:
 )
 def test_the_drop_out_of_the_motion_capture_is_found_without_being_told(split: str, expected: list) -> None:
     assert [(one.label, one.rows, one.columns) for one in stuck(read_alpha_truck(REAL / split))] == expected
+
+
+def test_a_hostile_log_is_refused(tmp_path: Path) -> None:
+    head = "header.stamp.secs,header.stamp.nsecs,"
+    pose = "pose.position.x,pose.position.y,pose.orientation.z,pose.orientation.w\n"
+    for text, says in (
+        ("," * 2_000_000 + "\n", "the first line has more than"),
+        (head + pose + f"{'9' * 400},0,0,0,0,1\n", "expected a finite number"),
+        (head + pose + "1e300,0,0,0,0,1\n", "expected a part of a time stamp"),
+        (head + pose + "1,-5,0,0,0,1\n", "expected a part of a time stamp"),
+    ):
+        (tmp_path / "vrpn-pose.csv").write_text(text)
+        with pytest.raises(DataError, match=says):
+            read_alpha_truck(tmp_path)

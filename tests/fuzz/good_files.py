@@ -14,36 +14,13 @@ from pathlib import Path
 from bag_writing import KINDS, stamped, write_bag
 from examples import MODELS
 from small import simulated, steady, written
+from small_studies import written as write_study
 from truck_logs import command_log, pose_log, write as write_logs
 
 FEW = ("--guide", "bootstrap", "--particles", "20", "--draws", "3", "--steps", "4", "--set", "validate_every=2")
 SEARCH = ("discover", "before", "t.csv", "--valid", "v.csv", "--simulations", "50", "--out")
 CART, HOVER = "models/linear_gaussian.py", "models/hovercraft.py"
 TRAINING = ("fit", CART, "t.csv", "--valid", "v.csv", *FEW, "--out")
-STUDY = f"""\
-title = "A cart"
-seeds = [1, 2]
-known_start = true
-[data]
-simulate = "{CART}"
-train = 2
-valid = 2
-test = 2
-[[method]]
-name = "hand"
-program = "{CART}"
-recipe = "hand"
-[[method]]
-name = "likelihood"
-program = "{CART}"
-recipe = "likelihood"
-settings = {{validation_particles = [50, 60]}}
-[picture]
-x = "settings.validation_particles"
-y = ["log_likelihood", "seconds"]
-labels = {{seconds = "s"}}
-published = {{log_likelihood = {{hand = [[50, -5.0], [60, -4.0]]}}}}
-"""
 MAPPING = """\
 step = 0.1
 messages = ["boat_msgs"]
@@ -106,7 +83,7 @@ class Desk:
         wider = (*SEARCH[:2], "pushed.csv", "--valid", "pushed_too.csv", *SEARCH[5:])
         self.must(*wider, "found", "--json", "found.json")
         assert json.loads((self.good / "found.json").read_text())["effects"]
-        (self.good / "study.toml").write_text(STUDY)
+        write_study(self.good, model=CART)
         self.must("study", "study.toml", "--workers", "1", "--out", "studied")
         self.tidy()
 

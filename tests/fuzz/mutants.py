@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from hypothesis import strategies as st
@@ -13,33 +12,17 @@ Change = Callable[[st.DrawFn, bytes], "bytes | str"]
 """From a good file's bytes to others, or to the name of what takes the file's place."""
 
 
-@dataclass(frozen=True)
-class Mutant:
-    """A spoiled file.
-
-    Attributes:
-        how: the name of the change.
-        now: its bytes; or `a folder`, `a pipe`, or where a link leads that takes its place.
-    """
-
-    how: str
-    now: bytes | str
-
-    def lay(self, file: Path) -> None:
-        """Put it in the place of the good file."""
-        file.unlink()
-        if isinstance(self.now, bytes):
-            file.write_bytes(self.now)
-        elif self.now == "a folder":
-            file.mkdir()
-        elif self.now == "a pipe":
-            os.mkfifo(file)  # reading from it never ends, since nobody writes
-        else:
-            file.symlink_to(self.now.format(name=file.name))
-
-    def __repr__(self) -> str:
-        now = repr(self.now)
-        return f"<{self.how}: {now if len(now) < 2000 else f'{now[:2000]}… of {len(self.now)}'}>"
+def lay(file: Path, now: bytes | str) -> None:
+    """Put something in the place of a good file: other bytes, `a folder`, `a pipe`, or a link, by where it leads."""
+    file.unlink()
+    if isinstance(now, bytes):
+        file.write_bytes(now)
+    elif now == "a folder":
+        file.mkdir()
+    elif now == "a pipe":
+        os.mkfifo(file)  # reading from it never ends, since nobody writes
+    else:
+        file.symlink_to(now.format(name=file.name))
 
 
 def of_text(change: Callable[[st.DrawFn, str], str | bytes]) -> Change:
@@ -57,17 +40,13 @@ def spelt(spell: Callable[[str], str | bytes]) -> Change:
     return of_text(lambda draw, text: spell(text))
 
 
-def _block(draw: st.DrawFn, content: bytes) -> tuple[bytes, bytes, bytes]:
-    """What lies before a block of at most 64 bytes, the block, and what lies behind it."""
-    start = draw(st.integers(0, len(content) - 1))
-    end = start + draw(st.integers(1, 64))
-    return content[:start], content[start:end], content[end:]
-
-
 def _around(change: Callable[[st.DrawFn, bytes], bytes]) -> Change:
+    """A change of a block of at most 64 bytes."""
+
     def changed(draw: st.DrawFn, content: bytes) -> bytes:
-        before, block, behind = _block(draw, content)
-        return before + change(draw, block) + behind
+        start = draw(st.integers(0, len(content) - 1))
+        end = start + draw(st.integers(1, 64))
+        return content[:start] + change(draw, content[start:end]) + content[end:]
 
     return changed
 

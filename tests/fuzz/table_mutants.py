@@ -11,13 +11,14 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
+import pandas as pd
 import pyarrow
 import pyarrow.parquet
 from hypothesis import strategies as st
 from mutants import Change, of_text, spelt
 
-Rows = list[list[str]]  # the header first
-RowChange = Callable[[st.DrawFn, Rows], Rows]
+Frame = pd.DataFrame  # of a CSV file's cells, as text
+FrameChange = Callable[[st.DrawFn, Frame], Frame]
 
 CELLS = (
     "nan", "inf", "-inf", "1e300", "-1e300", "1e308", "1e-320", "1e999", "-0", "", " ", "abc", "0x1p3", "1_000", "1,5",
@@ -32,202 +33,162 @@ LABELS = (*NAMES, "1.0", "nan", "-1", "1e5")
 cells = st.sampled_from(CELLS) | st.floats().map(repr) | st.text(max_size=9)
 
 
-def as_text(rows: Rows, quoting: int = csv.QUOTE_MINIMAL) -> str:
-    """A table as CSV."""
-    text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n", quoting=quoting).writerows(rows)
-    return text.getvalue()
-
-
-def in_rows(change: RowChange) -> Change:
-    """A change of the rows of a CSV file."""
-    return of_text(lambda draw, text: as_text(change(draw, list(csv.reader(io.StringIO(text, newline=""))))))
-
-
-def _of(rows: Rows, kinds: str) -> list[int]:
-    """Columns of some groups: controls, measurements, states, time; the first one where there is none."""
-    found = [i for i, name in enumerate(rows[0]) if name[:1] in kinds and (name[1:2] == "." or name == "time")]
-    return found or [0]
+def in_frame(change: FrameChange) -> Change:
+    """A change of the cells of a CSV file."""
+    read = lambda text: pd.read_csv(io.StringIO(text), dtype=object, keep_default_na=False)  # noqa: E731
+    return of_text(lambda draw, text: change(draw, read(text)).to_csv(index=False, lineterminator="\n"))
 
 
 def _any(draw: st.DrawFn, count: int) -> int:
     return draw(st.integers(0, count - 1))
 
 
-def _a_cell(draw: st.DrawFn, rows: Rows) -> Rows:
-    row = rows[1 + _any(draw, len(rows) - 1)]
-    row[_any(draw, len(row))] = draw(cells)
-    return rows
+def _of(frame: Frame, kinds: str) -> list[int]:
+    """Columns of some groups: controls, measurements, states, time; the first one where there is none."""
+    names = enumerate(frame.columns)
+    return [i for i, name in names if name[:1] in kinds and (name[1:2] == "." or name == "time")] or [0]
 
 
-def _cells(draw: st.DrawFn, rows: Rows) -> Rows:
-    value, at = draw(cells), draw(st.sampled_from(_of(rows, "uyxt")))
-    for i in draw(st.sets(st.integers(1, len(rows) - 1), min_size=1)):
-        rows[i][at] = value
-    return rows
+def _put(frame: Frame, rows: Any, columns: Any, value: Any) -> Frame:
+    frame.iloc[rows, columns] = value
+    return frame
 
 
-def _numbers(kinds: str, *factors: float, offset: float = 0.0) -> RowChange:
+def _filled(kinds: str, value: str) -> FrameChange:
+    """A whole column of one value."""
+    return lambda draw, frame: _put(frame, slice(None), draw(st.sampled_from(_of(frame, kinds))), value)
+
+
+def _scaled(kinds: str, *factors: float, offset: float = 0.0) -> FrameChange:
     """All columns of a group times a factor."""
 
-    def change(draw: st.DrawFn, rows: Rows) -> Rows:
-        factor = draw(st.sampled_from(factors))
-        for row in rows[1:]:
-            for at in _of(rows, kinds):
-                row[at] = _times(row[at], factor, offset)
-        return rows
+    def change(draw: st.DrawFn, frame: Frame) -> Frame:
+        at, factor = _of(frame, kinds), draw(st.sampled_from(factors))
+        return _put(frame, slice(None), at, frame.iloc[:, at].apply(pd.to_numeric, errors="coerce") * factor + offset)
 
     return change
 
 
-def _times(cell: str, factor: float, offset: float) -> str:
-    try:
-        return repr(float(cell) * factor + offset)
-    except ValueError:
-        return cell
+def _counts(frame: Frame) -> pd.Series:
+    """The number of every row within its trajectory."""
+    return frame.iloc[:, 0].groupby(frame.iloc[:, 0]).cumcount()
 
 
-def _filled(kinds: str, *values: str) -> RowChange:
-    """A whole column of one value."""
-
-    def change(draw: st.DrawFn, rows: Rows) -> Rows:
-        value, at = draw(st.sampled_from(values)), draw(st.sampled_from(_of(rows, kinds)))
-        return [rows[0], *([*row[:at], value, *row[at + 1 :]] for row in rows[1:])]
-
-    return change
-
-
-def _counted(rows: Rows) -> list[tuple[int, list[str]]]:
-    """Every row with its number within its trajectory."""
-    found, label, count = [], None, 0
-    for row in rows[1:]:
-        count = count + 1 if row[0] == label else 0
-        label = row[0]
-        found.append((count, row))
-    return found
-
-
-def _time(at: Callable[[int], float]) -> RowChange:
+def _time(at: Callable[[int], float]) -> FrameChange:
     """The time of every row of a trajectory by its number."""
-
-    def change(draw: st.DrawFn, rows: Rows) -> Rows:
-        column = rows[0].index("time")
-        for count, row in _counted(rows):
-            row[column] = repr(at(count))
-        return rows
-
-    return change
+    return lambda draw, frame: _put(frame, slice(None), _of(frame, "t")[0], _counts(frame).map(at))
 
 
-def _a_time(draw: st.DrawFn, rows: Rows) -> Rows:
-    row, at = draw(st.integers(2, len(rows) - 1)), rows[0].index("time")
-    rows[row][at] = _times(rows[row - 1][at], 1.0, draw(st.sampled_from((0.0, -1.0, 1e-12, 1e9, 1e300, math.nan))))
-    return rows
+def _a_time(draw: st.DrawFn, frame: Frame) -> Frame:
+    row, at = draw(st.integers(1, len(frame) - 1)), _of(frame, "t")[0]
+    later = draw(st.sampled_from((0.0, -1.0, 1e-12, 1e9, 1e300, math.nan)))
+    return _put(frame, row, at, float(frame.iloc[row - 1, at]) + later)
 
 
-def _kept(keep: Callable[[str, int], bool]) -> RowChange:
-    """Only some rows, by label and number within the trajectory."""
-    return lambda draw, rows: [rows[0], *(row for count, row in _counted(rows) if keep(row[0], count))]
+def _named(draw: st.DrawFn, frame: Frame) -> Frame:
+    names, at = list(frame.columns), _any(draw, frame.shape[1])
+    return frame.set_axis([*names[:at], draw(st.sampled_from(NAMES) | st.text(max_size=9)), *names[at + 1 :]], axis=1)
 
 
-def _a_name(draw: st.DrawFn, rows: Rows) -> Rows:
-    rows[0][_any(draw, len(rows[0]))] = draw(st.sampled_from(NAMES) | st.text(max_size=9))
-    return rows
+def _swapped(draw: st.DrawFn, frame: Frame) -> Frame:
+    names = list(frame.columns)
+    a, b = (_any(draw, len(names)) for _ in "ab")
+    names[a], names[b] = names[b], names[a]
+    return frame.set_axis(names, axis=1)
 
 
-def _a_label(draw: st.DrawFn, rows: Rows) -> Rows:
-    old, new = rows[1 + _any(draw, len(rows) - 1)][0], draw(st.sampled_from(LABELS) | st.text(max_size=9))
-    return [rows[0], *([new, *row[1:]] if row[0] == old else row for row in rows[1:])]
+def _labelled(draw: st.DrawFn, frame: Frame) -> Frame:
+    labels = frame.iloc[:, 0]
+    old, new = labels.iloc[_any(draw, len(labels))], draw(st.sampled_from(LABELS) | st.text(max_size=9))
+    return _put(frame, slice(None), 0, labels.mask(labels == old, new))
 
 
-def _lost(draw: st.DrawFn, rows: Rows) -> Rows:
-    at = _any(draw, len(rows[0]))
-    return [[*row[:at], *row[at + 1 :]] for row in rows]
+def _lost(draw: st.DrawFn, frame: Frame) -> Frame:
+    at = _any(draw, frame.shape[1])
+    return frame.iloc[:, [i for i in range(frame.shape[1]) if i != at]]
 
 
-def _twice(draw: st.DrawFn, rows: Rows) -> Rows:
-    at = _any(draw, len(rows[0]))
-    return [[*row, row[at]] for row in rows]
+def _row_twice(draw: st.DrawFn, frame: Frame) -> Frame:
+    at = _any(draw, len(frame))
+    return frame.iloc[[*range(at + 1), *range(at, len(frame))]]
 
 
-def _swapped(draw: st.DrawFn, rows: Rows) -> Rows:
-    a, b = (_any(draw, len(rows[0])) for _ in "ab")
-    rows[0][a], rows[0][b] = rows[0][b], rows[0][a]
-    return rows
+def _short(draw: st.DrawFn, frame: Frame) -> Frame:
+    return pd.concat([_put(frame.iloc[:2].copy(), slice(None), 0, f"{n}") for n in range(200)])
 
 
-def _cut(draw: st.DrawFn, rows: Rows) -> Rows:
-    row = draw(st.sampled_from(rows))
-    del row[_any(draw, len(row)) :]
-    return rows
+def _more(draw: st.DrawFn, frame: Frame) -> Frame:
+    return pd.concat([frame, Frame("1", frame.index, [f"y.more_{i}" for i in range(300)])], axis=1)
 
 
-def _row_twice(draw: st.DrawFn, rows: Rows) -> Rows:
-    at = _any(draw, len(rows))
-    return [*rows[: at + 1], *rows[at:]]
-
-
-def _more(draw: st.DrawFn, rows: Rows) -> Rows:
-    return [[*row, *(f"{'' if i else 'y.more_'}{k}" for k in range(300))] for i, row in enumerate(rows)]
-
-
-LOG: Mapping[str, RowChange] = {"a cell": _a_cell, "cells": _cells, "a column lost": _lost, "a row cut": _cut}
-TIMES: Mapping[str, RowChange] = {
-    "time since 1970": _numbers("t", 1.0, offset=1.7e9), "time in nanoseconds": _numbers("t", 1e9, offset=1.7e18),
+LOG: Mapping[str, FrameChange] = {
+    "a cell": lambda draw, frame: _put(frame, _any(draw, len(frame)), _any(draw, frame.shape[1]), draw(cells)),
+    "cells": lambda draw, frame: _put(
+        frame, draw(st.lists(st.integers(0, len(frame) - 1), min_size=1)), _any(draw, frame.shape[1]), draw(cells)
+    ),
+    "a column lost": _lost,
+}  # fmt: skip
+FRAMES: Mapping[str, FrameChange] = {
+    **LOG, "a time": _a_time, "a column's name": _named, "a label": _labelled, "columns swapped": _swapped,
+    "a row twice": _row_twice, "300 columns more": _more, "200 trajectories of two rows": _short,
+    "rows shuffled": lambda draw, frame: frame.iloc[draw(st.permutations(range(len(frame))))],
+    "a column twice": lambda draw, frame: pd.concat([frame, frame.iloc[:, _any(draw, frame.shape[1])]], axis=1),
+    "constant measurement": _filled("y", "0.5"), "constant control": _filled("u", "0"),
+    "no control": _filled("u", ""), "no measurement": _filled("y", ""), "no state": _filled("x", ""),
+    "measurements scaled": _scaled("y", 0.0, 180 / math.pi, 1e20, 1e300, 1e-300),
+    "controls scaled": _scaled("u", 1e20, 1e300), "states scaled": _scaled("x", 180 / math.pi, 1e300),
+    "time since 1970": _scaled("t", 1.0, offset=1.7e9), "time in nanoseconds": _scaled("t", 1e9, offset=1.7e18),
     "time that stands": _time(lambda row: 0.0), "time that goes back": _time(lambda row: -0.1 * row),
     "time by 1e-300": _time(lambda row: 1e-300 * row), "time by 1e-9": _time(lambda row: 1e-9 * row),
     "time by 1e6": _time(lambda row: 1e6 * row), "time that explodes": _time(lambda row: 10.0 ** (30 * row)),
-}  # fmt: skip
-FEWER: Mapping[str, RowChange] = {
-    "one row each": _kept(lambda label, count: count == 0), "two rows each": _kept(lambda label, count: count < 2),
-    "one trajectory": _kept(lambda label, count: label == "1"),
-    "one trajectory of one row": _kept(lambda label, count: label == "1" and count == 0),
-    "one row of the last": _kept(lambda label, count: label != "10" or count == 0),
-    "only the header": lambda draw, rows: rows[:1], "no header": lambda draw, rows: rows[1:],
-}  # fmt: skip
-ROWS: Mapping[str, RowChange] = {
-    **LOG, **TIMES, **FEWER, "a time": _a_time, "a column's name": _a_name, "a label": _a_label,
-    "columns swapped": _swapped, "a row twice": _row_twice, "a column twice": _twice, "300 columns more": _more,
-    "rows shuffled": lambda draw, rows: [rows[0], *draw(st.permutations(rows[1:]))],
-    "200 trajectories of two rows": lambda draw, rows: [
-        rows[0], *([f"{n}", *row[1:]] for n in range(200) for row in rows[1:3])
-    ],
-    "constant measurement": _filled("y", "0.5"), "constant control": _filled("u", "0"),
-    "no control": _filled("u", ""), "no measurement": _filled("y", ""), "no state": _filled("x", ""),
-    "measurements scaled": _numbers("y", 0.0, 180 / math.pi, 1e20, 1e300, 1e-300),
-    "controls scaled": _numbers("u", 1e20, 1e300), "states scaled": _numbers("x", 180 / math.pi, 1e300),
+    "one row each": lambda draw, frame: frame[_counts(frame) == 0],
+    "two rows each": lambda draw, frame: frame[_counts(frame) < 2],
+    "one trajectory": lambda draw, frame: frame[frame.iloc[:, 0] == "1"],
+    "one row of the last": lambda draw, frame: frame[(frame.iloc[:, 0] != "10") | (_counts(frame) == 0)],
+    "one row": lambda draw, frame: frame[:1], "only the header": lambda draw, frame: frame[:0],
 }  # fmt: skip
 
 
-def _two(draw: st.DrawFn, rows: Rows) -> Rows:
+def _two(draw: st.DrawFn, frame: Frame) -> Frame:
     """One change after another; where the second finds nothing to change, the first alone."""
-    first, second = (ROWS[draw(st.sampled_from(sorted(ROWS)))] for _ in "ab")
-    rows = first(draw, rows)
-    if len(rows) > 2:
+    first, second = (FRAMES[draw(st.sampled_from(sorted(FRAMES)))] for _ in "ab")
+    frame = first(draw, frame)
+    if len(frame) > 1:
         with suppress(IndexError, ValueError):
-            rows = second(draw, rows)
-    return rows
+            return second(draw, frame.copy())
+    return frame
+
+
+def _quoted(text: str) -> str:
+    return pd.read_csv(io.StringIO(text), dtype=object).to_csv(index=False, quoting=csv.QUOTE_ALL)
+
+
+def _cut(draw: st.DrawFn, text: str) -> str:
+    """A row without its last cells."""
+    lines = text.splitlines()
+    at = _any(draw, len(lines))
+    here = lines[at].split(",")
+    return "\n".join([*lines[:at], ",".join(here[: _any(draw, len(here))]), *lines[at + 1 :]]) + "\n"
 
 
 SPELT: Mapping[str, Change] = {
-    "semicolons and decimal commas": spelt(lambda text: text.replace(",", ";").replace(".", ",")),
-    "semicolons": spelt(lambda text: text.replace(",", ";")), "tabs": spelt(lambda text: text.replace(",", "\t")),
-    "a byte order mark": spelt(lambda text: "\ufeff" + text),
-    "two byte order marks": spelt(lambda text: "\ufeff\ufeff" + text),
-    "CRLF": spelt(lambda text: text.replace("\n", "\r\n")),
-    "CR alone": spelt(lambda text: text.replace("\n", "\r")),
-    "Latin 1": spelt(lambda text: text.replace("time", "zeït").encode("latin-1")),
-    "an open quote": spelt(lambda text: text.replace("\n", '\n"', 1)),
-    "quotes around all": spelt(lambda text: as_text(list(csv.reader(text.splitlines())), csv.QUOTE_ALL)),
-    "empty lines": spelt(lambda text: text.replace("\n", "\n\n")),
-    "commas at the end": spelt(lambda text: text.replace("\n", ",\n")),
-    "a cell of a megabyte": spelt(lambda text: text.replace("\n", "\n" + "1" * 1_000_000, 1)),
-    "a line of ten megabytes": spelt(lambda text: "," * 10_000_000 + "\n" + text),
-    "no last line end": spelt(lambda text: text.rstrip("\n")),
-    "a comment first": spelt(lambda text: "# made by hand\n" + text),
-}  # fmt: skip
-TABLE: Mapping[str, Change] = {name: in_rows(change) for name, change in (ROWS | {"two at once": _two}).items()} | SPELT
-LOGS: Mapping[str, Change] = {name: in_rows(change) for name, change in LOG.items()} | SPELT
+    name: spelt(spell)
+    for name, spell in {
+        "semicolons and decimal commas": lambda text: text.replace(",", ";").replace(".", ","),
+        "semicolons": lambda text: text.replace(",", ";"), "tabs": lambda text: text.replace(",", "\t"),
+        "a byte order mark": lambda text: "\ufeff" + text, "two byte order marks": lambda text: "\ufeff\ufeff" + text,
+        "CRLF": lambda text: text.replace("\n", "\r\n"), "CR alone": lambda text: text.replace("\n", "\r"),
+        "Latin 1": lambda text: text.replace("time", "zeït").encode("latin-1"), "quotes around all": _quoted,
+        "an open quote": lambda text: text.replace("\n", '\n"', 1), "no header": lambda text: text.partition("\n")[2],
+        "empty lines": lambda text: text.replace("\n", "\n\n"), "no last line end": lambda text: text.rstrip("\n"),
+        "commas at the end": lambda text: text.replace("\n", ",\n"),
+        "a cell of a megabyte": lambda text: text.replace("\n", "\n" + "1" * 1_000_000, 1),
+        "a line of ten megabytes": lambda text: "," * 10_000_000 + "\n" + text,
+        "a comment first": lambda text: "# made by hand\n" + text,
+    }.items()
+} | {"a row cut": of_text(_cut)}  # fmt: skip
+TABLE: Mapping[str, Change] = {n: in_frame(change) for n, change in {**FRAMES, "two at once": _two}.items()} | SPELT
+LOGS: Mapping[str, Change] = {name: in_frame(change) for name, change in LOG.items()} | SPELT
 
 DAY, SECOND = datetime.datetime(2024, 1, 1), datetime.timedelta(seconds=1)
 VALUES: Mapping[str, Callable[[int], Any]] = {

@@ -15,7 +15,7 @@ import pytest
 import torch
 from good_files import CART, FEW, HOVER, SEARCH, TRAINING, Desk
 from hypothesis import event, given, settings, strategies as st
-from mutants import BYTES, Change, Mutant
+from mutants import BYTES, Change, lay
 from record_mutants import JSON, RECORD, TENSORS
 from small import steady
 from table_mutants import LOGS, PARQUET, TABLE
@@ -38,100 +38,94 @@ class Kind(NamedTuple):
         return self.file
 
 
-def on_table(table: str, program: str, run: str, *others: str) -> tuple[Words, ...]:
-    """Every command that takes a table, with settings that make it short."""
-    few = ("--guide", "bootstrap", "--particles", "20", "--draws", "3", "--steps", "2")
-    return (
-        ("fit", program, table, *few, "--out", "out/run"),
-        ("fit", program, table, "--recipe", "likelihood", "--out", "out/run"),
-        ("check", run, table, "--simulations", "20", "--json", "out/check.json", "--mask", "out/mask.csv"),
-        ("evaluate", run, table, "--particles", "20", "--rollouts", "5", "--json", "out/errors.json"),
-        ("states", run, table, "--draws", "3", "--particles", "20", "--out", "out/states.csv"),
-        ("prove", run, *others, table, "--json", "out/proof.json"),
-        ("report", run, *others, table, "--simulations", "20", "--out", "out/page.html"),
-        ("simulate", program, "--controls", table, "--out", "out/again.csv"),
-        ("data", "cut", table, "--seconds", "0.4", "--out", "out/cut.csv"),
-    )
+def commands(text: str, **names: str) -> tuple[Words, ...]:
+    """The words of a command a line; cart, hovercraft, few and search stand for what is long."""
+    names |= {"cart": CART, "hovercraft": HOVER, "few": " ".join(FEW), "search": " ".join(SEARCH)}
+    return tuple(tuple(line.format(**names).split()) for line in text.strip().splitlines())
 
 
-def on_run(run: str) -> tuple[Words, ...]:
-    """Every command that takes a run."""
-    return (
-        ("check", run, "t.csv", "--simulations", "20", "--json", "out/check.json"),
-        ("evaluate", run, "after", "t.csv", "--particles", "20", "--rollouts", "5"),
-        ("states", run, "t.csv", "--draws", "3", "--particles", "20", "--out", "out/states.nc"),
-        ("prove", "after", "t.csv", "--oracle", run, "--json", "out/proof.json"),
-        ("discover", run, "t.csv", "--valid", "v.csv", "--simulations", "50", "--json", "out/found.json"),
-        ("report", "after", run, "t.csv", "--simulations", "20", "--out", "out/page.html"),
-        ("add", run, "stiffness=0.1", "--out", "models/stiff.py"),
-        ("fit", CART, "t.csv", "--recipe", "hand", "--force", "--out", run),
-    )
-
-
-def on_bag(bag: str) -> tuple[Words, ...]:
-    """A bag read, and listed."""
-    return ("import-bag", bag, "mapping.toml", "--out", "out/drives.csv"), ("import-bag", bag)
-
-
-MORE_OF_CART: tuple[Words, ...] = (
-    ("fit", CART, "v.csv", "--valid", "t.csv", *FEW, "--out", "out/run"),
-    ("fit", CART, "t.csv", "--recipe", "svi", "--steps", "2", "--out", "out/run"),
-    ("fit", CART, "t.csv", "--recipe", "fit-truth", "--steps", "2", "--out", "out/run"),
-    (*SEARCH, "out/run"),
-    ("discover", "before", "v.csv", "--valid", "t.csv", "--simulations", "50", "--out", "out/run"),
-)
-PARQUETS: tuple[Words, ...] = (
-    ("fit", CART, "t.parquet", "--recipe", "hand", "--out", "out/run"),
-    ("check", "before", "t.parquet", "--simulations", "20", "--json", "out/check.json"),
-    ("states", "before", "t.parquet", "--draws", "3", "--particles", "20", "--out", "out/states.parquet"),
-)
-KNOWN_START: Words = ("fit", HOVER, "h.csv", "--known-start", *FEW, "--out", "out/run")
-RESUMED: Words = (*TRAINING, "begun", "--resume")
-SEARCHED: Words = (*SEARCH, "searched", "--resume")
-SHOWN: Words = (
-    *("report", "before", "t.csv", "--discovery", "found.json"),
-    "--simulations",
-    "20",
-    "--out",
-    "out/p.html",
-)
-STUDY: Words = ("study", "study.toml", "--workers", "1", "--out")
-STUDIED: tuple[Words, ...] = ((*STUDY, "studied"), ("plot-study", "studied", "--out", "out/study.png"))
-LOG: Words = ("data", "alpha-truck", "logs", "--out", "out/logs.csv")
-PROGRAM: tuple[Words, ...] = (
-    ("simulate", CART, "--trajectories", "2", "--out", "out/drives.csv"),
-    ("effects", CART),
-    ("fit", CART, "t.csv", "--recipe", "hand", "--out", "out/run"),
-    ("check", "before", "t.csv", "--simulations", "20", "--program", CART),
-)
+ON_TABLE = """
+fit {program} {table} --guide bootstrap --particles 20 --draws 3 --steps 2 --out out/run
+fit {program} {table} --recipe likelihood --out out/run
+check {run} {table} --simulations 20 --json out/check.json --mask out/mask.csv
+evaluate {run} {table} --particles 20 --rollouts 5 --json out/errors.json
+states {run} {table} --draws 3 --particles 20 --out out/states.csv
+prove {run} {other} {table} --json out/proof.json
+report {run} {other} {table} --simulations 20 --out out/page.html
+simulate {program} --controls {table} --out out/again.csv
+data cut {table} --seconds 0.4 --out out/cut.csv
+"""
+MORE_OF_CART = """
+fit {cart} v.csv --valid t.csv {few} --out out/run
+fit {cart} t.csv --recipe svi --steps 2 --out out/run
+fit {cart} t.csv --recipe fit-truth --steps 2 --out out/run
+{search} out/run
+discover before v.csv --valid t.csv --simulations 50 --out out/run
+"""
+MORE_OF_HOVERCRAFT = "fit {hovercraft} h.csv --known-start {few} --out out/run"
+ON_PARQUET = """
+fit {cart} t.parquet --recipe hand --out out/run
+check before t.parquet --simulations 20 --json out/check.json
+states before t.parquet --draws 3 --particles 20 --out out/states.parquet
+"""
+ON_RUN = """
+check {run} t.csv --simulations 20 --json out/check.json
+evaluate {run} after t.csv --particles 20 --rollouts 5
+states {run} t.csv --draws 3 --particles 20 --out out/states.nc
+prove after t.csv --oracle {run} --json out/proof.json
+discover {run} t.csv --valid v.csv --simulations 50 --json out/found.json
+report after {run} t.csv --simulations 20 --out out/page.html
+add {run} stiffness=0.1 --out models/stiff.py
+fit {cart} t.csv --recipe hand --force --out {run}
+"""
+ON_BAG = """
+import-bag {bag} mapping.toml --out out/drives.csv
+import-bag {bag}
+"""
+ON_STUDY = """
+study study.toml --workers 1 --out studied
+plot-study studied --out out/study.png
+"""
+ON_PROGRAM = """
+simulate {cart} --trajectories 2 --out out/drives.csv
+effects {cart}
+fit {cart} t.csv --recipe hand --out out/run
+check before t.csv --simulations 20 --program {cart}
+"""
+OF_CART = {"program": CART, "table": "t.csv", "run": "before", "other": "after"}
+OF_HOVERCRAFT = {"program": HOVER, "table": "h.csv", "run": "hover", "other": "hover_too"}
+SHOWN = commands("report before t.csv --discovery found.json --simulations 20 --out out/page.html")
+SEARCHED = commands("{search} searched --resume")
+RESUMED: tuple[Words, ...] = ((*TRAINING, "begun", "--resume"),)
+RUN, STUDIED, PROGRAM = commands(ON_RUN, run="before"), commands(ON_STUDY), commands(ON_PROGRAM)
+MAPPED, LOG = commands(ON_BAG, bag="mcap_file.mcap")[:1], commands("data alpha-truck logs --out out/logs.csv")
 KINDS = (
-    Kind("t.csv", TABLE | BYTES, (*on_table("t.csv", CART, "before", "after"), *MORE_OF_CART)),
-    Kind("h.csv", TABLE, (*on_table("h.csv", HOVER, "hover", "hover_too"), KNOWN_START)),
-    Kind("t.parquet", PARQUET | BYTES, PARQUETS),
-    Kind("before/run.json", RECORD | BYTES, on_run("before")),
-    Kind("before/parameters.safetensors", TENSORS | BYTES, on_run("before")),
-    Kind("before/posterior.nc", BYTES, on_run("before")),
-    Kind("begun/checkpoint.safetensors", TENSORS | BYTES, (RESUMED,)),
-    Kind("begun/run.json", JSON, (RESUMED,)),
-    Kind("searched/journal/000001.safetensors", TENSORS | BYTES, (SEARCHED,)),
-    Kind("searched/run.json", JSON, (SEARCHED,)),
-    Kind("found.json", JSON | BYTES, (SHOWN,), True),
-    Kind("found/discovery.json", JSON, on_run("found"), True),
-    Kind("ros1.bag", BYTES, on_bag("ros1.bag")),
-    Kind("sqlite/sqlite.db3", BYTES, on_bag("sqlite")),
-    Kind("mcap/mcap.mcap", BYTES, on_bag("mcap")),
-    Kind("mcap_file.mcap", BYTES, on_bag("mcap_file.mcap")),
-    Kind("sqlite/metadata.yaml", BYTES, on_bag("sqlite")),
-    Kind("mapping.toml", TOML | BYTES, on_bag("mcap_file.mcap")[:1]),
-    Kind("boat_msgs/msg/Battery.msg", DEFINITION | BYTES, on_bag("mcap_file.mcap")[:1]),
-    Kind("logs/vrpn-pose.csv", LOGS | BYTES, (LOG,)),
-    Kind("logs/vesc_drive.csv", LOGS | BYTES, (LOG,)),
-    Kind("study.toml", TOML | BYTES, ((*STUDY, "out/study"),), True),
+    Kind("t.csv", TABLE | BYTES, commands(ON_TABLE + MORE_OF_CART, **OF_CART)),
+    Kind("h.csv", TABLE, commands(ON_TABLE + MORE_OF_HOVERCRAFT, **OF_HOVERCRAFT)),
+    Kind("t.parquet", PARQUET | BYTES, commands(ON_PARQUET)),
+    Kind("before/run.json", RECORD | BYTES, RUN),
+    Kind("before/parameters.safetensors", TENSORS | BYTES, RUN),
+    Kind("before/posterior.nc", BYTES, RUN),
+    Kind("begun/checkpoint.safetensors", TENSORS | BYTES, RESUMED),
+    Kind("begun/run.json", JSON, RESUMED),
+    Kind("searched/journal/000001.safetensors", TENSORS | BYTES, SEARCHED),
+    Kind("searched/run.json", JSON, SEARCHED),
+    Kind("found.json", JSON | BYTES, SHOWN, True),
+    Kind("found/discovery.json", JSON, commands(ON_RUN, run="found"), True),
+    Kind("ros1.bag", BYTES, commands(ON_BAG, bag="ros1.bag")),
+    Kind("sqlite/sqlite.db3", BYTES, commands(ON_BAG, bag="sqlite")),
+    Kind("mcap/mcap.mcap", BYTES, commands(ON_BAG, bag="mcap")),
+    Kind("mcap_file.mcap", BYTES, commands(ON_BAG, bag="mcap_file.mcap")),
+    Kind("sqlite/metadata.yaml", BYTES, commands(ON_BAG, bag="sqlite")),
+    Kind("mapping.toml", TOML | BYTES, MAPPED),
+    Kind("boat_msgs/msg/Battery.msg", DEFINITION | BYTES, MAPPED),
+    Kind("logs/vrpn-pose.csv", LOGS | BYTES, LOG),
+    Kind("logs/vesc_drive.csv", LOGS | BYTES, LOG),
+    Kind("study.toml", TOML | BYTES, commands("study study.toml --workers 1 --out out/study"), True),
     Kind("studied/study.json", JSON | BYTES, STUDIED, True),
     Kind("studied/results.parquet", PARQUET | BYTES, STUDIED, True),
     Kind(CART, CUT, PROGRAM),
 )
-ALL = {words for kind in KINDS for words in kind.commands}
 
 
 def few(count: int) -> settings:
@@ -166,17 +160,11 @@ def warm(desk: Desk, words: Words, done: set[Words] = set()) -> None:  # noqa: B
 
 def spoil(desk: Desk, kind: Kind, data: st.DataObject, how: str, words: Words) -> None:
     """Spoil a file, run a command, and see that nothing is wrong."""
-    content = (desk.good / kind.file).read_bytes()
     warm(desk, words)
-    mutant = Mutant(how, kind.changes[how](data.draw, content))
-    mutant.lay(desk.place / kind.file)
+    lay(desk.place / kind.file, kind.changes[how](data.draw, (desk.good / kind.file).read_bytes()))
     ending, wrong = tried(desk, words)
     event(f"{kind.file}: exit code {ending.code}")
-    assert wrong == [], f"{wrong}: steady {' '.join(words)}, {mutant}\n{ending.error[-2000:]}"
-
-
-def drawn(data: st.DataObject, kind: Kind, quick: bool) -> Words:
-    return data.draw(st.sampled_from([words for words in kind.commands if not (quick and is_long(words))]), "command")
+    assert wrong == [], f"{wrong}: steady {' '.join(words)}: {ending.error[-2000:]}"
 
 
 def quick(kind: Kind) -> list[Words]:
@@ -211,6 +199,6 @@ def test_every_change_of_every_file(full_desk: Desk, kind: Kind, how: str, words
 @few(40)
 @given(data=st.data())
 def test_a_misspelt_command_is_done_or_refused_in_a_line(desk: Desk, data: st.DataObject) -> None:
-    words = data.draw(spellings(data.draw(st.sampled_from([*PROGRAM, *on_run("before")]), "command")))
+    words = data.draw(spellings(data.draw(st.sampled_from([*PROGRAM, *RUN]), "command")))
     ending, wrong = tried(desk, words, strict=False)
     assert wrong == [], f"{wrong}: steady {words}\n{ending.error[-2000:]}"

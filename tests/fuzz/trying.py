@@ -18,10 +18,12 @@ from pathlib import Path
 from typing import Any
 
 from good_files import Desk, snapshot
+from joblib.externals.loky import reusable_executor
 
 from steady_ppl.cli import main as command_line
 
 SECONDS = 10  # of the processor
+PATIENCE = 6  # times as long by the clock, for what waits
 LONG = 180  # for a command that searches, climbs to a maximum or starts processes
 ROOM = 4 << 30  # bytes of address space beside what the process has when it begins
 MOST_MIB = 1024  # that a small file may cost
@@ -63,7 +65,7 @@ def attempt(
         os._exit(0)
     writer.close()
     try:
-        return reader.recv() if reader.poll(6 * seconds) else Ending(f"no end within {6 * seconds} s")
+        return reader.recv() if reader.poll(PATIENCE * seconds) else Ending(f"no end within {PATIENCE * seconds} s")
     except EOFError:
         return Ending(f"the process died, perhaps after {seconds} s of the processor")
     finally:
@@ -83,6 +85,7 @@ def _ended(place: Path, words: Sequence[str], seconds: int, strict: bool, do: Ca
     resource.setrlimit(resource.RLIMIT_CPU, (seconds,) * 2)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    reusable_executor._executor = None  # its threads stayed behind
     if strict:
         command_line.as_refusal = lambda error: None
     Path("/proc/self/clear_refs").write_text("5")  # forget the peak of the memory
@@ -106,10 +109,11 @@ def _status() -> Mapping[str, int]:
 def _listener(place: Path, starts: bool, heard: list[str]) -> Callable[[str, tuple[Any, ...]], None]:
     """What the interpreter announces and no command does: files outside changed, code of a run's, others called."""
 
-    def outside(path: Any) -> bool:
+    def outside(path: Any, through: bool = False) -> bool:
         if not isinstance(path, str | bytes | os.PathLike):
             return False
-        real = Path(os.path.realpath(os.fsdecode(path)))
+        named = Path(os.fsdecode(path))
+        real = Path(os.path.realpath(named)) if through else Path(os.path.realpath(named.parent), named.name)
         own = any(part.startswith(CACHES) for part in real.parts)
         return not (real.is_relative_to(place) or real == Path(os.devnull) or own)
 
@@ -117,7 +121,7 @@ def _listener(place: Path, starts: bool, heard: list[str]) -> Callable[[str, tup
         if event == "exec" and Path(file := said[0].co_filename).is_relative_to(place):
             if not Path(file).is_relative_to(place / "models"):
                 heard.append(f"code of {file}")
-        elif event == "open" and isinstance(said[2], int) and said[2] & WRITING and outside(said[0]):
+        elif event == "open" and isinstance(said[2], int) and said[2] & WRITING and outside(said[0], through=True):
             heard.append(f"written: {said[0]}")
         elif (event in CHANGES and any(map(outside, said[:2]))) or (event in CALLS and not starts):
             heard.append(f"{event} {said}")

@@ -12,7 +12,7 @@ import torch
 from examples import MODELS, HeavyTailed, example
 from pyro.distributions import constraints
 from pyro.nn import PyroParam
-from small import HOVERCRAFT, steady, written
+from small import HOVERCRAFT, simulated, steady, written
 
 import steady_ppl as st
 from steady_ppl.runs.diagnostics import diagnose_fit, diagnose_units
@@ -138,3 +138,14 @@ def test_degrees_are_asked_for(tmp_path: Path, drives, capsys):
     table = written(tmp_path / "degrees.csv", degrees)
     assert steady("fit", HOVERCRAFT, table, "--recipe", "hand", "--out", tmp_path / "run") == 0
     assert "y.bearing_0 is between" in capsys.readouterr().err
+
+
+def test_degrees_are_suspected_in_controls_and_known_headings(tmp_path: Path, capsys) -> None:
+    program, data = example("truck", torch.float32), simulated("truck", 3, 13)
+    controls, states = data.controls.clone(), data.states.clone()
+    controls[..., 1] = 45.0
+    states[..., 2] = 170.0
+    found = doubts_of_units(program, st.for_program(program, replace(data, controls=controls, states=states)))
+    assert any(said.startswith("u.turn") and "radians a second" in said for said in found)
+    assert any(said.startswith("x.heading is between 170 and 170") for said in found)
+    assert doubts_of_units(program, st.for_program(program, data)) == []

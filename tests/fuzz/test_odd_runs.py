@@ -1,0 +1,128 @@
+"""Odd run folders by hand: records, parameters, checkpoints and discoveries of another form are refused in a line."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from pathlib import Path
+
+import pytest
+import torch
+from examples import MODELS
+from small import FEW, contents, simulated, steady, written
+
+import steady_ppl as st
+from steady_ppl.errors import RunError
+from steady_ppl.runs.folder import read_discovery
+from steady_ppl.utils.tensor_files import read_tensors, write_tensors
+
+CART = MODELS / "linear_gaussian.py"
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda record: record.update(program=3), "program is 3, expected names and values"),
+        (lambda record: record["program"].pop("class"), "program has no class"),
+        (lambda record: record.update(seed=-1), "seed is -1, expected a whole number"),
+        (lambda record: record.update(notes=[None]), "notes[0] is None, expected text"),
+        (lambda record: record.update(effects="wind"), "effects is 'wind', expected a list"),
+        (lambda record: record.pop("history"), "it has no history"),
+        (lambda record: record.update(recipe=["\x1b[2J"]), "recipe is "),
+    ],
+)
+def test_a_record_of_another_form_is_refused(tmp_path: Path, cart_run: Path, refused, change, says: str) -> None:
+    copy = copied(cart_run, tmp_path / "run")
+    record = json.loads((copy / "run.json").read_text())
+    change(record)
+    (copy / "run.json").write_text(json.dumps(record))
+    refused(2, says, "evaluate", copy, written(tmp_path / "t.csv", simulated("linear_gaussian", 5, 9)))
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "", "3", "\ud83d", '{"a": ' + "9" * 10_000 + "}"])
+def test_a_record_that_is_no_json_is_refused(tmp_path: Path, cart_run: Path, refused, text: str) -> None:
+    copy = copied(cart_run, tmp_path / "run")
+    (copy / "run.json").write_bytes(text.encode(errors="surrogatepass"))
+    refused(2, "run.json is damaged", "evaluate", copy, written(tmp_path / "t.csv", simulated("linear_gaussian", 5, 9)))
+
+
+def copied(run: Path, place: Path) -> Path:
+    place.mkdir()
+    for name, content in contents(run).items():
+        (place / name).write_bytes(content)
+    record = json.loads((place / "run.json").read_text())
+    record["program"]["file"] = os.path.relpath(CART, place)
+    (place / "run.json").write_text(json.dumps(record))
+    return place
+
+
+def test_parameters_of_which_a_bit_has_turned_are_refused(tmp_path: Path, cart_run: Path, refused) -> None:
+    copy, table = copied(cart_run, tmp_path / "run"), written(tmp_path / "t.csv", simulated("linear_gaussian", 5, 9))
+    file = copy / "parameters.safetensors"
+    good = file.read_bytes()
+    file.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
+    refused(2, "its numbers are not those that were written", "evaluate", copy, table)
+    file.write_bytes(struct.pack("<Q", 2**63) + good[8:])
+    refused(2, "is damaged", "evaluate", copy, table)
+
+
+def test_parameters_that_are_not_finite_are_refused(tmp_path: Path, cart_run: Path) -> None:
+    fit = st.Fit.load(cart_run)
+    with torch.no_grad():
+        next(fit.program.parameters()).fill_(torch.nan)
+    fit.save(tmp_path / "run")
+    with pytest.raises(RunError, match="are not finite: fit again"):
+        st.Fit.load(tmp_path / "run")
+
+
+def test_a_run_in_which_a_folder_takes_a_files_place_is_not_overwritten(
+    tmp_path: Path, cart_run: Path, refused
+) -> None:
+    copy, table = copied(cart_run, tmp_path / "run"), written(tmp_path / "t.csv", simulated("linear_gaussian", 5, 9))
+    (copy / "run.json").unlink()
+    (copy / "run.json").mkdir()
+    refused(2, "run.json is a folder", "fit", CART, table, "--recipe", "hand", "--force", "--out", copy)
+
+
+def test_a_checkpoint_of_another_form_is_refused(tmp_path: Path, refused) -> None:
+    table, run = written(tmp_path / "t.csv", simulated("linear_gaussian", 5, 9)), tmp_path / "run"
+    assert steady("fit", CART, table, *FEW, "--out", run) == 0
+    tensors, text = read_tensors(run / "checkpoint.safetensors")
+    resumed = ("fit", CART, table, *FEW, "--out", run, "--resume")
+    slot = next(name for name in tensors if name.startswith("optimizer/") and tensors[name].dim() == 0)
+    for other, said, says in (
+        ({"odd/name": torch.zeros(1)}, {}, "no checkpoint has odd/name"),
+        ({slot.replace("/0/", "/77/"): torch.zeros(1)}, {}, "the optimiser has no"),
+        ({"averaged/gain": torch.zeros(7)}, {}, "the averaged parameters are others"),
+        ({}, {"step": '"one"'}, "step is 'one', expected a whole number"),
+        ({}, {"history": "{"}, "is no JSON"),
+    ):
+        write_tensors(run / "checkpoint.safetensors", tensors | other, text | said)
+        refused(2, says, *resumed)
+
+
+def test_a_discovery_of_another_form_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "found.json"
+    said = {
+        "sentence": "s",
+        "candidates": [],
+        "effects": [],
+        "shape": None,
+        "doubts": [],
+        "notes": [],
+        "next_run": None,
+    }
+    for change, says in (
+        ({}, None),
+        ({"candidates": [3]}, "candidates[0] is 3, expected names and values"),
+        ({"doubts": None}, "doubts is None, expected a list"),
+        ({"shape": {"channel": "yaw"}}, "shape has no variable"),
+    ):
+        file.write_text(json.dumps(said | change))
+        if says is None:
+            assert read_discovery(file) == said
+            continue
+        with pytest.raises(RunError) as caught:
+            read_discovery(file)
+        assert says in str(caught.value)

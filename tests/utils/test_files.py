@@ -1,0 +1,40 @@
+"""Files of another kind, JSON of another form, and what a file says on a line."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import pytest
+
+from steady_ppl.errors import DataError
+from steady_ppl.utils.files import read_json, require_file
+from steady_ppl.utils.schema import NUMBER, TEXT, WHOLE, Absent, Among, Maybe, misfit
+from steady_ppl.utils.text import shown
+
+
+def test_a_form_is_told_from_another(tmp_path: Path) -> None:
+    form = {"a": NUMBER, "b": Maybe([WHOLE]), "c": Absent(TEXT), "d": Among((NUMBER, TEXT))}
+    assert misfit({"a": 1, "b": None, "d": "x"}, form) is None
+    assert misfit({"a": 1, "b": [1, -1], "d": 2}, form) == "b[1] is -1, expected a whole number from 0 to 2^63"
+    assert misfit({"a": math.inf, "b": [], "d": 2}, form) == "a is inf, expected a finite number"
+    assert misfit({"a": True, "b": [], "d": 2}, form) == "a is True, expected a finite number"
+    assert misfit({"b": [], "d": 2}, form) == "it has no a"
+    assert misfit([], form) == "it is [], expected names and values"
+    assert misfit({"x": 10**400}, {str: NUMBER}).startswith("x is 1000")
+    assert misfit({"a": 1, "b": [], "c": 3, "d": 2}, form) == "c is 3, expected text"
+
+
+def test_what_may_never_end_is_no_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.json")
+    with pytest.raises(DataError, match="is a pipe"):
+        read_json(tmp_path / "pipe.json", DataError)
+    require_file(tmp_path / "nothing", DataError)  # is for the reader to find
+    with pytest.raises(FileNotFoundError):
+        read_json(tmp_path / "nothing", DataError)
+
+
+def test_what_a_file_says_is_shown_on_one_line() -> None:
+    assert shown("a\x1b[2J\nb\0\u202e") == r"a\x1b[2J\nb\x00\u202e"
+    assert shown("x" * 200, 10) == "x" * 9 + "…"
