@@ -41,7 +41,7 @@ class Kind(NamedTuple):
 def commands(text: str, **names: str) -> tuple[Words, ...]:
     """The words of a command a line; cart, hovercraft, few and search stand for what is long."""
     names |= {"cart": CART, "hovercraft": HOVER, "few": " ".join(FEW), "search": " ".join(SEARCH)}
-    return tuple(tuple(line.format(**names).split()) for line in text.strip().splitlines())
+    return tuple(tuple(line.format(**names).split()) for line in text.splitlines() if line)
 
 
 ON_TABLE = """
