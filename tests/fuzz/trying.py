@@ -23,8 +23,9 @@ from joblib.externals.loky import reusable_executor
 from steady_ppl.cli import main as command_line
 
 SECONDS = 10  # of the processor
-PATIENCE = 6  # times as long by the clock, for what waits
-LONG = 180  # for a command that searches, climbs to a maximum or starts processes
+PATIENCE = 4  # times as long by the clock, for what waits
+CLIMBING = ("check", "report")  # fit the program at finer steps to what they are given
+LONG = 180  # for these, and for a command that searches, climbs to a maximum or starts processes
 ROOM = 4 << 30  # bytes of address space beside what the process has when it begins
 MOST_MIB = 1024  # that a small file may cost
 RESUMABLE = ("checkpoint.safetensors", "journal", "results.parquet")
@@ -53,7 +54,7 @@ def attempt(
     Args:
         strict: what `main` puts into words at the last moment nobody has thought of: that counts as a crash.
     """
-    seconds = LONG if is_long(words) else SECONDS
+    seconds = LONG if is_long(words) or words[0] in CLIMBING else SECONDS
     reader, writer = multiprocessing.Pipe(duplex=False)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # threads of libraries, which do not run meanwhile
