@@ -32,6 +32,7 @@ RESUMABLE = ("checkpoint.safetensors", "journal", "results.parquet")
 CALLS = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "socket.connect", "urllib.Request")
 CHANGES = ("os.remove", "os.rename", "os.mkdir", "os.rmdir", "os.symlink", "os.link", "os.truncate", "shutil.rmtree")
 CACHES = ("__pycache__", "torchinductor_")  # of Python, numba and torch
+LENT = ("steady-study-", "joblib_memmapping_folder_")  # folders of a study's processes in the system's place for such
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 
 
@@ -115,7 +116,7 @@ def _listener(place: Path, starts: bool, heard: list[str]) -> Callable[[str, tup
             return False
         named = Path(os.fsdecode(path))
         real = Path(os.path.realpath(named)) if through else Path(os.path.realpath(named.parent), named.name)
-        own = any(part.startswith(CACHES) for part in real.parts)
+        own = any(part.startswith(CACHES + LENT) for part in real.parts)
         return not (real.is_relative_to(place) or real == Path(os.devnull) or own)
 
     def listen(event: str, said: tuple[Any, ...]) -> None:
