@@ -145,7 +145,7 @@ def test_degrees_are_suspected_in_controls_and_known_headings(tmp_path: Path, ca
     controls, states = data.controls.clone(), data.states.clone()
     controls[..., 1] = 45.0
     states[..., 2] = 170.0
-    found = doubts_of_units(program, st.for_program(program, replace(data, controls=controls, states=states)))
+    found = diagnose_units(program, st.for_program(program, replace(data, controls=controls, states=states)))
     assert any(said.startswith("u.turn") and "radians a second" in said for said in found)
     assert any(said.startswith("x.heading is between 170 and 170") for said in found)
-    assert doubts_of_units(program, st.for_program(program, data)) == []
+    assert diagnose_units(program, st.for_program(program, data)) == []
