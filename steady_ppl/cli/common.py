@@ -1,4 +1,4 @@
-"""What the commands share: programs by path, JSON whole or not at all, a word to the person."""
+"""What the commands share: programs, runs and their labels, JSON, options, refusals of the system."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`steady check`: compare a run with measurements."""
+"""`steady check`, `prove`, `evaluate`, `states` and `report`: what runs say of drives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`steady fit`: learn a program's parameters."""
+"""`steady fit`, `discover`, `add`, `effects`, `study` and `plot-study`: programs and what they learn."""
 
 from __future__ import annotations
 

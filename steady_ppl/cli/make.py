@@ -1,4 +1,4 @@
-"""`steady init`: a folder to work in."""
+"""`steady init`, `simulate`, `import-bag` and `data`: folders and tables to work with."""
 
 from __future__ import annotations
 

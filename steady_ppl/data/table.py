@@ -1,4 +1,4 @@
-"""The table: one row a trajectory and time step, as CSV, Parquet or a pandas frame.
+"""The table: one row a trajectory and time step, as CSV, Parquet, a pandas frame or arrays; long drives in pieces.
 
 Columns: `trajectory`, `time` (s), `u.<control>`, `y.<measurement>` and, where known, `x.<state component>`.
 

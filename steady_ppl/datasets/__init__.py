@@ -1,1 +1,4 @@
-"""Published logs as trajectories."""
+"""Published logs as trajectories.
+
+Nothing here downloads; a reader is given a folder.
+"""

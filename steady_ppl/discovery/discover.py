@@ -1,4 +1,4 @@
-"""Learn which physical effect a program lacks, from measurements alone."""
+"""Learn which physical effect a program lacks, after a look at what the search needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which effect is missing: screen, refit the leaders, choose on held-out drives, go on until nothing is left.
+"""Which effect is missing: screen, refit the leaders, choose on held-out drives, look again, until nothing is left.
 
 The steps are those of score-test model building (Klein and Morelli 2006 do them by stepwise regression); what decides
 is held-out log p(y), each drive judged by a program that was fitted without it, but for its process noise.

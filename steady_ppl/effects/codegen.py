@@ -91,10 +91,17 @@ def _named(program: Program, variant: Variant) -> str:
     """An effect with its coefficient, as a class lists it.
 
     Raises:
-        UsageError: the name does not say all that the effect depends on.
+        UsageError: the name does not say all that the effect depends on, or no file that is loaded registers it.
     """
     if dict(chosen_variant(program, variant.written).options) != dict(variant.options):
         raise UsageError(f"effect {variant.name}: the name {variant.written} does not say all that it depends on")
+    known = {"steady_ppl", *(one.__module__ for one in type(program).__mro__)}
+    home = variant.effect.function.__module__ or ""
+    if home not in known and home.partition(".")[0] not in known:
+        raise UsageError(
+            f"effect {variant.name} is registered in {home}, which the new file would not load: register it in the "
+            "program's own file"
+        )
     numbers = _numbers(coefficient(program, variant).detach())
     return f"{variant.written}={','.join(numbers if isinstance(numbers, list) else [numbers])}"
 

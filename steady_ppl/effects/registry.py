@@ -1,4 +1,4 @@
-"""Which effects there are, which of them a program could lack, and how users name them."""
+"""Which effects there are, which of them a program could lack, how users name them, and the page of them."""
 
 from __future__ import annotations
 

@@ -1,1 +1,4 @@
-"""The program to first order along a path: linearise, smooth, look ahead, predict, and steer a particle filter."""
+"""The program to first order along a path: linearise, smooth, look ahead, predict, and steer a particle filter.
+
+Nothing here learns a parameter.
+"""

@@ -4,6 +4,9 @@ The backward information filter gives the likelihood of everything after a row, 
 exp(c − ½ δᵀ Λ δ + λᵀ δ) in deviations δ from the path. Sampling each step's noise from N(0, I) times that function of
 where it leads draws from the posterior, forward in time: the optimal twist of Guarniero, Johansen and Lee (2017) and of
 Whiteley and Lee (2014), and with a linear program the smoother itself.
+
+The recursions are compiled, on numpy arrays in double precision; rows or intervals first, trajectories second. A
+matrix that is not positive definite turns into NaN, which log p(y) then shows.
 """
 
 from __future__ import annotations

@@ -1,9 +1,13 @@
-"""Where the linearised program believes the vehicle was, row by row, and how log p(y) would change.
+"""Kalman filter and smoother of the linearised program, and how log p(y) changes by row.
 
 The scores are the derivatives of log p(y) by a push on the state of any row and by a shift of any measurement (de Jong
 1989; Harvey and Koopman 1992 call them auxiliary residuals). Their sums over rows test for anything that pushes or
 shifts. They are no estimates: the smoother has believed the program, so that a missing effect appears in them a tenth
 of its size.
+
+The recursions are compiled, on numpy arrays in double precision; rows or intervals first, trajectories second. The
+notation is that of `linearize`: δ' = F δ + offset + G ε, and a measurement's residual r̄ − H δ with the given precision,
+zero where it is missing.
 """
 
 from __future__ import annotations

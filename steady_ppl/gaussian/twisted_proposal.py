@@ -200,6 +200,10 @@ def _times(matrix: Tensor, vectors: Tensor) -> Tensor:
 class Twist(Proposal):
     """A lookahead as proposals.
 
+    Whatever the lookahead is, the filter's estimate of p(y) stays unbiased: each noise is weighted by the ratio of its
+    own density to that of the mixture which it was drawn from. A share of untwisted draws bounds these ratios by one
+    over the share.
+
     Args:
         lookahead: along any path; the closer to the posterior, the smaller the variance.
         untwisted: probability with which a particle draws one step's noise as the program does. At 100 intervals a

@@ -1,4 +1,4 @@
-"""Guides whose sites are Deltas at given paths: with them the ELBO is STEADY's M-step objective."""
+"""Guides at given paths, filtered or known, and schedules of the observation weight."""
 
 from __future__ import annotations
 

@@ -1,8 +1,10 @@
-"""A traced method of a program, element by element: what a kernel has to compute for one particle.
+"""A traced method of a program, element by element, and its forward derivatives.
 
 A method is traced for a single particle of a single trajectory, so that every dimension of every tensor is known and
 whatever only moves elements about (`view`, `select`, `stack`, …) costs nothing. What depends on parameters alone stays
 with torch and is handed to the kernel as numbers. Long vectors, a network's hidden layer, stay vectors.
+
+Derivatives that are zero are never written, so that a kernel of the Jacobian costs as much as what depends on what.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Kernels: machine code that runs for all particles of all trajectories."""
+"""Trace a function of a program, compile it, keep it, and check it against torch."""
 
 from __future__ import annotations
 

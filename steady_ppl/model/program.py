@@ -34,10 +34,11 @@ def _then_effects(init: Callable[..., None]) -> Callable[..., None]:
             init(self, *arguments, **options)
         finally:
             if outermost:
-                del self.__dict__["_begun"]
+                self.__dict__.pop("_begun", None)
         if outermost and self.effects:
             late.attach_listed(self)
 
+    wrapped.attaches_effects = True  # type: ignore[attr-defined]
     return wrapped
 
 
@@ -136,7 +137,7 @@ class Program(PyroModule):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        if "__init__" in vars(cls):
+        if not getattr(cls.__init__, "attaches_effects", False):
             cls.__init__ = _then_effects(cls.__init__)  # type: ignore[method-assign]
 
     def __setattr__(self, name: str, value: Any) -> None:

@@ -317,8 +317,6 @@ def unknown_effect(found: Discovery, *, axes: Axes | None = None) -> Axes:
     Raises:
         UsageError: the verdict is another one: there is no curve.
     """
-    from steady_ppl.plotting.discovery import curve_panel
-
     if found.shape is None:
         raise UsageError(f"there is no curve to draw: the verdict is {found.verdict}")
     return curve_panel(found, axes if axes is not None else plt.subplots(figsize=(6, 4), layout="constrained")[1])

@@ -1,4 +1,4 @@
-"""Where, when and in which regime a program fails, with a place to look at for every cell."""
+"""What the page shows of drives: maps of misfit, and some drives row by row, packed."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def _longest(there: np.ndarray, found: Check, drive: int) -> tuple[float, float]
     return float(elapsed[starts[longest]]), float(elapsed[min(ends[longest], len(elapsed) - 1)])
 
 
-LEVELS = 65534
+LEVELS = 65534  # of sixteen bits, which is finer than a screen
 
 
 MISSING = -32768

@@ -1,1 +1,4 @@
-"""A fit as a thing that is kept: its folder, its recipe, what it predicts and what is to be doubted of it."""
+"""A fit as a thing that is kept: its folder, its recipe, what it predicts and what is to be doubted of it.
+
+Nothing here judges one fit against another.
+"""

@@ -1,4 +1,4 @@
-"""Posterior trajectories as ArviZ InferenceData, with named coordinates and units."""
+"""Posterior trajectories and forecasts as ArviZ InferenceData; states as files."""
 
 from __future__ import annotations
 

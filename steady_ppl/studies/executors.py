@@ -1,8 +1,11 @@
-"""A Dask cluster that computes the jobs of a study.
+"""Where the jobs of a study are computed: processes of this machine, or a Dask cluster.
 
 joblib's own way to Dask is not taken: when a job had killed four workers, it waited for ever if there was another such
 job, and otherwise had everything that was left computed twice. A result is let go of when it is here, so that a worker
 that dies later does not have it computed again.
+
+Of this machine's processes joblib leaves open what `Local` adds: that a worker dies is told apart from what a job
+raises, and which jobs had been begun, and which had ended, is known afterwards.
 """
 
 from __future__ import annotations

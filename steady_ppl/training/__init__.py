@@ -1,1 +1,4 @@
-"""One training loop for every guide, its stopping rule and its checkpoints."""
+"""One training loop for every guide, its stopping rule and its checkpoints.
+
+Nothing here knows one guide from another.
+"""

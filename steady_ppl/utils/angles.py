@@ -1,4 +1,4 @@
-"""Angles that differ by whole turns, brought side by side, so that medians and bands of them mean something."""
+"""Angles wrapped to one turn, and paths and draws brought to the same turn."""
 
 from __future__ import annotations
 

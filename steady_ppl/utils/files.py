@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Files: written whole or not at all, refused early, read as JSON; pictures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that somebody gives: that they can be read to their end, and that JSON in them has the expected form."""
+"""The form of JSON that somebody gives, and where it departs from it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Text for a terminal: names come from tables, bags and run folders, and a terminal obeys what is written to it."""
+"""Text for a terminal, which obeys what is written to it; and the command line, for a run's record."""
 
 from __future__ import annotations
 

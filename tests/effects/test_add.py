@@ -225,6 +225,8 @@ def test_there_must_be_something_to_write_and_a_file_to_derive_from(folder: Path
 
 
 def own(function, **more) -> Effect:
+    """An effect as if it were of the catalogue."""
+    function.__module__ = more.pop("module", "steady_ppl.effects.catalogue.own")
     about = {"equation": "a = c", "text": "a = c", "unit": "1", "feels": "odd", "typical": 0.3, "limit": 1.0, **more}
     return register(Effect(name="own", form="push", function=function, **about))
 
@@ -276,6 +278,17 @@ def test_a_function_may_be_any(folder: Path, function) -> None:
     program = load_program(folder / "hovercraft.py").with_effect("own")
     write_program(program, folder / "new.py")
     assert same_drives(program, load_program(folder / "new.py"))
+
+
+def test_an_effect_that_the_new_file_would_not_load_is_refused(folder: Path) -> None:
+    def elsewhere(self, state, control, time, step, c):
+        return {"forward": c * state[..., 3]}
+
+    own(elsewhere, module="somebody.script")
+    program = load_program(folder / "hovercraft.py").with_effect("own")
+    with pytest.raises(UsageError, match="registered in somebody.script"):
+        write_program(program, folder / "new.py")
+    assert not list(folder.glob("*new.py"))
 
 
 def test_an_effect_whose_name_does_not_say_all_is_refused(folder: Path) -> None:

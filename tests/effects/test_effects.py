@@ -505,3 +505,28 @@ def test_a_wrong_declaration_is_explained(wrong: dict, says: str) -> None:
     right = {"typical": 0.1, "limit": 1.0}
     with pytest.raises(UsageError, match=says):
         Effect("mine", "push", "a = c", "a = c", "1", "pulls", lambda self, c: {}, **{**right, **wrong})
+
+
+def test_listed_effects_come_after_the_whole_of_init() -> None:
+    class Mixin:
+        def __init__(self) -> None:
+            super().__init__()
+            self.linear_drag = pyro.nn.PyroParam(torch.tensor(5.0))
+
+    class Dragged(Mixin, type(example("hovercraft"))):
+        effects = ("linear_drag=0.1",)
+
+    program = Dragged()
+    assert program.linear_drag.item() == 5.0 and program.linear_drag_effect.item() == pytest.approx(0.1)
+
+
+def test_an_init_that_fails_is_heard() -> None:
+    class Broken(type(example("hovercraft"))):
+        effects = ("linear_drag=0.1",)
+
+        def __init__(self) -> None:
+            super().__init__()
+            raise RuntimeError("mine")
+
+    with pytest.raises(RuntimeError, match="mine"):
+        Broken()

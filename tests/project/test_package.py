@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import steady_ppl
+from steady_ppl.utils import late
 
 STUB = Path(steady_ppl.__file__).with_suffix(".pyi")
 
@@ -33,3 +34,7 @@ def test_an_unknown_name_is_an_ordinary_error() -> None:
 def test_importing_the_package_loads_no_torch() -> None:
     code = "import steady_ppl, steady_ppl.cli.main, sys; print('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
+
+
+def test_the_root_says_what_lower_packages_call_of_higher_ones() -> None:
+    assert late._absent not in (late.html, late.attach_listed, late.with_effect)

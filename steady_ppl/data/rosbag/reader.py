@@ -1,4 +1,4 @@
-"""A bag as topics and messages, read by the `rosbags` package; whatever is wrong with a file is one line.
+"""A bag as topics and messages, read by the `rosbags` package; and a listing with a mapping to start from.
 
 ROS 1 bags and most ROS 2 bags define the types of their messages. Where a ROS 2 bag does not (sqlite bags recorded
 before Iron never do), the standard types are those of Humble, and others are read from .msg files.

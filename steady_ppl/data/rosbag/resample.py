@@ -1,4 +1,4 @@
-"""From what came at any time to rows at even times: pieces without pauses, and what each row knows.
+"""From what came at any time to rows at even times; header stamps on the bag's clock.
 
 Times are whole nanoseconds throughout, so that a command at the very time of a row is known there.
 """
@@ -217,6 +217,15 @@ def align(stamps: np.ndarray, received: np.ndarray) -> Alignment:
 
     Returns:
         No drift where all stamps are alike.
+
+    A bag keeps when a message arrived at the recorder; its header may keep when it was made, on the clock of the
+    machine that made it. That clock is off by an offset and drifts, and what arrives has been on its way for a delay
+    that is never negative. Of all lines offset + drift · stamp below the points (stamp, received − stamp), the nearest
+    to them, summed over the points, is the edge of their lower convex hull over the mean of the stamps. Stamps moved by
+    that line are when messages were made, all late by the smallest delay that occurs.
+
+    Sue B. Moon, Paul Skelly and Don Towsley. Estimation and removal of clock skew from network delay measurements.
+    INFOCOM 1999.
     """
     delays = received - stamps
     origin, least = int(stamps.min()), int(delays.min())
