@@ -188,6 +188,15 @@ def test_the_stored_table_is_that_of_the_records(stored):
     assert STORED.with_suffix(".md").read_text().startswith(discovery_scores.scores_table(stored))
 
 
+def test_the_sets_in_finer_worlds_are_the_first_of_all_by_one_engine():
+    file = STORED.with_stem("discovery-continuous")
+    records = [json.loads(line) for line in file.read_text().splitlines()]
+    assert {record["set"] for record in records} == {one.name for one in EVERY[: len(records)]}
+    assert len({record["version"] for record in records}) == 1
+    page = file.with_suffix(".md").read_text()
+    assert page.startswith(discovery_scores.scores_table(records)) and f"The first {len(records)} of the" in page
+
+
 def test_the_stored_comparison_is_that_of_the_records(stored):
     beside = STORED.with_stem("discovery-rivals")
     rivals = [json.loads(line) for line in beside.read_text().splitlines()]
