@@ -27,9 +27,9 @@ from steady_ppl.utils.random import seeded
 
 LEADERS, ALIKE = 6, 0.85  # how many are refitted at least, and whose columns correlate so much with the first
 NATS = 2.0  # of held-out log p(y) within which two candidates cannot be told apart
-NO_DOUBT = 10.0  # nats of held-out log p(y) for which a test need only be near the family's level
-NEARLY = ALPHA / 5  # p-value of a single test that is near it
-PROMISING = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
+CLEAR_GAIN = 10.0  # nats of held-out log p(y) for which a test need only be near the family's level
+NEAR_ALPHA = ALPHA / 5  # p-value of a single test that is near it
+MIN_STATISTIC_TO_RETRY = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
 LINEAR = ("push", "command", "history", "measured", "viewpoint")
 
 
@@ -113,8 +113,8 @@ class Candidate:
         Where the program's own fit has ended beside its best, anything that moves the other parameters gains; the test
         does not see that.
         """
-        if self.total > NO_DOUBT:
-            return self.tested.p_value <= max(critical, NEARLY)
+        if self.total > CLEAR_GAIN:
+            return self.tested.p_value <= max(critical, NEAR_ALPHA)
         return self.total > NATS and self.tested.p_value <= critical
 
     @property
@@ -202,7 +202,7 @@ def leaders(screened: Screened, first: bool) -> list[Tested]:
 
 
 def _nearly(tested: Tested) -> bool:
-    return tested.p_value < NEARLY
+    return tested.p_value < NEAR_ALPHA
 
 
 def fitted(now: Refit, tested: Tested, screening: Screening, settings: Settings, worth: Worth = ALWAYS) -> Candidate:
@@ -227,7 +227,7 @@ def fitted(now: Refit, tested: Tested, screening: Screening, settings: Settings,
         return fit(absent)  # scoring steps go from there as far as the likelihood rises
     candidate = fit(_start(tested))
     lost = isinstance(candidate.refit, str) or gain_of_first_fold(now, candidate.refit) < 0
-    return fit(absent) if lost and known is not None and tested.statistic > PROMISING else candidate
+    return fit(absent) if lost and known is not None and tested.statistic > MIN_STATISTIC_TO_RETRY else candidate
 
 
 def judged(now: Refit, tested: Tested, refit: Refit | str) -> Candidate:

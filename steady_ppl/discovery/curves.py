@@ -25,10 +25,10 @@ from steady_ppl.model.substeps import acting_controls, row_controls
 
 KNOTS = 7
 REACH = 0.4  # of the variable's range over which heights are alike
-LOWEST = 1e-15  # height of a curve whose square is still a number in single precision
-TALL = 1.5  # prior standard deviation of the heights, in the noise's
+MIN_HEIGHT = 1e-15  # height of a curve whose square is still a number in single precision
+HEIGHT_SD = 1.5  # prior standard deviation of the heights, in the noise's
 NAME = "curve"
-ALONE, COMMANDED = "", "what is commanded"  # what a curve is multiplied with
+ADDITIVE, COMMANDED = "", "what is commanded"  # what a curve is multiplied with
 
 
 @torch.no_grad()
@@ -53,9 +53,9 @@ def curves(program: Program, data: Trajectories, spread: Tensor, sharpness: Tens
         if knots is None:
             continue
         for index, channel in enumerate(program.channel_names):
-            for times in (ALONE, COMMANDED) if variable == "time" else (ALONE,):
+            for times in (ADDITIVE, COMMANDED) if variable == "time" else (ADDITIVE,):
                 size = _size(data, multiplier(mean, channel, times))
-                if size > 0 and float(spread[index]) / size > LOWEST:
+                if size > 0 and float(spread[index]) / size > MIN_HEIGHT:
                     unit = "1" if times else program.channel_units[index]
                     height = float(spread[index]) / size
                     effect = _effect("push", variable, knots, height, unit, variable in program.angles)
@@ -173,7 +173,7 @@ def over_reading(self: Any, state: Tensor, measured: Tensor, c: Tensor, chosen: 
 
 
 def _effect(form: str, variable: str, knots: Sequence[float], spread: float, unit: str, circular: bool) -> Effect:
-    covariance = TALL**2 * spread**2 * _correlation(knots, circular)
+    covariance = HEIGHT_SD**2 * spread**2 * _correlation(knots, circular)
     return Effect(
         name=NAME,
         form=form,
@@ -183,7 +183,7 @@ def _effect(form: str, variable: str, knots: Sequence[float], spread: float, uni
         feels="something that is in no catalogue",
         function=over_state if form == "push" else over_reading,
         typical=tuple(spread for _ in knots),
-        limit=TALL * spread,
+        limit=HEIGHT_SD * spread,
         components=tuple(f"{knot:.3g}" for knot in knots),
         prior=dist.MultivariateNormal(torch.zeros(len(knots)), covariance_matrix=covariance.float()),
     )

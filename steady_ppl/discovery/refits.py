@@ -24,8 +24,9 @@ from steady_ppl.likelihood.scores import widens
 from steady_ppl.model.program import Program
 from steady_ppl.utils.random import seeded
 
-WIDER = math.log(20.0)  # log ratio of a channel's noise after a fit and before, from which it explains next to nothing
-NOTHING = 2.0  # nats below the program without, after which a fit is given up: a candidate at zero is that program
+MAX_LOG_NOISE_RATIO = math.log(20.0)
+"""Of a channel's noise after a fit and before; beyond it a program explains next to nothing."""
+MAX_LOSS = 2.0  # nats below the program without, after which a fit is given up: a candidate at zero is that program
 
 
 @dataclass(frozen=True)
@@ -193,7 +194,7 @@ def first_by_draws(given: Program, fitted: list[Program], folds: list[Fold], kno
 def _far_wider(fitted: Program, program: Program, data: Trajectories) -> bool:
     """Whether a fit has made some channel's noise several times what it was."""
     parts = elements(fitted)
-    grown = values_of(parts) - values_of(elements(program)) > WIDER
+    grown = values_of(parts) - values_of(elements(program)) > MAX_LOG_NOISE_RATIO
     return bool((grown & torch.tensor(widens(fitted, parts, data))).any())
 
 
@@ -218,7 +219,7 @@ def refit_with(
     """
     try:
         programs = [attach(copy.deepcopy(program), variant, value) for program in base.programs]
-        least = [float(maximum.log_likelihood.sum()) - NOTHING for maximum in base.maxima]
+        least = [float(maximum.log_likelihood.sum()) - MAX_LOSS for maximum in base.maxima]
         nothing = [None] * len(programs)
         fit = _refit(programs, base.folds, known_start, nothing, information, least, worth, base.rough, base.fitting)
     except SteadyError as error:

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 from steady_ppl.criticism.step_size import StepCheck, check_step
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.candidates import (
+    CLEAR_GAIN,
     NATS,
-    NEARLY,
-    NO_DOUBT,
+    NEAR_ALPHA,
     Candidate,
     Screening,
     Settings,
@@ -129,7 +129,7 @@ class Search:
             return None
         tests = self.rounds[0].screening.tests
         of_all = min(tested.p_value for tested in tests.tested if tested.is_curve)
-        return best if not self.departed or best.total > NO_DOUBT or of_all <= tests.critical else None
+        return best if not self.departed or best.total > CLEAR_GAIN or of_all <= tests.critical else None
 
     @property
     def needs_a_name(self) -> bool:
@@ -269,7 +269,7 @@ def _add_best(found: Search, screening: Screening, settings: Settings, index: in
     if index == 0 and not gains:
         found.curves = _curves(found.base, screening, settings)
     if index == 0 and not gains and found.needs_a_name:
-        best = next((c for c in able if c.total > NATS and c.tested.p_value <= NEARLY), None)
+        best = next((c for c in able if c.total > NATS and c.tested.p_value <= NEAR_ALPHA), None)
     found.rounds[-1] = Round(screening, candidates, best)
     if best is None:
         return False

@@ -35,8 +35,9 @@ from steady_ppl.smc.filter import particle_filter
 from steady_ppl.smc.genealogy import Paths
 from steady_ppl.utils.angles import wrap_angles
 
-WORSE = 10.0  # nats by which a step may leave a path worse off, see `_Merit`: some such steps lead out of a bad place
-RESTS = 0.05  # a trajectory is at rest where no noise moves by more, in standard deviations of its channel
+MAX_INCREASE = 10.0
+"""Nats by which a step may leave a path worse off, see `_Merit`: some such steps lead out of a bad place."""
+REST_TOLERANCE = 0.05  # a trajectory is at rest where no noise moves by more, in standard deviations of its channel
 
 
 @torch.no_grad()
@@ -53,7 +54,7 @@ def smooth(
 ) -> Lookahead:
     """Move a path to the mode of the posterior and look ahead along it.
 
-    Gauss and Newton's method. A step is halved while its end is worse by more than `WORSE` nats, see `_Merit`.
+    Gauss and Newton's method. A step is halved while its end is worse by more than `MAX_INCREASE` nats, see `_Merit`.
 
     Args:
         program: with normal noise; see `linearize`.
@@ -92,7 +93,7 @@ def smooth(
         moved = _either(worse, halfway, means_as_path(ahead, data))
         change = torch.nan_to_num((moved.noise - path.noise).abs(), nan=0.0).max()  # of those that have not blown up
         penalty = torch.where(worse[:, None], penalty, _penalty(ahead, moved))
-        most = torch.where(worse, most, merit.cost(penalty) + WORSE)
+        most = torch.where(worse, most, merit.cost(penalty) + MAX_INCREASE)
         path = moved
         if not bool(change > tolerance):
             break
@@ -207,7 +208,7 @@ def resting_path(ahead: Lookahead, data: Trajectories) -> ReferencePath:
     How good a path is a step further is not known there. After a single pass it would never move.
     """
     means, path = means_as_path(ahead, data), ahead.linearization.path
-    far = ~((means.noise - path.noise).abs().amax((0, 2)) <= RESTS)
+    far = ~((means.noise - path.noise).abs().amax((0, 2)) <= REST_TOLERANCE)
     return _either(far, path, means)
 
 

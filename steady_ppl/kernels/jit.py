@@ -84,7 +84,7 @@ def _machine_code(text: str) -> Any:
 TRACES = 8  # of one method of one program; each takes some tenths of a second
 
 
-RESTLESS = "its settings or tensors change from run to run"
+KEEPS_CHANGING = "its settings or tensors change from run to run"
 
 
 DIFFERENT = "its kernel and its own lines come to different numbers"
@@ -188,7 +188,7 @@ def compiled(program: nn.Module, name: str, build: Callable[[], Compiled]) -> Co
     known = _COMPILED.setdefault(program, {})
     key = (name, signature(program))
     if key not in known and sum(at == name for at, _ in known) >= TRACES:
-        return RESTLESS
+        return KEEPS_CHANGING
     if key not in known:
         with torch.random.fork_rng(devices=[]):
             try:

@@ -26,12 +26,14 @@ from steady_ppl.utils.journal import Piece, piece
 from steady_ppl.utils.progress import stages
 
 PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
-PATIENT = 30  # linearisations a step once no share of a step was accepted: some path swings about its mode
-REACH = 150  # steps of differences, 1.5 of a logarithm: the most that a number moves at once
-AGAINST = 1 / 3  # share of that for a number whose own score points the other way: noise or a friction that is driven
+STALLED_PASSES = 30  # linearisations a step once no share of a step was accepted: some path swings about its mode
+MAX_MOVE = 150  # steps of differences, 1.5 of a logarithm: the most that a number moves at once
+SHARE_AGAINST_SCORE = (
+    1 / 3
+)  # share of that for a number whose own score points the other way: noise or a friction that is driven
 # to nothing early has no score there, and a fit cannot return
 FEWER = 0.8  # share of fits that take one step more, by which the time left is told
-GIVES_WAY = 0.3  # nats by which an objective may fall: paths are at rest but for the tolerance
+MAX_DECREASE = 0.3  # nats by which an objective may fall: paths are at rest but for the tolerance
 
 
 @dataclass(frozen=True)
@@ -171,7 +173,7 @@ def climb(
     for term, at in zip(terms, here.terms, strict=True):
         require_found(at.ahead, term.program, term.data)
     began = [at.objective for at in here.terms]
-    reach = _gathered(terms, [[REACH * part.step for part in term.parts] for term in terms])
+    reach = _gathered(terms, [[MAX_MOVE * part.step for part in term.parts] for term in terms])
     information = _firm(_of_drives(here) if information is None else information)
     taken, decrement, passes = 0, 0.0, PASSES
     with stages(*(("", FEWER**step) for step in range(steps + 1))) as begin:
@@ -191,15 +193,15 @@ def climb(
                 break
             move = move * min(1.0, 1 / max(1e-9, float((move.abs() / reach).max())))
             against = move * here.gradient < 0
-            move = torch.where(against, move.clamp(-AGAINST * reach, AGAINST * reach), move)
+            move = torch.where(against, move.clamp(-SHARE_AGAINST_SCORE * reach, SHARE_AGAINST_SCORE * reach), move)
             share, there = _searched(terms, here, move, known_start, passes)
             if there is not None:
                 information = _updated(information, share * move, here.gradient - there.gradient)
                 here = there
-            elif passes == PATIENT:
+            elif passes == STALLED_PASSES:
                 break
             else:
-                passes = PATIENT
+                passes = STALLED_PASSES
                 here = _look(_along(terms, here), known_start, passes)
                 information = _firm(_of_drives(here))
     return [
@@ -229,7 +231,7 @@ def _searched(
     while share > 0.01:
         for term, values in zip(terms, before, strict=True):
             set_values(term.parts, values + share * move[list(term.columns)])
-        there = _try(_along(terms, here), known_start, passes, here.objective - GIVES_WAY)
+        there = _try(_along(terms, here), known_start, passes, here.objective - MAX_DECREASE)
         if there is not None:
             return share, there
         share /= 3
@@ -315,7 +317,7 @@ def posterior_score(program: Program, data: Trajectories, path: ReferencePath, k
         FilterError: the program diverges there.
     """
     parts = elements(program)
-    return _look([Term(program, data, path, parts, range(len(parts)))], known_start, PATIENT).gradient
+    return _look([Term(program, data, path, parts, range(len(parts)))], known_start, STALLED_PASSES).gradient
 
 
 def _try(terms: Sequence[Term], known_start: bool, passes: int, least: float) -> _Here | None:

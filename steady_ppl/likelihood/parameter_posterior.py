@@ -24,7 +24,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, require
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import smooth
-from steady_ppl.likelihood.maximize import PASSES, REACH, TOLERANCE, log_prior, maximise, posterior_score
+from steady_ppl.likelihood.maximize import MAX_MOVE, PASSES, TOLERANCE, log_prior, maximise, posterior_score
 from steady_ppl.likelihood.parameters import Element, elements, moved, set_values, values_of
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.utils.progress import stages
@@ -142,7 +142,7 @@ class Shape:
 def about_maximum(program: Program, data: Trajectories, path: ReferencePath, known_start: bool = False) -> Shape:
     """By the curvature where the program is; what the data do not tell is open by as much as a fit moves it at once."""
     parts = elements(program)
-    reach = torch.tensor([REACH * part.step for part in parts], dtype=torch.float64)
+    reach = torch.tensor([MAX_MOVE * part.step for part in parts], dtype=torch.float64)
     information = observed_information(program, data, path, parts, known_start)
     curvature, directions = torch.linalg.eigh(reach * information * reach[:, None])
     return Shape(values_of(parts), reach[:, None] * directions * curvature.clamp(min=1.0).rsqrt())

@@ -15,8 +15,8 @@ from steady_ppl.model.program import Program
 if TYPE_CHECKING:
     from steady_ppl.runs.fit import Fit
 
-VANISHED = math.log(20.0)  # log ratio by which a positive number falls to next to nothing
-GONE = math.log(1e3)  # the same of a guess, such as noise
+LOG_RATIO_TO_ZERO = math.log(20.0)  # log ratio by which a positive number falls to next to nothing
+LOG_RATIO_OF_GUESS = math.log(1e3)  # the same of a guess, such as noise
 HIDDEN = (
     "as the program stands, these drives see next to nothing of it; an effect that is missing may hide it (`steady "
     "discover`), or commands are swapped, or a heading counts the other way"
@@ -51,7 +51,7 @@ def diagnose_fit(fit: Fit, declared: Mapping[str, Tensor]) -> list[str]:
         why = COLLAPSED if guessed else HIDDEN
         now = dict(fit.program.state_dict())[name]
         for index, (then, value) in enumerate(zip(before.flatten().tolist(), now.flatten().tolist(), strict=True)):
-            if then - value > (GONE if guessed else VANISHED):
+            if then - value > (LOG_RATIO_OF_GUESS if guessed else LOG_RATIO_TO_ZERO):
                 label = f"{short}[{index}]" if before.numel() > 1 else short
                 found.append(f"{label} fell from {math.exp(then):.3g} to {math.exp(value):.2g}: {why}")
     return found

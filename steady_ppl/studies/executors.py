@@ -131,8 +131,8 @@ def _marked(job: Job, marks: Path) -> Row:
 WORKER_WAIT = 30  # s for the first worker, and between looks at whether there still is one
 TRIES = 3  # of a job whose workers die; the scheduler itself tries it so often as it is set, four times at first
 HOLD, LONGEST_HOLD = 10, 60  # s for which a worker that is not used holds what it is given, or it would get it all
-LATE = 4  # jobs whose files are others, at which a worker has been refused if its files alone are
-IN_VAIN = 10  # jobs that Dask gives up while nothing is begun
+MIN_REFUSED_JOBS = 4  # jobs whose files are others, at which a worker has been refused if its files alone are
+MAX_LOST_JOBS = 10  # jobs that Dask gives up while nothing is begun
 
 
 class Cluster(Place):
@@ -329,7 +329,7 @@ class Deaths:
             ComputationError: Dask gives up one after the other, and nothing is begun.
         """
         self.in_vain = 0 if self.begun[key] > self.before[key] else self.in_vain + 1
-        if self.in_vain > IN_VAIN:
+        if self.in_vain > MAX_LOST_JOBS:
             raise ComputationError("workers die before they begin")
         return self.begun[key] >= TRIES
 
@@ -365,7 +365,7 @@ def computed(job: Job, here: Mapping[str, str], topic: str) -> Answer:
     row = work.run(job)
     if row.get("reason") == work.CHANGED:
         _changed[topic] += 1
-        if 1 < _changed[topic] <= LATE:  # it would get everything before it is refused
+        if 1 < _changed[topic] <= MIN_REFUSED_JOBS:  # it would get everything before it is refused
             time.sleep(HOLD)
     return Answer(worker.address, "", row)
 

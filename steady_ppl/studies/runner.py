@@ -28,7 +28,7 @@ from steady_ppl.studies.plan import RECORD, Job, Plan, record_plan, recorded_pla
 from steady_ppl.studies.table import read_results, study_table
 
 Keep = Callable[[Row], None]
-IN_VAIN = 3  # rounds in which workers died and nothing had been begun
+MAX_IDLE_ROUNDS = 3  # rounds in which workers died and nothing had been begun
 
 
 def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, say: Say = lambda line: None) -> int:
@@ -97,7 +97,7 @@ def _compute(place: Place, left: dict[str, Job], keep: Keep, say: Say) -> None:
             say(f"a worker died: {len(begun)} jobs are begun again, {len(suspects)} of them apart")
             _sift(place, suspects, left, keep, say)
             in_vain = 0 if begun or len(left) < before else in_vain + 1
-            if in_vain == IN_VAIN:
+            if in_vain == MAX_IDLE_ROUNDS:
                 raise ComputationError("workers die before they begin") from error
 
 
