@@ -34,9 +34,12 @@ from .guides.base import (
     SMCGuide as SMCGuide,
     TruthGuide as TruthGuide,
 )
-from .guides.linearized import GaussianGuide as GaussianGuide, LookaheadGuide as LookaheadGuide
+from .guides.linearized import (
+    GaussianGuide as GaussianGuide,
+    LookaheadGuide as LookaheadGuide,
+    SmootherGuide as SmootherGuide,
+)
 from .guides.network import InferenceNetwork as InferenceNetwork
-from .guides.smoother import SmootherGuide as SmootherGuide
 from .guides.variational import AutoRollout as AutoRollout, VariationalGuide as VariationalGuide
 from .likelihood.evidence import (
     choose_filter as choose_filter,
@@ -81,7 +84,6 @@ from .runs.fit import Fit as Fit
 from .smc.filter import particle_filter as particle_filter, roll_out as roll_out
 from .smc.genealogy import Filtered as Filtered, Paths as Paths
 from .smc.simulate import simulate as simulate
-from .training.loop import Optimization as Optimization, Trained as Trained, train as train
-from .training.validation import Validation as Validation
+from .training.loop import Optimization as Optimization, Trained as Trained, Validation as Validation, train as train
 from .utils.angles import wrap as wrap
 from .utils.random import seeded as seeded

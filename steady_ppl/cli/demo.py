@@ -22,8 +22,7 @@ import typer
 
 from steady_ppl.errors import ComputationError, RunError
 from steady_ppl.runs.workbench import TRUTH, empty_again, workbench
-from steady_ppl.utils.tables import aligned
-from steady_ppl.utils.text import tell
+from steady_ppl.utils.text import aligned, tell
 
 WIDTH = 100
 

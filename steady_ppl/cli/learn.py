@@ -155,8 +155,7 @@ def discover(
     """Learn which physical effect a program lacks: none, one by name, several, or a curve that has no name."""
     from steady_ppl.cli.common import present, program_from, write_json
     from steady_ppl.data.table import read_table
-    from steady_ppl.discovery.discover import discover as search
-    from steady_ppl.discovery.resume import kept_search
+    from steady_ppl.discovery.discover import discover as search, kept_search
     from steady_ppl.model.substeps import with_substeps
     from steady_ppl.model.validate import probe
     from steady_ppl.runs.fit import Fit

@@ -17,7 +17,7 @@ from steady_ppl.model.program import Program, for_program, names
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
-from steady_ppl.utils.tables import aligned
+from steady_ppl.utils.text import aligned
 
 
 def evaluate(

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from steady_ppl.comparison.bootstrap import MIN_DRIVES
 from steady_ppl.comparison.result import FLOOR, Proof
 from steady_ppl.comparison.scores import (
+    MIN_DRIVES,
     SECONDS,
     Judged,
     Row,

@@ -9,11 +9,10 @@ from typing import Any
 
 from torch import Tensor
 
-from steady_ppl.comparison.bootstrap import COVERAGE, RESAMPLES, Change, paired
-from steady_ppl.comparison.scores import BANDS, Key, Row
+from steady_ppl.comparison.scores import BANDS, COVERAGE, RESAMPLES, Change, Key, Row, paired
 from steady_ppl.effects import attached
 from steady_ppl.utils.late import Displayed
-from steady_ppl.utils.tables import aligned
+from steady_ppl.utils.text import aligned
 
 
 @dataclass(frozen=True, repr=False)

@@ -20,7 +20,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.predict import Prediction
 from steady_ppl.model.program import Program, names, units
 from steady_ppl.utils.late import Displayed
-from steady_ppl.utils.tables import aligned
+from steady_ppl.utils.text import aligned
 
 
 @dataclass(frozen=True, repr=False)

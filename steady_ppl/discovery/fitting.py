@@ -26,8 +26,7 @@ from steady_ppl.guides.linearized import LookaheadGuide
 from steady_ppl.likelihood.evidence import neglected
 from steady_ppl.likelihood.maximize import Maximum, kept_maximum, maximise
 from steady_ppl.model.program import Program
-from steady_ppl.training.loop import Optimization, train
-from steady_ppl.training.validation import Validation
+from steady_ppl.training.loop import Optimization, Validation, train
 from steady_ppl.utils.random import seeded
 
 MAX_LINEARISATION_ERROR = 0.5  # nats a drive by which the linearised log p(y) may be off

@@ -19,7 +19,7 @@ from steady_ppl.discovery.screening import ALPHA, Tested
 from steady_ppl.discovery.search import Search
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.late import Displayed
-from steady_ppl.utils.tables import aligned
+from steady_ppl.utils.text import aligned
 
 
 @dataclass(frozen=True, repr=False)

@@ -12,8 +12,7 @@ from typing import Any
 from llvmlite import ir
 
 from steady_ppl.kernels.graph import PARTICLE, Each, NotCompilable, Product, ScalarGraph
-from steady_ppl.kernels.simd import FLOAT, Lanes
-from steady_ppl.kernels.simd_math import OPERATIONS
+from steady_ppl.kernels.simd import FLOAT, OPERATIONS, Lanes
 
 NAME = "kernel"
 LANES = 16

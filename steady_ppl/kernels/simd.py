@@ -1,8 +1,10 @@
-"""Arithmetic on vectors of particles while a kernel is written: what looks like a number writes an instruction."""
+"""Arithmetic and elementary functions on vectors of particles while a kernel is written."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from llvmlite import ir
@@ -150,3 +152,180 @@ def number(x: Lanes) -> Lanes:
     if kind == FLOAT:
         return x
     return Lanes(x.builder, x.builder.uitofp(x.value, _shaped(x, FLOAT)))
+
+
+def polynomial(x: Lanes, *coefficients: float) -> Lanes:
+    """Horner's scheme, the highest power first."""
+    value = x * coefficients[0] + coefficients[1]
+    for coefficient in coefficients[2:]:
+        value = value * x + coefficient
+    return value
+
+
+def absolute(x: Lanes) -> Lanes:
+    return x.call("fabs")
+
+
+def _turned(x: Lanes, quarters: int) -> Lanes:
+    """sin(x + quarters · π/2), for |x| up to some thousands."""
+    n = (x * (2 / math.pi) + 0.5).call("floor")
+    r = ((x - n * 1.5703125) - n * 4.837512969970703125e-4) - n * 7.54978995489188216e-8
+    s = r * r
+    sine = polynomial(s, -1.9515295891e-4, 8.3321608736e-3, -1.6666654611e-1) * s * r + r
+    cosine = polynomial(s, 2.443315711809948e-5, -1.388731625493765e-3, 4.166664568298827e-2) * s * s - s * 0.5 + 1.0
+    turn = n.integer().on_integers("add", quarters)
+    value = turn.has_bit(1).where(cosine, sine)
+    return turn.has_bit(2).where(-value, value)
+
+
+def sin(x: Lanes) -> Lanes:
+    return _turned(x, 0)
+
+
+def cos(x: Lanes) -> Lanes:
+    return _turned(x, 1)
+
+
+def exp(x: Lanes) -> Lanes:
+    low, high = x < -87.33654, x > 88.72283
+    clipped = low.where(-87.33654, high.where(88.72283, x))
+    n = (clipped * (1 / math.log(2)) + 0.5).call("floor")
+    r = (clipped - n * 0.693359375) - n * -2.12194440e-4
+    p = polynomial(
+        r, 1.9875691500e-4, 1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1
+    )
+    value = p * r * r + r + 1.0
+    half = n.integer().on_integers("ashr", 1)  # 2ⁿ in two factors: 2¹²⁸ alone is no float
+    rest = Lanes(x.builder, x.builder.sub(n.integer().value, half.value))
+    for exponent in (half, rest):
+        value = value * exponent.on_integers("add", 127).on_integers("shl", 23).of_bits()
+    return low.where(0.0, high.where(math.inf, value))
+
+
+def log(x: Lanes) -> Lanes:
+    bits = x.bits()
+    mantissa = bits.on_integers("and_", 0x007FFFFF).on_integers("or_", 0x3F000000).of_bits()  # in [0.5, 1)
+    exponent = bits.on_integers("ashr", 23).on_integers("sub", 126).to_float()
+    small = mantissa < math.sqrt(0.5)
+    exponent = small.where(exponent - 1.0, exponent)
+    m = small.where(mantissa + mantissa, mantissa) - 1.0
+    s = m * m
+    p = polynomial(
+        m,
+        *(7.0376836292e-2, -1.1514610310e-1, 1.1676998740e-1, -1.2420140846e-1, 1.4249322787e-1),
+        *(-1.6668057665e-1, 2.0000714765e-1, -2.4999993993e-1, 3.3333331174e-1),
+    )
+    value = m * s * p + exponent * -2.12194440e-4 - s * 0.5 + m + exponent * 0.693359375
+    value = (x < math.inf).where(value, x)  # infinity and what is not a number
+    value = (x > 0.0).where(value, (x < 0.0).where(math.nan, value))
+    return x.compare("==", 0.0).where(-math.inf, value)
+
+
+def log1p(x: Lanes) -> Lanes:
+    u = x + 1.0
+    logarithm = log(u)
+    finite = (u > 0.0).logical("and_", u < math.inf)
+    return finite.where(logarithm + (x - (u - 1.0)) / u, logarithm)
+
+
+def softplus(x: Lanes) -> Lanes:
+    return maximum(x, x.like(0.0)) + log1p(exp(-absolute(x)))
+
+
+def sigmoid(x: Lanes) -> Lanes:
+    e = exp(-absolute(x))
+    share = 1.0 / (e + 1.0)
+    return (x < 0.0).where(e * share, share)
+
+
+def tanh(x: Lanes) -> Lanes:
+    size, s = absolute(x), x * x
+    small = polynomial(s, -5.70498872745e-3, 2.06390887954e-2, -5.37397155531e-2, 1.33314422036e-1, -3.33332819422e-1)
+    large = 1.0 - 2.0 / (exp(size + size) + 1.0)
+    return (size < 0.625).where(small * s * x + x, (x < 0.0).where(-large, large))
+
+
+def atan2(y: Lanes, x: Lanes) -> Lanes:
+    y, x = y._pair(x)
+    a, b = absolute(y), absolute(x)
+    steep = a > b
+    larger, smaller = steep.where(a, b), steep.where(b, a)
+    t = smaller / (larger > 0.0).where(larger, larger.like(1.0))  # in [0, 1]
+    big = t > math.tan(math.pi / 8)
+    u = big.where((t - 1.0) / (t + 1.0), t)
+    s = u * u
+    angle = polynomial(s, 8.05374449538e-2, -1.38776856032e-1, 1.99777106478e-1, -3.33329491539e-1) * s * u + u
+    angle = big.where(angle + math.pi / 4, angle)
+    angle = steep.where(math.pi / 2 - angle, angle)
+    angle = (x < 0.0).where(math.pi - angle, angle)
+    return (y + x).compare("!=", y + x).where(y + x, (y < 0.0).where(-angle, angle))
+
+
+def maximum(x: Lanes, y: Lanes) -> Lanes:
+    return (x > y).where(x, x.compare("!=", x).where(x, y))
+
+
+def minimum(x: Lanes, y: Lanes) -> Lanes:
+    return (x < y).where(x, x.compare("!=", x).where(x, y))
+
+
+def expm1(x: Lanes) -> Lanes:
+    half = tanh(x * 0.5)
+    return (absolute(x) < 0.5).where(half * 2.0 / (1.0 - half), exp(x) - 1.0)
+
+
+def power(x: Lanes, y: Lanes) -> Lanes:
+    """xʸ of x ≥ 0; of negative x not a number."""
+    return y.compare("==", 0.0).where(1.0, exp(log(x) * y))
+
+
+def remainder(x: Lanes, y: Lanes) -> Lanes:
+    """x less the multiple of y below it; in [0, y) for positive y."""
+    rest = x - (x / y).call("floor") * y
+    rest = (rest < 0.0).logical("and_", y > y.like(0.0)).where(rest + y, rest)
+    return (absolute(rest) < absolute(y)).where(rest, rest - y)
+
+
+def _compare(how: str, x: Lanes, y: Lanes) -> Lanes:
+    return x.compare(how, y)
+
+
+def _other_leg(x: Lanes) -> Lanes:
+    return ((1.0 - x) * (x + 1.0)).call("sqrt")
+
+
+OPERATIONS: dict[str, Any] = {
+    "number": number,
+    "pow": power,
+    "tan": lambda x: sin(x) / cos(x),
+    "atan": lambda x: atan2(x, x.like(1.0)),
+    "asin": lambda x: atan2(x, _other_leg(x)),
+    "acos": lambda x: atan2(_other_leg(x), x),
+    "hypot": lambda x, y: (x * x + y * y).call("sqrt"),
+    "remainder": remainder,
+    "silu": lambda x: x * sigmoid(x),
+    "add": lambda x, y: x + y,
+    "sub": lambda x, y: x - y,
+    "mul": lambda x, y: x * y,
+    "div": lambda x, y: x / y,
+    "neg": lambda x: -x,
+    "abs": absolute,
+    "sqrt": lambda x: x.call("sqrt"),
+    "rsqrt": lambda x: 1.0 / x.call("sqrt"),
+    "reciprocal": lambda x: 1.0 / x,
+    "square": lambda x: x * x,
+    "relu": lambda x: (x < 0.0).where(0.0, x),
+    "floor": lambda x: x.call("floor"),
+    "ceil": lambda x: x.call("ceil"),
+    "round": lambda x: x.call("rint"),
+    "sign": lambda x: (x > 0.0).where(1.0, (x < 0.0).where(-1.0, x.like(0.0))),
+    "where": lambda condition, yes, no: truth(condition).where(yes, no),
+    "logical_and": lambda x, y: truth(x).logical("and_", truth(y)),
+    "logical_or": lambda x, y: truth(x).logical("or_", truth(y)),
+    "logical_not": lambda x: Lanes(x.builder, x.builder.not_(truth(x).value)),
+    **{
+        name: partial(_compare, how)
+        for name, how in {"gt": ">", "ge": ">=", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}.items()
+    },
+    **{f.__name__: f for f in (sin, cos, exp, log, log1p, softplus, sigmoid, tanh, expm1, atan2, maximum, minimum)},
+}

@@ -28,10 +28,9 @@ from steady_ppl.utils.progress import stages
 PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
 STALLED_PASSES = 30  # linearisations a step once no share of a step was accepted: some path swings about its mode
 MAX_MOVE = 150  # steps of differences, 1.5 of a logarithm: the most that a number moves at once
-SHARE_AGAINST_SCORE = (
-    1 / 3
-)  # share of that for a number whose own score points the other way: noise or a friction that is driven
-# to nothing early has no score there, and a fit cannot return
+SHARE_AGAINST_SCORE = 1 / 3
+"""Of that, for a number whose own score points the other way: noise or a friction that is driven to nothing early has
+no score there, and a fit cannot return."""
 FEWER = 0.8  # share of fits that take one step more, by which the time left is told
 MAX_DECREASE = 0.3  # nats by which an objective may fall: paths are at rest but for the tolerance
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 
@@ -93,3 +93,20 @@ def commanded(words: Sequence[str]) -> Iterator[None]:
 def command_line() -> str | None:
     """The words of it as a shell takes them; None in Python."""
     return _command.get()
+
+
+def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list[str]:
+    """Rows of cells as lines of equal columns, which are flush right but for those that are `left`.
+
+    Example:
+        >>> aligned([["", "log p(y)"], ["before", "9.5"]])
+        ['        log p(y)', 'before       9.5']
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if index in left else cell.rjust(width)
+            for index, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]

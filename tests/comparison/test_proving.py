@@ -16,9 +16,8 @@ from scipy import stats
 from small import FEW, HOVERCRAFT, TRUTH, contents, finite, only_start, simulated, steady, written
 
 import steady_ppl as st
-from steady_ppl.comparison.bootstrap import Sums, paired
 from steady_ppl.comparison.prove import far_off, prove
-from steady_ppl.comparison.scores import Key
+from steady_ppl.comparison.scores import Key, Sums, paired
 from steady_ppl.model.program import Program, for_program
 
 matplotlib.use("Agg")

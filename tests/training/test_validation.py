@@ -6,7 +6,7 @@ from examples import HeavyTailed, example
 from small import simulated
 
 from steady_ppl import Validation, for_program, log_likelihood, seeded, simulate
-from steady_ppl.training.validation import as_good
+from steady_ppl.training.loop import as_good
 
 
 def test_better_is_as_good() -> None:
