@@ -59,6 +59,7 @@ FAULTS = {
 def test_a_fault_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
     monkeypatch.setattr(trying, "MOST_MIB", 20)
     monkeypatch.setattr(trying, "SECONDS", 1)
+    monkeypatch.setattr(trying, "LONG", 1)
     monkeypatch.setattr(trying, "PATIENCE", 3)
     place = tmp_path / "desk"
     place.mkdir()
