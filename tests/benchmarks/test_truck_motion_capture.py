@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -24,11 +23,8 @@ SECONDS = 120.0
 
 @pytest.fixture(scope="module")
 def capture():
-    sys.path.insert(0, str(BENCHMARKS))
-    try:
-        import truck_motion_capture
-    finally:
-        sys.path.remove(str(BENCHMARKS))
+    import truck_motion_capture
+
     return truck_motion_capture
 
 

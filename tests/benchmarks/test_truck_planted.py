@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from pathlib import Path
 
 import pytest
@@ -18,11 +17,8 @@ STEP = 0.1
 
 @pytest.fixture(scope="module")
 def planted():
-    sys.path.insert(0, str(BENCHMARKS))
-    try:
-        import truck_planted
-    finally:
-        sys.path.remove(str(BENCHMARKS))
+    import truck_planted
+
     return truck_planted
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import statistics
-import sys
 from pathlib import Path
 
 import pytest
@@ -19,11 +18,8 @@ PLANTED = [record for record in RECORDS if record["part"] == "planted"]
 
 @pytest.fixture(scope="module")
 def benchmark():
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    try:
-        import truck
-    finally:
-        sys.path.remove(str(ROOT / "benchmarks"))
+    import truck
+
     return truck
 
 

@@ -16,23 +16,6 @@ from steady_ppl.comparison.metrics import measurement_errors
 from steady_ppl.likelihood.evidence import in_parts
 
 
-@pytest.fixture(scope="module")
-def cart():
-    return example("linear_gaussian").requires_grad_(False)
-
-
-@pytest.fixture(scope="module")
-def still():
-    program = example("linear_gaussian").requires_grad_(False)
-    program.noise = torch.tensor(1e-9, dtype=torch.float64)
-    return program
-
-
-@pytest.fixture(scope="module")
-def data(cart):
-    return drives(cart, 4, 24, gaps=True)
-
-
 def predicted(program, data, *, known_start: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
     """Measured minus predicted, and the prediction's variance, of each measured cell but the first rows'."""
     exact = kalman(data, cart_parameters(program), known_start=known_start)

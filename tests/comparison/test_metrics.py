@@ -18,24 +18,6 @@ from steady_ppl.likelihood.evidence import in_parts
 HORIZON = 10
 
 
-@pytest.fixture(scope="module")
-def cart():
-    return example("linear_gaussian").requires_grad_(False)
-
-
-@pytest.fixture(scope="module")
-def still():
-    """A cart whose noise is next to nothing: from a known start its filter is a plain recursion."""
-    program = example("linear_gaussian").requires_grad_(False)
-    program.noise = torch.tensor(1e-9, dtype=torch.float64)
-    return program
-
-
-@pytest.fixture(scope="module")
-def data(cart):
-    return drives(cart, 4, 24, gaps=True)
-
-
 def roll_out_moments(program, data, horizon: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Error of the mean roll-out and its variance, `(starts, B, 2)`, by matrices, from every true state."""
     system = cart_system(data, cart_parameters(program))

@@ -13,6 +13,7 @@ import pyro.distributions as dist
 import pytest
 import scipy.linalg
 import torch
+from continuous_programs import UnicycleProgram
 from continuous_worlds import Hovercraft, Unicycle, simulate as in_continuous_time
 from examples import MODELS, example
 from pyro.distributions import constraints
@@ -23,9 +24,7 @@ from torch import tensor
 from steady_ppl import (
     FilterError,
     Fit,
-    PlanarVehicle,
     Program,
-    WrappedNormal,
     check,
     discover,
     fit_by_likelihood,
@@ -45,23 +44,8 @@ from steady_ppl.likelihood.parameters import elements
 CASE = Path(__file__).parents[3] / "shared" / "cases" / "exact_unicycle"
 
 
-class Turning(PlanarVehicle):
+class Turning(UnicycleProgram):
     """A unicycle whose lateral velocity is taken back in each step, without the term that turns the velocity."""
-
-    controls = ("speed [m/s]", "turn [rad/s]")
-    measurements = ("x [m]", "y [m]", "heading [rad]")
-    guesses = ("noise",)
-    slips = False
-
-    def __init__(self):
-        super().__init__()
-        self.speed_time = PyroParam(tensor(0.3), constraints.positive)
-        self.turn_time = PyroParam(tensor(0.2), constraints.positive)
-        self.noise = PyroParam(tensor([0.1, 0.1, 0.1]), constraints.positive)
-
-    def initial(self):
-        sd = tensor([0.5, 0.5, 3.0, 2.0, 2.0, 1.0])
-        return pyro.sample("start", dist.Normal(torch.zeros_like(sd).to(self.noise), sd.to(self.noise)).to_event(1))
 
     def transition(self, state, control, time, step):
         speed, turn = control.unbind(-1)
@@ -69,10 +53,6 @@ class Turning(PlanarVehicle):
         mean = stack((speed - forward) / self.speed_time, -lateral / step, (turn - yaw_rate) / self.turn_time)
         acceleration = pyro.sample("acceleration", dist.Normal(mean, self.noise).to_event(1))
         return self.integrate(state, acceleration, step)
-
-    def observe(self, state):
-        pyro.sample("position", dist.Normal(state[..., :2], 0.02).to_event(1))
-        pyro.sample("heading", WrappedNormal(state[..., 2:3], 0.01).to_event(1))
 
 
 @pytest.fixture(scope="module")
