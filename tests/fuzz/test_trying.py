@@ -48,7 +48,7 @@ FAULTS = {
     "written: ": wrote("../outside.csv"),
     "code of ": lambda words: exec(compile("x = 1", str(Path("run/payload.py").resolve()), "exec")) or 0,
     "subprocess.Popen": lambda words: subprocess.run(["true"]).returncode,
-    " MiB": lambda words: len(b"x" * (50 << 20)) * 0,
+    " MiB": lambda words: len(b"x" * (400 << 20)) * 0,
     "MemoryError": lambda words: len(bytearray(8 << 30)) * 0,
     "no end within": lambda words: time.sleep(60) or 0,
     "the process died": lambda words: sum(iter(lambda: 0, 1)),
