@@ -26,8 +26,8 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
+from bounds import Bound, report, run_jobs
 from experiments import CONDITIONS, LOGS, SIZES, STANDARD, STEADY_SETTINGS, Condition, hov, truck
-from foundation import Bound, report, run_jobs
 
 from inference import steady
 from models.paper import PaperHovercraftTruth, PaperNeuralHovercraft, PaperNeuralTruck

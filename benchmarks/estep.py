@@ -23,8 +23,8 @@ import time
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
+from bounds import Bound
 from experiments import CONDITIONS, STANDARD, hov
-from foundation import Bound
 from pyro.infer import Trace_ELBO
 
 from inference import fit_truth

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +24,6 @@ from models.paper import (  # noqa: E402
     PaperTruck,
 )
 from steady_ppl import Fit, PlanarVehicle, Trajectories, seeded, simulate  # noqa: E402
-from steady_ppl.comparison.evaluate import evaluate  # noqa: E402
 from steady_ppl.datasets.alpha_truck import read_alpha_truck  # noqa: E402
 
 # Chosen by held-out log p(y): on Hov with simulated drives of the seeds 101 to 104, on the truck with the valid split,
@@ -136,18 +134,3 @@ def learn(
             program, train, valid, known_start=True, seed=seed, progress=progress, **FIT_TRUTH_SETTINGS[vehicle]
         )
     return hand.fit(program, train, valid, known_start=True, seed=seed)
-
-
-def learn_and_judge(job: tuple[str, str, Path | None, int, int]) -> dict:
-    """One method on one data seed, for a process pool: the evaluation with the seconds that learning took."""
-    method, vehicle, folder, seed, particles = job
-    data = hov(seed) if folder is None else truck(folder, seed)
-    began = time.perf_counter()
-    fit = learn(method, vehicle, data, seed)
-    seconds = time.perf_counter() - began
-    return {
-        "method": method,
-        "seed": seed,
-        "seconds": seconds,
-        **evaluate(fit, data[2], particles=particles, look_ahead=False),
-    }
