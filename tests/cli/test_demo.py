@@ -28,6 +28,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     return out, lines
 
 
+@pytest.mark.slow
 def test_it_goes_through_the_loop_and_keeps_everything(told: tuple[Path, list[str]]) -> None:
     out, lines = told
     commands = [line.split()[2] for line in lines if line.startswith("   $ steady")]
@@ -39,6 +40,7 @@ def test_it_goes_through_the_loop_and_keeps_everything(told: tuple[Path, list[st
     assert all(step["result"] and step["commands"] for step in record["steps"])
 
 
+@pytest.mark.slow
 def test_poses_of_the_drives_that_are_fitted_are_not_kept(told: tuple[Path, list[str]]) -> None:
     out, _ = told
     for name in ("train", "valid"):
@@ -46,6 +48,7 @@ def test_poses_of_the_drives_that_are_fitted_are_not_kept(told: tuple[Path, list
         assert states is not None and bool(states[0].isfinite().all()) and bool(states[1:].isnan().all())
 
 
+@pytest.mark.slow
 def test_what_it_adds_is_a_program_that_was_fitted(told: tuple[Path, list[str]]) -> None:
     out, _ = told
     (file,) = (out / "models").glob("hovercraft_with_*.py")
@@ -57,6 +60,7 @@ def test_what_it_adds_is_a_program_that_was_fitted(told: tuple[Path, list[str]])
         assert not getattr(after.program, name).equal(getattr(program, name))
 
 
+@pytest.mark.slow
 def test_predictions_of_the_locked_drives_get_better(told: tuple[Path, list[str]]) -> None:
     out, lines = told
     rows = {row["row"]: row for row in json.loads((out / "proof.json").read_text())["rows"]}
@@ -76,7 +80,7 @@ def test_a_search_that_finds_nothing_to_add_is_its_end(tmp_path: Path, monkeypat
         demo.discover(demo.Tour(STEADY, [].append), QUICK)
 
 
-def test_it_goes_over_its_own_folder_only(told: tuple[Path, list[str]], tmp_path: Path) -> None:
+def test_it_goes_over_its_own_folder_only(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(RunError, match="is no demo's"):
         demonstrate(tmp_path, STEADY, size=QUICK)

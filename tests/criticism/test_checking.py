@@ -139,6 +139,7 @@ def test_false_discoveries_on_clean_drives_are_as_rare_as_they_should_be(cart):
     assert most < seeds / 2
 
 
+@pytest.mark.slow
 def test_a_single_drive_beside_few_simulated_ones_accuses_nobody_either():
     """Twenty drives tell the covariance of some eighty scores: simulated ones, too, are judged by the others' alone."""
     program, seeds = hovercraft("hovercraft:HovercraftTruth"), 20

@@ -106,12 +106,14 @@ def test_a_fault_of_the_sensor_is_not_blamed_on_the_dynamics():
     assert abs(found.findings[0].coefficient[0] - 0.07) < 4 * found.findings[0].sd[0]
 
 
+@pytest.mark.slow
 def test_two_effects_are_both_found():
     found = discovered("linear_drag=0.12", "landmark_bias:2=0.08")
     assert {finding.alike[0] for finding in found.findings} >= {"landmark_bias:bearing_2"}
     assert any("linear_drag" in finding.alike for finding in found.findings)
 
 
+@pytest.mark.slow
 def test_what_no_effect_explains_is_a_curve():
     found = discovered("yaw_linear_drag=0.12", withheld=["yaw_linear_drag", "yaw_quadratic_drag"])
     assert found.verdict == "other" and found.findings == []
@@ -125,6 +127,7 @@ def test_what_no_effect_explains_is_a_curve():
     assert curve.get_ydata().tolist() == pytest.approx(list(shape.curve)) and "yaw_rate [rad/s]" in axes.get_xlabel()
 
 
+@pytest.mark.slow
 def test_noise_that_is_not_the_declared_is_said_to_be():
     program = owner()
     truth = owner()
@@ -139,6 +142,7 @@ def test_noise_that_is_not_the_declared_is_said_to_be():
     assert "process_noise" not in [finding.variant.effect.name for finding in again.findings]
 
 
+@pytest.mark.slow
 def test_a_sensor_whose_noise_is_learned_is_said_not_to_be_the_declared():
     truth, program = FreeSight(), FreeSight()
     truth.bearing_sd = torch.tensor(0.12)
@@ -186,6 +190,7 @@ def test_a_fit_that_has_not_converged_is_said_before_any_ranking(monkeypatch):
     assert found.figures["doubts"] == found.doubts
 
 
+@pytest.mark.slow
 def test_not_knowing_a_knee_is_in_the_coefficients_interval():
     found = discovered("thrust_saturation:knee=0.6=0.8")
     (finding,) = found.findings
@@ -264,6 +269,7 @@ def test_an_effect_of_ones_own_is_found():
     assert abs(found.findings[0].coefficient[0] - 0.08) < 4 * found.findings[0].sd[0]
 
 
+@pytest.mark.slow
 def test_a_pendulum_lacks_friction_and_a_spring_and_says_so():
     program = example("pendulum", torch.float32)
     found = discovered("coulomb_friction=0.8", "cubic_stiffness=4", program=program)
@@ -273,6 +279,7 @@ def test_a_pendulum_lacks_friction_and_a_spring_and_says_so():
         assert abs(finding.coefficient[0] - planted) < 4 * finding.sd[0]
 
 
+@pytest.mark.slow
 def test_an_unknown_start_gaps_and_unequal_lengths_do_not_mislead():
     train, valid = tables(with_effects(owner(), "quadratic_drag=0.06"), rows=91)
     found = st.discover(owner(), gappy(train, 1), gappy(valid, 2), simulations=SETS)

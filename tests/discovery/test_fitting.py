@@ -84,6 +84,7 @@ def test_where_a_climb_by_draws_diverges_another_begins_at_the_program_as_given(
     assert began == pytest.approx([1.5])
 
 
+@pytest.mark.slow
 def test_a_program_whose_linearised_likelihood_is_off_is_fitted_by_draws(monkeypatch) -> None:
     truth = example("paper.py:PaperTruck", torch.float32).with_effect("lever_arm", 0.4)
     truth.noise = torch.tensor([2.0, 1.0, 1.0])

@@ -62,7 +62,7 @@ def is_clean(folder: Path) -> None:
         assert done.returncode == 0, done.stdout
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("name", ["pendulum", *(pytest.param(name, marks=pytest.mark.slow) for name in SYSTEMS[:2])])
 def test_every_effect_written_out_is_the_effect(folder: Path, name: str) -> None:
     base = load_program(folder / f"{name}.py")
     for number, variant in enumerate(v for effect in catalogue(base) for v in effect.variants(base)):

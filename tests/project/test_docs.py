@@ -19,7 +19,14 @@ from steady_ppl.effects import catalogue
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = [*sorted(DOCS.glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
-RUN = ("own-data", "own-program", "own-effect", "own-sensor", "own-recipe", "control")
+RUN = (
+    "own-data",
+    pytest.param("own-program", marks=pytest.mark.slow),
+    "own-effect",
+    "own-sensor",
+    "own-recipe",
+    "control",
+)
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda page: page.stem)

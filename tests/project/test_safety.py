@@ -146,6 +146,7 @@ except RuntimeError as error:
 """
 
 
+@pytest.mark.slow
 def test_a_whole_loop_reads_no_pickle_and_calls_nobody(tmp_path: Path) -> None:
     """fit, resume, check, states, evaluate, discover, add, prove and report, with the interpreter telling of every
     pickle that is read."""

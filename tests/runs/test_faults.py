@@ -89,22 +89,29 @@ KEPT = {"discover": ("discovery.json", "parameters.safetensors"), "fit": ("param
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory) -> Path:
-    """Two tables of drives with a yaw bias, and what each command makes of them when nothing happens to it."""
+    """Two tables of drives with a yaw bias."""
     desk = tmp_path_factory.mktemp("desk")
     truth = example("hovercraft", torch.float32).with_effect("yaw_bias", 0.15)
     truth.duration = 3.0
     for seed, name in enumerate(("train", "valid")):
         st.write_table(st.simulate(truth, 6, seed=seed), desk / f"{name}.csv")
-    for name, command in COMMANDS.items():
-        began = time.monotonic()
-        process = started(desk, *command, "--out", name)
+    return desk
+
+
+def undisturbed(desk: Path, name: str) -> tuple[float, float]:
+    """Run the command where nothing happens to it, once; seconds until it has begun, and until it has ended."""
+    timed = desk / f"{name}.seconds"
+    if not timed.exists():
+        start = time.monotonic()
+        process = started(desk, *COMMANDS[name], "--out", name)
         while not begun(desk / name):
             assert process.poll() is None
             time.sleep(0.01)
-        first = time.monotonic() - began
+        first = time.monotonic() - start
         assert process.wait() == 0
-        (desk / f"{name}.seconds").write_text(f"{first} {time.monotonic() - began}")
-    return desk
+        timed.write_text(f"{first} {time.monotonic() - start}")
+    first, whole = map(float, timed.read_text().split())
+    return first, whole
 
 
 def started(desk: Path, *words: object, room: int = -1) -> subprocess.Popen:
@@ -152,6 +159,8 @@ def begun(run: Path) -> bool:
 
 
 def same_results(desk: Path, name: str, out: str) -> None:
+    """What the command has made is what it makes undisturbed, and nothing else is left."""
+    undisturbed(desk, name)
     for kept in KEPT[name]:  # the record says where the run was written
         ours, theirs = ((desk / run / kept).read_bytes().replace(f"--out {run}".encode(), b"") for run in (out, name))
         assert ours == theirs, kept
@@ -159,7 +168,11 @@ def same_results(desk: Path, name: str, out: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "begun"), [("discover", "journal/000004.safetensors"), ("fit", "checkpoint.safetensors")]
+    ("name", "begun"),
+    [
+        pytest.param("discover", "journal/000004.safetensors", marks=pytest.mark.slow),
+        ("fit", "checkpoint.safetensors"),
+    ],
 )
 def test_a_command_that_is_killed_goes_on_to_the_same_result(desk: Path, name: str, begun: str) -> None:
     out = f"{name}_killed"
@@ -175,8 +188,10 @@ def test_a_command_that_is_killed_goes_on_to_the_same_result(desk: Path, name: s
 
 @pytest.mark.parametrize(
     ("room", "some"),
-    [(20_000, True), (4_000, False)],  # bytes: less than the largest of the pieces, and less than the first
-    ids=["some", "none"],
+    [  # bytes: less than the largest of the pieces, and less than the first
+        pytest.param(20_000, True, marks=pytest.mark.slow, id="some"),
+        pytest.param(4_000, False, id="none"),
+    ],
 )
 def test_a_search_on_a_disk_that_fills_up_goes_on_when_there_is_room(desk: Path, room: int, some: bool) -> None:
     out = f"full_{room}"
@@ -197,8 +212,7 @@ def test_a_search_on_a_disk_that_fills_up_goes_on_when_there_is_room(desk: Path,
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(COMMANDS))
 def test_twenty_random_kills_change_nothing(desk: Path, name: str) -> None:
-    (first, whole), random = map(float, (desk / f"{name}.seconds").read_text().split()), np.random.default_rng(20)
-    caught = []
+    (first, whole), random, caught = undisturbed(desk, name), np.random.default_rng(20), []
     for trial in range(20):
         began = time.perf_counter()
         caught.append(killed_and_resumed(desk, name, f"{name}_{trial}", float(random.uniform(0.9 * first, whole))))
@@ -209,6 +223,7 @@ def test_twenty_random_kills_change_nothing(desk: Path, name: str) -> None:
     assert caught.count("resumed") >= 10, caught
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_with_what_it_was_begun_with_only(desk: Path, refused, monkeypatch) -> None:
     monkeypatch.chdir(desk)
     process = started(desk, *COMMANDS["discover"], "--out", "begun")
