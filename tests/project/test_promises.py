@@ -35,9 +35,7 @@ def test_the_calibration_is_that_of_its_records_and_the_page_has_its_musts():
     found = records("calibration")
     wanted = list(calibrate.jobs(calibrate.FULL))
     assert sorted(record["set"] for record in found) == sorted(wanted)
-    anew = ("parameters", "check")  # by later sources than the others
-    groups = {record["kind"] if record["kind"] in anew else "others": record["version"] for record in found}
-    assert {record["version"] for record in found} == set(groups.values()) and len(groups) == 3
+    assert len({record["version"] for record in found}) == 1
     text, missed = tables(sorted(found, key=lambda record: wanted.index(record["set"])))
     assert (RESULTS / "calibration.md").read_text() == text
     musts = text.partition("\n\n")[0]
