@@ -27,6 +27,7 @@ def few_drives(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(unknown_map, "hov", lambda seed, truth: hov(seed, 2, 2, 2, truth=truth))
 
 
+@pytest.mark.slow
 def test_the_bound_of_a_linear_program_is_kalmans() -> None:
     """The gain moves the measurements' mean in proportion: minus the second difference of log p(y) in it is its
     information, whatever was measured, and at a gain of one that of its logarithm, which is what is learned."""
@@ -46,6 +47,7 @@ def test_the_bound_of_a_linear_program_is_kalmans() -> None:
     assert sd < 0.15 * bound and abs(bound - 1 / math.sqrt(information)) < 3 * sd
 
 
+@pytest.mark.slow
 def test_an_unknown_map_is_learned_beside_the_known_one(monkeypatch: pytest.MonkeyPatch) -> None:
     known, unknown, _ = unknown_map.PROGRAMS["mechanistic"]
     monkeypatch.setitem(unknown_map.PROGRAMS, "mechanistic", (known, unknown, FEW | {"guide": "gaussian"}))
