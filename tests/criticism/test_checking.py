@@ -150,6 +150,7 @@ def test_a_single_drive_beside_few_simulated_ones_accuses_nobody_either():
     assert accused <= 4  # one in 400
 
 
+@pytest.mark.slow
 def test_where_a_single_drive_dwells_is_not_taken_for_a_regime():
     """Of forty drives these three were accused, one of them at less than 1e-4, while simulated drives were sorted by
     the ranges of the measured one, in which they hardly were; since each is sorted by its own, none of the forty is

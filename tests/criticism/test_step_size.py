@@ -73,6 +73,7 @@ def steps_of_turning(turning):
     return checked(Turning(), turning)
 
 
+@pytest.mark.slow
 def test_a_step_that_is_too_coarse_is_told_by_its_gain(steps_of_turning) -> None:
     found = steps_of_turning
     assert found.too_coarse and found.suited.substeps == 32 and found.gain > 20
@@ -139,7 +140,8 @@ def motors(inductance: float, drives: int = 12, rows: int = 151, step: float = 0
     return pd.concat(frames)
 
 
-@pytest.mark.parametrize(("inductance", "within"), [(0.02, 64), pytest.param(0.003, 128, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("inductance", "within"), [(0.02, 64), (0.003, 128)])
 def test_parameters_that_a_coarse_step_has_bent_do_not_acquit_it(inductance, within, tmp_path) -> None:
     """At one step a row log p(y) is 341 and 968 nats lower. With the parameters of that fit two steps a row are 4,300
     and 68,700 nats lower still, and scoring steps from there end without noise or without friction."""

@@ -182,6 +182,7 @@ def test_what_cannot_be_tested_says_why(clean):
     assert notes["process_noise:yaw"] == "the fitted noise against the declared"
 
 
+@pytest.mark.slow
 def test_a_fit_that_has_not_converged_is_said_before_any_ranking(monkeypatch):
     monkeypatch.setattr("steady_ppl.discovery.refits.maximise", partial(maximise, steps=1))
     found = discovered("yaw_bias=0.1")
@@ -214,6 +215,7 @@ def test_a_drive_that_strayed_isled_back():
     assert led_back(program, data, right, known_start=True) is right
 
 
+@pytest.mark.slow
 def test_the_next_run_tells_what_these_drives_do_not():
     """Steady flight at one speed: what brakes it may go with the velocity or with its square."""
     found = discovered("linear_drag=0.1")
@@ -243,6 +245,7 @@ def test_a_sensor_that_failed_on_all_training_drives_is_no_obstacle():
     assert knots_of(torch.zeros(0), circular=False) is None
 
 
+@pytest.mark.slow
 def test_an_effect_of_ones_own_is_found():
     def tether(self, state, control, time, step, c):
         return {"yaw": -c * state[..., 2].sin()}

@@ -17,6 +17,7 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path
 
 
+@pytest.mark.slow
 def test_both_ways_agree_where_the_program_is_nearly_linear() -> None:
     program = example("hovercraft", torch.float32)
     data = drives(example("hovercraft.py:HovercraftTruth", torch.float32), 6, 61, seed=3)

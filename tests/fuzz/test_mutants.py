@@ -189,7 +189,7 @@ ONCE = [
 
 
 @pytest.mark.parametrize("kind", QUICK, ids=str)
-@few(8)
+@few(4)
 @given(data=st.data())
 def test_a_spoiled_file_is_read_or_refused_in_a_line(desk: Desk, kind: Kind, data: st.DataObject) -> None:
     how = data.draw(st.sampled_from(sorted(kind.changes)), "change")

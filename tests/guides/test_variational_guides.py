@@ -95,8 +95,8 @@ def pushed(cart, rows: int):
 
 LONG = pytest.mark.slow
 NEAR = [
-    (12, "network", 0.5),
-    (12, "network, not centred", 0.1),
+    pytest.param(12, "network", 0.5, marks=LONG),
+    pytest.param(12, "network, not centred", 0.1, marks=LONG),
     (12, "mean-field", 1.5),
     pytest.param(101, "network", 8.0, marks=LONG),
     pytest.param(101, "network, not centred", 16.0, marks=LONG),
@@ -148,7 +148,7 @@ def test_the_kl_weight_follows_its_schedule(cart, even) -> None:
     assert guide.refresh(even, 0.25) == {"kl_weight": pytest.approx(0.55)}
 
 
-@pytest.mark.parametrize("name", list(GUIDES))
+@pytest.mark.parametrize("name", ["network", *(pytest.param(name, marks=LONG) for name in GUIDES if name != "network")])
 def test_past_a_drives_end_there_is_no_divergence(cart, even, name: str) -> None:
     """A longer drive beside a short one changes nothing in what the short one adds."""
     long, short = even.subset([0]), cut(even.subset([1]), 4)

@@ -83,7 +83,13 @@ def test_explicit_euler_does_not() -> None:
     assert worst(example("paper:PaperHovercraft")) > 0.3
 
 
-@pytest.mark.parametrize(("name", "effect"), EFFECTS, ids=["-".join(pair) for pair in EFFECTS])
+@pytest.mark.parametrize(
+    ("name", "effect"),
+    [
+        pytest.param(name, effect, id=f"{name}-{effect}", marks=pytest.mark.slow if name != "pendulum" else ())
+        for name, effect in EFFECTS
+    ],
+)
 def test_an_effect_converges(name, effect) -> None:
     """With as many substeps as it takes, at most `FINEST` times the program's own."""
     program = example(name)
