@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 
 from steady_ppl.criticism.perturbations import Direction
 from steady_ppl.criticism.residual_maps import ALPHA, standardise, tail_p_value
@@ -23,39 +24,25 @@ TEST_COUNT = 4  # of the mean, the parameters, the scatter and the maps; each at
 MIN_GAIN_OF_KIND = 3.0  # nats of log p(y) between the best kind and the next
 SCATTER = "scatter of "  # begins the names of mean squares
 STEPS = 4
-MAX_INFORMATIVE_SD = 100.0
-"""Standard deviations; so far off the scores say nothing of what would be nearest to the drives."""
+MAX_INFORMATIVE_SD = 100.0  # so far off the scores say nothing of what would be nearest to the drives
 MAX_SCORE_SD = 5.0  # standard deviations of one drive's score, more where most drives' are large
 MIN_GAIN_OF_DIRECTION = 2.0  # nats that another direction of the same kind must bring
 
 
 @dataclass(frozen=True)
-class Blame:
-    """What the scores say.
+class Attribution:
+    """What the scores say."""
 
-    Attributes:
-        kind: "sensor", "actuator", "dynamics", "parameters", "noise", "cannot tell" or "nothing found".
-        p_value: of the hypothesis that the program is right, all tests together (Bonferroni).
-        mean_p_value: of the hypothesis that no direction is wrong, the program's own parameters let free.
-        noise_p_value: of the hypothesis that the scatter is right.
-        parameters_p_value: of the hypothesis that the program's parameters suit these drives.
-        explained: nats that the best directions of each kind explain.
-        evidence: the directions picked, best first: (kind, name, z).
-        parameters: z of each parameter's score.
-        noise: z of each mean square.
-        dispersion: how much more than simulated drives the drives differ in their scores.
-    """
-
-    kind: str
-    p_value: float
-    mean_p_value: float
-    noise_p_value: float
-    parameters_p_value: float
-    explained: dict[str, float] = field(default_factory=dict)
-    evidence: list[tuple[str, str, float]] = field(default_factory=list)
-    parameters: dict[str, float] = field(default_factory=dict)
-    noise: dict[str, float] = field(default_factory=dict)
-    dispersion: float = 1.0
+    kind: str  # "sensor", "actuator", "dynamics", "parameters", "noise", "cannot tell" or "nothing found"
+    p_value: float  # of the hypothesis that the program is right, all tests together (Bonferroni)
+    mean_p_value: float  # of the hypothesis that no direction is wrong, the program's own parameters let free
+    noise_p_value: float  # of the hypothesis that the scatter is right
+    parameters_p_value: float  # of the hypothesis that the program's parameters suit these drives
+    explained: dict[str, float]  # nats that the best directions of each kind explain
+    evidence: list[tuple[str, str, float]]  # the directions picked, best first: (kind, name, z)
+    parameters: dict[str, float]  # z of each parameter's score
+    noise: dict[str, float]  # z of each mean square
+    dispersion: float  # how much more than simulated drives the drives differ in their scores
 
     @property
     def parameters_misfit(self) -> bool:
@@ -72,84 +59,60 @@ class Blame:
 
 @dataclass(frozen=True)
 class Scored:
-    """Scores made comparable.
-
-    Attributes:
-        kinds, names: of the `J` directions that the parameters do not explain.
-        z: `(1 + M, J)` the real set first.
-        correlation: `(J, J)`.
-        dispersion: `(1 + M, J)` how much more than simulated drives the drives of a set differ.
-        parameters, parameters_dispersion: `(1 + M, P)`, the same of the parameters' scores.
-        parameters_correlation: `(P, P)`.
-        parameter_names: of these.
-    """
+    """Scores made comparable: of the `J` directions that the `P` parameters do not explain, and of the parameters."""
 
     kinds: list[str]
     names: list[str]
-    z: Array
-    correlation: Array
-    dispersion: Array
-    parameters: Array
-    parameters_dispersion: Array
-    parameters_correlation: Array
+    z: Array  # (1 + M, J), the real set first
+    correlation: Array  # (J, J)
+    dispersion: Array  # (1 + M, J): how much more than simulated drives the drives of a set differ
+    parameters: Array  # (1 + M, P), their z
+    parameters_dispersion: Array  # (1 + M, P)
+    parameters_correlation: Array  # (P, P)
     parameter_names: list[str]
 
 
 def scored(real: Sequence[Direction], simulated: Sequence[Direction], sets: int) -> Scored:
-    """Take the program's own parameters out of every score and standardise.
-
-    Args:
-        real: of `B` drives.
-        simulated: the same directions of `sets` · `B` drives.
-    """
+    """Take the parameters' scores out of all others, of `B` real and `sets` · `B` simulated drives, and standardise."""
     order = {direction.name: direction for direction in real}
     simulated = [direction for direction in simulated if direction.name in order]
     real = [order[direction.name] for direction in simulated]
     own = np.array([d.kind == "parameter" for d in real])
-    each = np.stack([d.scores.double().numpy().reshape(sets, -1) for d in simulated], -1)  # (M, B, J)
-    each = np.concatenate([np.stack([d.scores.double().numpy() for d in real], -1)[None], each])
-    each = _held(each)
+    scores = [torch.cat([ours.scores, theirs.scores]).double() for ours, theirs in zip(real, simulated, strict=True)]
+    each = _without_outliers(torch.stack(scores, -1).numpy().reshape(1 + sets, -1, len(real)))  # (1 + M, B, J)
     covariance = np.einsum("mbi,mbj->ij", each[1:], each[1:]) / (sets - 1)
-    fit = _fitted(covariance, own)
+    fit = _Fitted(covariance, own)
     free = ~own & (fit.left.diagonal() > 0.02) & (covariance.diagonal() > 1e-20)
     parts = [fit.split(each[0], free)]
     for values in each[1:]:  # compared with the others, as the real set is: what fits itself looks small
         away = values * sets / (sets - 1)
-        others = _fitted((covariance * (sets - 1) - values.T @ away) / (sets - 2), own)
+        others = _Fitted((covariance * (sets - 1) - values.T @ away) / (sets - 2), own)
         parts.append(others.split(away, free))
     parameters, rest = (np.stack(part) for part in zip(*parts, strict=True))
     sd = fit.spread(free)
     left = fit.left[np.ix_(free, free)] / np.outer(sd, sd)
     return Scored(
-        kinds=[d.kind for d, is_free in zip(real, free, strict=True) if is_free],
-        names=[d.name for d, is_free in zip(real, free, strict=True) if is_free],
+        kinds=[real[j].kind for j in np.flatnonzero(free)],
+        names=[real[j].name for j in np.flatnonzero(free)],
         z=rest.sum(1),
         correlation=left,
         dispersion=_dispersion(rest, left),
         parameters=parameters.sum(1),
         parameters_dispersion=_dispersion(each / fit.scale, fit.correlation)[:, own],
         parameters_correlation=fit.correlation[np.ix_(own, own)],
-        parameter_names=[d.name for d in real if d.kind == "parameter"],
+        parameter_names=[real[j].name for j in np.flatnonzero(own)],
     )
 
 
-@dataclass(frozen=True)
 class _Fitted:
-    """A covariance of scores, and what of every score the parameters' explain.
+    """A covariance of scores `(J, J)`, and what of every score those of the parameters, `own` `(J,)`, explain."""
 
-    Attributes:
-        own: `(J,)` which scores are the parameters'.
-        scale: `(J,)` standard deviations.
-        correlation: `(J, J)`.
-        by_own: `(J, P)` regression on the parameters' scores.
-        left: `(J, J)` correlation that these leave.
-    """
-
-    own: Array
-    scale: Array
-    correlation: Array
-    by_own: Array
-    left: Array
+    def __init__(self, covariance: Array, own: Array) -> None:
+        self.own, self.scale = own, np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
+        self.correlation = covariance / np.outer(self.scale, self.scale)
+        of_own = self.correlation[np.ix_(own, own)]
+        self.by_own = self.correlation[:, own] @ np.linalg.pinv(of_own, rcond=1e-6, hermitian=True)  # regression (J, P)
+        self.left = self.correlation - self.by_own @ self.correlation[own]  # what the parameters leave of it
 
     def split(self, values: Array, free: Array) -> tuple[Array, Array]:
         """Scores `(B, J)` of the parameters and, less what those explain, of the `free`, in standard deviations."""
@@ -162,14 +125,7 @@ class _Fitted:
         return np.sqrt(np.maximum(self.left.diagonal()[free], 1e-3))
 
 
-def _fitted(covariance: Array, own: Array) -> _Fitted:
-    scale = np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
-    correlation = covariance / np.outer(scale, scale)
-    by_own = correlation[:, own] @ np.linalg.pinv(correlation[np.ix_(own, own)], rcond=1e-6, hermitian=True)
-    return _Fitted(own, scale, correlation, by_own, correlation - by_own @ correlation[own])
-
-
-def _held(each: Array) -> Array:
+def _without_outliers(each: Array) -> Array:
     """Less the simulated mean, and no drive's score much larger than most drives' of its set: past a landmark closely
     the linearised program's are, by chance."""
     each = each - each[1:].mean(0)
@@ -195,11 +151,10 @@ def _dispersion(each: Array, correlation: Array) -> Array:
     return (squares / np.maximum(squares[1:].mean(0), 1e-300)) @ weight / np.maximum(weight.sum(0), 1e-300)
 
 
-def blame(scores: Scored, noise: dict[str, Array], maps_p_value: float) -> Blame:
-    """Decide.
+def attribute(scores: Scored, noise: dict[str, Array], maps_p_value: float) -> Attribution:
+    """Decide who is at fault.
 
     Args:
-        scores: of real and simulated drives.
         noise: name of a mean square or the like → its value in the real and every simulated set, `(1 + M,)`.
         maps_p_value: of the hypothesis that the maps hold nothing.
     """
@@ -232,7 +187,7 @@ def blame(scores: Scored, noise: dict[str, Array], maps_p_value: float) -> Blame
         kind = "noise"
     else:
         kind = "cannot tell" if maps_p_value <= each else "nothing found"
-    return Blame(
+    return Attribution(
         kind=kind,
         p_value=min(1.0, TEST_COUNT * min(mean_p, own_p, noise_p, maps_p_value)),
         mean_p_value=mean_p,

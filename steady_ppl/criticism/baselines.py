@@ -28,11 +28,7 @@ ABOUT = (
 
 
 class Coasting(ByColumn):
-    """Give latent sites mean zero and other standard deviations, in the order in which they are met.
-
-    Args:
-        scales: of each channel.
-    """
+    """Give latent sites mean zero and each channel another standard deviation, in the order in which they are met."""
 
     def __init__(self, scales: Sequence[float]) -> None:
         super().__init__()
@@ -42,28 +38,20 @@ class Coasting(ByColumn):
         if message["is_observed"]:
             return
         fn = message["fn"]
-        mean, _ = normal_moments(fn, message["name"])
-        scale = mean.new_tensor(self.scales[self.take(fn)])
-        zero = torch.zeros_like(mean)
-        message["fn"] = (
-            dist.Normal(zero, scale.expand_as(zero)).to_event(1) if fn.event_dim else dist.Normal(zero, scale[0])
-        )
+        zero = torch.zeros_like(normal_moments(fn, message["name"])[0])
+        scale = zero.new_tensor(self.scales[self.take(fn)])
+        scaled = dist.Normal(zero, scale.expand_as(zero) if fn.event_dim else scale[0])
+        message["fn"] = scaled.to_event(1) if fn.event_dim else scaled
 
 
 class ConstantVelocity(Program):
-    """Another program's start, kinematics and sensors, but no acceleration other than noise.
-
-    Args:
-        program: the other.
-        scales: standard deviation of each channel.
-    """
+    """Another program's start, kinematics and sensors, but no acceleration other than noise of these scales."""
 
     def __init__(self, program: Program, scales: Sequence[float]) -> None:
         super().__init__()
         self.scales = tuple(scales)
-        self.states, self.controls, self.channels = program.states, program.controls, program.channels
-        self.measurements, self.substeps = program.measurements, program.substeps
-        self.angles = program.angles  # type: ignore[misc]
+        for name in ("states", "controls", "channels", "measurements", "substeps", "angles"):
+            setattr(self, name, getattr(program, name))
         object.__setattr__(self, "of", program)  # not a part of this one: Pyro would rename it
 
     def initial(self) -> Tensor:
@@ -82,17 +70,11 @@ class ConstantVelocity(Program):
 
 @dataclass(frozen=True)
 class Reference:
-    """Predictions of the vehicle that keeps its velocity.
+    """Predictions of the vehicle that keeps its velocity."""
 
-    Attributes:
-        scales: standard deviation of each channel.
-        log_likelihood: log p(y) of all drives, linearised.
-        predictions: horizon → prediction.
-    """
-
-    scales: tuple[float, ...]
-    log_likelihood: float
-    predictions: dict[int, Prediction]
+    scales: tuple[float, ...]  # standard deviation of each channel
+    log_likelihood: float  # log p(y) of all drives, linearised
+    predictions: dict[int, Prediction]  # by how many rows ahead
 
 
 @torch.no_grad()
@@ -101,12 +83,7 @@ def constant_velocity(
 ) -> Reference | str:
     """Scan the channel noise of `ConstantVelocity` by log p(y) and predict with the best; or why there is none.
 
-    Args:
-        program: the state-space model.
-        data: as returned by `for_program`.
-        tracked: of the program; where the scan begins.
-        horizons: how many rows ahead.
-        known_start: the first state is certain.
+    The scan begins where the program was tracked. The horizons count rows; `data` is as returned by `for_program`.
     """
     path = tracked.path(data)
     inputs = acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps

@@ -13,16 +13,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from steady_ppl.criticism.attribution import SCATTER, blame, scored
+from steady_ppl.criticism.attribution import SCATTER, attribute, scored
 from steady_ppl.criticism.baselines import constant_velocity, last_measurement
 from steady_ppl.criticism.perturbations import directions
 from steady_ppl.criticism.reference_sets import MIN_SETS, residuals, simulate_sets
 from steady_ppl.criticism.residual_maps import Residuals, judge
 from steady_ppl.criticism.result import Check
 from steady_ppl.criticism.step_size import check_step
-from steady_ppl.data.frozen_sensors import stuck
+from steady_ppl.data.frozen_sensors import frozen_stretches
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
@@ -47,7 +46,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
 
     Args:
         fit: the program, its noise normal; with its `known_start` the drives' first x. columns are used, nothing else
-            of the truth ever is, but to see whether the table itself has stretches that nobody measured (`stuck`).
+            of the truth ever is, but to see whether the table itself has stretches that nobody measured.
         data: drives, best those that were not used for the fit.
         simulations: sets of drives to simulate for the bands.
         seed: of the simulation.
@@ -81,23 +80,17 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
             made = simulate_sets(program, run, starts, channels, rows, known_start=fit.known_start)
         begin()
         predictions = predict(program, run, real, rows)
-        ours = replace(residuals(program, run, real, predictions[1], 1), raw=_array(predictions[1].error))
+        ours = replace(residuals(program, run, real, predictions[1], 1), raw=predictions[1].error.numpy(force=True))
         ours, theirs = _in_own_spreads(ours, made.residuals)
         scores = scored(directions(program, run, real), made.directions, made.sets)
-        misfit = judge(
-            ours,
-            theirs,
-            _array(run.elapsed[:-1]),
-            _controls(program, run),
-            _pairs(program, ours),
-            scores.dispersion.mean(-1),
-        )
+        time, dispersion = run.elapsed[:-1].numpy(force=True), scores.dispersion.mean(-1)
+        acting = run.controls[:-1]
+        controls = {name: acting[..., i].double().numpy(force=True) for i, name in enumerate(program.control_names)}
+        misfit = judge(ours, theirs, time, controls, _pairs(program, ours), dispersion)
     notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
     notes += run.uneven_steps + diagnose_units(program, run)
-    if step.note:
-        notes.append(f"refitted to these drives, {step.note}")
-    if step.uncompared:
-        notes.append(step.uncompared)
+    notes += [f"refitted to these drives, {step.note}"] if step.note else []
+    notes += [step.uncompared] if step.uncompared else []
     if not scores.parameter_names:
         notes.append("the program's own parameters were not looked at one by one: it has none, or a network's")
     return Check(
@@ -110,10 +103,10 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         held=last_measurement(program, run, real.smoothed, rows),
         step=step,
         misfit=misfit,
-        blame=blame(scores, _scatter(ours, theirs), misfit.p_value),
+        blame=attribute(scores, _scatter(ours, theirs), misfit.p_value),
         residuals=list(ours.names),
         standardised=ours,
-        stuck=stuck(data),
+        stuck=frozen_stretches(data),
         notes=notes,
     )
 
@@ -141,17 +134,13 @@ def _in_own_spreads(real: Residuals, simulated: Residuals) -> tuple[Residuals, R
     typical = np.sqrt((scale**2).mean((0, 1)))
     told = (scale > 0.05 * typical) & (count > 1)
     scale = np.where(told, scale, 1.0)
-    found = []
-    for part in (real, simulated):
+
+    def scaled(part: Residuals) -> Residuals:
         there = part.there & told
-        found.append(
-            replace(
-                part,
-                values=np.where(there, part.values / scale, 0.0).clip(-MAX_RESIDUAL_SD, MAX_RESIDUAL_SD),
-                there=there,
-            )
-        )
-    return found[0], found[1]
+        values = np.where(there, part.values / scale, 0.0).clip(-MAX_RESIDUAL_SD, MAX_RESIDUAL_SD)
+        return replace(part, values=values, there=there)
+
+    return scaled(real), scaled(simulated)
 
 
 def _pairs(program: Program, residuals: Residuals) -> list[tuple[str, str]]:
@@ -167,19 +156,11 @@ def _pairs(program: Program, residuals: Residuals) -> list[tuple[str, str]]:
 
 def _scatter(real: Residuals, simulated: Residuals) -> dict[str, np.ndarray]:
     """Mean squares of every residual, and the fourth power of the measurements' as a sign of tails; of every set."""
-    values = np.concatenate([real.values, simulated.values])
-    count = np.maximum(np.concatenate([real.there, simulated.there]).sum((1, 2)), 1)
+    both = Residuals.joined([real, simulated])
+    values, count = both.values, np.maximum(both.there.sum((1, 2)), 1)
     squares = (values**2).sum((1, 2)) / count
     told = [i for i in range(len(real.names)) if real.there[..., i].any()]
     found = {f"{SCATTER}{real.names[i]}": squares[:, i] for i in told}
     fourth = (values**4).sum((1, 2)) / count
     tails = np.log(fourth / np.maximum(squares, 1e-12) ** 2 + 1e-12)
     return found | {f"tails of {real.names[i]}": tails[:, i] for i in told}
-
-
-def _controls(program: Program, data: Trajectories) -> dict[str, np.ndarray]:
-    return {name: _array(data.controls[:-1, :, i].double()) for i, name in enumerate(program.control_names)}
-
-
-def _array(values: Tensor) -> np.ndarray:
-    return values.numpy(force=True)

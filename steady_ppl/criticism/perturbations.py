@@ -8,15 +8,15 @@ tests physical effects by name.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
-from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import errors, on_a_circle
 from steady_ppl.model.actuation import lagged
 from steady_ppl.model.handlers import AtMean, running
@@ -32,216 +32,191 @@ MAX_PARAMETERS = 40  # parameters; a network's are not looked at one by one
 
 @dataclass(frozen=True)
 class Direction:
-    """A way of being wrong.
+    """A way of being wrong."""
 
-    Attributes:
-        kind: "sensor", "actuator", "dynamics", or "parameter" for the program's own.
-        name: in words.
-        scores: of each drive, `(B,)`.
-    """
+    kind: str  # "sensor", "actuator", "dynamics", or "parameter" for the program's own
+    name: str  # in words
+    scores: Tensor  # of each drive, (B,)
 
-    kind: str
-    name: str
-    scores: Tensor
+
+Named = Iterator[tuple[str, Tensor]]
 
 
 @torch.no_grad()
 def directions(program: Program, data: Trajectories, tracked: Tracked) -> list[Direction]:
-    """Every direction's score.
-
-    Args:
-        program: the state-space model.
-        data: as returned by `for_program`.
-        tracked: of these drives.
-    """
-    path, scores = tracked.path(data), _Scores(program, data, tracked)
-    found = itertools.chain(
-        _parameters(program, data, path, scores),
-        _sensor(program, data, path, scores),
-        _actuator(program, data, path, scores),
-        _dynamics(program, data, path, scores),
-    )
-    return [Direction(kind, name, value) for kind, name, value in found]
-
-
-Named = Iterator[tuple[str, str, Tensor]]
+    """Every direction's score of these drives; `data` is as returned by `for_program`."""
+    scores = _Scores(program, data, tracked)
+    kinds = {
+        "parameter": scores.of_parameters(),
+        "sensor": scores.of_sensors(),
+        "actuator": scores.of_actuators(),
+        "dynamics": itertools.chain(scores.of_channels(), scores.of_states(), scores.of_couplings()),
+    }
+    return [Direction(kind, name, value) for kind, found in kinds.items() for name, value in found]
 
 
 class _Scores:
     """Scores of pushes on the states `(T, B, D)`, by the channels `(T, B)`, and of shifts `(T + 1, B, K)`."""
 
     def __init__(self, program: Program, data: Trajectories, tracked: Tracked) -> None:
-        self.linear, self.inside = tracked.linearization, data.transitions
+        self.program, self.data, self.path = program, data, tracked.path(data)
+        self.linear, self.states, self.steps = tracked.linearization, self.path.states[:-1], data.steps.double()
         self.arrival, self.noise, self.reading = tracked.arrival[1:], tracked.noise, tracked.reading
+        self.controls = acting_controls(program, data)
+        self.commands = row_controls(program, self.controls).double()
+        channels = range(self.noise.shape[-1])
+        declared = len(program.channels) == len(channels)
+        self.channels = program.channel_names if declared else [f"{i + 1}" for i in channels]
 
     def push(self, change: Tensor) -> Tensor:
-        return torch.where(self.inside, (change * self.arrival).sum(-1), 0.0).sum(0)
+        return torch.where(self.data.transitions, (change * self.arrival).sum(-1), 0.0).sum(0)
 
     def channel(self, index: int, size: Tensor) -> Tensor:
-        return torch.where(self.inside, size * self.noise[..., index], 0.0).sum(0)
+        return torch.where(self.data.transitions, size * self.noise[..., index], 0.0).sum(0)
 
     def shift(self, change: Tensor) -> Tensor:
         return (change * self.reading).sum((0, 2))
 
+    def of_parameters(self) -> Named:
+        """The program's own parameters, where they move the mean."""
+        program, data = self.program, self.data
+        scalars = [(name, value, i) for name, value in program.named_parameters() for i in range(value.numel())]
+        if len(scalars) > MAX_PARAMETERS:
+            return
 
-def _parameters(program: Program, data: Trajectories, path: ReferencePath, scores: _Scores) -> Named:
-    """The program's own parameters, where they move the mean."""
-    scalars = [(name, value, i) for name, value in program.named_parameters() for i in range(value.numel())]
-    if len(scalars) > MAX_PARAMETERS:
-        return
-    states = path.states
+        def run() -> tuple[Tensor, Tensor]:
+            measured = errors(program, self.path.states, data.measurements, data.observed)
+            return self._moved(acting_controls(program, data)), -measured.double()
 
-    def run() -> tuple[Tensor, Tensor]:
-        measured = errors(program, states, data.measurements, data.observed)
-        return _moved(program, data, path, acting_controls(program, data)), -measured
+        for name, value, index in scalars:
+            flat = value.data.view(-1)
+            before = flat[index].clone()
+            size = 0.01 * max(1.0, abs(float(before)))
+            try:
+                flat[index] = before + size
+                moved, measured = run()
+                flat[index] = before - size
+                moved_less, measured_less = run()
+            finally:
+                flat[index] = before
+            push = wrap_angles(moved - moved_less, self.linear.angles) / (2 * size)
+            shift = torch.where(data.observed, measured - measured_less, 0.0) / (2 * size)
+            score = self.push(push) + self.shift(shift)
+            if bool((score != 0).any()):
+                word = name.removesuffix("_unconstrained")
+                yield word if value.numel() == 1 else f"{word}[{index}]", score
 
-    for name, value, index in scalars:
-        flat = value.data.view(-1)
-        before = flat[index].clone()
-        size = 0.01 * max(1.0, abs(float(before)))
-        try:
-            flat[index] = before + size
-            moved, measured = run()
-            flat[index] = before - size
-            moved_less, measured_less = run()
-        finally:
-            flat[index] = before
-        push = wrap_angles(moved.double() - moved_less.double(), scores.linear.angles) / (2 * size)
-        shift = torch.where(data.observed, measured.double() - measured_less.double(), 0.0) / (2 * size)
-        score = scores.push(push) + scores.shift(shift)
-        if bool((score != 0).any()):
-            word = name.removesuffix("_unconstrained")
-            yield "parameter", word if value.numel() == 1 else f"{word}[{index}]", score
+    def of_sensors(self) -> Named:
+        """Offset, scale and delay of every measurement, and of all in one unit together."""
+        program, data = self.program, self.data
+        components, unit = program.measurement_names, program.measurement_units
+        predicted = torch.where(data.observed, data.measurements, 0.0).double() - self.linear.residual
+        predicted = torch.where(on_a_circle(program, data, self.path.states), wrap(predicted), predicted)
+        moved = wrap_angles((self.path.states[1:] - self.states).double(), self.linear.angles)
+        velocity = moved / self.steps.clamp(min=1e-9).unsqueeze(-1)
+        late = torch.cat([velocity[:1], velocity]).unsqueeze(-2)
+        late = torch.where(data.rows[..., None], -(self.linear.measurement * late).sum(-1), 0.0)
+        for word, change in (("offset", torch.ones_like(self.reading)), ("scale", predicted), ("delay", late)):
+            for kind in dict.fromkeys(unit):
+                chosen = [i for i, u in enumerate(unit) if u == kind]
+                for members in [[i] for i in chosen] + ([chosen] if len(chosen) > 1 else []):
+                    mask = torch.zeros(len(components), dtype=torch.float64)
+                    mask[members] = 1.0
+                    of = components[members[0]] if len(members) == 1 else f"all measurements in {kind or 'their unit'}"
+                    yield f"{word} of {of}", self.shift(change * mask)
 
+    def of_actuators(self) -> Named:
+        """Other controls than those commanded, as the program would answer to them: one's, and all together."""
+        together: dict[str, list[Tensor]] = {}
+        for index, (name, answer) in enumerate(zip(self.program.control_names, self.answers, strict=True)):
+            if answer is None:
+                continue
+            for word, shape in self._other_than(self.commands[:-1, :, index]).items():
+                push = answer * shape.unsqueeze(-1)
+                together.setdefault(word, []).append(push)
+                yield f"{word} {name}", self.push(push)
+        for word, pushes in together.items():
+            if len(pushes) > 1 and word not in ALONE:
+                yield f"{word} all controls", self.push(torch.stack(pushes).sum(0))
 
-def _sensor(program: Program, data: Trajectories, path: ReferencePath, scores: _Scores) -> Named:
-    components, unit = program.measurement_names, program.measurement_units
-    unity = torch.ones_like(scores.reading)
-    predicted = torch.where(data.observed, data.measurements, 0.0).double() - scores.linear.residual
-    predicted = torch.where(on_a_circle(program, data, path.states), wrap(predicted), predicted)
-    step = data.steps.double().clamp(min=1e-9).unsqueeze(-1)
-    velocity = wrap_angles((path.states[1:] - path.states[:-1]).double(), scores.linear.angles) / step
-    late = torch.cat([velocity[:1], velocity]).unsqueeze(-2)
-    late = torch.where(data.rows[..., None], -(scores.linear.measurement * late).sum(-1), 0.0)
-    for word, change in (("offset", unity), ("scale", predicted), ("delay", late)):
-        for kind in dict.fromkeys(unit):
-            chosen = [i for i, u in enumerate(unit) if u == kind]
-            for members in [[i] for i in chosen] + ([chosen] if len(chosen) > 1 else []):
-                mask = torch.zeros(len(components), dtype=torch.float64)
-                mask[members] = 1.0
-                of = components[members[0]] if len(members) == 1 else f"all measurements in {kind or 'their unit'}"
-                yield "sensor", f"{word} of {of}", scores.shift(change * mask)
+    def _other_than(self, command: Tensor) -> dict[str, Tensor]:
+        """How what acts may differ from a command `(T, B)`, in words."""
+        change = torch.cat([torch.zeros_like(command[:1]), command.diff(dim=0)]) / self.steps.clamp(min=1e-9)
+        time, most = self.data.elapsed.double()[:-1], float(command.abs().amax())
+        shapes = {
+            "gain of": command,
+            "drift of the gain of": command * time,
+            "curvature in": command * command.abs(),
+            "offset of": torch.ones_like(command),
+            "dead zone of": -command.clamp(-DEAD * most, DEAD * most),
+            "saturation of": command.clamp(-KNEE * most, KNEE * most) - command,
+            "delay of": -change,
+            "lag of": lagged(command.unsqueeze(-1), time, torch.tensor(LAG)).squeeze(-1) - command,
+        }
+        speed = next(iter(self.program.velocities(self.states).values()), None)
+        if speed is not None:
+            shapes["speed-dependent gain of"] = command * speed.abs().double()
+        return shapes
 
+    def of_channels(self) -> Named:
+        """Accelerations that grow with velocities, positions and angles."""
+        program, states = self.program, self.states
+        speeds = {f"{name} velocity": value.double() for name, value in program.velocities(states).items()}
+        places = {f"{name} position": value.double() for name, value in program.positions(states).items()}
+        shapes = {"always": torch.ones_like(self.steps)}
+        shapes |= {f"with {name}": value for name, value in (speeds | places).items()}
+        shapes |= {f"with the square of {name}": value * value.abs() for name, value in speeds.items()}
+        shapes |= {f"with the cube of {name}": value**3 for name, value in places.items()}
+        for (one, first), (other, second) in itertools.combinations(speeds.items(), 2):
+            shapes[f"with {one} times {other}"] = first * second
+        for angle in program.angles:
+            value = states[..., program.state_names.index(angle)].double()
+            shapes |= {f"with the sine of {angle}": value.sin(), f"with the cosine of {angle}": value.cos()}
+        for index, channel in enumerate(self.channels):
+            for word, shape in shapes.items():
+                yield f"{channel} acceleration {word}", self.channel(index, shape)
 
-def _actuator(program: Program, data: Trajectories, path: ReferencePath, scores: _Scores) -> Named:
-    """Other controls than those commanded, as the program would answer to them: one's, and all together."""
-    controls = acting_controls(program, data)
-    speed = next(iter(program.velocities(path.states[:-1]).values()), None)
-    together: dict[str, list[Tensor]] = {}
-    for index, name in enumerate(program.control_names):
-        answer = _answer(program, data, path, controls, index, scores.linear.angles)
-        if answer is None:
-            continue
-        command = row_controls(program, controls)[:-1, :, index].double()
-        for word, shape in _miscarried(command, data, speed).items():
-            push = answer * shape.unsqueeze(-1)
-            together.setdefault(word, []).append(push)
-            yield "actuator", f"{word} {name}", scores.push(push)
-    for word, pushes in together.items():
-        if len(pushes) > 1 and word not in ALONE:
-            yield "actuator", f"{word} all controls", scores.push(torch.stack(pushes).sum(0))
+    def of_states(self) -> Named:
+        """A constant push on each state component that noise reaches."""
+        reached = self.linear.noise.square().sum((0, 1, 3)) > 0
+        for index, name in enumerate(self.program.state_names):
+            if bool(reached[index]):
+                push = torch.zeros_like(self.arrival)
+                push[..., index] = self.steps
+                yield f"constant push on {name}", self.push(push)
 
+    def of_couplings(self) -> Named:
+        """Controls acting on channels that they do not move in the program."""
+        name, unit, commands = self.program.control_names, self.program.control_units, self.commands[:-1]
+        along = self.linear.noise / self.linear.noise.norm(dim=-2, keepdim=True).clamp(min=1e-300)
+        for channel, called in enumerate(self.channels):
+            unmoved = []
+            for index, answer in enumerate(self.answers):
+                if answer is None or float((answer * along[..., channel]).sum(-1).norm() / answer.norm()) < 1e-3:
+                    unmoved.append(index)
+            for one in unmoved:
+                yield f"{called} acceleration with {name[one]}", self.channel(channel, commands[..., one])
+            for one, other in itertools.combinations(unmoved, 2):
+                if unit[one] == unit[other]:
+                    word = f"{called} acceleration with {name[one]} − {name[other]}"
+                    yield word, self.channel(channel, commands[..., one] - commands[..., other])
 
-def _miscarried(command: Tensor, data: Trajectories, speed: Tensor | None) -> dict[str, Tensor]:
-    """How what acts may differ from a command `(T, B)`, in words."""
-    step = data.steps.double().clamp(min=1e-9)
-    change = torch.cat([torch.zeros_like(command[:1]), command.diff(dim=0)]) / step
-    most = float(command.abs().amax())
-    shapes = {
-        "gain of": command,
-        "drift of the gain of": command * data.elapsed.double()[:-1],
-        "curvature in": command * command.abs(),
-        "offset of": torch.ones_like(command),
-        "dead zone of": -command.clamp(-DEAD * most, DEAD * most),
-        "saturation of": command.clamp(-KNEE * most, KNEE * most) - command,
-        "delay of": -change,
-        "lag of": lagged(command.unsqueeze(-1), data.elapsed.double()[:-1], torch.tensor(LAG)).squeeze(-1) - command,
-    }
-    if speed is not None:
-        shapes["speed-dependent gain of"] = command * speed.abs().double()
-    return shapes
+    @cached_property
+    def answers(self) -> list[Tensor | None]:
+        """How the next state changes with each control, `(T, B, D)`; None where it does not."""
+        found: list[Tensor | None] = []
+        for index in range(len(self.program.controls)):
+            size = 0.05 * float(self.commands[..., index].abs().amax()) or 0.05
+            change = torch.zeros_like(self.controls)
+            change[..., index :: len(self.program.controls)] = size  # in every substep
+            more, less = (self._moved(self.controls + sign * change) for sign in (1, -1))
+            answer = wrap_angles(more - less, self.linear.angles) / (2 * size)
+            answer = torch.where(self.data.transitions[..., None], answer, 0.0)
+            found.append(answer if bool((answer.abs() > 1e-9).any()) else None)
+        return found
 
-
-def _dynamics(program: Program, data: Trajectories, path: ReferencePath, scores: _Scores) -> Named:
-    states = path.states[:-1]
-    speeds = {f"{name} velocity": value.double() for name, value in program.velocities(states).items()}
-    places = {f"{name} position": value.double() for name, value in program.positions(states).items()}
-    order = program.state_names
-    shapes: dict[str, Tensor] = {"always": torch.ones_like(data.steps).double()}
-    shapes |= {f"with {name}": value for name, value in (speeds | places).items()}
-    shapes |= {f"with the square of {name}": value * value.abs() for name, value in speeds.items()}
-    shapes |= {f"with the cube of {name}": value**3 for name, value in places.items()}
-    for (one, first), (other, second) in itertools.combinations(speeds.items(), 2):
-        shapes[f"with {one} times {other}"] = first * second
-    for angle in program.angles:
-        value = states[..., order.index(angle)].double()
-        shapes |= {f"with the sine of {angle}": value.sin(), f"with the cosine of {angle}": value.cos()}
-    channels = scores.noise.shape[-1]
-    called = program.channel_names if len(program.channels) == channels else [f"{i + 1}" for i in range(channels)]
-    for index, channel in enumerate(called):
-        for word, shape in shapes.items():
-            yield "dynamics", f"{channel} acceleration {word}", scores.channel(index, shape)
-    reached = scores.linear.noise.square().sum((0, 1, 3)) > 0
-    for index, name in enumerate(order):
-        if bool(reached[index]):
-            push = torch.zeros_like(scores.arrival)
-            push[..., index] = data.steps
-            yield "dynamics", f"constant push on {name}", scores.push(push)
-    yield from _couplings(program, data, path, scores, called)
-
-
-def _couplings(
-    program: Program, data: Trajectories, path: ReferencePath, scores: _Scores, called: Sequence[str]
-) -> Named:
-    """Controls acting on channels that they do not move in the program."""
-    controls = acting_controls(program, data)
-    along = scores.linear.noise / scores.linear.noise.norm(dim=-2, keepdim=True).clamp(min=1e-300)
-    unmoved: dict[int, list[int]] = {channel: [] for channel in range(len(called))}
-    for index in range(len(program.controls)):
-        answer = _answer(program, data, path, controls, index, scores.linear.angles)
-        for channel, members in unmoved.items():
-            if answer is None or float((answer * along[..., channel]).sum(-1).norm() / answer.norm()) < 1e-3:
-                members.append(index)
-    commands, name, unit = (
-        row_controls(program, controls)[:-1].double(),
-        program.control_names,
-        program.control_units,
-    )
-    for channel, members in unmoved.items():
-        for one in members:
-            word = f"{called[channel]} acceleration with {name[one]}"
-            yield "dynamics", word, scores.channel(channel, commands[..., one])
-        for one, other in itertools.combinations(members, 2):
-            if unit[one] == unit[other]:
-                word = f"{called[channel]} acceleration with {name[one]} − {name[other]}"
-                yield "dynamics", word, scores.channel(channel, commands[..., one] - commands[..., other])
-
-
-def _answer(
-    program: Program, data: Trajectories, path: ReferencePath, controls: Tensor, index: int, angles: tuple[int, ...]
-) -> Tensor | None:
-    """How the next state changes with a control, `(T, B, D)`; None where it does not."""
-    size = 0.05 * float(row_controls(program, controls)[..., index].abs().amax()) or 0.05
-    change = torch.zeros_like(controls)
-    change[..., index :: len(program.controls)] = size  # in every substep
-    more, less = (_moved(program, data, path, controls + sign * change).double() for sign in (1, -1))
-    answer = wrap_angles(more - less, angles) / (2 * size)
-    answer = torch.where(data.transitions[..., None], answer, 0.0)
-    return answer if bool((answer.abs() > 1e-9).any()) else None
-
-
-def _moved(program: Program, data: Trajectories, path: ReferencePath, controls: Tensor) -> Tensor:
-    """The program's mean step from every row, `(T, B, D)`."""
-    states = path.states[:-1]
-    with running(*states.shape[:-1]), AtMean():
-        return advance(program, states, controls[:-1], data.elapsed[:-1], data.steps)
+    def _moved(self, controls: Tensor) -> Tensor:
+        """The program's mean step from every row, `(T, B, D)`."""
+        with running(*self.states.shape[:-1]), AtMean():
+            moved = advance(self.program, self.states, controls[:-1], self.data.elapsed[:-1], self.data.steps)
+        return moved.double()

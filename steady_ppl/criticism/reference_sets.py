@@ -31,19 +31,12 @@ LINEARISATIONS = 4
 
 @dataclass(frozen=True)
 class SimulatedSets:
-    """`M` sets of the same `B` drives.
+    """`M` sets of the same `B` drives."""
 
-    Attributes:
-        sets: M, those that blew up left out.
-        floor: horizon → RMSE of each component in each set, `(M, K)`.
-        residuals: of all sets.
-        directions: with the scores of all `M · B` drives.
-    """
-
-    sets: int
-    floor: dict[int, np.ndarray]
+    sets: int  # M, those that blew up left out
+    floor: dict[int, np.ndarray]  # horizon → RMSE of each component in each set, (M, K)
     residuals: Residuals
-    directions: list[Direction]
+    directions: list[Direction]  # with the scores of all M · B drives
 
 
 @torch.no_grad()
@@ -53,29 +46,22 @@ def simulate_sets(
     """Simulate, track and predict.
 
     Args:
-        program: the state-space model.
         data: `B` drives, as returned by `for_program`.
         starts: `(M, B, D)`, where each drive of each set begins.
         channels: C, how many numbers a step's noise has.
         horizons: rows ahead, one row among them.
-        known_start: the first state is certain.
 
     Raises:
         FilterError: too many sets blew up.
     """
     at_once = max(1, MAX_ROWS_OF_BLOCK // data.time.numel())
-    found = [
-        one
-        for block in starts.split(at_once)
-        if (one := _block(program, data, block, channels, horizons, known_start)) is not None
-    ]
-    whole = sum(one.sets for one in found)
-    if whole < MIN_SETS:
-        raise FilterError(
-            f"{len(starts) - whole} of {len(starts)} simulated sets blew up: the fitted program does not even explain "
-            "drives of its own"
-        )
-    return found[0] if len(found) == 1 else _joined(found)
+    blocks = [_block(program, data, block, channels, horizons, known_start) for block in starts.split(at_once)]
+    found = [one for one in blocks if one is not None]
+    lost = len(starts) - sum(one.sets for one in found)
+    if len(starts) - lost < MIN_SETS:
+        what = f"{lost} of {len(starts)} simulated sets blew up"
+        raise FilterError(f"{what}: the fitted program does not even explain drives of its own")
+    return _joined(found)
 
 
 def _block(
@@ -105,19 +91,11 @@ def _block(
 
 def _joined(blocks: Sequence[SimulatedSets]) -> SimulatedSets:
     """As one; directions that are not in every block are left out."""
-    first, sets = blocks[0].residuals, sum(block.sets for block in blocks)
     scores = [{one.name: one.scores for one in block.directions} for block in blocks]
     return SimulatedSets(
-        sets,
+        sum(block.sets for block in blocks),
         {horizon: np.concatenate([block.floor[horizon] for block in blocks]) for horizon in blocks[0].floor},
-        replace(
-            first,
-            values=np.concatenate([block.residuals.values for block in blocks]),
-            there=np.concatenate([block.residuals.there for block in blocks]),
-            variables={
-                name: np.concatenate([block.residuals.variables[name] for block in blocks]) for name in first.variables
-            },
-        ),
+        Residuals.joined([block.residuals for block in blocks]),
         [
             replace(one, scores=torch.cat([block[one.name] for block in scores]))
             for one in blocks[0].directions
@@ -138,9 +116,9 @@ def residuals(program: Program, data: Trajectories, tracked: Tracked, ahead: Pre
     for name, velocity in program.velocities(states).items():
         if not any(torch.equal(velocity, value) for value in variables.values()):
             variables[f"{name} velocity"] = velocity
-    channels = program.channel_names
-    if len(channels) != tracked.noise.shape[-1]:
-        channels = tuple(f"channel {i + 1}" for i in range(tracked.noise.shape[-1]))
+    channels, count = program.channel_names, tracked.noise.shape[-1]
+    if len(channels) != count:
+        channels = tuple(f"channel {i + 1}" for i in range(count))
     return Residuals(
         names=[*program.measurement_names, *channels],
         values=_by_set(torch.where(there, values, 0.0), sets),

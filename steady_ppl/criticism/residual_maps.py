@@ -13,11 +13,11 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy import special
+from scipy import special, stats
 
 from steady_ppl.errors import DataError
 
@@ -32,91 +32,68 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class Residuals:
-    """Residuals of `M` sets of the same `B` drives, at each interval.
-
-    Attributes:
-        names: of the `R` residuals.
-        values: `(M, T, B, R)`, standardised, zero where there is none.
-        there: of the same shape, bool.
-        variables: name → what the intervals are sorted by, `(M, T, B)`.
-        raw: of the first set, those with a unit in it, `(T, B, ·)`.
-    """
+    """`R` residuals of `M` sets of the same `B` drives, at each interval."""
 
     names: Sequence[str]
-    values: Array
-    there: Array
-    variables: dict[str, Array] = field(default_factory=dict)
-    raw: Array | None = None
+    values: Array  # (M, T, B, R), standardised, zero where there is none
+    there: Array  # of the same shape, bool
+    variables: dict[str, Array] = field(default_factory=dict)  # what the intervals are sorted by, (M, T, B) each
+    raw: Array | None = None  # of the first set, those with a unit in it, (T, B, ·)
+
+    @staticmethod
+    def joined(parts: Sequence[Residuals]) -> Residuals:
+        """The sets of all parts, one part after another."""
+        return replace(
+            parts[0],
+            values=np.concatenate([one.values for one in parts]),
+            there=np.concatenate([one.there for one in parts]),
+            variables={name: np.concatenate([one.variables[name] for one in parts]) for name in parts[0].variables},
+        )
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What a statistic is an average over.
+    """What a statistic is an average over."""
 
-    Attributes:
-        map: the kind of cells: "all", "drive", "time", "drive and time", "regime", "pair", "lag", "memory".
-        residual: its number.
-        where: what tells the cell from others of its map, for example {"left": (0.2, 0.6)}.
-        count: residuals in it.
-        mean: of the residuals, in their unit; None where they have none.
-    """
-
-    map: str
-    residual: int
-    where: dict[str, Any]
-    count: int
-    mean: float | None = None
+    map: str  # "all", "drive", "time", "drive and time", "regime", "pair", "lag" or "memory"
+    residual: int  # its number
+    where: dict[str, Any]  # what tells the cell from others of its map, for example {"left": (0.2, 0.6)}
+    count: int  # residuals in it
+    mean: float | None = None  # of the residuals, in their unit; None where they have none
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A cell whose average lies outside the simulated band.
-
-    Attributes:
-        cell: which.
-        z: how far from the simulated mean, in simulated standard deviations.
-        p_value: of this cell alone, two-sided.
-    """
+    """A cell whose average lies outside the simulated band."""
 
     cell: Cell
-    z: float
-    p_value: float
+    z: float  # how far from the simulated mean, in simulated standard deviations
+    p_value: float  # of this cell alone, two-sided
 
 
 @dataclass(frozen=True)
 class Misfit:
-    """All cells, judged.
-
-    Attributes:
-        cells, z, p_values: one entry a cell.
-        significant: the findings at a false-discovery rate of 5 %, strongest first.
-        p_value: of the hypothesis that there is nothing, by Simes' test, calibrated on the simulated sets.
-        simulated: the same of each simulated set, `(M,)`.
-        dispersion: mean square of each residual over that of the simulated ones, `(R,)`; NaN where there are none.
-    """
+    """All cells, judged."""
 
     cells: list[Cell]
-    z: Array
-    p_values: Array
-    significant: list[Finding]
-    p_value: float
-    simulated: Array
-    dispersion: Array
+    z: Array  # one a cell
+    p_values: Array  # one a cell
+    significant: list[Finding]  # at a false-discovery rate of 5 %, strongest first
+    p_value: float  # of the hypothesis that there is nothing, by Simes' test, calibrated on the simulated sets
+    simulated: Array  # the same of each simulated set, (M,)
+    dispersion: Array  # mean square of each residual over that of the simulated ones, (R,); NaN where there are none
+
+    def of_map(self, name: str) -> list[tuple[Cell, float]]:
+        """The cells of one map, each with its z."""
+        return [(cell, float(z)) for cell, z in zip(self.cells, self.z, strict=True) if cell.map == name]
 
 
 def judge(
-    real: Residuals,
-    simulated: Residuals,
-    time: Array,
-    controls: dict[str, Array],
-    pairs: Sequence,
-    unexplained: Array,
+    real: Residuals, simulated: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence, unexplained: Array
 ) -> Misfit:
-    """Compare every cell with the simulated ones.
+    """Compare every cell of one real set with those of many simulated ones.
 
     Args:
-        real: of one set.
-        simulated: of many.
         time: s since each drive's first row, `(T, B)`.
         controls: `(T, B)` each; they sort the intervals and are correlated with the residuals.
         pairs: names of variables that make a map together.
@@ -126,24 +103,14 @@ def judge(
     Raises:
         DataError: too few residuals to average anywhere.
     """
-    both = Residuals(
-        real.names,
-        np.concatenate([real.values, simulated.values]),
-        np.concatenate([real.there, simulated.there]),
-        {name: np.concatenate([value, simulated.variables[name]]) for name, value in real.variables.items()},
-        real.raw,
-    )
-    cells, averages = [], []
-    for found, average in _all_cells(both, time, controls, pairs):
-        cells.append(found)
-        averages.append(average)
+    both = Residuals.joined([real, simulated])
+    found = list(_all_cells(both, time, controls, pairs))
+    cells = [cell for cell, _ in found]
     if not cells:
         rows, drives = real.values.shape[1:3]
-        raise DataError(
-            f"{drives} drives of at most {rows} intervals hold no place, time or regime with enough residuals to "
-            "average: take more drives, or longer ones"
-        )
-    average = np.stack(averages, -1)  # (1 + M, cells)
+        what = f"{drives} drives of at most {rows} intervals hold no place, time or regime"
+        raise DataError(f"{what} with enough residuals to average: take more drives, or longer ones")
+    average = np.stack([average for _, average in found], -1)  # (1 + M, cells)
     squares = (both.values**2).sum((1, 2)) / np.maximum(both.there.sum((1, 2)), 1)
     typical = squares[1:].mean(0)
     dispersion = np.divide(squares, typical, out=np.full_like(squares, np.nan), where=typical > 0)
@@ -153,8 +120,8 @@ def judge(
     p_values = 2 * special.stdtr(freedom, -np.abs(z))
     simes = np.array([_simes(row) for row in p_values])
     level = min(ALPHA, float(np.quantile(simes[1:], ALPHA, method="lower")))  # the tails of t are a model, too
-    chosen = _benjamini_hochberg(p_values[0], level)
-    findings = [Finding(cells[i], float(z[0, i]), float(p_values[0, i])) for i in np.flatnonzero(chosen)]
+    chosen = np.flatnonzero(stats.false_discovery_control(p_values[0]) <= level)
+    findings = [Finding(cells[i], float(z[0, i]), float(p_values[0, i])) for i in chosen]
     return Misfit(
         cells=cells,
         z=z[0],
@@ -196,12 +163,6 @@ def tail_p_value(values: Array) -> float:
 def _simes(p_values: Array) -> float:
     ordered = np.sort(p_values)
     return float((ordered * len(ordered) / np.arange(1, len(ordered) + 1)).min())
-
-
-def _benjamini_hochberg(p_values: Array, level: float) -> Array:
-    ordered = np.sort(p_values)
-    passing = np.flatnonzero(ordered <= level * np.arange(1, len(ordered) + 1) / len(ordered))
-    return p_values <= (ordered[passing[-1]] if len(passing) else -1.0)
 
 
 def _all_cells(
@@ -258,19 +219,13 @@ def _sums(data: Residuals, kind: str, labels: Array, where: list[dict[str, Any]]
         total = np.bincount(at, data.values[..., residual][there], minlength=size).reshape(sets, -1)
         enough = count >= MIN_RESIDUALS
         average = np.where(enough, total / np.sqrt(np.maximum(count, 1)), np.nan)
-        mean = _means(data, residual, index[0], count[0])
+        mean: list[float | None] = [None] * len(where)  # of the first set, in the residual's unit
+        if data.raw is not None and residual < data.raw.shape[-1]:
+            raw = np.bincount(index[0][there[0]], data.raw[..., residual][there[0]], minlength=len(where))
+            mean = (raw / np.maximum(count[0], 1)).tolist()
         for cell, place in enumerate(where):
             if enough[0, cell] and enough[1:, cell].mean() > MIN_SHARE_OF_SETS:
-                yield Cell(kind, residual, place, int(count[0, cell]), mean[cell] if mean else None), average[:, cell]
-
-
-def _means(data: Residuals, residual: int, index: Array, count: Array) -> list[float] | None:
-    """The first set's mean residual in each cell, in its unit."""
-    if data.raw is None or residual >= data.raw.shape[-1]:
-        return None
-    there = data.there[0, ..., residual]
-    total = np.bincount(index[there], data.raw[..., residual][there], minlength=len(count))
-    return (total / np.maximum(count, 1)).tolist()
+                yield Cell(kind, residual, place, int(count[0, cell]), mean[cell]), average[:, cell]
 
 
 def _correlations(data: Residuals, inside: Array, controls: dict[str, Array]) -> Iterator[tuple[Cell, Array]]:

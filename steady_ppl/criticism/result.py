@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,16 +10,32 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from steady_ppl.criticism.attribution import Blame
+from steady_ppl.criticism.attribution import Attribution
 from steady_ppl.criticism.baselines import ABOUT, Reference
 from steady_ppl.criticism.residual_maps import Cell, Finding, Misfit, Residuals
 from steady_ppl.criticism.step_size import StepCheck
 from steady_ppl.data.frozen_sensors import Stretch
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.predict import Prediction
-from steady_ppl.model.program import Program, names, units
+from steady_ppl.model.program import Program
 from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.text import aligned
+
+SHOWN = 8  # findings in the table
+WHO = {
+    "sensor": "the sensor is at fault",
+    "actuator": "the actuators are at fault",
+    "dynamics": "the dynamics are at fault",
+    "noise": "its noise is at fault",
+    "parameters": "its own parameters do not suit these drives",
+    "cannot tell": "these drives cannot tell what is at fault",
+}
+BESIDE = {  # what stands out as well, which is no verdict while the parameters are wrong
+    "sensor": "the sensor stands out",
+    "actuator": "the actuators stand out",
+    "dynamics": "the dynamics stand out",
+    "noise": "its noise stands out",
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -53,7 +68,7 @@ class Check(Displayed):
     held: dict[int, tuple[Tensor, Tensor]]
     step: StepCheck
     misfit: Misfit
-    blame: Blame
+    blame: Attribution
     residuals: list[str]
     standardised: Residuals
     stuck: list[Stretch]
@@ -61,87 +76,70 @@ class Check(Displayed):
 
     @property
     def figures(self) -> dict[str, Any]:
-        """Everything as a plain dict, ready for JSON."""
-        return figures(self)
+        """Everything as a plain dict, ready for JSON; every figure is finite, None where there is none."""
+        blame, misfit, reference = self.blame, self.misfit, self.reference
+        scatter = zip(self.residuals, misfit.dispersion.tolist(), strict=True)
+        about: dict[str, Any] = {"what": ABOUT, "why_not": reference if isinstance(reference, str) else None}
+        if isinstance(reference, Reference):
+            about |= {"noise": list(reference.scales), "log_likelihood": reference.log_likelihood}
+        return {
+            "verdict": verdict(self),
+            "who": blame.kind,
+            "p_value": blame.p_value,
+            "program": type(self.program).__name__,
+            "trajectories": len(self.data),
+            "simulations": len(misfit.simulated),
+            "measurements": {name: _component(self, i) for i, name in enumerate(self.program.measurement_names)},
+            "constant_velocity": about | {"loses_to_it": lost_horizons(self)},
+            "findings": [
+                {"text": sentence(self, one), "map": one.cell.map, "residual": self.residuals[one.cell.residual]}
+                | {"where": {key: _plain(self, key, value) for key, value in one.cell.where.items()}}
+                | {"count": one.cell.count, "mean": one.cell.mean, "z": one.z, "p_value": one.p_value}
+                for one in misfit.significant
+            ],
+            "cells": len(misfit.cells),
+            "evidence": {
+                "p_values": {
+                    "mean": blame.mean_p_value,
+                    "parameters": blame.parameters_p_value,
+                    "noise": blame.noise_p_value,
+                    "maps": misfit.p_value,
+                },
+                "explained_nats": blame.explained,
+                "directions": [{"kind": kind, "direction": name, "z": z} for kind, name, z in blame.evidence],
+                "parameters": blame.parameters,
+                "noise": blame.noise,
+                "scatter": {name: ratio for name, ratio in scatter if math.isfinite(ratio)},
+            },
+            "step": self.step.figures,
+            "stuck": [
+                {"trajectory": one.label, "seconds": list(one.seconds), "columns": list(one.columns), "text": str(one)}
+                for one in self.stuck
+            ],
+            "notes": self.notes,
+        }
 
     def __str__(self) -> str:
-        return as_text(self.figures)
+        content = self.figures
+        table = [["", "ahead", "RMSE", "noise alone", "constant velocity", "last measurement", "in 90 % band"]]
+        for name, component in content["measurements"].items():
+            for horizon, row in component["horizons"].items():
+                keys = ("rmse", "noise_floor", "constant_velocity", "last_measurement")
+                cells = ["–" if row[key] is None else f"{row[key]:.4g}" for key in keys]
+                label = f"{name} [{component['unit']}]" if component["unit"] else name
+                table.append([label, horizon, *cells, f"{row['coverage_90']:.1%}"])
+        lines = [content["verdict"], "", *aligned(table, left=(0, 1))]
+        scatter = content["evidence"]["scatter"]
+        lines += ["", "mean squares over those of simulated drives (nearly blind to a missing effect): "]
+        lines[-1] += ", ".join(f"{name} {value:.2f}" for name, value in scatter.items())
+        total, cells = len(content["findings"]), content["cells"]
+        lines += ["", f"{total} of {cells} cells are outside their simulated bands (false discoveries held at 5 %)"]
+        lines += [f"  {finding['z']:+6.1f} sd  {finding['text']}" for finding in strongest(content["findings"])]
+        lines += [f"the table: {one['text']}" for one in content["stuck"]]
+        return "\n".join(lines + [f"note: {note}" for note in content["notes"]])
 
     def __repr__(self) -> str:
         return f"Check({verdict(self)!r})"
-
-
-SHOWN = 8  # findings in the table
-WHO = {
-    "sensor": "the sensor is at fault",
-    "actuator": "the actuators are at fault",
-    "dynamics": "the dynamics are at fault",
-    "noise": "its noise is at fault",
-    "parameters": "its own parameters do not suit these drives",
-    "cannot tell": "these drives cannot tell what is at fault",
-}
-BESIDE = {
-    "sensor": "the sensor stands out",
-    "actuator": "the actuators stand out",
-    "dynamics": "the dynamics stand out",
-    "noise": "its noise stands out",
-}
-
-
-def figures(found: Check) -> dict[str, Any]:
-    """Everything as a plain dict; every figure is finite, None where there is none."""
-    blame, misfit, reference = found.blame, found.misfit, found.reference
-    loses = lost_horizons(found)
-    about: dict[str, Any] = {"what": ABOUT, "why_not": reference if isinstance(reference, str) else None}
-    if isinstance(reference, Reference):
-        about |= {"noise": list(reference.scales), "log_likelihood": reference.log_likelihood}
-    return {
-        "verdict": verdict(found),
-        "who": blame.kind,
-        "p_value": blame.p_value,
-        "program": type(found.program).__name__,
-        "trajectories": len(found.data),
-        "simulations": len(misfit.simulated),
-        "measurements": {name: _component(found, i) for i, name in enumerate(found.program.measurement_names)},
-        "constant_velocity": about | {"loses_to_it": loses},
-        "findings": [
-            {
-                "text": sentence(found, finding),
-                "map": finding.cell.map,
-                "residual": found.residuals[finding.cell.residual],
-                "where": {key: _plain(found, key, value) for key, value in finding.cell.where.items()},
-                "count": finding.cell.count,
-                "mean": finding.cell.mean,
-                "z": finding.z,
-                "p_value": finding.p_value,
-            }
-            for finding in misfit.significant
-        ],
-        "cells": len(misfit.cells),
-        "evidence": {
-            "p_values": {
-                "mean": blame.mean_p_value,
-                "parameters": blame.parameters_p_value,
-                "noise": blame.noise_p_value,
-                "maps": misfit.p_value,
-            },
-            "explained_nats": blame.explained,
-            "directions": [{"kind": kind, "direction": name, "z": z} for kind, name, z in blame.evidence],
-            "parameters": blame.parameters,
-            "noise": blame.noise,
-            "scatter": {
-                name: ratio
-                for name, ratio in zip(found.residuals, misfit.dispersion.tolist(), strict=True)
-                if math.isfinite(ratio)
-            },
-        },
-        "step": found.step.figures,
-        "stuck": [
-            {"trajectory": one.label, "seconds": list(one.seconds), "columns": list(one.columns), "text": str(one)}
-            for one in found.stuck
-        ],
-        "notes": found.notes,
-    }
 
 
 def _component(found: Check, index: int) -> dict[str, Any]:
@@ -153,17 +151,14 @@ def _component(found: Check, index: int) -> dict[str, Any]:
         count = int(seen.sum())
         if not count:
             continue
-        reference = None
-        if isinstance(found.reference, Reference):
-            theirs = found.reference.predictions[horizon]
-            reference = _rms(theirs.error[..., index], theirs.observed[..., index])
+        theirs = found.reference.predictions[horizon] if isinstance(found.reference, Reference) else None
         error, both = found.held[horizon]
         floor = torch.from_numpy(found.floor[horizon][:, index]).double()
         horizons[name] = {
             "rmse": _rms(prediction.error[..., index], seen),
             "noise_floor": float(floor.mean()),
             "noise_floor_90": [float(floor.quantile(0.05)), float(floor.quantile(0.95))],
-            "constant_velocity": reference,
+            "constant_velocity": _rms(theirs.error[..., index], theirs.observed[..., index]) if theirs else None,
             "last_measurement": _rms(error[..., index], both[..., index]),
             "predicted_sd": float(prediction.variance[..., index][seen].mean().sqrt()),
             "coverage_90": float(prediction.covered()[..., index].sum()) / count,
@@ -196,30 +191,23 @@ def lost_horizons(found: Check) -> list[str]:
 
 def verdict(found: Check) -> str:
     """The first line of `steady check`: one sentence, after a first one on the time step where that is too coarse."""
-    if found.step.sentence:
-        first = found.step.sentence
-        first = f"{first[0].upper()}{first[1:]}: refit at that step first; what follows is of the coarse one."
-        return f"{first} {_verdict(found)}"
-    return _verdict(found)
-
-
-def _verdict(found: Check) -> str:
-    blame = found.blame
+    first, blame = found.step.sentence, found.blame
+    if first:
+        first = f"{first[0].upper()}{first[1:]}: refit at that step first; what follows is of the coarse one. "
     if blame.kind == "nothing found":
         drives, alone = len(found.data), len(found.misfit.significant)
         where = "in no place, time or regime more than" if not alone else "over all tests no more than"
-        said = (
-            f"Nothing found: on {'this drive' if drives == 1 else f'these {drives} drives'} the program errs {where} "
-        )
-        said += "on simulated drives of its own, which is no proof"
+        said = f"Nothing found: on {'this drive' if drives == 1 else f'these {drives} drives'} the program errs {where}"
+        said += " on simulated drives of its own, which is no proof"
         said += f" ({alone} of {len(found.misfit.cells)} cells would stand out by themselves)" if alone else ""
         said += "; `steady discover` says what could not have been seen"
     else:
         said = "The program does not explain these drives: "
         discover = "`steady discover` tests the physical effects by name"
         if blame.parameters_misfit:
+            beside = f"; beside them {BESIDE[blame.kind]}{_most_clearly(found)}" if blame.kind in BESIDE else ""
             said += f"{WHO['parameters']}{_parameters(found)}: fit it again first (more "
-            said += f"--steps, or --recipe likelihood){_beside_parameters(found)}; if that changes little, {discover}"
+            said += f"--steps, or --recipe likelihood){beside}; if that changes little, {discover}"
         else:
             said += f"{WHO[blame.kind]}{_most_clearly(found)}; "
             of_noise = "the effects of kind noise in `steady discover` say in which way"
@@ -227,14 +215,7 @@ def _verdict(found: Check) -> str:
     loses = lost_horizons(found)
     if loses:
         said += f"; it predicts worse than a vehicle that just keeps its velocity ({', '.join(loses)} ahead)"
-    return said + "."
-
-
-def _beside_parameters(found: Check) -> str:
-    """What stands out as well, which is no verdict while the parameters are wrong."""
-    if found.blame.kind not in BESIDE:
-        return ""
-    return f"; beside them {BESIDE[found.blame.kind]}{_most_clearly(found)}"
+    return f"{first}{said}."
 
 
 def _most_clearly(found: Check) -> str:
@@ -256,19 +237,21 @@ def _parameters(found: Check) -> str:
     return f", most clearly {' or '.join(alike)}"
 
 
+def subject(found: Check, residual: int) -> str:
+    """What a residual is of, in words."""
+    name = found.residuals[residual]
+    return name if residual < len(found.program.measurement_names) else f"{name} acceleration"
+
+
 def sentence(found: Check, finding: Finding) -> str:
     """A finding in words."""
     cell = finding.cell
-    name, more = found.residuals[cell.residual], finding.z > 0
-    where = place(found, cell)
-    measurements = found.program.measurement_names
-    if cell.residual >= len(measurements):
-        name = f"{name} acceleration"
+    name, more, where = subject(found, cell.residual), finding.z > 0, place(found, cell)
     if cell.map == "memory":
         return f"the misfit of {name} {'keeps' if more else 'changes'} its sign {where}"
     if cell.map == "lag":
         return f"the misfit of {name} goes {'with' if more else 'against'} {where}"
-    if cell.residual >= len(measurements):
+    if cell.residual >= len(found.program.measurements):
         return f"{name} {'above' if more else 'below'} the program's{where}"
     unit = found.program.measurement_units[cell.residual]
     size = f"{abs(cell.mean or 0.0):.2g} {unit} ".replace("  ", " ")
@@ -298,40 +281,15 @@ def place(found: Check, cell: Cell) -> str:
 def unit_of(found: Check, variable: str) -> str:
     """Of a control, a state component, or a channel's velocity; empty where it is not declared."""
     program = found.program
-    for declared in (program.controls, program.states):
-        if variable in names(declared):
-            return units(declared)[names(declared).index(variable)]
-    channel = variable.removesuffix(" velocity")
-    if channel in program.channel_names:
-        return program.channel_units[program.channel_names.index(channel)].replace("/s²", "/s")
-    return ""
+    moving = [f"{name} velocity" for name in program.channel_names]
+    of = dict(zip(moving, (unit.replace("/s²", "/s") for unit in program.channel_units), strict=True))
+    of |= zip(program.state_names, program.state_units, strict=True)
+    of |= zip(program.control_names, program.control_units, strict=True)
+    return of.get(variable, "")
 
 
 def _plain(found: Check, key: str, value: Any) -> Any:
     return found.data.labels[value] if key == "drive" else list(value) if isinstance(value, tuple) else value
-
-
-def as_text(content: Mapping[str, Any]) -> str:
-    """The figures as text: the verdict, a table of errors, and the strongest findings."""
-    lines = [content["verdict"], ""]
-    header = ["", "ahead", "RMSE", "noise alone", "constant velocity", "last measurement", "in 90 % band"]
-    table = [header]
-    for name, component in content["measurements"].items():
-        for horizon, row in component["horizons"].items():
-            keys = ("rmse", "noise_floor", "constant_velocity", "last_measurement")
-            cells = ["–" if row[key] is None else f"{row[key]:.4g}" for key in keys]
-            label = f"{name} [{component['unit']}]" if component["unit"] else name
-            table.append([label, horizon, *cells, f"{row['coverage_90']:.1%}"])
-    lines += aligned(table, left=(0, 1))
-    scatter = content["evidence"]["scatter"]
-    lines += ["", "mean squares over those of simulated drives (nearly blind to a missing effect): "]
-    lines[-1] += ", ".join(f"{name} {value:.2f}" for name, value in scatter.items())
-    shown = strongest(content["findings"])
-    total, cells = len(content["findings"]), content["cells"]
-    lines += ["", f"{total} of {cells} cells are outside their simulated bands (false discoveries held at 5 %)"]
-    lines += [f"  {finding['z']:+6.1f} sd  {finding['text']}" for finding in shown]
-    lines += [f"the table: {one['text']}" for one in content["stuck"]]
-    return "\n".join(lines + [f"note: {note}" for note in content["notes"]])
 
 
 def strongest(findings: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -30,33 +31,23 @@ MIN_GAIN = 3.0  # nats, of all drives together, from which a finer step counts
 MAX_SHIFT = 2.0  # nats that watched parameters of another step lie below the maximum: two standard deviations
 MAX_DECREMENT = 1.0  # nats that a scoring step may promise; beyond it more steps may gain far more
 PRECISION = 0.005  # nats, of refits
-MAX_SUBSTEPS_TRIED = 32
-"""Substeps of a trial, at most, unless more are asked for; a program may always be tried at twice its own."""
+MAX_SUBSTEPS_TRIED = 32  # of a trial, unless more are asked for; a program may always be tried at twice its own
 REFITS = 25  # scoring steps of a fit
 UNKNOWN = "whether the time step suits is not known"
 
 
 @dataclass(frozen=True)
 class StepTrial:
-    """A program with some number of substeps a row.
+    """A program with some number of substeps a row; names, values and covariance are of its `P` watched numbers."""
 
-    Attributes:
-        substeps: of a row.
-        log_likelihood: log p(y) of all drives, linearised.
-        decrement: what a scoring step would add, nats; zero where parameters are not refitted.
-        program: with the parameters of this trial.
-        path: of the drives, along which it was linearised.
-        names, values, covariance: of the learnable numbers that are watched, `(P,)`, `(P,)`, `(P, P)`.
-    """
-
-    substeps: int
-    log_likelihood: float
-    decrement: float
-    program: Program
-    path: ReferencePath
+    substeps: int  # of a row
+    log_likelihood: float  # log p(y) of all drives, linearised
+    decrement: float  # what a scoring step would add, nats; zero where parameters are not refitted
+    program: Program  # with the parameters of this trial
+    path: ReferencePath  # of the drives, along which it was linearised
     names: tuple[str, ...] = ()
-    values: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
-    covariance: Tensor = field(default_factory=lambda: torch.zeros(0, 0, dtype=torch.float64))
+    values: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))  # (P,)
+    covariance: Tensor = field(default_factory=lambda: torch.zeros(0, 0, dtype=torch.float64))  # (P, P)
 
     @property
     def reachable(self) -> float:
@@ -70,37 +61,32 @@ class StepTrial:
         change = other.values - self.values
         return 0.5 * float(change @ torch.linalg.pinv(self.covariance) @ change)
 
-    def farthest(self, other: StepTrial) -> tuple[str, float]:
-        """The watched number that differs most from the other trial's, and by how many standard deviations."""
+    def farthest(self, other: StepTrial) -> str:
+        """The watched number that differs most from the other trial's, and by how much, in words."""
         spread = self.covariance.diagonal().clamp(min=1e-300).sqrt()
         apart = ((other.values - self.values) / spread).abs()
-        index = int(apart.argmax())
-        return self.names[index], float(apart[index])
+        return f"{self.names[int(apart.argmax())]} by {float(apart.max()):.1f} standard deviations"
 
 
 @dataclass(frozen=True)
 class StepCheck:
     """A program beside itself at finer steps, on the same drives.
 
-    Attributes:
-        trials: the program's own number of substeps first, then twice as many each time, to the first that changes
-            neither log p(y) nor the watched parameters by what counts, or to one too many that loses.
-        max_shift: nats by which the watched parameters may move.
-        uncompared: why nothing is known of steps finer than the suited one; None where something is.
+    The first trial has the program's own number of substeps, each further one twice as many, to the first that changes
+    neither log p(y) nor the watched parameters by what counts, or to one too many that loses.
     """
 
     trials: tuple[StepTrial, ...]
-    max_shift: float = MAX_SHIFT
-    uncompared: str | None = None
+    max_shift: float  # nats by which the watched parameters may move
+    uncompared: str | None = None  # why nothing is known of steps finer than the suited one
 
     @property
     def suited(self) -> StepTrial:
         """The trial with the fewest substeps, beyond which twice as many change nothing that counts."""
-        return next(
-            trial
-            for index, trial in enumerate(self.trials)
-            if not any(_differs(trial, finer, self.max_shift) for finer in self.trials[index + 1 :])
-        )
+        for index, trial in enumerate(self.trials):
+            if not any(_differs(trial, finer, self.max_shift) for finer in self.trials[index + 1 :]):
+                break
+        return trial
 
     @property
     def settled(self) -> bool:
@@ -114,14 +100,12 @@ class StepCheck:
 
     @property
     def too_coarse(self) -> bool:
-        """Whether finer steps make the drives likelier by more than `MIN_GAIN` nats, or move what is watched by more
-        than `max_shift`."""
+        """Whether finer steps gain more than `MIN_GAIN` nats, or move what is watched by more than `max_shift`."""
         return self.suited is not self.trials[0]
 
     @property
     def sentence(self) -> str:
-        """What is to be said first where a finer step makes the drives likelier or moves parameters far; empty
-        otherwise."""
+        """What is to be said first where a finer step gains nats or moves parameters far; empty otherwise."""
         if self.gain > MIN_GAIN:
             said = f"{self._instead} gain {self.gain:.0f} nats"
             if self.suited is self.trials[-1]:
@@ -130,25 +114,23 @@ class StepCheck:
                 if gain > MIN_GAIN:
                     said += f", the last doubling {gain:.0f} of them: more substeps may gain more"
                 else:
-                    name, far = last.farthest(coarser)
-                    said += f", the last doubling moves {name} by {far:.1f} standard deviations: more may move it on"
+                    said += f", the last doubling moves {last.farthest(coarser)}: more may move it on"
         elif self.too_coarse and self.suited.shift(self.trials[0]) > MAX_SHIFT:
-            said = f"{self._instead} move {self._farthest}"
+            said = self._moves
         else:
             return ""
-        return f"the program's own time step is too coarse: {said} ({self._option})"
+        return f"the program's own time step is too coarse: {said} {self._option}"
 
     @property
     def note(self) -> str:
         """What is to be noted where a finer step moves parameters a little; empty otherwise."""
         if not self.too_coarse or self.sentence:
             return ""
-        return f"{self._instead} move {self._farthest} ({self._option})"
+        return f"{self._moves} {self._option}"
 
     @property
-    def _farthest(self) -> str:
-        name, far = self.suited.farthest(self.trials[0])
-        return f"{name} by {far:.1f} standard deviations"
+    def _moves(self) -> str:
+        return f"{self._instead} move {self.suited.farthest(self.trials[0])}"
 
     @property
     def _instead(self) -> str:
@@ -156,7 +138,7 @@ class StepCheck:
 
     @property
     def _option(self) -> str:
-        return f"fit with --substeps {self.suited.substeps}"
+        return f"(fit with --substeps {self.suited.substeps})"
 
     @property
     def figures(self) -> dict[str, object]:
@@ -201,7 +183,6 @@ def check_step(
         data: as returned by `for_program`.
         at: the program's maximum on these drives, or a path near their posterior means, from which it is fitted to them
             first; found when None.
-        known_start: the first state is certain.
         watched: names of the parameters whose values a finer step must not move either; all but those of noise when
             None, of which a program that holds something within each substep needs more in shorter ones.
         max_shift: nats by which it may move them.
@@ -210,8 +191,7 @@ def check_step(
     Raises:
         FilterError: the program cannot be smoothed as it is.
     """
-
-    refits = can_refit(program)
+    refits = _can_refit(program)
     if isinstance(at, Maximum) and not at.names:  # fitted by draws: nothing is known of its curvature
         at = at.path
     if not is_step(program, data):  # in substeps it is another model, whose parameters are others
@@ -297,21 +277,17 @@ def _uncompared(found: StepCheck, failure: str | None) -> str | None:
         return failure
     doubtful = [trial for trial in lost if trial.decrement > MAX_DECREMENT]
     if finer == lost and doubtful:
-        return f"{UNKNOWN}: fits with {_counts(doubtful)} substeps a row have not converged"
+        counts = " and ".join(str(trial.substeps) for trial in doubtful)
+        return f"{UNKNOWN}: fits with {counts} substeps a row have not converged"
     return None
 
 
-def _counts(trials: Sequence[StepTrial]) -> str:
-    return " and ".join(str(trial.substeps) for trial in trials)
-
-
-def can_refit(program: Program) -> bool:
+def _can_refit(program: Program) -> bool:
     """Whether a program has few enough learnable numbers to be refitted by scoring steps."""
-    try:
+    with suppress(UsageError):
         elements(program)
-    except UsageError:
-        return False
-    return True
+        return True
+    return False
 
 
 def _trial(program: Program, maximum: Maximum, watched: Sequence[str]) -> StepTrial:

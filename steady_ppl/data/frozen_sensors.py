@@ -19,23 +19,18 @@ MIN_ROWS = 12  # rows of a stretch
 MAX_DEVIATION = 1e-6  # of the column's range over all drives, by which a row may be beside the line
 
 
+Run = tuple[int, int, int, str]  # drive, first and last row, column
+
+
 @dataclass(frozen=True)
 class Stretch:
-    """Rows of a drive in which some logged columns are on a line.
-
-    Attributes:
-        drive: its number.
-        label: its name.
-        rows: the first and the last row of the stretch, from 0.
-        seconds: when these are, from the drive's first row.
-        columns: which, as the table names them.
-    """
+    """Rows of a drive in which some logged columns are on a line."""
 
     drive: int
     label: str
-    rows: tuple[int, int]
-    seconds: tuple[float, float]
-    columns: tuple[str, ...]
+    rows: tuple[int, int]  # the first and the last, from 0
+    seconds: tuple[float, float]  # when these are, from the drive's first row
+    columns: tuple[str, ...]  # as the table names them
 
     def __str__(self) -> str:
         begin, end = self.seconds
@@ -45,14 +40,14 @@ class Stretch:
         )
 
 
-def stuck(data: Trajectories) -> list[Stretch]:
+def frozen_stretches(data: Trajectories) -> list[Stretch]:
     """Stretches in which a measurement or a known state is on a line over time though it scatters elsewhere.
 
     Known states are looked at because they were logged, too: where somebody's tracking lost the vehicle, whatever was
     made of its poses is made up.
     """
-    runs: list[tuple[int, int, int, str]] = []
-    moving: set[tuple[int, int, int, str]] = set()
+    runs: list[Run] = []
+    moving: set[Run] = set()
     for column, values, there in _columns(data):
         of_column = _runs(data.time, values, there)
         if sum(last - first for _, first, last in of_column) < 0.5 * float(there.sum()):
@@ -69,7 +64,7 @@ def stuck(data: Trajectories) -> list[Stretch]:
     return found
 
 
-def _beside(run: tuple[int, int, int, str], moving: set[tuple[int, int, int, str]]) -> bool:
+def _beside(run: Run, moving: set[Run]) -> bool:
     """Whether another known state moves along a line meanwhile: then one that keeps its value is made up as well."""
     drive, first, last, _ = run
     return any(m[0] == drive and m[1] <= last and first <= m[2] and m[3].startswith("x.") for m in moving)
@@ -94,14 +89,12 @@ def masked(data: Trajectories, stretches: list[Stretch]) -> Trajectories:
 
 
 def _columns(data: Trajectories) -> list[tuple[str, Tensor, Tensor]]:
-    columns = [
-        (f"y.{name}", data.measurements[..., i], data.observed[..., i]) for i, name in enumerate(data.measurement_names)
-    ]
+    names, values, there = [f"y.{name}" for name in data.measurement_names], data.measurements, data.observed
     if data.states is not None:
-        for i, name in enumerate(data.state_names):
-            values = data.states[..., i]
-            columns.append((f"x.{name}", values.nan_to_num(), torch.isfinite(values) & data.rows))
-    return columns
+        names += [f"x.{name}" for name in data.state_names]
+        values = torch.cat([values, data.states.nan_to_num()], -1)
+        there = torch.cat([there, torch.isfinite(data.states) & data.rows.unsqueeze(-1)], -1)
+    return list(zip(names, values.unbind(-1), there.unbind(-1), strict=True))
 
 
 def _runs(time: Tensor, values: Tensor, there: Tensor) -> list[tuple[int, int, int]]:

@@ -28,6 +28,8 @@ from steady_ppl.utils.files import require_file, whole_file
 from steady_ppl.utils.text import shown
 
 SEPARATORS = {";": "semicolons", "\t": "tabs"}  # of other programs' CSV
+MAX_PIECES = 1_000_000  # of all drives
+MAX_ROWS = 20_000  # of a drive that is looked at as a whole
 
 
 def read_table(path: str | Path) -> Trajectories:
@@ -74,19 +76,16 @@ def write_table(data: Trajectories, path: str | Path) -> None:
 def to_frame(data: Trajectories) -> pd.DataFrame:
     """The table as a pandas frame, trajectory after trajectory; missing cells are NaN.
 
-    Trajectories without labels are numbered from 1.
-
     Raises:
         DataError: where two trajectories have the same label, or a measurement that was made is NaN: as rows of a
             table they would be one trajectory, or a missing measurement.
     """
-    labels = data.labels or tuple(str(i + 1) for i in range(len(data)))
-    again = pd.Series(labels, dtype=object).duplicated()
+    again = pd.Series(data.labels, dtype=object).duplicated()
     if again.any():
-        _fail("table", "two trajectories have this label", column="trajectory", trajectory=labels[again.argmax()])
+        _fail("table", "two trajectories have this label", column="trajectory", trajectory=data.labels[again.argmax()])
     for t, b, k in (data.measurements.isnan() & data.observed & data.rows[..., None]).nonzero()[:1].tolist():
         row, column = int(data.lengths[:b].sum()) + t + 1, f"y.{data.measurement_names[k]}"
-        _fail("table", "a measurement is NaN", column=column, trajectory=labels[b], row=row)
+        _fail("table", "a measurement is NaN", column=column, trajectory=data.labels[b], row=row)
     blocks = [data.time[..., None], data.controls, data.measurements.masked_fill(~data.observed, torch.nan)]
     names = ["time", *(f"u.{n}" for n in data.control_names), *(f"y.{n}" for n in data.measurement_names)]
     if data.states is not None:
@@ -94,7 +93,7 @@ def to_frame(data: Trajectories) -> pd.DataFrame:
         names += [f"x.{n}" for n in data.state_names]
     values = torch.cat([block.detach().double() for block in blocks], -1).transpose(0, 1)[data.rows.T]
     frame = pd.DataFrame(values.cpu().numpy(), columns=names)
-    frame.insert(0, "trajectory", np.repeat(np.array(labels, dtype=object), data.lengths.cpu().numpy()))
+    frame.insert(0, "trajectory", np.repeat(np.array(data.labels, dtype=object), data.lengths.cpu().numpy()))
     return frame
 
 
@@ -238,11 +237,7 @@ def _read_parquet(path: Path) -> pd.DataFrame:
 
 
 def require_table_file(path: Path) -> str:
-    """The suffix of a file that a table can be written to.
-
-    Raises:
-        DataError: for another suffix, or a missing folder.
-    """
+    """The suffix of a file that a table can be written to; DataError for another one, or a missing folder."""
     suffix = _suffix(path)
     if not path.parent.is_dir():
         raise DataError(f"{path.name}: cannot be written: there is no folder {path.parent.name}, create it first")
@@ -309,26 +304,14 @@ def from_arrays(drives: Sequence[Mapping[str, Any]], labels: Sequence[str] | Non
     return from_frame(pd.concat(frames), name="arrays")
 
 
-MOST_PIECES = 1_000_000
-
-
-MOST_ROWS = 20_000
-
-
 def refuse_long(data: Trajectories) -> None:
-    """Whatever looks at a drive as a whole does not begin with one that is longer than `MOST_ROWS`.
-
-    Raises:
-        DataError: naming the longest.
-    """
+    """Raise DataError, naming the longest trajectory, where it has more than `MAX_ROWS` rows."""
     longest = int(data.lengths.argmax())
-    rows = int(data.lengths[longest])
-    if rows > MOST_ROWS:
-        raise DataError(
-            f"trajectory {data.labels[longest]} has {rows} rows, and at most {MOST_ROWS} are looked at in one piece: "
-            "cut it by `steady data cut TABLE --seconds 60 --out PIECES`",
-            trajectory=data.labels[longest],
-        )
+    label, rows = data.labels[longest], int(data.lengths[longest])
+    if rows > MAX_ROWS:
+        what = f"trajectory {label} has {rows} rows, and at most {MAX_ROWS} are looked at in one piece"
+        how = "cut it by `steady data cut TABLE --seconds 60 --out PIECES`"
+        raise DataError(f"{what}: {how}", trajectory=label)
 
 
 def cut(data: Trajectories, seconds: float) -> Trajectories:
@@ -356,7 +339,7 @@ def cut(data: Trajectories, seconds: float) -> Trajectories:
     frame = to_frame(data)
     drives = frame.groupby("trajectory", sort=False)
     since = frame["time"] - drives["time"].transform("first")
-    require(float(since.max()) / seconds < MOST_PIECES, "seconds", seconds, f"enough for {MOST_PIECES} pieces")
+    require(float(since.max()) / seconds < MAX_PIECES, "seconds", seconds, f"enough for {MAX_PIECES} pieces")
     piece = np.floor(since / seconds + 1e-6).astype(int)  # a row that rounding puts before its time is in time
     measured = frame.filter(regex=r"^y\.").notna().any(axis=1)
     place = [frame["trajectory"], piece]

@@ -7,17 +7,18 @@ time goes on at the last step, controls and measurements are zero, nothing is ob
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from steady_ppl.errors import DataError
 from steady_ppl.utils.late import Displayed
 
-ALIKE = 1.25  # ratio of the drives' steps up to which they count as one
+MAX_STEP_RATIO = 1.25  # ratio of the drives' steps up to which they count as one
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +91,7 @@ class Trajectories(Displayed):
         """What is to be said of times ahead where drives are sampled at different rates; they are counted in rows."""
         steps = torch.where(self.transitions, (self.time[1:] - self.time[:-1]), torch.nan).nanmedian(0).values
         least, most = float(steps.min()), float(steps.max())
-        if most < ALIKE * least:
+        if most < MAX_STEP_RATIO * least:
             return []
         return [
             f"the drives' steps differ, {least:.3g} to {most:.3g} s: a time ahead is so many rows of "
@@ -113,31 +114,24 @@ class Trajectories(Displayed):
             raise DataError(
                 "a known start needs the true states of every trajectory's first row: the table has no x. columns"
             )
-        unknown = ~torch.isfinite(self.states[0])
-        if bool(unknown.any()):
-            trajectory, component = (int(i) for i in unknown.nonzero()[0])
-            raise DataError(
-                f"a known start needs every trajectory's first state: x.{self.state_names[component]} "
-                f"of trajectory {self.labels[trajectory]} is empty",
-                column=f"x.{self.state_names[component]}",
-                trajectory=self.labels[trajectory],
-                row=1,
-            )
+        for trajectory, component in (~torch.isfinite(self.states[0])).nonzero()[:1].tolist():
+            column, label = f"x.{self.state_names[component]}", self.labels[trajectory]
+            problem = f"a known start needs every trajectory's first state: {column} of trajectory {label} is empty"
+            raise DataError(problem, column=column, trajectory=label, row=1)
         return self.states[0]
 
     def subset(self, index: Sequence[int] | Tensor) -> Trajectories:
         """The trajectories at `index`, still padded to the same number of rows."""
         index = torch.as_tensor(index, dtype=torch.long, device=self.time.device)
-        return replace(
-            self,
-            time=self.time[:, index],
-            controls=self.controls[:, index],
-            measurements=self.measurements[:, index],
-            observed=self.observed[:, index],
-            lengths=self.lengths[index],
-            states=None if self.states is None else self.states[:, index],
-            labels=tuple(self.labels[int(i)] for i in index),
-        )
+        chosen = self._each(lambda rows: rows[:, index])
+        return replace(chosen, lengths=self.lengths[index], labels=tuple(self.labels[int(i)] for i in index))
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> Trajectories:
+        """The same with every tensor of rows changed."""
+        names = ("time", "controls", "measurements", "observed", "states")
+        rows = {name: getattr(self, name) for name in names}
+        changed: dict[str, Any] = {name: change(values) for name, values in rows.items() if values is not None}
+        return replace(self, **changed)
 
     def observed_every(self, stride: int) -> Trajectories:
         """Keep the measurements of rows 1, 1 + stride, … only; every row stays (10 turns 10 Hz into 1 Hz)."""
@@ -165,7 +159,7 @@ class Trajectories(Displayed):
         if not 0 < step < math.inf:
             raise DataError(f"a step of {step} s leads nowhere")
         later = step * torch.arange(1, len(plan) + 1, dtype=self.time.dtype, device=self.time.device)
-        ends = [int(length) for length in self.lengths]
+        ends = self.lengths.tolist()
 
         def continued(values: Tensor, fill: float = 0.0) -> Tensor:
             rest = values.new_full((len(plan), *values.shape[2:]), fill)
@@ -174,11 +168,10 @@ class Trajectories(Displayed):
         def acting(drive: int, end: int) -> Tensor:
             return torch.cat([self.controls[: end - 1, drive], plan[:, drive], plan.new_zeros(1, plan.shape[-1])])
 
+        times = [torch.cat([self.time[:end, b], self.time[end - 1, b] + later]) for b, end in enumerate(ends)]
         return replace(
             self,
-            time=pad_time(
-                [torch.cat([self.time[:end, b], self.time[end - 1, b] + later]) for b, end in enumerate(ends)]
-            ),
+            time=pad_time(times),
             controls=pad([acting(drive, end) for drive, end in enumerate(ends)]),
             measurements=continued(self.measurements),
             observed=continued(self.observed, False),
@@ -200,41 +193,30 @@ class Trajectories(Displayed):
         def cast(tensor: Tensor) -> Tensor:
             return tensor.to(device=device, dtype=like if tensor.is_floating_point() else None)
 
-        return replace(
-            self,
-            time=(self.time - self.time[0]).to(device=device),
-            controls=cast(self.controls),
-            measurements=cast(self.measurements),
-            observed=cast(self.observed),
-            lengths=cast(self.lengths),
-            states=None if self.states is None else cast(self.states),
-        )
+        time = (self.time - self.time[0]).to(device=device)
+        return replace(self._each(cast), time=time, lengths=cast(self.lengths))
 
     def select(self, controls: Sequence[str], measurements: Sequence[str], states: Sequence[str]) -> Trajectories:
-        """The named columns in the named order; what a program reads.
-
-        Unknown state components become NaN; a control or a measurement that the table lacks is an error.
+        """The named columns in the named order; what a program reads. Unknown state components become NaN.
 
         Raises:
-            DataError: naming the missing column and those that the table has.
+            DataError: the table lacks a control or a measurement; it names what is missing and what is there.
         """
-
         columns = (("u", controls, self.control_names), ("y", measurements, self.measurement_names))
         said, missing = [], list[str]()
         for prefix, wanted, have in columns:
             lacking = [f"{prefix}.{name}" for name in wanted if name not in have]
             there = ", ".join(f"{prefix}.{name}" for name in have) or f"no {prefix}. column"
-            said += [f"the table has no column {', '.join(lacking)}; it has {there}"] if lacking else []
+            said += [f"no column {', '.join(lacking)}; it has {there}"] if lacking else []
             missing += lacking
         if missing:
-            raise DataError("; ".join(said).replace("; the table has no", ", and no"), column=missing[0])
+            raise DataError(f"the table has {', and '.join(said)}", column=missing[0])
         chosen_controls, chosen = ([have.index(name) for name in wanted] for _, wanted, have in columns)
         truth = None
         if self.states is not None and any(name in self.state_names for name in states):
-            truth = self.states.new_full((*self.time.shape, len(states)), torch.nan)
-            for i, name in enumerate(states):
-                if name in self.state_names:
-                    truth[..., i] = self.states[..., self.state_names.index(name)]
+            known = dict(zip(self.state_names, self.states.unbind(-1), strict=True))
+            unknown = torch.full_like(self.states[..., 0], torch.nan)
+            truth = torch.stack([known.get(name, unknown) for name in states], -1)
         return replace(
             self,
             controls=self.controls[..., chosen_controls],
@@ -249,11 +231,7 @@ class Trajectories(Displayed):
 
 def pad(columns: Sequence[Tensor], fill: float = 0.0) -> Tensor:
     """Stack `B` tensors of shapes `(rows_b, ·)` into `(T + 1, B, ·)`, filled up with `fill`."""
-    longest = max(len(column) for column in columns)
-    out = columns[0].new_full((longest, len(columns), *columns[0].shape[1:]), fill)
-    for i, column in enumerate(columns):
-        out[: len(column), i] = column
-    return out
+    return pad_sequence(list(columns), padding_value=fill)
 
 
 def pad_time(times: Sequence[Tensor]) -> Tensor:
@@ -286,22 +264,18 @@ def joined(**tables: Trajectories) -> Trajectories:
     labels = [label for part in parts for label in part.labels]
     if len(set(labels)) < len(labels):
         labels = [f"{name} {label}" for name, part in tables.items() for label in part.labels]
-    known = all(part.states is not None for part in parts)
+
+    def drives(name: str) -> list[Tensor]:
+        """What each trajectory of each table has there, without padding."""
+        return [getattr(part, name)[:rows, i] for part in parts for i, rows in enumerate(part.lengths.tolist())]
+
     return replace(
         parts[0],
-        time=pad_time([column for part in parts for column in _columns(part, part.time)]),
-        controls=_stacked(parts, "controls"),
-        measurements=_stacked(parts, "measurements"),
-        observed=_stacked(parts, "observed"),
+        time=pad_time(drives("time")),
+        controls=pad(drives("controls")),
+        measurements=pad(drives("measurements")),
+        observed=pad(drives("observed"), False),
         lengths=torch.cat([part.lengths for part in parts]),
-        states=_stacked(parts, "states", torch.nan) if known else None,
+        states=pad(drives("states"), torch.nan) if all(part.states is not None for part in parts) else None,
         labels=tuple(labels),
     )
-
-
-def _columns(part: Trajectories, values: Tensor) -> list[Tensor]:
-    return [values[: int(length), i] for i, length in enumerate(part.lengths)]
-
-
-def _stacked(parts: list[Trajectories], name: str, fill: float = 0.0) -> Tensor:
-    return pad([column for part in parts for column in _columns(part, getattr(part, name))], fill)

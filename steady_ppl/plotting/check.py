@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import textwrap
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -12,11 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from steady_ppl.criticism.baselines import Reference
-from steady_ppl.criticism.result import unit_of, verdict
+from steady_ppl.criticism.result import Check, subject, unit_of, verdict
 from steady_ppl.errors import UsageError
-
-if TYPE_CHECKING:
-    from steady_ppl.criticism.result import Check
 
 MEASURED, NEAR, FAR, REFERENCE, FLOOR = "black", "#0072b2", "#d55e00", "#cc79a7", "#009e73"
 COMPONENTS = 4  # panels at most
@@ -25,22 +23,23 @@ WIDTH = 165  # letters of a line over the whole width
 
 def check_picture(found: Check) -> Figure:
     """One figure of everything; made without pyplot's list of figures, so that nothing needs to be closed."""
-    shown = min(COMPONENTS, len(found.program.measurement_names))
-    figure = Figure(figsize=(13, 2.2 * max(shown, 3) + 1.3), layout="constrained")
-    left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1.25, 1), squeeze=False))
-    drive = representative(found)
-    panels = left.subplots(shown, 1, sharex=True, squeeze=False)[:, 0]
-    for component, axes in enumerate(panels):
-        predictions(found, drive, component, axes)
-    panels[0].set_title(f"measured and predicted, drive {found.data.labels[drive]}", fontsize=9, parse_math=False)
-    panels[-1].set_xlabel("time [s]", fontsize=8)
-    left.legend(*panels[0].get_legend_handles_labels(), fontsize=8, ncols=3, loc="outside lower center")
-    figure.suptitle("\n".join(textwrap.wrap(verdict(found), WIDTH)), fontsize=10)
-    strips, regime, against = right.subplots(3, 1, height_ratios=(1.2, 1, 1))
-    where_and_when(found, strips)
-    regime_panel(found, regime)
-    against_references(found, against)
-    return figure
+    with plt.rc_context({"axes.titlesize": 9, "axes.labelsize": 8}):
+        shown = min(COMPONENTS, len(found.program.measurement_names))
+        figure = Figure(figsize=(13, 2.2 * max(shown, 3) + 1.3), layout="constrained")
+        left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1.25, 1), squeeze=False))
+        drive = representative(found)
+        panels = left.subplots(shown, 1, sharex=True, squeeze=False)[:, 0]
+        for component, axes in enumerate(panels):
+            predictions(found, drive, component, axes)
+        panels[0].set_title(f"measured and predicted, drive {found.data.labels[drive]}", parse_math=False)
+        panels[-1].set_xlabel("time [s]")
+        left.legend(*panels[0].get_legend_handles_labels(), fontsize=8, ncols=3, loc="outside lower center")
+        figure.suptitle("\n".join(textwrap.wrap(verdict(found), WIDTH)), fontsize=10)
+        above, regime, against = right.subplots(3, 1, height_ratios=(1.2, 1, 1))
+        where_and_when(found, above)
+        regime_panel(found, regime)
+        against_references(found, against)
+        return figure
 
 
 def representative(found: Check) -> int:
@@ -58,15 +57,13 @@ def predictions(found: Check, drive: int, component: int, axes: Axes) -> None:
     data = found.data
     time = data.elapsed[:, drive].numpy(force=True)
     last = list(found.horizons)[-1]
-    for name, color in {"one step": NEAR, last: FAR}.items():
-        if name == last and len(found.horizons) == 1:
-            continue
+    for name, color in zip(dict.fromkeys(("one step", last)), (NEAR, FAR), strict=False):
         at, middle, half = _joined(time, *(values[:, drive, component] for values in band(found, name)))
         axes.fill_between(at, middle - half, middle + half, color=color, alpha=0.18, lw=0)
         axes.plot(at, middle, color=color, lw=1, label=f"{name} ahead, 90 % band")
     axes.plot(time, measured(found)[:, drive, component], ".", color=MEASURED, ms=3, label="measured")
     name, unit = found.program.measurement_names[component], found.program.measurement_units[component]
-    axes.set_ylabel(f"{name} [{unit}]" if unit else name, fontsize=8)
+    axes.set_ylabel(f"{name} [{unit}]" if unit else name)
 
 
 def _joined(time: np.ndarray, middle: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -99,88 +96,79 @@ def band(found: Check, horizon: str) -> tuple[np.ndarray, np.ndarray]:
     return np.where(jumps, np.nan, middle), half
 
 
+def strips(found: Check) -> tuple[list[tuple[float, float]], np.ndarray]:
+    """The strips of time, s, and z of each residual, drive and strip; NaN where there are too few residuals."""
+    cells = found.misfit.of_map("drive and time")
+    times = sorted({cell.where["time"] for cell, _ in cells})
+    grid = np.full((len(found.residuals), len(found.data), len(times)), np.nan)
+    for cell, z in cells:
+        grid[cell.residual, cell.where["drive"], times.index(cell.where["time"])] = z
+    return times, grid
+
+
 def where_and_when(found: Check, axes: Axes) -> None:
     """The strongest residual of every drive and strip of time."""
-    cells = [(i, cell) for i, cell in enumerate(found.misfit.cells) if cell.map == "drive and time"]
-    axes.set_title("where and when: strongest mean residual of each drive and strip", fontsize=9)
-    if not cells:
+    times, every = strips(found)
+    axes.set_title("where and when: strongest mean residual of each drive and strip")
+    if not times:
         axes.text(0.5, 0.5, "too few rows for strips", ha="center", va="center", transform=axes.transAxes)
         axes.set_axis_off()
         return
-    starts = sorted({cell.where["time"] for _, cell in cells})
-    grid = np.full((len(found.data), len(starts)), np.nan)
-    for i, cell in cells:
-        at = cell.where["drive"], starts.index(cell.where["time"])
-        z = found.misfit.z[i]
-        if not abs(z) <= abs(np.nan_to_num(grid[at])):
-            grid[at] = z
-    edges = [start for start, _ in starts] + [starts[-1][1]]
+    grid = np.take_along_axis(every, np.abs(np.nan_to_num(every)).argmax(0)[None], 0)[0]
+    edges = [start for start, _ in times] + [times[-1][1]]
     mesh = axes.pcolormesh(edges, np.arange(len(grid) + 1) + 0.5, grid, cmap="RdBu_r", vmin=-6, vmax=6)
     for finding in found.misfit.significant:
         if finding.cell.map == "drive and time":
-            start, end = finding.cell.where["time"]
-            axes.plot((start + end) / 2, finding.cell.where["drive"] + 1, "k*", ms=5)
+            axes.plot(sum(finding.cell.where["time"]) / 2, finding.cell.where["drive"] + 1, "k*", ms=5)
     step = max(1, len(grid) // 8)
     axes.set_yticks(np.arange(1, len(grid) + 1, step), found.data.labels[::step], fontsize=7, parse_math=False)
-    axes.set_xlabel("time [s]  (★ significant)", fontsize=8)
-    axes.set_ylabel("drive", fontsize=8)
-    axes.figure.colorbar(mesh, ax=axes).set_label("simulated sd", fontsize=8)
+    axes.set(xlabel="time [s]  (★ significant)", ylabel="drive")
+    axes.figure.colorbar(mesh, ax=axes).set_label("simulated sd")
 
 
 def regime_panel(found: Check, axes: Axes) -> None:
     """The mean residual over the ranges of the variable in which it stands out most."""
-    cells = [(i, cell) for i, cell in enumerate(found.misfit.cells) if cell.map == "regime"]
+    cells = found.misfit.of_map("regime")
     if not cells:
         axes.set_axis_off()
         return
-    _, strongest = max(cells, key=lambda pair: abs(found.misfit.z[pair[0]]))
+    strongest, _ = max(cells, key=lambda pair: abs(pair[1]))
     ((variable, _),) = strongest.where.items()
-    chosen = [(i, c) for i, c in cells if c.residual == strongest.residual and variable in c.where]
-    ranges = [cell.where[variable] for _, cell in chosen]
-    for (low, high), (i, _) in zip(ranges, chosen, strict=True):
-        axes.fill_between([low, high], -2, 2, color="0.85", lw=0)
-        axes.plot([low, high], [found.misfit.z[i]] * 2, color=NEAR, lw=3, solid_capstyle="butt")
-    stand_out = [f.cell for f in found.misfit.significant if f.cell.map == "regime"]
-    for low, high, z in [(*cell.where[variable], found.misfit.z[i]) for i, cell in chosen if cell in stand_out]:
-        axes.plot((low + high) / 2, z, "k*", ms=6)
+    chosen = [(cell, z) for cell, z in cells if cell.residual == strongest.residual and variable in cell.where]
+    for cell, z in chosen:
+        axes.fill_between(cell.where[variable], -2, 2, color="0.85", lw=0)
+        axes.plot(cell.where[variable], [z, z], color=NEAR, lw=3, solid_capstyle="butt")
+    stand_out = [one.cell for one in found.misfit.significant if one.cell.map == "regime"]
+    for cell, z in chosen:
+        if cell in stand_out:
+            axes.plot(sum(cell.where[variable]) / 2, z, "k*", ms=6)
     axes.axhline(0, color="black", lw=0.6)
     unit = unit_of(found, variable)
-    axes.set_xlabel(f"{variable} [{unit}]" if unit else variable, fontsize=8)
-    axes.set_ylabel("simulated sd", fontsize=8)
+    axes.set(xlabel=f"{variable} [{unit}]" if unit else variable, ylabel="simulated sd")
     what = "in which regime" if stand_out else "strongest regime, not significant"
-    axes.set_title(f"{what}: mean residual of {subject(found, strongest.residual)} (grey: ±2)", fontsize=9)
-
-
-def subject(found: Check, residual: int) -> str:
-    """What a residual is of, in words."""
-    name = found.residuals[residual]
-    return name if residual < len(found.program.measurement_names) else f"{name} acceleration"
+    axes.set_title(f"{what}: mean residual of {subject(found, strongest.residual)} (grey: ±2)")
 
 
 def against_references(found: Check, axes: Axes) -> None:
     """Errors over the noise floor, root mean square over the components, against the time ahead."""
-    step = found.data.median_step
-    seconds = [horizon * step for horizon in found.horizons.values()]
-    lines: dict[str, Any] = {"program": (NEAR, "o-", []), "last measurement": ("0.5", "s:", [])}
-    if isinstance(found.reference, Reference):
-        lines["constant velocity"] = (REFERENCE, "^--", [])
-    for horizon in found.horizons.values():
-        floor = found.floor[horizon].mean(0)
-        ours = found.predictions[horizon]
-        lines["program"][2].append(_relative(ours.error, ours.observed, floor))
-        lines["last measurement"][2].append(_relative(*found.held[horizon], floor))
-        if isinstance(found.reference, Reference):
-            theirs = found.reference.predictions[horizon]
-            lines["constant velocity"][2].append(_relative(theirs.error, theirs.observed, floor))
+    horizons = list(found.horizons.values())
+    seconds = [horizon * found.data.median_step for horizon in horizons]
     axes.axhline(1, color=FLOOR, lw=1.5, label="noise alone")
-    for name, (color, style, values) in lines.items():
-        axes.plot(seconds, values, style, color=color, label=name, ms=4)
+
+    def line(errors: Mapping[int, tuple[Any, Any]], style: str, color: str, label: str) -> None:
+        relative = [_relative(*errors[horizon], found.floor[horizon].mean(0)) for horizon in horizons]
+        axes.plot(seconds, relative, style, color=color, label=label, ms=4)
+
+    line({ahead: (one.error, one.observed) for ahead, one in found.predictions.items()}, "o-", NEAR, "program")
+    line(found.held, "s:", "0.5", "last measurement")
+    if isinstance(found.reference, Reference):
+        theirs = {ahead: (one.error, one.observed) for ahead, one in found.reference.predictions.items()}
+        line(theirs, "^--", REFERENCE, "constant velocity")
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("{x:g}")
-    axes.set_title("against references: root mean square error over all measurements", fontsize=9)
-    axes.set_xlabel("predicted ahead [s]", fontsize=8)
-    axes.set_ylabel("RMSE / noise alone", fontsize=8)
+    axes.set_title("against references: root mean square error over all measurements")
+    axes.set(xlabel="predicted ahead [s]", ylabel="RMSE / noise alone")
     axes.legend(fontsize=7)
 
 
@@ -213,8 +201,7 @@ def innovations(found: Check, trajectory: str, *, axes: Axes | None = None) -> A
     for component, (name, mark) in enumerate(zip(found.program.measurement_names, "os^Dvx+*" * 99, strict=False)):
         axes.plot(time, scores[:, component], mark, ms=3, label=name)
     axes.axhline(0, color="black", lw=0.6)
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel("innovation [standard deviations]")
+    axes.set(xlabel="time [s]", ylabel="innovation [standard deviations]")
     axes.set_title(f"trajectory {trajectory}", parse_math=False)
     axes.legend(fontsize=7, ncols=4)
     return axes

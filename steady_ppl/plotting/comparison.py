@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
 
-from steady_ppl.comparison.result import FLOOR, units_of_states
+from steady_ppl.comparison.result import FLOOR, Proof, units_of_states
 from steady_ppl.errors import UsageError
-
-if TYPE_CHECKING:
-    from steady_ppl.comparison.result import Proof
 
 COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "black")  # Okabe and Ito
 MARKS = "os^Dvx+"
@@ -47,7 +41,7 @@ def open_loop_picture(found: Proof, *, of: str | None = None, axes: Axes | None 
     axes.set_yscale("log")
     for axis in (axes.xaxis, axes.yaxis):  # 0.1 and 20 rather than powers of ten
         axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter(FuncFormatter(_sparse))
+        axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")  # twos and fives
     axes.tick_params(which="minor", labelsize=7)
     if floor:
         seconds, errors = zip(*floor, strict=True)
@@ -68,16 +62,8 @@ def proof_picture(found: Proof) -> Figure:
     return figure
 
 
-def _sparse(value: float, place: int | None = None) -> str:
-    """A label between powers of ten, of twos and fives only."""
-    return f"{value:g}" if f"{value:e}"[0] in "25" else ""
-
-
 def _curve(found: Proof, name: str, of: str) -> list[tuple[float, float]]:
     """Seconds ahead and error, where there is one."""
-    found_at = {
-        key.horizon: sums.value
-        for key, sums in found.rows[name].sums.items()
-        if key.kind in ("measurement", "state") and key.of == of
-    }
-    return [(rows * found.step, value) for rows, value in sorted(found_at.items()) if value]
+    kinds, sums = ("measurement", "state"), found.rows[name].sums.items()
+    at = {key.horizon: one.value for key, one in sums if key.kind in kinds and key.of == of}
+    return [(rows * found.step, value) for rows, value in sorted(at.items()) if value]

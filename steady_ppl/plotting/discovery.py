@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -17,7 +17,7 @@ from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.curves import variables
 from steady_ppl.discovery.finding import Finding, gain_interval
 from steady_ppl.discovery.refits import Fold, Refit
-from steady_ppl.discovery.result import limit_of, sentence
+from steady_ppl.discovery.result import Discovery, limit_of, sentence
 from steady_ppl.discovery.screening import Tested
 from steady_ppl.effects import Variant
 from steady_ppl.errors import UsageError
@@ -26,13 +26,12 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, row_controls
 from steady_ppl.plotting.comparison import open_loop_picture
 
-if TYPE_CHECKING:
-    from steady_ppl.discovery.result import Discovery
-
-ALIKE, OTHER, LIMIT = "#e69f00", "#0072b2", "#009e73"  # Okabe and Ito
+CHOSEN, ALIKE, OTHER, LIMIT = "#d55e00", "#e69f00", "#0072b2", "#009e73"  # Okabe and Ito
 MAX_CANDIDATES = 9  # candidates of a group
 MAX_OTHERS = 20  # effects that were not found, beside those that were
 WIDTH = 125  # letters of a line over the whole width
+SMALL = 8  # points, of letters
+TICKS = 400  # of the rug
 
 
 class Row(NamedTuple):
@@ -63,7 +62,8 @@ def discovery_picture(found: Discovery) -> Figure:
         left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1, 1.05), squeeze=False))
         above, below = left.subplots(2, 1, height_ratios=(height - 3.5, 3))
         gains(found, above)
-        before_and_after(found, below)
+        open_loop_picture(found.proof, axes=below)
+        titled(below, "predictions of the validation drives", below.get_xlabel())
         (curve_panel if found.shape else coefficients)(found, right.subplots())
     else:
         left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
@@ -73,7 +73,7 @@ def discovery_picture(found: Discovery) -> Figure:
     return figure
 
 
-def gains(found: Discovery, axes: Axes) -> Axes:
+def gains(found: Discovery, axes: Axes) -> None:
     """Held-out log p(y) that each fitted candidate brings, one group for each effect that was found."""
     rows = [row for group in _groups(found) for row in _of_group(group, found.before.seed)]
     most = max(row.value for row in rows if row.label)
@@ -96,29 +96,15 @@ def gains(found: Discovery, axes: Axes) -> Axes:
     if any(row.label and row.interval is None and row.value >= left for row in rows):
         axes.plot([], [], "o", mfc="none", color=OTHER, ms=5, label="given up after half the drives")
     axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3)
-    return axes
 
 
-def before_and_after(found: Discovery, axes: Axes) -> Axes:
-    """Open-loop errors of the program before and after."""
-    open_loop_picture(found.proof, axes=axes)
-    return titled(axes, "predictions of the validation drives", axes.get_xlabel())
-
-
-def coefficients(found: Discovery, axes: Axes, rest: int = MAX_OTHERS) -> Axes:
+def coefficients(found: Discovery, axes: Axes, rest: int = MAX_OTHERS) -> None:
     """Coefficients in units of what could have been seen: those that were found, then those of the last tests."""
     rows = [row for finding in found.findings for row in _of_finding(found, finding)]
-    rows += [row for tested in _remaining(found)[:rest] for row in _of_test(found, tested)]
+    rows += [row for tested in _remaining(found)[:rest] for row in _of_test(tested)]
     for place, row in enumerate(rows):
         _point(axes, row, place)
-        axes.annotate(
-            row.beside,
-            (1.01, place),
-            xycoords=("axes fraction", "data"),
-            fontsize=7,
-            va="center",
-            annotation_clip=False,
-        )
+        axes.text(1.01, place, row.beside, transform=axes.get_yaxis_transform(), fontsize=7, va="center")
     axes.axvspan(-1, 1, color=LIMIT, alpha=0.15, lw=0)
     axes.axvline(0, color="black", lw=0.6)
     axes.set_yticks(range(len(rows)), [row.label for row in rows], fontsize=SMALL)
@@ -127,12 +113,12 @@ def coefficients(found: Discovery, axes: Axes, rest: int = MAX_OTHERS) -> Axes:
         axes.set_xscale("symlog", linthresh=1)
         axes.xaxis.set_major_formatter("{x:g}")
         axes.margins(x=0.06)
-    axes.annotate("limit", (1.01, 1.01), xycoords="axes fraction", fontsize=7, va="bottom", annotation_clip=False)
+    axes.text(1.01, 1.01, "limit", transform=axes.transAxes, fontsize=7, va="bottom")
     what = "what was found and what is left" if found.findings else "what could have been seen"
-    return titled(axes, what, "coefficient / detection limit, 90 % interval (green: can be missed)")
+    titled(axes, what, "coefficient / detection limit, 90 % interval (green: can be missed)")
 
 
-def tests(found: Discovery, axes: Axes) -> Axes:
+def tests(found: Discovery, axes: Axes) -> None:
     """Every candidate's own p-value against the one that keeps the family-wise level; where nothing was fitted."""
     screened = found.search.rounds[0].screening.tests
     shown = [tested for tested in screened.tested if not tested.untestable]
@@ -146,7 +132,7 @@ def tests(found: Discovery, axes: Axes) -> Axes:
     axes.set_ylim(len(shown) - 0.4, -0.6)
     axes.legend(fontsize=7, loc="lower right")
     about = "p-value of each candidate alone; beyond the line something is missing"
-    return titled(axes, f"score tests: family-wise p = {found.p_value:.2g}", about)
+    titled(axes, f"score tests: family-wise p = {found.p_value:.2g}", about)
 
 
 def _groups(found: Discovery) -> list[Group]:
@@ -194,47 +180,40 @@ def _remaining(found: Discovery) -> list[Tested]:
 
 
 def _of_finding(found: Discovery, finding: Finding) -> list[Row]:
-    variant = finding.variant
+    variant, absent = finding.variant, finding.variant.effect.null
     tests_of = (one.screening.tests.tested for one in found.search.rounds)
     first = next((t for tested in tests_of for t in tested if t.variant.name == variant.name), None)
-    if first is None or not math.isfinite(variant.effect.null):
+    if first is None or not math.isfinite(absent):
         return []
-    limits, absent = limit_of(found, first), variant.effect.null
-    return [
-        Row(_component(variant, i), (value - absent) / limits[i], _scaled(interval, absent, limits[i]), CHOSEN, beside)
-        for i, (value, interval) in enumerate(zip(finding.coefficient, finding.interval, strict=True))
-        for beside in [_with_unit(limits[i], variant)]
-    ]
+    values, ends = np.array(finding.coefficient) - absent, np.array(finding.interval) - absent
+    return _in_limits(variant, values, ends, limit_of(found, first), CHOSEN)
 
 
-def _of_test(found: Discovery, tested: Tested) -> list[Row]:
-    values, halves = tested.coefficient, 1.645 * tested.sd
+def _of_test(tested: Tested) -> list[Row]:
+    half = 1.645 * tested.sd
+    ends = np.stack([tested.coefficient - half, tested.coefficient + half], -1)
+    return _in_limits(tested.variant, tested.coefficient, ends, tested.detection_limit, OTHER)
+
+
+def _in_limits(variant: Variant, values: np.ndarray, ends: np.ndarray, limits: np.ndarray, color: str) -> list[Row]:
+    """A line for each component: its value and interval `(k, 2)` over its detection limit."""
+    parts = variant.effect.components
     return [
         Row(
-            _component(tested.variant, i),
-            float(value / limit),
-            _scaled((value - half, value + half), 0.0, limit),
-            OTHER,
-            _with_unit(limit, tested.variant),
+            f"{_label(variant)} {parts[i]}" if parts else _label(variant),
+            value / limit,
+            (low / limit, high / limit),
+            color,
+            _with_unit(limit, variant),
         )
-        for i, (value, half, limit) in enumerate(zip(values, halves, tested.detection_limit, strict=True))
+        for i, (value, (low, high), limit) in enumerate(zip(values, ends, limits, strict=True))
     ]
-
-
-def _scaled(interval: tuple[float, float], absent: float, limit: float) -> tuple[float, float]:
-    return (interval[0] - absent) / limit, (interval[1] - absent) / limit
-
-
-def _component(variant: Variant, index: int) -> str:
-    parts = variant.effect.components
-    return f"{_label(variant)} {parts[index]}" if parts else _label(variant)
 
 
 def _with_unit(limit: float, variant: Variant) -> str:
-    unit = variant.unit
     if limit > variant.effect.limit:
         return "beyond the physical"
-    return f"{limit:.2g}" + ("" if unit in ("", "1") else f" {unit}")
+    return f"{limit:.2g}" + ("" if variant.unit in ("", "1") else f" {variant.unit}")
 
 
 def _label(variant: Variant) -> str:
@@ -247,15 +226,6 @@ def _point(axes: Axes, row: Row, place: float, hollow: bool = False) -> None:
     if row.interval is not None:
         axes.plot(row.interval, (place, place), "-", color=row.color, lw=1.6)
     axes.plot(row.value, place, "o", color=row.color, ms=5, mfc="none" if hollow else row.color)
-
-
-CHOSEN = "#d55e00"  # Okabe and Ito
-
-
-SMALL = 8  # points, of letters
-
-
-TICKS = 400  # of the rug
 
 
 def curve_panel(found: Discovery, axes: Axes) -> Axes:
@@ -282,10 +252,8 @@ def curve_panel(found: Discovery, axes: Axes) -> Axes:
     times = f", times {shape.times}" if shape.times else ""
     axes.set_ylabel(f"missing from {shape.channel}{times}{f' [{shape.unit}]' if shape.unit not in ('', '1') else ''}")
     axes.legend(fontsize=7, loc="upper right" if heights[0] > heights[-1] else "upper left")
-    about = (
-        f"{shape.variable}{f' [{shape.variable_unit}]' if shape.variable_unit else ''}; ticks: where the drives were"
-    )
-    return titled(axes, "the curve that is missing, in no catalogue", about)
+    variable = f"{shape.variable} [{shape.variable_unit}]" if shape.variable_unit else shape.variable
+    return titled(axes, "the curve that is missing, in no catalogue", f"{variable}; ticks: where the drives were")
 
 
 def titled(axes: Axes, title: str, about: str) -> Axes:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Sequence
-from functools import singledispatch
+from collections.abc import Callable, Sequence
+from functools import partial, singledispatch
+from operator import attrgetter
 from typing import Any
 
 import torch
@@ -25,6 +26,7 @@ from steady_ppl.runs.fit import Fit
 
 MAX_NUMBERS = 12  # numbers of a parameter that are shown one by one
 DOTS = 90  # an inch, of pictures
+SENTENCE, PARAGRAPH = Markup("<p><strong>{}</strong></p>"), Markup("<p>{}</p>")
 
 
 @singledispatch
@@ -46,50 +48,44 @@ def _(data: Trajectories) -> str:
         rows.append((name, *ends, f"{1 - len(values) / len(frame):.1%}"))
     count = "1 trajectory" if len(data) == 1 else f"{len(data)} trajectories"
     about = f"{count} of {lengths} rows, a row every {data.median_step:.3g} s"
-    return str(_sentence(about) + _table(("column", "least", "most", "empty"), rows))
+    return str(SENTENCE.format(about) + _table(("column", "least", "most", "empty"), rows))
 
 
 @html.register
 def _(fit: Fit) -> str:
     """Program, recipe, parameters, how it was judged, and what must be known of it."""
     name, trained = type(fit.program).__name__, fit.trained
-    said = _sentence(f"{name}, fitted by {fit.recipe}" if trained else f"{name}, recipe {fit.recipe}, nothing learned")
+    said = SENTENCE.format(
+        f"{name}, fitted by {fit.recipe}" if trained else f"{name}, recipe {fit.recipe}, nothing learned"
+    )
     judged = [entry for entry in trained.history if "log_likelihood" in entry] if trained else []
     if trained and judged:
         kept = {entry["step"]: entry["log_likelihood"] for entry in judged}[trained.kept]
         first = judged[0]["log_likelihood"]
-        said += _paragraph(f"held-out log p(y) {first:.2f} → {kept:.2f} nats a drive, kept at step {trained.kept}")
+        said += PARAGRAPH.format(
+            f"held-out log p(y) {first:.2f} → {kept:.2f} nats a drive, kept at step {trained.kept}"
+        )
     said += _table(("parameter", "value"), parameter_rows(fit.program))
     for note in fit.notes:
-        said += _paragraph(f"note: {note}")
+        said += PARAGRAPH.format(f"note: {note}")
     return str(said)
 
 
-@html.register
-def _(found: Check) -> str:
-    return _of_result(criticism_verdict(found), str(found), check_picture(found))
-
-
-@html.register
-def _(found: Proof) -> str:
-    return _of_result(comparison_verdict(found), str(found), proof_picture(found))
-
-
-@html.register
-def _(found: Discovery) -> str:
-    return _of_result(sentence(found), str(found), discovery_picture(found))
-
-
-def _of_result(sentence: str, text: str, picture: Figure) -> str:
+def _of_result(verdict: Callable[[Any], str], picture: Callable[[Any], Figure], found: Any) -> str:
     """A verdict, its picture, and all figures as text to unfold."""
     file = io.BytesIO()
-    picture.savefig(file, format="png", dpi=DOTS)
-    image = base64.b64encode(file.getvalue()).decode()
+    picture(found).savefig(file, format="png", dpi=DOTS)
+    said, image = verdict(found), base64.b64encode(file.getvalue()).decode()
     return str(
-        _sentence(sentence)
-        + Markup('<img style="max-width:100%" alt="{}" src="data:image/png;base64,{}">').format(sentence, image)
-        + Markup("<details><summary>all figures</summary><pre>{}</pre></details>").format(text)
+        SENTENCE.format(said)
+        + Markup('<img style="max-width:100%" alt="{}" src="data:image/png;base64,{}">').format(said, image)
+        + Markup("<details><summary>all figures</summary><pre>{}</pre></details>").format(found)
     )
+
+
+html.register(Check, partial(_of_result, criticism_verdict, check_picture))
+html.register(Proof, partial(_of_result, comparison_verdict, proof_picture))
+html.register(Discovery, partial(_of_result, sentence, discovery_picture))
 
 
 @torch.no_grad()
@@ -97,9 +93,7 @@ def parameter_rows(program: Program) -> list[tuple[str, str]]:
     """Name and value of each learnable parameter; of many numbers how many, and their range."""
     rows = []
     for name in dict.fromkeys(name.removesuffix("_unconstrained") for name, _ in program.named_parameters()):
-        value: Any = program
-        for part in name.split("."):
-            value = getattr(value, part)
+        value = attrgetter(name)(program)
         numbers = value.flatten().tolist()
         said = ", ".join(f"{number:.4g}" for number in numbers)
         if len(numbers) > MAX_NUMBERS:
@@ -108,18 +102,8 @@ def parameter_rows(program: Program) -> list[tuple[str, str]]:
     return rows
 
 
-def _sentence(text: str) -> Markup:
-    return Markup("<p><strong>{}</strong></p>").format(text)
-
-
-def _paragraph(text: str) -> Markup:
-    return Markup("<p>{}</p>").format(text)
-
-
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Markup:
     head = Markup("").join(Markup('<th scope="col">{}</th>').format(cell) for cell in header)
-    body = Markup("").join(
-        Markup("<tr>{}</tr>").format(Markup("").join(Markup("<td>{}</td>").format(cell) for cell in row))
-        for row in rows
-    )
+    cells = (Markup("").join(Markup("<td>{}</td>").format(cell) for cell in row) for row in rows)
+    body = Markup("").join(Markup("<tr>{}</tr>").format(row) for row in cells)
     return Markup("<table><thead><tr>{}</tr></thead><tbody>{}</tbody></table>").format(head, body)

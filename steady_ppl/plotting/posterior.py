@@ -43,7 +43,7 @@ def posterior_trajectories(
     Raises:
         UsageError: there is no such trajectory, or the program has no such states.
     """
-    draws, true = _drawn(posterior, trajectory, plane)
+    _, draws, true = _drawn(posterior, trajectory, plane)
     axes = axes if axes is not None else plt.subplots(figsize=(5, 5))[1]
     for index in range(min(shown, draws[0].sizes["draw"])):
         first = label if index == 0 else None
@@ -53,8 +53,7 @@ def posterior_trajectories(
     if len(landmarks):
         xs, ys = torch.as_tensor(landmarks).detach().cpu().unbind(-1)
         axes.plot(xs, ys, "^", color=LANDMARK, ms=8, label="landmark", clip_on=True)
-    axes.set_xlabel(with_unit(plane[0], draws[0]))
-    axes.set_ylabel(with_unit(plane[1], draws[1]))
+    axes.set(xlabel=with_unit(plane[0], draws[0]), ylabel=with_unit(plane[1], draws[1]))
     if draws[0].attrs.get("units") == draws[1].attrs.get("units"):
         axes.set_aspect("equal", "box")
     axes.set_title(f"trajectory {trajectory}", parse_math=False)
@@ -84,9 +83,9 @@ def posterior_states(
     Raises:
         UsageError: there is no such trajectory, or the program has no such states.
     """
-    draws, true = _drawn(posterior, trajectory, components)
+    time, draws, true = _drawn(posterior, trajectory, components)
     called = [with_unit(name, one) for name, one in zip(components, draws, strict=True)]
-    return _bands(posterior, trajectory, called, draws, true, axes, color, label)
+    return _bands(time, called, draws, true, axes, color, label)
 
 
 def posterior_velocities(
@@ -97,21 +96,15 @@ def posterior_velocities(
     color: str = POSTERIOR,
     label: str = "posterior",
 ) -> Sequence[Axes]:
-    """Longitudinal and lateral velocity in the body frame: median and 90 % of the draws, and the truth where it
-    is known.
-
-    Args:
-        posterior: of `Fit.posterior`, of a planar vehicle; `posterior_states` draws those of any other program.
-        trajectory: its label.
-        axes: two, drawn on; new ones when not given.
+    """Longitudinal and lateral velocity of a planar vehicle in the body frame, on two axes, as in `posterior_states`.
 
     Raises:
         UsageError: there is no such trajectory, or the program has not the states heading, vx and vy.
     """
-    draws, true = _drawn(posterior, trajectory, ("heading", "vx", "vy"))
+    time, draws, true = _drawn(posterior, trajectory, ("heading", "vx", "vy"))
     called = [with_unit(name, draws[1]) for name in ("longitudinal", "lateral")]
     bodily = None if true is None else _in_body_frame(*true)
-    return _bands(posterior, trajectory, called, _in_body_frame(*draws), bodily, axes, color, label)
+    return _bands(time, called, _in_body_frame(*draws), bodily, axes, color, label)
 
 
 def effective_sizes(posterior: arviz.InferenceData, trajectory: str, *, axes: Axes | None = None) -> Axes:
@@ -125,31 +118,28 @@ def effective_sizes(posterior: arviz.InferenceData, trajectory: str, *, axes: Ax
     Raises:
         UsageError: there is no such trajectory.
     """
-    require_trajectory(posterior, trajectory)
+    time = _time(posterior, trajectory)
     axes = axes if axes is not None else plt.subplots(figsize=(6, 3), layout="constrained")[1]
     sizes = posterior["sample_stats"]["effective_size"].sel(trajectory=trajectory, chain=0)
     about = posterior["posterior"].attrs
-    axes.plot(
-        posterior["constant_data"]["time"].sel(trajectory=trajectory), sizes, color=POSTERIOR, label=about["filter"]
-    )
+    axes.plot(time, sizes, color=POSTERIOR, label=about["filter"])
     axes.axhline(about["particles"], color="black", lw=0.6, label="N")
-    axes.set_yscale("log")
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel("effective sample size [particles]")
+    axes.set(yscale="log", xlabel="time [s]", ylabel="effective sample size [particles]")
     axes.legend(fontsize=8)
     return axes
 
 
-def require_trajectory(found: arviz.InferenceData, trajectory: str) -> None:
-    """Refuse a label that no drive has."""
+def _time(found: arviz.InferenceData, trajectory: str) -> Any:
+    """The times of a trajectory's rows, s; a label that no drive has is refused."""
     known = found["posterior"]["trajectory"].values
     if trajectory not in known:
         raise UsageError(f"no trajectory {trajectory!r}; there are {', '.join(map(str, known))}")
+    return found["constant_data"]["time"].sel(trajectory=trajectory)
 
 
-def _drawn(posterior: arviz.InferenceData, trajectory: str, components: Sequence[str]) -> tuple[list[Any], Any]:
-    """Draws of these state components, and their true values where all are known beyond a start."""
-    require_trajectory(posterior, trajectory)
+def _drawn(posterior: arviz.InferenceData, trajectory: str, components: Sequence[str]) -> tuple[Any, list[Any], Any]:
+    """Times, draws of these state components, and their true values where all are known beyond a start."""
+    time = _time(posterior, trajectory)
     states = posterior["posterior"]
     plain = [str(name) for name, values in states.data_vars.items() if values.ndim == 4]
     lacking = [name for name in components if name not in plain]
@@ -158,7 +148,8 @@ def _drawn(posterior: arviz.InferenceData, trajectory: str, components: Sequence
     constants = posterior["constant_data"].sel(trajectory=trajectory)
     true = [constants.get(f"true_{name}") for name in components]
     known = all(one is not None and int(one.notnull().sum()) > 1 for one in true)
-    return [states[name].sel(trajectory=trajectory, chain=0) for name in components], true if known else None
+    draws = [states[name].sel(trajectory=trajectory, chain=0) for name in components]
+    return time, draws, true if known else None
 
 
 def with_unit(name: str, values: Any) -> str:
@@ -168,19 +159,18 @@ def with_unit(name: str, values: Any) -> str:
 
 
 def _bands(
-    posterior: arviz.InferenceData,
-    trajectory: str,
+    time: Any,
     called: Sequence[str],
     draws: Sequence[Any],
-    true: Sequence[Any] | None,
+    true: Any,
     axes: Sequence[Axes] | None,
     color: str,
     label: str,
 ) -> Sequence[Axes]:
-    size = (7, 0.5 + 2 * len(draws))
+    """Median and 90 % of the draws over time, one axes each; the truth where no other picture has drawn it yet."""
     if axes is None:
+        size = (7, 0.5 + 2 * len(draws))
         axes = list(plt.subplots(len(draws), 1, figsize=size, sharex=True, squeeze=False)[1][:, 0])
-    time = posterior["constant_data"]["time"].sel(trajectory=trajectory)
     for index, (one, name) in enumerate(zip(axes, called, strict=True)):
         low, median, high = draws[index].quantile([0.05, 0.5, 0.95], dim="draw")
         one.fill_between(time, low, high, color=color, alpha=0.25, lw=0)
@@ -211,13 +201,12 @@ def forecast_band(
     Raises:
         UsageError: nothing of that name was forecast, or there is no such trajectory.
     """
-    require_trajectory(found, trajectory)
+    time = _time(found, trajectory)
     variables, later = found["predictions"], found["predictions_constant_data"]
     name = of if of in variables else f"measured_{of}"
     if name not in variables:
         raise UsageError(f"no forecast of {of!r}; there are {', '.join(map(str, variables.data_vars))}")
     axes = axes if axes is not None else plt.subplots(figsize=(7, 3), layout="constrained")[1]
-    time = found["constant_data"]["time"].sel(trajectory=trajectory)
     draws = variables[name].sel(trajectory=trajectory, chain=0)
     there = np.isfinite(draws.values).all(0)
     low, median, high = np.quantile(draws.values[:, there], [0.05, 0.5, 0.95], axis=0)
@@ -230,10 +219,8 @@ def forecast_band(
             after = nearest_turn(after, median) if variables[name].attrs["circular"] else after
             axes.plot(time[there], after, "x", color=TRUTH, ms=4, label="measured later")
     elif f"true_{of}" in found["constant_data"]:
-        axes.plot(
-            time, found["constant_data"][f"true_{of}"].sel(trajectory=trajectory), "--", color=TRUTH, label="truth"
-        )
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel(with_unit(of, variables[name]))
+        truth = found["constant_data"][f"true_{of}"].sel(trajectory=trajectory)
+        axes.plot(time, truth, "--", color=TRUTH, label="truth")
+    axes.set(xlabel="time [s]", ylabel=with_unit(of, variables[name]))
     axes.legend(fontsize=8)
     return axes

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
 from steady_ppl.errors import UsageError
-
-if TYPE_CHECKING:
-    from steady_ppl.runs.fit import Fit
+from steady_ppl.runs.fit import Fit
 
 COLOR, MARK = "#0072b2", "#d55e00"  # Okabe and Ito
 
@@ -84,6 +81,5 @@ def _logged(fit: Fit, figure: str, why_not: str) -> tuple[list[float], list[floa
 
 def _over_steps(axes: Axes | None, label: str) -> Axes:
     axes = axes if axes is not None else plt.subplots(figsize=(6, 3), layout="constrained")[1]
-    axes.set_xlabel("step")
-    axes.set_ylabel(label)
+    axes.set(xlabel="step", ylabel=label)
     return axes

@@ -10,14 +10,18 @@ import numpy as np
 import torch
 
 from steady_ppl.criticism.residual_maps import Cell
-from steady_ppl.criticism.result import Check, place, sentence
+from steady_ppl.criticism.result import Check, place, sentence, subject
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.program import Program, names, units
-from steady_ppl.plotting.check import band, measured, subject
+from steady_ppl.plotting.check import band, measured, strips
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.angles import nearest_turn
 
 AROUND = 0.5  # s shown before and after a stretch
+LEVELS, MISSING = 65534, -32768  # codes of sixteen bits, which are finer than a screen
+MAX_NUMBERS = 300_000  # of all drives and runs: .8 MB of text
+QUANTILES = (0.05, 0.5, 0.95)
+PATHS = 8  # draws in the plane
 Place = tuple[int, float, float]  # drive, and from when to when
 
 
@@ -35,23 +39,15 @@ def maps(found: Check) -> dict[str, Any]:
 
 
 def _strips(found: Check) -> dict[str, Any] | None:
-    cells = [(i, cell) for i, cell in enumerate(found.misfit.cells) if cell.map == "drive and time"]
-    if not cells:
+    times, z = strips(found)
+    if not times:
         return None
-    ranges = sorted({cell.where["time"] for _, cell in cells})
-    z = np.full((len(found.residuals), len(found.data), len(ranges)), np.nan)
-    for i, cell in cells:
-        z[cell.residual, cell.where["drive"], ranges.index(cell.where["time"])] = found.misfit.z[i]
-    significant = [
-        [one.cell.residual, one.cell.where["drive"], ranges.index(one.cell.where["time"])]
-        for one in found.misfit.significant
-        if one.cell.map == "drive and time"
-    ]
+    significant = [one.cell for one in found.misfit.significant if one.cell.map == "drive and time"]
     return {
-        "edges": [start for start, _ in ranges] + [ranges[-1][1]],
+        "edges": [start for start, _ in times] + [times[-1][1]],
         "drives": list(found.data.labels),
         "z": packed(z),
-        "significant": significant,
+        "significant": [[one.residual, one.where["drive"], times.index(one.where["time"])] for one in significant],
     }
 
 
@@ -60,21 +56,19 @@ def _regimes(found: Check) -> dict[str, Any]:
 
     A cell is: residual, column, mean, whether it stands out, and the place to look at.
     """
-    columns: dict[tuple, dict[str, Any]] = {}
-    cells: list[list[Any]] = []
     significant = {id(one.cell) for one in found.misfit.significant}
-    regimes = [(i, cell) for i, cell in enumerate(found.misfit.cells) if cell.map == "regime"]
-    variables = list(dict.fromkeys(variable for _, cell in regimes for variable in cell.where))
-    for _, cell in sorted(regimes, key=lambda one: [(variables.index(v), b) for v, b in one[1].where.items()]):
-        ((variable, between),) = cell.where.items()
-        columns.setdefault((variable, between), {"variable": variable, "where": place(found, cell).strip()})
-    order = list(columns)
-    for i, cell in regimes:
-        ((variable, between),) = cell.where.items()
-        z = round(float(found.misfit.z[i]), 2)
-        column = order.index((variable, between))
-        cells.append([cell.residual, column, z, id(cell) in significant, where_to_look(found, cell)])
-    return {"columns": list(columns.values()), "cells": cells}
+    regimes = found.misfit.of_map("regime")
+    keys = [next(iter(cell.where.items())) for cell, _ in regimes]
+    variables = list(dict.fromkeys(variable for variable, _ in keys))
+    order = sorted(set(keys), key=lambda key: (variables.index(key[0]), key[1]))
+    words = {key: place(found, cell).strip() for key, (cell, _) in zip(keys, regimes, strict=True)}
+    return {
+        "columns": [{"variable": key[0], "where": words[key]} for key in order],
+        "cells": [
+            [cell.residual, order.index(key), round(z, 2), id(cell) in significant, where_to_look(found, cell)]
+            for key, (cell, z) in zip(keys, regimes, strict=True)
+        ],
+    }
 
 
 def where_to_look(found: Check, cell: Cell) -> Place | None:
@@ -95,38 +89,27 @@ def where_to_look(found: Check, cell: Cell) -> Place | None:
 
 def _rows(found: Check, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
     """Which intervals a cell is an average over, and the residual there, `(T, B)` each."""
-    residuals = found.standardised
+    data, residuals = found.data, found.standardised
+    variables = {name: values[0] for name, values in residuals.variables.items()}
+    for i, name in enumerate(found.program.control_names):
+        variables[name] = data.controls[:-1, :, i].double().numpy(force=True)
+    variables["time"] = data.elapsed[:-1].numpy(force=True)
     there = residuals.there[0, ..., cell.residual].copy()
-    elapsed = found.data.elapsed[:-1].numpy(force=True)
     for name, value in cell.where.items():
         if name == "drive":
             there &= np.arange(there.shape[1]) == value
         else:
-            at = elapsed if name == "time" else _variable(found, name)
-            there &= (at >= value[0]) & (at <= value[1])
+            there &= (variables[name] >= value[0]) & (variables[name] <= value[1])
     return there, residuals.values[0, ..., cell.residual]
-
-
-def _variable(found: Check, name: str) -> np.ndarray:
-    controls = found.program.control_names
-    if name in controls:
-        return found.data.controls[:-1, :, controls.index(name)].double().numpy(force=True)
-    return found.standardised.variables[name][0]
 
 
 def _longest(there: np.ndarray, found: Check, drive: int) -> tuple[float, float]:
     """Seconds of the longest stretch in which all rows count."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
+    edges = np.flatnonzero(np.diff(there.astype(int), prepend=0, append=0))
     starts, ends = edges[::2], edges[1::2]
     longest = int(np.argmax(ends - starts))
     elapsed = found.data.elapsed[:, drive]
     return float(elapsed[starts[longest]]), float(elapsed[min(ends[longest], len(elapsed) - 1)])
-
-
-LEVELS = 65534  # of sixteen bits, which is finer than a screen
-
-
-MISSING = -32768
 
 
 def packed(values: Any) -> dict[str, Any]:
@@ -139,36 +122,17 @@ def packed(values: Any) -> dict[str, Any]:
     low, high = (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 0.0)
     step = (high - low) / LEVELS or 1.0
     codes = np.where(known, np.round((np.where(known, values, low) - low) / step) - LEVELS // 2, MISSING)
-    return {
-        "shape": list(values.shape),
-        "low": low,
-        "step": step,
-        "data": base64.b64encode(codes.astype("<i2").tobytes()).decode(),
-    }
-
-
-NUMBERS = 300_000  # of all drives and runs: .8 MB of text
-
-
-QUANTILES = (0.05, 0.5, 0.95)
-
-
-PATHS = 8  # draws in the plane
+    text = base64.b64encode(codes.astype("<i2").tobytes()).decode()
+    return {"shape": list(values.shape), "low": low, "step": step, "data": text}
 
 
 @dataclass(frozen=True)
 class Shown:
-    """Which drives a report has row by row.
+    """Which drives a report has row by row."""
 
-    Attributes:
-        drives: their numbers, in the table's order.
-        every: one row of so many.
-        total: how many drives the table has.
-    """
-
-    drives: list[int]
-    every: int
-    total: int
+    drives: list[int]  # their numbers, in the table's order
+    every: int  # one row of so many
+    total: int  # how many drives the table has
 
     @property
     def note(self) -> str | None:
@@ -185,7 +149,7 @@ class Shown:
         return packed(np.asarray(values)[:: self.every, self.drives].transpose(1, 2, 0))
 
 
-def chosen(checks: list[Check], numbers: int = NUMBERS) -> Shown:
+def chosen(checks: list[Check], numbers: int = MAX_NUMBERS) -> Shown:
     """As many drives as there is room for, those whose strips stand out most in any run first."""
     first = checks[0]
     rows, count = first.data.time.shape
@@ -194,10 +158,9 @@ def chosen(checks: list[Check], numbers: int = NUMBERS) -> Shown:
     room = max(1, numbers // (-(-rows // every) * columns))
     worst = np.zeros(count)
     for one in checks:
-        for i, cell in enumerate(one.misfit.cells):
-            if cell.map == "drive and time":
-                drive = cell.where["drive"]
-                worst[drive] = max(worst[drive], abs(one.misfit.z[i]))
+        for cell, z in one.misfit.of_map("drive and time"):
+            drive = cell.where["drive"]
+            worst[drive] = max(worst[drive], abs(z))
     order = np.argsort(-worst, kind="stable")[:room]
     return Shown(sorted(int(i) for i in order), every, count)
 
@@ -224,25 +187,22 @@ def given(found: Check, shown: Shown) -> dict[str, Any]:
 def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: int, seed: int) -> dict[str, Any]:
     """Measurements, predictions with their bands, quantiles of the posterior of the states given all measurements and,
     where the table has it, the truth; a run's components are its program's, in their order."""
-    horizons = list(dict.fromkeys(["one step", list(found.horizons)[-1]]))
+    bands = {name: map(shown.of, band(found, name)) for name in ("one step", list(found.horizons)[-1])}
     data = found.data.subset(shown.drives)
     posterior = fit.posterior(data, draws=draws, seed=seed)["posterior"]
     states = found.program.state_names
     quantiles = np.stack([posterior[name].quantile(QUANTILES, ("chain", "draw")).values for name in states], -1)
+    quantiles = quantiles.swapaxes(1, 2)  # (3, rows, B, D)
     all_of_them = Shown(list(range(len(data))), shown.every, len(data))
-    low, middle, high = (all_of_them.of(quantile.swapaxes(0, 1)) for quantile in quantiles)
+    low, middle, high = map(all_of_them.of, quantiles)
     across = [states[i] for i in plane(found.program)]
     paths = [posterior[name].values[0, draw].T for draw in range(min(PATHS, draws)) for name in across]
     truth = _truth(found.program, table.subset(shown.drives), quantiles[1])
     return {
         "measurements": _components(found.program.measurements),
         "measured": shown.of(measured(found)),
-        "truth": None if truth is None else all_of_them.of(truth.swapaxes(0, 1)),
-        "predictions": [
-            {"ahead": name, "middle": shown.of(middle), "half": shown.of(half)}
-            for name in horizons
-            for middle, half in [band(found, name)]
-        ],
+        "truth": None if truth is None else all_of_them.of(truth),
+        "predictions": [{"ahead": name, "middle": middle, "half": half} for name, (middle, half) in bands.items()],
         "states": _components(found.program.states),
         "posterior": {"low": low, "middle": middle, "high": high},
         "plane": plane(found.program),
@@ -263,12 +223,12 @@ def _components(declared: Any) -> list[dict[str, str]]:
 
 
 def _truth(program: Program, table: Trajectories, middle: np.ndarray) -> np.ndarray | None:
-    """The true states `(B, rows, D)`, angles on the turn of the posterior's median; None where the table has no more
+    """The true states `(rows, B, D)`, angles on the turn of the posterior's median; None where the table has no more
     than starts."""
     truth = table.select(program.control_names, program.measurement_names, program.state_names).states
     if truth is None or not bool(torch.isfinite(truth[1:]).any()):
         return None
-    found = truth.transpose(0, 1).double().numpy(force=True).copy()
+    found = truth.double().numpy(force=True).copy()
     for index in program.angle_indices:
         found[..., index] = nearest_turn(found[..., index], middle[..., index])
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import inspect
 import json
 import math
@@ -25,6 +26,8 @@ from steady_ppl.plotting.notebook import parameter_rows
 from steady_ppl.reporting.drives import Shown
 from steady_ppl.runs.fit import Fit, versions
 from steady_ppl.utils.files import whole_file
+
+SCRIPTS = ("page.js", "curves.js", "maps.js", "choosing.js")
 
 
 @dataclass(frozen=True)
@@ -54,8 +57,34 @@ class Report:
 
     @property
     def html(self) -> str:
-        """The page, whole: style, scripts and data are in it."""
-        return html(self)
+        """The page, whole: style, scripts and data are in it; whatever comes from a table or a program is escaped."""
+        templates = Environment(
+            loader=PackageLoader("steady_ppl.reporting", "."),
+            autoescape=True,
+            undefined=StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        templates.filters |= {"number": number, "signed": signed, "interval": interval, "spread": spread, "said": said}
+        figures = {label: one.figures for label, one in self.checks.items()}
+        content = {
+            "title": self.title,
+            "notes": self.notes,
+            "checks": figures,
+            "strongest": {label: _linked(one["findings"], self, label) for label, one in figures.items()},
+            "proof": self.proof if isinstance(self.proof, str) else self.proof.figures,
+            "curves": {} if isinstance(self.proof, str) else _curves(self.proof),
+            "discovery": self.discovery,
+            "programs": [_program(label, fit) for label, fit in self.fits.items()],
+            "shown": self.shown.note,
+            "how": self.how,
+            "versions": versions(),
+            "style": _asset("page.css"),
+            "script": Markup("\n").join(_asset(name) for name in SCRIPTS),
+            "plotly": Markup(get_plotlyjs().replace("</script", "<\\/script")),
+        }
+        content["data"] = _data({**_drawn(self), "curves": content["curves"]})
+        return templates.get_template("page.html").render(content)
 
     def write(self, path: str | Path) -> None:
         """Write the page whole or not at all.
@@ -63,47 +92,12 @@ class Report:
         Raises:
             UsageError: the file cannot be written.
         """
-        write_page(self.html, Path(path))
+        with whole_file(Path(path)) as beside:
+            beside.write_bytes(self.html.encode(errors="backslashreplace"))  # a file's name need not be UTF-8
 
     def _repr_html_(self) -> str:
-        from html import escape
-
-        style = "width:100%;height:40em;border:0"
-        return f'<iframe title="{escape(self.title)}" srcdoc="{escape(self.html)}" style="{style}"></iframe>'
-
-
-SCRIPTS = ("page.js", "curves.js", "maps.js", "choosing.js")
-
-
-def html(found: Report) -> str:
-    """The page; whatever comes from a table or a program is escaped."""
-    rooms = Environment(
-        loader=PackageLoader("steady_ppl.reporting", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    rooms.filters |= {"number": number, "signed": signed, "interval": interval, "spread": spread, "said": said}
-    figures = {label: one.figures for label, one in found.checks.items()}
-    content = {
-        "title": found.title,
-        "notes": found.notes,
-        "checks": figures,
-        "strongest": {label: _linked(one["findings"], found, label) for label, one in figures.items()},
-        "proof": found.proof if isinstance(found.proof, str) else found.proof.figures,
-        "curves": {} if isinstance(found.proof, str) else _curves(found.proof),
-        "discovery": found.discovery,
-        "programs": [program_page(label, fit) for label, fit in found.fits.items()],
-        "shown": found.shown.note,
-        "how": found.how,
-        "versions": versions(),
-        "style": _asset("page.css"),
-        "script": Markup("\n").join(_asset(name) for name in SCRIPTS),
-        "plotly": Markup(get_plotlyjs().replace("</script", "<\\/script")),
-    }
-    content["data"] = _data({**_drawn(found), "curves": content["curves"]})
-    return rooms.get_template("page.html").render(content)
+        title, page = html.escape(self.title), html.escape(self.html)
+        return f'<iframe title="{title}" srcdoc="{page}" style="width:100%;height:40em;border:0"></iframe>'
 
 
 def _drawn(found: Report) -> dict[str, Any]:
@@ -114,26 +108,15 @@ def _drawn(found: Report) -> dict[str, Any]:
     return {**found.drives, "runs": runs, "discovery": discovery}
 
 
-def write_page(text: str, path: Path) -> None:
-    """Write a page whole or not at all.
-
-    Raises:
-        UsageError: the file cannot be written.
-    """
-    with whole_file(path) as beside:
-        beside.write_bytes(text.encode(errors="backslashreplace"))  # a file's name need not be UTF-8
-
-
 def _linked(findings: list[dict[str, Any]], found: Report, label: str) -> list[dict[str, Any]]:
     """The strongest findings of a run, each with the address of its place on the page."""
     run = list(found.checks).index(label)
     places = [row["place"] for row in found.drives["runs"][run]["findings"]]
     rows = []
     for finding in strongest([{**one, "place": place} for one, place in zip(findings, places, strict=True)]):
-        place = finding["place"]
         link = drive = None
-        if place is not None:
-            number, start, end = place
+        if finding["place"] is not None:
+            number, start, end = finding["place"]
             drive = found.checks[label].data.labels[number]
             if number in found.shown.drives:
                 link = f"#run={run}&drive={found.shown.drives.index(number)}&from={start:.2f}&to={end:.2f}"
@@ -157,11 +140,7 @@ def _asset(name: str) -> Markup:
 
 
 def _data(content: Mapping[str, Any]) -> Markup:
-    """JSON that cannot end the element that holds it.
-
-    Raises:
-        ComputationError: a figure is not finite.
-    """
+    """JSON that cannot end the element that holds it; ComputationError where a figure is not finite."""
     try:
         text = json.dumps(content, separators=(",", ":"), allow_nan=False)
     except ValueError as error:
@@ -193,10 +172,8 @@ def spread(candidate: Mapping[str, Any]) -> str:
 def said(sentence: str) -> Markup:
     """A sentence of a verdict: commands in it as code, signs as minus, no line broken before a per cent sign."""
     text = re.sub(r"(?<![\w.])-(?=[\d.])", "−", sentence).replace(" %", "\u00a0%")
-    parts = text.split("`")
-    return Markup("").join(
-        Markup("<code>{}</code>").format(part) if i % 2 else escape(part) for i, part in enumerate(parts)
-    )
+    parts = enumerate(text.split("`"))
+    return Markup("").join(Markup("<code>{}</code>").format(part) if i % 2 else escape(part) for i, part in parts)
 
 
 def interval(pair: Any, digits: int = 3) -> str:
@@ -204,34 +181,22 @@ def interval(pair: Any, digits: int = 3) -> str:
     return "" if pair is None else f"[{number(pair[0], digits)}, {number(pair[1], digits)}]"
 
 
-def program_page(label: str, fit: Fit) -> dict[str, Any]:
+def _program(label: str, fit: Fit) -> dict[str, Any]:
     """Name, equations of its effects as MathML, values of its parameters, its class as it is written."""
-    program = fit.program
-    kind = written_class(program)
+    kind = written_class(fit.program)
     try:
         text = inspect.getsource(kind)
     except (TypeError, OSError):
         text = ""
+    effects = [(one.label, _equation(one.effect), one.effect.feels) for one in attached(fit.program)]
     return {
         "label": label,
         "name": kind.__name__,
         "about": inspect.cleandoc(kind.__doc__ or ""),
-        "effects": [
-            {
-                "name": variant.label,
-                "equation": _equation(variant.effect),
-                "text": variant.effect.text,
-                "feels": variant.effect.feels,
-            }
-            for variant in attached(program)
-        ],
-        "parameters": [{"name": name, "value": value} for name, value in parameter_rows(program)],
+        "effects": effects,
+        "parameters": parameter_rows(fit.program),
         "text": text,
-        "recipe": fit.recipe,
-        "settings": {name: value for name, value in fit.settings.items() if value is not None},
-        "seed": fit.seed,
-        "known_start": fit.known_start,
-        "notes": fit.notes,
+        "fit": fit,
     }
 
 

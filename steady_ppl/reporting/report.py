@@ -54,12 +54,8 @@ def report(
     """
     if not runs:
         raise UsageError("a report needs at least one run")
-    plan = [
-        *((f"checking {label}", 4) for label in runs),
-        *((f"drawing {label}", 1) for label in runs),
-        ("comparing", len(runs)),
-    ]
-    with stages(*plan) as begin:
+    plan = [(f"checking {label}", 4) for label in runs] + [(f"drawing {label}", 1) for label in runs]
+    with stages(*plan, ("comparing", len(runs))) as begin:
         checks = {}
         for label, fit in runs.items():
             begin()

@@ -24,12 +24,8 @@ def whole_file(path: Path, refused: type[SteadyError] = UsageError, beside: Path
     if not.
 
     Args:
-        path: the file that is meant.
         refused: what is raised when the block, or the last step, meets an `OSError`.
         beside: where the block writes; a hidden file of this process in the same folder when not given.
-
-    Raises:
-        UsageError, or `refused`: it cannot be written.
     """
     beside = beside or hidden_beside(path)
     try:
@@ -49,11 +45,7 @@ def hidden_beside(path: Path) -> Path:
 
 
 def require_place(path: Path | None) -> None:
-    """Refuse a file whose folder does not exist, or that is one, before anything is computed; None is no file.
-
-    Raises:
-        UsageError: naming the folder.
-    """
+    """Raise UsageError for a file that is a folder or whose folder does not exist; None is no file."""
     if path is not None and not path.parent.is_dir():
         raise UsageError(f"{path} cannot be written: there is no folder {path.parent}")
     if path is not None and path.is_dir():
@@ -61,12 +53,7 @@ def require_place(path: Path | None) -> None:
 
 
 def require_picture(path: Path | None) -> None:
-    """Refuse a name whose ending is no picture's, or a place that there is not, before anything is computed; None is no
-    picture.
-
-    Raises:
-        UsageError: naming the endings that matplotlib writes, or the folder.
-    """
+    """Raise UsageError for a picture's place that there is not, or an ending that matplotlib does not write."""
     require_place(path)
     if path is None:
         return
@@ -78,11 +65,7 @@ def require_picture(path: Path | None) -> None:
 
 
 def write_picture(figure: Figure, path: Path) -> None:
-    """Write a picture whole or not at all.
-
-    Raises:
-        UsageError: the file cannot be written.
-    """
+    """Write a picture whole or not at all; UsageError where it cannot be written."""
     from matplotlib.text import Text
 
     for text in figure.findobj(Text):
@@ -95,11 +78,7 @@ KINDS = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISCHR, "
 
 
 def require_file(path: Path, refused: type[SteadyError]) -> None:
-    """Refuse a folder in place of a file, and what may never end: a pipe, a device. A missing file is left to be found.
-
-    Raises:
-        SteadyError, of the kind that is `refused`.
-    """
+    """Raise `refused` for a folder and for what may never end: a pipe, a device. A missing file is left to be found."""
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError):
@@ -110,12 +89,7 @@ def require_file(path: Path, refused: type[SteadyError]) -> None:
 
 
 def read_json(path: Path, refused: type[SteadyError]) -> Any:
-    """What a JSON file says.
-
-    Raises:
-        FileNotFoundError, NotADirectoryError: there is none.
-        SteadyError, of the kind that is `refused`: it cannot be read, or is no JSON.
-    """
+    """What a JSON file says; FileNotFoundError or NotADirectoryError where there is none, else `refused`."""
     require_file(path, refused)
     try:
         return json.loads(path.read_text(encoding="utf-8"))

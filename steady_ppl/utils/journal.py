@@ -9,12 +9,12 @@ goes on has the inputs of the one that was killed.
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,19 +30,12 @@ RANDOM = "random state"  # of torch, after the piece
 SAID = Among(({"values": {str: ANYTHING}}, {"failed": TEXT}))
 
 
-@dataclass
-class _Journal:
-    folder: Path
-    pieces: int = 0
-
-
-_open: ContextVar[_Journal | None] = ContextVar("journal", default=None)
+_files: ContextVar[Iterator[Path] | None] = ContextVar("the files of a journal's pieces, in order", default=None)
 
 
 @contextmanager
 def journal(folder: Path) -> Iterator[None]:
-    """Keep the pieces of the block in a folder, and read those that are there; it is removed when the block has ended
-    well.
+    """Keep the pieces of the block in a folder, and read those that are there; the folder goes when all went well.
 
     Raises:
         RunError: the folder cannot be written, or a piece in it is damaged.
@@ -51,11 +44,11 @@ def journal(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"{folder} cannot be written: {error.strerror}") from error
-    token = _open.set(_Journal(folder))
+    token = _files.set(folder / f"{number:06d}.safetensors" for number in itertools.count(1))
     try:
         yield
     finally:
-        _open.reset(token)
+        _files.reset(token)
     shutil.rmtree(folder)
 
 
@@ -64,11 +57,10 @@ def piece(compute: Callable[[], Piece]) -> Piece:
 
     A `FilterError` is a result like any other. Outside of a journal nothing is kept.
     """
-    now = _open.get()
-    if now is None:
+    files = _files.get()
+    if files is None:
         return compute()
-    now.pieces += 1
-    file = now.folder / f"{now.pieces:06d}.safetensors"
+    file = next(files)
     if not file.is_file():
         _write(file, compute)
     tensors, said = _read(file)
@@ -79,11 +71,7 @@ def piece(compute: Callable[[], Piece]) -> Piece:
 
 
 def _read(file: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """A piece, the random state among its tensors.
-
-    Raises:
-        RunError: the file is damaged.
-    """
+    """A piece, the random state among its tensors; RunError where the file is damaged."""
     tensors, text = read_tensors(file)
     try:
         said = json.loads(text.get("said", "null"))

@@ -29,11 +29,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: Mapping[str, 
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read a file of `write_tensors`, or one from before there was a hash in it.
-
-    Raises:
-        RunError: the file is missing or damaged.
-    """
+    """Read a file of `write_tensors`, or one without a hash in it; RunError where it is missing or damaged."""
     require_file(path, RunError)
     try:
         content = path.read_bytes()  # not by name: safetensors reads none that is not UTF-8
@@ -44,17 +40,12 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise RunError(f"{path.name} in {path.parent} is damaged ({error})") from error
     except OSError as error:
         raise RunError(f"{path.name} in {path.parent} cannot be read: {error.strerror or error}") from error
-    text = _text(content)
+    header = content[8 : 8 + int.from_bytes(content[:8], "little")]  # whose length comes first
+    text: dict[str, str] = json.loads(header).get("__metadata__") or {}
     written = text.pop(HASH, None)
     if written is not None and written != _hash(tensors, text):
         raise damaged(path, "its numbers are not those that were written")
     return tensors, text
-
-
-def _text(content: bytes) -> dict[str, str]:
-    """The text beside the tensors of a safetensors file that is whole: its header's length comes first."""
-    end = 8 + int.from_bytes(content[:8], "little")
-    return json.loads(content[8:end]).get("__metadata__") or {}
 
 
 def _hash(tensors: Mapping[str, Tensor], text: Mapping[str, str]) -> str:

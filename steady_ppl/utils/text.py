@@ -11,6 +11,10 @@ from contextvars import ContextVar
 
 # what moves the cursor, colours, renames the window, turns lines round, is not seen, or cannot be written at all
 UNSEEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # categories of Unicode: control, format, half of a pair, line separators
+MAX_LINE_LENGTH = 1000  # characters of a line that is said; a file that somebody gives can put more into it
+
+_quiet: ContextVar[bool] = ContextVar("quiet", default=False)
+_command: ContextVar[str | None] = ContextVar("command", default=None)
 
 
 def printable(text: str, kept: str = "\t\n") -> str:
@@ -49,12 +53,6 @@ def one_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
-MAX_LINE_LENGTH = 1000  # characters of a line that is said; a file that somebody gives can put more into it
-
-
-_quiet: ContextVar[bool] = ContextVar("quiet", default=False)
-
-
 @contextmanager
 def quietly(quiet: bool) -> Iterator[None]:
     """Say nothing but errors and results, if asked for."""
@@ -75,9 +73,6 @@ def say(line: str, *, always: bool = False) -> None:
     if always or not is_quiet():
         lines = [shown(part, MAX_LINE_LENGTH) for part in line.splitlines()]
         tell("\n".join([f"steady: {part}" for part in lines[:1]] + lines[1:]), aside=True)
-
-
-_command: ContextVar[str | None] = ContextVar("command", default=None)
 
 
 @contextmanager
@@ -103,10 +98,5 @@ def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list
         ['        log p(y)', 'before       9.5']
     """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(
-            cell.ljust(width) if index in left else cell.rjust(width)
-            for index, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
+    cells = [f"{{:{'<' if index in left else '>'}{width}}}" for index, width in enumerate(widths)]
+    return ["  ".join(cells).format(*row).rstrip() for row in rows]

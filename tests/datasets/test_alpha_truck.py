@@ -10,7 +10,7 @@ import pytest
 import torch
 from truck_logs import RADIUS, TURN_RATE, command_log, pose_log, write
 
-from steady_ppl.data.frozen_sensors import stuck
+from steady_ppl.data.frozen_sensors import frozen_stretches
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.datasets.alpha_truck import LANDMARKS, read_alpha_truck
 from steady_ppl.errors import DataError, UsageError
@@ -242,7 +242,7 @@ def test_the_published_drives_follow_their_commands() -> None:
     [("train", [("12", (56, 75), ("x.x", "x.y", "x.heading", "x.vx", "x.vy", "x.yaw_rate"))]), ("valid", [])],
 )
 def test_the_drop_out_of_the_motion_capture_is_found_without_being_told(split: str, expected: list) -> None:
-    assert [(one.label, one.rows, one.columns) for one in stuck(read_alpha_truck(REAL / split))] == expected
+    assert [(one.label, one.rows, one.columns) for one in frozen_stretches(read_alpha_truck(REAL / split))] == expected
 
 
 def test_a_hostile_log_is_refused(tmp_path: Path) -> None:

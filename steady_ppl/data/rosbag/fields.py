@@ -11,6 +11,8 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
+from rosbags.interfaces import Nodetype
+
 from steady_ppl.errors import DataError, UsageError
 
 Steps = tuple[str | int, ...]
@@ -20,28 +22,14 @@ _TEXT = ("string", "wstring", "wchar")
 
 
 def parse_field(field: str) -> Steps:
-    """The names and indices that a field is made of.
-
-    Raises:
-        UsageError: it is not spelt as a field.
-    """
+    """The names and indices that a field is made of; UsageError where it is not spelt as one."""
     if not _SPELLING.fullmatch(field):
         raise UsageError(f"field {field!r} is not spelt as one: expected names and indices such as linear.x or data[0]")
     return tuple(int(step) if step.isdigit() else step for step in re.findall(r"\w+", field))
 
 
 def check_field(store: Any, type_name: str, steps: Steps, where: str, *, quaternion: bool = False) -> None:
-    """Refuse a field that a message type does not have, or that holds no number, or no quaternion where one is wanted.
-
-    Args:
-        store: rosbags' typestore, which knows the type and all that it is made of.
-        where: what error messages begin with.
-
-    Raises:
-        DataError: it says what is there instead.
-    """
-    from rosbags.interfaces import Nodetype
-
+    """Raise DataError, which begins with `where`, unless a message type has a number, or a quaternion, in a field."""
     kind: Any = (Nodetype.NAME, type_name)
     so_far = ""
     for step in steps:
@@ -51,9 +39,8 @@ def check_field(store: Any, type_name: str, steps: Steps, where: str, *, quatern
                 raise DataError(f"{where}: {here} is {_describe(store, kind)}, it takes no index [{step}]")
             inner, length = kind[1]
             if kind[0] == Nodetype.ARRAY and step >= length:
-                raise DataError(
-                    f"{where}: index [{step}] is out of range, {here} has {length} elements: 0 to {length - 1}"
-                )
+                about = f"{here} has {length} elements: 0 to {length - 1}"
+                raise DataError(f"{where}: index [{step}] is out of range, {about}")
             kind, so_far = inner, f"{so_far}[{step}]"
             continue
         if kind[0] != Nodetype.NAME:
@@ -64,59 +51,43 @@ def check_field(store: Any, type_name: str, steps: Steps, where: str, *, quatern
         kind, so_far = fields[step], f"{so_far}.{step}" if so_far else step
     if quaternion:
         if kind[0] != Nodetype.NAME or not {"x", "y", "z", "w"} <= dict(store.get_msgdef(kind[1]).fields).keys():
-            raise DataError(
-                f"{where}: as yaw needs a quaternion with x, y, z and w, {so_far} is {_describe(store, kind)}"
-            )
+            there = _describe(store, kind)
+            raise DataError(f"{where}: as yaw needs a quaternion with x, y, z and w, {so_far} is {there}")
     elif kind[0] != Nodetype.BASE or kind[1][0] in _TEXT:
         raise DataError(f"{where}: expected a number, {so_far} is {_describe(store, kind)}")
 
 
 def has_stamp(store: Any, type_name: str) -> bool:
     """Whether messages of a type carry `header.stamp`."""
-    kinds = dict(store.get_msgdef(type_name).fields)
-    if "header" not in kinds or not isinstance(kinds["header"][1], str):
-        return False
-    inner = dict(store.get_msgdef(kinds["header"][1]).fields)
-    return "stamp" in inner and isinstance(inner["stamp"][1], str)
+    return {"header.stamp.sec", "header.stamp.nanosec"} <= set(numeric_fields(store, type_name))
 
 
-def undefined_types(store: Any, type_name: str, seen: set[str] | None = None) -> list[str]:
-    """Which of a type and the types that it is made of the typestore does not know."""
+def undefined_type(store: Any, type_name: str, seen: set[str] | None = None) -> str | None:
+    """The first of a type and the types that it is made of that the typestore does not know."""
     seen = set() if seen is None else seen
     if type_name in seen:
-        return []
+        return None
     seen.add(type_name)
     if type_name not in store.fielddefs:
-        return [type_name]
-    missing = []
-    for _, kind in store.fielddefs[type_name][1]:
-        inner = kind[1] if isinstance(kind[1], str) else kind[1][0]
-        if isinstance(inner, tuple):
-            inner = inner[1]
-        if isinstance(inner, str) and "/" in inner:
-            missing += undefined_types(store, inner, seen)
-    return missing
+        return type_name
+    kinds = [
+        kind if kind[0] in (Nodetype.NAME, Nodetype.BASE) else kind[1][0] for _, kind in store.fielddefs[type_name][1]
+    ]
+    parts = (undefined_type(store, name, seen) for node, name in kinds if node == Nodetype.NAME)
+    return next((missing for missing in parts if missing), None)
 
 
-def number_at(message: Any, steps: Steps) -> float:
-    """The number that a message has in a field.
+def value_at(message: Any, steps: Steps, *, yaw: bool = False) -> float:
+    """The number that a message has in a field, or the heading of a quaternion; IndexError in too short an array.
 
-    Raises:
-        IndexError: the array is shorter in this message.
+    The heading, −π to π rad, is the rotation about z that comes last in z-y-x angles. The quaternion may have any
+    length; NaN where it is zero.
     """
-    return float(_follow(message, steps))
-
-
-def yaw_at(message: Any, steps: Steps) -> float:
-    """The heading of the quaternion that a message has in a field, rad, −π to π; NaN where all four numbers are zero.
-
-    The rotation about z that comes last in z-y-x angles; the quaternion need not have length one.
-
-    Raises:
-        IndexError: the array is shorter in this message.
-    """
-    q = _follow(message, steps)
-    x, y, z, w = float(q.x), float(q.y), float(q.z), float(q.w)
+    for step in steps:
+        message = message[step] if isinstance(step, int) else getattr(message, step)
+    if not yaw:
+        return float(message)
+    x, y, z, w = (float(getattr(message, name)) for name in "xyzw")
     if x == y == z == w == 0:
         return math.nan
     return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
@@ -134,7 +105,6 @@ def numeric_fields(store: Any, type_name: str, message: Any = None) -> Iterator[
     An array of three numbers is `gains[0…2]`; without a message, one of no fixed length is `ranges[0…]`. A quaternion
     comes once more, with what reads its heading.
     """
-    from rosbags.interfaces import Nodetype
 
     def walk(kind: Any, spelt: str, value: Any) -> Iterator[str]:
         if kind[0] == Nodetype.BASE:
@@ -149,10 +119,7 @@ def numeric_fields(store: Any, type_name: str, message: Any = None) -> Iterator[
                     yield from walk(inner, f"{spelt}.{name}".lstrip("."), getattr(value, name, None))
         else:
             inner, length = kind[1]
-            if value is not None:
-                length = len(value)
-            elif kind[0] != Nodetype.ARRAY:
-                length = None
+            length = len(value) if value is not None else length if kind[0] == Nodetype.ARRAY else None
             if length == 0:
                 yield from walk(inner, f"{spelt}[] (empty in the first message)", None)
                 return
@@ -162,16 +129,8 @@ def numeric_fields(store: Any, type_name: str, message: Any = None) -> Iterator[
     yield from walk((Nodetype.NAME, type_name), "", message)
 
 
-def _follow(message: Any, steps: Steps) -> Any:
-    for step in steps:
-        message = message[step] if isinstance(step, int) else getattr(message, step)
-    return message
-
-
 def _describe(store: Any, kind: Any) -> str:
     """What a field holds, in words."""
-    from rosbags.interfaces import Nodetype
-
     if kind[0] == Nodetype.BASE:
         return "text" if kind[1][0] in _TEXT else f"a number ({kind[1][0]})"
     if kind[0] == Nodetype.NAME:

@@ -1,45 +1,32 @@
 """What of a bag goes into which column of a table: `BagMapping`, from a TOML file, from `--map`, or built in Python.
 
-    step = 0.1                      # s between rows
-    messages = ["src/my_msgs"]      # optional: definitions that the bag lacks, PACKAGE/msg/NAME.msg or folders of them
-    [columns."u.speed"]             # u. a control, y. a measurement, x. a state that is known
-    topic = "/cmd_vel"
-    field = "linear.x"              # names and indices, such as ranges[0]
-    as = "yaw"                      # optional: a quaternion's heading; "angle": a number that is an angle in rad
-    between = "hold"                # controls only: "hold" (default) or "interpolate"
-    longest = 1.0                   # controls only, s: a longer pause ends the trajectory; two steps at least
-    clock = "bag"                   # "bag" (default), "header" or "aligned"
-    late = 0.0                      # s that are subtracted from the time stamps
-    scale = 1.0                     # value = scale * read + offset
-    offset = 0.0
-
-`read_bags` says what each of them does to the numbers.
+`docs/import-bag.md` shows a file; `read_bags` says what each key does to the numbers.
 """
 
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from steady_ppl.data.rosbag.fields import Steps, parse_field
-from steady_ppl.errors import UsageError
+from steady_ppl.errors import UsageError, labelled
 from steady_ppl.utils.files import require_file
 
-_CHOICES = {
+CHOICES = {
     "between": (None, "hold", "interpolate"),
     "reading": (None, "yaw", "angle"),
     "clock": ("bag", "header", "aligned"),
 }
-
-LATEST = 1e9  # s; times are whole nanoseconds in 64 bits
+MAX_LATE = 1e9  # s; times are whole nanoseconds in 64 bits
 
 
 @dataclass(frozen=True)
 class BagColumn:
-    """One column of the table and the field of a topic that fills it.
+    """One column of the table and the field of a topic that fills it: a section `[columns."u.speed"]` of the file.
 
     Attributes:
         name: the column, `u.…`, `y.…` or `x.…`.
@@ -69,33 +56,33 @@ class BagColumn:
     offset: float = 0.0
 
     def __post_init__(self) -> None:
-        where = f"column {self.name}"
+        with labelled(f"column {self.name}"):
+            self._check()
+
+    def _check(self) -> None:
         if self.name[:2] not in ("u.", "y.", "x.") or len(self.name) < 3:
-            raise UsageError(f"{where}: expected u.NAME (a control), y.NAME (a measurement) or x.NAME (a known state)")
+            raise UsageError("expected u.NAME (a control), y.NAME (a measurement) or x.NAME (a known state)")
         for key in ("topic", "field"):
             value = getattr(self, key)
             if not isinstance(value, str) or not value:
-                raise UsageError(f"{where}: {key} is {value!r}, expected text")
-        for key, choices in _CHOICES.items():
+                raise UsageError(f"{key} is {value!r}, expected text")
+        for key, choices in CHOICES.items():
             value = getattr(self, key)
             if value not in choices:
                 known = " or ".join(f'"{choice}"' for choice in choices if choice)
-                raise UsageError(f"{where}: {'as' if key == 'reading' else key} is {value!r}, expected {known}")
+                raise UsageError(f"{'as' if key == 'reading' else key} is {value!r}, expected {known}")
         for key in ("longest", "late", "scale", "offset"):
             value = getattr(self, key)
             if not _is_number(value) and not (key == "longest" and value is None):
-                raise UsageError(f"{where}: {key} is {value!r}, expected a finite number")
+                raise UsageError(f"{key} is {value!r}, expected a finite number")
         if self.kind != "u" and (self.between is not None or self.longest is not None):
             key = "between" if self.between is not None else "longest"
-            raise UsageError(f"{where}: {key} is for controls (u.); measurements and states are not held: leave it out")
-        if abs(self.late) > LATEST:
-            raise UsageError(f"{where}: late is {self.late:g} s, expected at most {LATEST:g} s, which are thirty years")
+            raise UsageError(f"{key} is for controls (u.); measurements and states are not held: leave it out")
+        if abs(self.late) > MAX_LATE:
+            raise UsageError(f"late is {self.late:g} s, expected at most {MAX_LATE:g} s, which are thirty years")
         if self.scale == 0:
-            raise UsageError(f"{where}: scale is 0, which leaves nothing of what was read")
-        try:
-            parse_field(self.field)
-        except UsageError as error:
-            raise UsageError(f"{where}: {error}") from None
+            raise UsageError("scale is 0, which leaves nothing of what was read")
+        parse_field(self.field)
 
     @property
     def kind(self) -> str:
@@ -138,29 +125,21 @@ class BagMapping:
             if column.name in names[:i]:
                 raise UsageError(f"column {column.name} is given twice")
             if column.longest is not None and column.longest < 2 * self.step:
-                raise UsageError(  # else a measurement in the pause could be in a row on either side of it
-                    f"column {column.name}: longest is {column.longest} s, expected at least two steps of {self.step} s"
-                )
+                # else a measurement in the pause could be in a row on either side of it
+                least = f"expected at least two steps of {self.step} s"
+                raise UsageError(f"column {column.name}: longest is {column.longest} s, {least}")
         if not any(column.kind == "y" for column in self.columns):
             raise UsageError("there is no measurement: name at least one column y.NAME")
 
     @classmethod
     def read(cls, path: str | Path) -> BagMapping:
-        """Read a mapping from a TOML file.
-
-        Raises:
-            UsageError: naming the file and what is wrong in it.
-        """
+        """Read a mapping from a TOML file; UsageError names the file and what is wrong in it."""
         return cls.parse(read_toml(Path(path)), Path(path).name)
 
     @classmethod
     def parse(cls, content: Mapping[str, Any], name: str) -> BagMapping:
-        """The mapping that a TOML file spells; `name` is what error messages call it.
-
-        Raises:
-            UsageError: naming what is wrong.
-        """
-        try:
+        """The mapping that a TOML file spells; UsageError, in which the file is called `name`, where it is none."""
+        with labelled(name):
             _known(content, ("step", "columns", "messages"), "")
             if "step" not in content:
                 raise UsageError("there is no step: say how many seconds lie between two rows, for example step = 0.1")
@@ -171,18 +150,10 @@ class BagMapping:
                 raise UsageError(f"messages is {messages!r}, expected a list of .msg files or folders of them")
             found = tuple(_column(column, said) for column, said in columns.items())
             return cls(found, content["step"], tuple(Path(text) for text in messages))
-        except UsageError as error:
-            raise UsageError(f"{name}: {error}") from None
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """What a TOML file spells; `messages` count from its folder.
-
-    Raises:
-        UsageError: it cannot be read.
-    """
-    import tomllib
-
+    """What a TOML file spells, `messages` counted from its folder; UsageError where it cannot be read."""
     require_file(path, UsageError)
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -198,11 +169,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_map(text: str) -> tuple[str, dict[str, Any]]:
-    """The column and its keys that `COLUMN=TOPIC:FIELD[,KEY=VALUE...]` spells.
-
-    Raises:
-        UsageError: it is not spelt so.
-    """
+    """The column and its keys that `COLUMN=TOPIC:FIELD[,KEY=VALUE...]` spells; UsageError where it is not spelt so."""
     source, *pairs = text.split(",")
     name, equals, rest = source.partition("=")
     topic, colon, field = rest.rpartition(":")

@@ -4,21 +4,17 @@ A bag has messages at any time; a table has one row every `step` seconds.
 
 - Rows lie on a grid from the first moment at which every control is known to the last measurement. Each trajectory's
   time starts at zero.
-- A control is held: a row has the last command at or before it. With `between = "interpolate"` it is on the line
-  between the commands before and after, angles the shorter way round; after the last command that one goes on.
-- A measurement is in the row that is nearest to it, thus within half a step. It is never interpolated and never held,
-  which would make up data: a row without one is missing it. Of several the nearest to the row's time is kept (of two as
-  near, the earlier), and how many were left out is said.
+- A control is held, or with `between = "interpolate"` on the line between two commands, angles the shorter way round;
+  after the last command that one goes on.
+- A measurement is in the row that is nearest to it. It is never interpolated or held, which would make up data. Of
+  several the nearest to the row's time is kept (of two as near, the earlier); how many were left out is said.
 - A state is on the line between its neighbours where these are at most two steps apart, else unknown. Headings come
   back continuous, the first of a trajectory between −π and π.
-- NaN and infinity, and an array too short in some messages, are missing measurements or states; in a control they are
-  an error.
-- Where the messages of a control pause for more than its `longest`, the trajectory ends with the last command before,
-  and a new one begins with the first after. It is left out, and this is said, if it has fewer than two rows or no
-  measurement.
-- `clock` says whose time counts: the bag's (when a message arrived), the header's (when it was made), or the header's
-  moved onto the bag's (`resample.align`). `late` is subtracted last. Messages are then sorted by time; those of one
-  time stay in their order.
+- NaN and infinity, and an array too short in some messages, are missing measurements or states, and in a control an
+  error.
+- Where a control pauses for more than its `longest`, the trajectory ends with the last command before, and a new one
+  begins with the first after. It is left out, and this is said, if it has fewer than two rows or no measurement.
+- `clock` says whose time counts; `late` is subtracted last. Messages of one time stay in their order.
 - Every bag is a trajectory named after its file, or several, `name-1`, `name-2`, … where it pauses.
 """
 
@@ -29,11 +25,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
-from steady_ppl.data.rosbag.fields import check_field, has_stamp, number_at, stamp_of, yaw_at
+from steady_ppl.data.rosbag.fields import check_field, has_stamp, stamp_of, value_at
 from steady_ppl.data.rosbag.mapping import BagColumn, BagMapping
-from steady_ppl.data.rosbag.reader import Bag, Say, bag_label, open_bag
+from steady_ppl.data.rosbag.reader import Bag, Say, bag_name, open_bag
 from steady_ppl.data.rosbag.resample import Piece, Series, align, held_pauses, in_rows
+from steady_ppl.data.table import from_frame
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.utils.progress import stages
@@ -55,12 +53,8 @@ def read_bags(paths: Sequence[str | Path], mapping: BagMapping, say: Say = say_a
         DataError: naming the bag and, where they apply, the column, the topic and the field.
         UsageError: two bags of one name.
     """
-    import pandas as pd
-
-    from steady_ppl.data.table import from_frame
-
     files = [Path(path) for path in paths]
-    labels = [bag_label(file) for file in files]
+    labels = [bag_name(file) if file.is_dir() else file.stem for file in files]
     for i, label in enumerate(labels):
         if label in labels[:i]:
             raise UsageError(f"two bags are named {label}, and so would be their trajectories: rename one")
@@ -71,7 +65,7 @@ def read_bags(paths: Sequence[str | Path], mapping: BagMapping, say: Say = say_a
         for file, label in zip(files, labels, strict=True):
             begin()
             with open_bag(file, mapping.messages) as bag:
-                series = read_series(bag, mapping, say)
+                series = _series_of(bag, mapping, say)
             for name, piece in _pieces(series, mapping, label, say).items():
                 if name in kept:
                     raise UsageError(f"two trajectories are named {name}: rename the bag {file.name}")
@@ -81,20 +75,18 @@ def read_bags(paths: Sequence[str | Path], mapping: BagMapping, say: Say = say_a
             f"no trajectory is left of {', '.join(labels)}: no two rows have known controls and a measurement; are the "
             'clocks the same? clock = "bag" and "aligned" go by that of the recorder'
         )
-    names = {kind: [one.name for one in mapping.columns if one.kind == kind] for kind in "uyx"}
+    columns = [column.name for column in sorted(mapping.columns, key=lambda column: "uyx".index(column.kind))]
     blocks = []
     for name, piece in kept.items():
-        block = {"trajectory": name, "time": np.arange(piece.rows) * float(mapping.step)}
-        blocks.append(pd.DataFrame(block | {column: piece.cells[column] for kind in "uyx" for column in names[kind]}))
+        block = pd.DataFrame(piece.cells, columns=columns)
+        block.insert(0, "trajectory", name)
+        block.insert(1, "time", np.arange(piece.rows) * float(mapping.step))
+        blocks.append(block)
     return from_frame(pd.concat(blocks, ignore_index=True), name=", ".join(labels))
 
 
-def read_series(bag: Bag, mapping: BagMapping, say: Say = say_aside) -> list[Series]:
-    """What the messages of a bag say in the fields of a mapping, in the order of its columns.
-
-    Raises:
-        DataError: naming the bag's column, topic and field.
-    """
+def _series_of(bag: Bag, mapping: BagMapping, say: Say) -> list[Series]:
+    """What the messages of a bag say in the fields of a mapping, in the order of its columns."""
     topics: dict[str, list[BagColumn]] = {}
     for column in mapping.columns:
         where = f"{bag.name}: {column.where}"
@@ -116,69 +108,60 @@ def read_series(bag: Bag, mapping: BagMapping, say: Say = say_aside) -> list[Ser
 
 def _of_topic(bag: Bag, topic: str, columns: list[BagColumn], say: Say) -> list[Series]:
     stamped = any(column.clock != "bag" for column in columns)
-    read = [(yaw_at if column.reading == "yaw" else number_at, column.steps) for column in columns]
+    fields = [(column.steps, column.reading == "yaw") for column in columns]
     arrivals: list[int] = []
     headers: list[int] = []
     values: list[list[float]] = []
     short = [0] * len(columns)
-    for arrival, message in bag.messages(topic):
+    for connection, arrival, raw in bag.messages([topic]):
+        message = bag.content(connection, raw)
         arrivals.append(arrival)
         if stamped:
             headers.append(stamp_of(message))
         cells = []
-        for i, (value_at, steps) in enumerate(read):
+        for i, (steps, yaw) in enumerate(fields):
             try:
-                cells.append(value_at(message, steps))
+                cells.append(value_at(message, steps, yaw=yaw))
             except IndexError:
                 short[i] += 1
                 cells.append(math.nan)
         values.append(cells)
     received, stamps = np.array(arrivals, dtype=np.int64), np.array(headers, dtype=np.int64)
     table = np.array(values, dtype=np.float64).reshape(len(arrivals), len(columns))
-    if stamped and len(stamps) and (stamps == 0).any():
-        raise DataError(
-            f"{bag.name}: topic {topic}: the header.stamp of {int((stamps == 0).sum())} of {len(stamps)} messages is "
-            'zero, nobody set it; use clock = "bag"'
-        )
+    unset = int((stamps == 0).sum())
+    if unset:
+        what = f"the header.stamp of {unset} of {len(stamps)} messages is zero, nobody set it"
+        raise DataError(f'{bag.name}: topic {topic}: {what}; use clock = "bag"')
     times = {"bag": received, "header": stamps}
     if any(column.clock == "aligned" for column in columns) and len(stamps):
         moved = align(stamps, received)
         times["aligned"] = moved.times
-        say(
-            f"{bag.name}: {topic}: its clock was {abs(moved.offset) * 1e3:.3f} ms "
-            f"{'behind' if moved.offset >= 0 else 'ahead of'} the bag's halfway, the smallest delay included, and "
-            f"{'lost' if moved.drift >= 0 else 'gained'} {abs(moved.drift) * 1e6:.2f} ppm"
-        )
+        off = f"{abs(moved.offset) * 1e3:.3f} ms {'behind' if moved.offset >= 0 else 'ahead of'} the bag's halfway"
+        drift = f"{'lost' if moved.drift >= 0 else 'gained'} {abs(moved.drift) * 1e6:.2f} ppm"
+        say(f"{bag.name}: {topic}: its clock was {off}, the smallest delay included, and {drift}")
     found = []
-    for column, read_values, missing in zip(columns, table.T, short, strict=True):
+    for column, cells_of, missing in zip(columns, table.T, short, strict=True):
+        where, among = f"{bag.name}: {column.where}", f"in {missing} of {len(arrivals)} messages"
+        if missing and (missing == len(arrivals) or column.kind == "u"):
+            raise DataError(f"{where}: the index is out of range {among}, the array is shorter")
         if missing:
-            _short_array(bag, column, missing, len(arrivals), say)
+            say(f"{where}: the array is shorter {among}, where nothing is taken for measured")
         time = times.get(column.clock, received) - round(column.late * 1e9)
-        found.append(_series(bag, column, time, read_values))
+        found.append(_series(where, column, time, cells_of))
     return found
 
 
-def _short_array(bag: Bag, column: BagColumn, missing: int, messages: int, say: Say) -> None:
-    """Refuse an index that no message has, or that a control's lacks once; else say how often it is missing."""
-    where = f"{bag.name}: {column.where}"
-    if missing == messages or column.kind == "u":
-        raise DataError(f"{where}: the index is out of range in {missing} of {messages} messages, the array is shorter")
-    say(f"{where}: the array is shorter in {missing} of {messages} messages, where nothing is taken for measured")
-
-
-def _series(bag: Bag, column: BagColumn, time: np.ndarray, values: np.ndarray) -> Series:
+def _series(where: str, column: BagColumn, time: np.ndarray, values: np.ndarray) -> Series:
+    """The finite values in the order of their times; a control must have some, and no others."""
     order = np.argsort(time, kind="stable")
     time, values = time[order], values[order]
     good = np.isfinite(values)
     if column.kind == "u" and not good.all():
         i = int(good.argmin())
-        raise DataError(
-            f"{bag.name}: {column.where}: got {values[i]} after {(time[i] - time[0]) / 1e9:.3f} s, expected a finite "
-            "number: a control must be known",
-            column=column.name,
-        )
+        got = f"got {values[i]} after {(time[i] - time[0]) / 1e9:.3f} s, expected a finite number"
+        raise DataError(f"{where}: {got}: a control must be known", column=column.name)
     if column.kind == "u" and not len(time):
-        raise DataError(f"{bag.name}: {column.where}: there is no message, and a control must be known")
+        raise DataError(f"{where}: there is no message, and a control must be known")
     return Series(column, time[good], values[good])
 
 

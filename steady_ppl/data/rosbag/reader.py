@@ -17,28 +17,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from steady_ppl.data.rosbag.fields import has_stamp, numeric_fields, undefined_types
+from steady_ppl.data.rosbag.fields import has_stamp, numeric_fields, undefined_type
 from steady_ppl.errors import DataError, SteadyError, UsageError
 from steady_ppl.utils.files import require_file
 from steady_ppl.utils.text import one_line
 
 Say = Callable[[str], None]
+MAX_WIDTH = 110  # characters of a list of fields
 
 
 @dataclass(frozen=True)
 class Bag:
-    """An open bag.
+    """An open bag."""
 
-    Attributes:
-        name: its file's or folder's name, for error messages.
-        reader: rosbags' reader, open.
-        defined: the message types that the bag itself defines.
-    """
-
-    name: str
-    reader: Any
-    defined: frozenset[str]
+    name: str  # of its file or folder, for error messages
+    reader: AnyReader
+    defined: frozenset[str]  # the message types that the bag itself defines
 
     @property
     def store(self) -> Any:
@@ -54,19 +51,8 @@ class Bag:
         """The types of a topic's messages: one, unless publishers disagreed."""
         return sorted({connection.msgtype for connection in self.reader.connections if connection.topic == topic})
 
-    def undefined(self, type_name: str) -> list[str]:
-        """Which types that messages of a type are made of nobody has defined."""
-        return undefined_types(self.store, type_name)
-
     def type_of(self, topic: str, where: str) -> str:
-        """The type of a topic's messages, defined.
-
-        Args:
-            where: what error messages begin with.
-
-        Raises:
-            DataError: no such topic, messages of several types, or a type that nobody defines.
-        """
+        """The type of a topic's messages; DataError, which begins with `where`, unless there is one that is defined."""
         if topic not in self.topics:
             near = difflib.get_close_matches(topic, self.topics, n=3, cutoff=0.5)
             hint = f"did you mean {' or '.join(near)}?" if near else f"it has {', '.join(self.topics) or 'no topics'}"
@@ -74,44 +60,25 @@ class Bag:
         names = self.types(topic)
         if len(names) > 1:
             raise DataError(f"{where}: its messages are of several types, {' and '.join(names)}; expected one")
-        missing = self.undefined(names[0])
+        missing = undefined_type(self.store, names[0])
         if missing:
-            raise DataError(
-                f"{where}: neither {self.name} nor rosbags' typestore defines the message type {missing[0]}; name its "
-                'file in the mapping: messages = ["PACKAGE/msg/NAME.msg"], or a folder of such files'
-            )
+            what = f"neither {self.name} nor rosbags' typestore defines the message type {missing}"
+            how = 'name its file in the mapping: messages = ["PACKAGE/msg/NAME.msg"], or a folder of such files'
+            raise DataError(f"{where}: {what}; {how}")
         return names[0]
 
-    def raw_messages(self, topics: Sequence[str]) -> Iterator[tuple[Any, int, bytes]]:
-        """Connection, time of arrival (ns) and bytes of every message of some topics, in the order of the bag.
-
-        Raises:
-            DataError: the bag is damaged.
-        """
+    def messages(self, topics: Sequence[str]) -> Iterator[tuple[Any, int, bytes]]:
+        """Connection, time of arrival (ns) and bytes of every message of some topics, in the order of the bag."""
         connections = [connection for connection in self.reader.connections if connection.topic in topics]
         with _damage(self.name):
             for connection, received, raw in self.reader.messages(connections=connections) if connections else ():
                 if received >= 2**63:
-                    raise DataError(
-                        f"{self.name}: a message of {connection.topic} came at {received} ns: is it damaged?"
-                    )
+                    what = f"a message of {connection.topic} came at {received} ns"
+                    raise DataError(f"{self.name}: {what}: is it damaged?")
                 yield connection, received, raw
 
-    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Time of arrival (ns) and content of every message of a topic, in the order of the bag.
-
-        Raises:
-            DataError: the bag is damaged.
-        """
-        for connection, received, raw in self.raw_messages([topic]):
-            yield received, self.content(connection, raw)
-
     def content(self, connection: Any, raw: bytes) -> Any:
-        """What the bytes of a message say.
-
-        Raises:
-            DataError: they are not of the type that the bag says.
-        """
+        """What the bytes of a message say; DataError where they are not of the type that the bag says."""
         with _damage(self.name, f"a message of {connection.topic} "):
             return self.reader.deserialize(raw, connection.msgtype)
 
@@ -120,16 +87,10 @@ class Bag:
 def open_bag(path: Path, messages: Sequence[Path] = ()) -> Iterator[Bag]:
     """Open a ROS 1 .bag, a ROS 2 folder, or a single .mcap or .db3 file.
 
-    Args:
-        messages: .msg files, or folders of them, that define types which the bag does not.
-
     Raises:
         DataError: it is no bag, or damaged.
-        UsageError: a .msg file is missing or wrong.
+        UsageError: one of `messages`, the .msg files of types that the bag does not define, is missing or wrong.
     """
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
-
     name = bag_name(path)
     own = _definitions(messages)
     if not path.exists():
@@ -151,7 +112,7 @@ def open_bag(path: Path, messages: Sequence[Path] = ()) -> Iterator[Bag]:
             speaks = any(connection.msgdef.data for connection in reader.connections)
             defined = frozenset(reader.typestore.fielddefs) if speaks else frozenset[str]()
             extra = known.fielddefs if reader.is2 else own
-            if any(undefined_types(reader.typestore, connection.msgtype) for connection in reader.connections):
+            if any(undefined_type(reader.typestore, connection.msgtype) for connection in reader.connections):
                 reader.typestore.register({key: extra[key] for key in extra if key not in reader.typestore.fielddefs})
         yield Bag(name, reader, defined)
     finally:
@@ -161,11 +122,6 @@ def open_bag(path: Path, messages: Sequence[Path] = ()) -> Iterator[Bag]:
 def bag_name(path: Path) -> str:
     """The name of a bag's file or folder."""
     return path.name or path.resolve().name
-
-
-def bag_label(path: Path) -> str:
-    """What a bag's trajectory is called: a file's name without suffix, a folder's name."""
-    return bag_name(path) if path.is_dir() else path.stem
 
 
 @contextmanager
@@ -181,13 +137,7 @@ def _damage(name: str, what: str = "") -> Iterator[None]:
 
 
 def _definitions(paths: Sequence[Path]) -> dict[str, Any]:
-    """The message types that .msg files define, named after their package.
-
-    Raises:
-        UsageError: naming the file.
-    """
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
+    """The message types that .msg files, or folders of them, define, named after their package."""
     found: dict[str, Any] = {}
     for path in paths:
         files = sorted(path.rglob("*.msg")) if path.is_dir() else [path]
@@ -209,55 +159,38 @@ def _definitions(paths: Sequence[Path]) -> dict[str, Any]:
     return found
 
 
-_WIDTH = 116
-
-
 def listing(bags: Sequence[Bag]) -> str:
     """Of each bag its topics with type, number of messages, median rate and numeric fields; then a mapping to start
     from, whose sections are comments."""
-    lines: list[str] = []
     sections: dict[tuple[str, str], list[str]] = {}
-    for bag in bags:
-        said, found = _of_bag(bag)
-        lines += said
-        sections |= found
+    lines = [line for bag in bags for line in _of_bag(bag, sections)]
     return "\n".join(lines + _skeleton(sections))
 
 
-def _of_bag(bag: Bag) -> tuple[list[str], dict[tuple[str, str], list[str]]]:
-    """Its lines, and sections by topic and field."""
+def _of_bag(bag: Bag, sections: dict[tuple[str, str], list[str]]) -> list[str]:
+    """Its lines; the sections of a mapping, by topic and field, are added to those of other bags."""
     arrivals: dict[str, list[int]] = {topic: [] for topic in bag.topics}
     first: dict[str, Any] = {}
-    for connection, received, raw in bag.raw_messages(bag.topics):
+    for connection, received, raw in bag.messages(bag.topics):
         arrivals[connection.topic].append(received)
-        if connection.topic not in first and not bag.undefined(connection.msgtype):
+        if connection.topic not in first and not undefined_type(bag.store, connection.msgtype):
             first[connection.topic] = bag.content(connection, raw)
-    lines: list[str] = [f"# {bag.name}"]
-    sections: dict[tuple[str, str], list[str]] = {}
-    for topic in bag.topics:
-        types, count = bag.types(topic), len(arrivals[topic])
-        rate = _median_rate(arrivals[topic])
-        lines += ["#", f"# {topic}  {' and '.join(types)}  {count} message{'' if count == 1 else 's'}{rate}"]
-        missing = [missing for type_name in types for missing in bag.undefined(type_name)]
+    lines = [f"# {bag.name}"]
+    for topic, at in arrivals.items():
+        types, gaps = bag.types(topic), np.diff(np.sort(np.array(at, dtype=np.int64)))
+        middle = float(np.median(gaps)) if len(gaps) else 0.0
+        rate = f"  {1e9 / middle:.4g} Hz" if middle > 0 else ""
+        lines += ["#", f"# {topic}  {' and '.join(types)}  {len(at)} message{'' if len(at) == 1 else 's'}{rate}"]
+        missing = next(filter(None, (undefined_type(bag.store, one) for one in types)), None)
         if missing:
-            lines.append(f'#     nobody defines {missing[0]}: messages = ["PACKAGE/msg/NAME.msg"] in the mapping does')
+            lines.append(f'#     nobody defines {missing}: messages = ["PACKAGE/msg/NAME.msg"] in the mapping does')
         elif len(types) == 1:
             fields = list(numeric_fields(bag.store, types[0], first.get(topic)))
-            lines += _wrapped(fields)
+            text = ", ".join(field.replace(" ", "\0") for field in fields) or "no number"
+            wrapped = textwrap.wrap(text, MAX_WIDTH, break_long_words=False, break_on_hyphens=False)
+            lines += [f"#     {line}".replace("\0", " ") for line in wrapped]
             sections |= _section(topic, fields, has_stamp(bag.store, types[0]))
-    return lines, sections
-
-
-def _median_rate(arrivals: list[int]) -> str:
-    gaps = np.diff(np.sort(np.array(arrivals, dtype=np.int64)))
-    middle = float(np.median(gaps)) if len(gaps) else 0.0
-    return f"  {1e9 / middle:.4g} Hz" if middle > 0 else ""
-
-
-def _wrapped(fields: list[str]) -> Iterator[str]:
-    text = ", ".join(field.replace(" ", "\0") for field in fields) or "no number"
-    for line in textwrap.wrap(text, _WIDTH - 6, break_long_words=False, break_on_hyphens=False):
-        yield f"#     {line}".replace("\0", " ")
+    return lines
 
 
 def _section(topic: str, fields: list[str], stamped: bool) -> dict[tuple[str, str], list[str]]:
@@ -267,9 +200,7 @@ def _section(topic: str, fields: list[str], stamped: bool) -> dict[tuple[str, st
         return {}
     field, _, reading = said[0].partition(" ")
     field = field.partition("…")[0].rstrip(".") + ("]" if "…" in field else "")
-    lines = [f'# topic = "{topic}"', f'# field = "{field}"']
-    if reading:
-        lines.append('# as = "yaw"')
+    lines = [f'# topic = "{topic}"', f'# field = "{field}"', *(['# as = "yaw"'] if reading else [])]
     if stamped:
         lines.append('# clock = "aligned"  # its header says when it was made; leave out for the time of arrival')
     return {(topic, field): lines}

@@ -5,6 +5,7 @@ Times are whole nanoseconds throughout, so that a command at the very time of a 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -13,40 +14,29 @@ import numpy as np
 from steady_ppl.data.rosbag.mapping import BagColumn
 from steady_ppl.errors import DataError
 
-MOST_ROWS = 10_000_000
-UNUSUAL = 20  # times the usual time between commands, or the step if that is longer, from which holding one is said
+MAX_ROWS = 10_000_000
+MAX_PAUSE_RATIO = (
+    20  # times the usual time between commands, or the step if that is longer, from which holding one is said
+)
 
 
 @dataclass(frozen=True)
 class Series:
-    """What the messages of a topic say in one field.
+    """What the messages of a topic say in one field."""
 
-    Attributes:
-        column: what it becomes.
-        times: `(messages,)` int64 ns, not decreasing.
-        values: `(messages,)` finite, as they were read: `scale` and `offset` come last.
-    """
-
-    column: BagColumn
-    times: np.ndarray
-    values: np.ndarray
+    column: BagColumn  # what it becomes
+    times: np.ndarray  # (messages,) int64 ns, not decreasing
+    values: np.ndarray  # (messages,) finite, as they were read: `scale` and `offset` come last
 
 
 @dataclass(frozen=True)
 class Piece:
-    """The rows of one trajectory.
+    """The rows of one trajectory, its columns by their names."""
 
-    Attributes:
-        start: ns, the time of the first row.
-        cells: a column's name to its `(rows,)` values, NaN where there is none.
-        rivals: a measurement's column to how many of its values were left out, another one being nearer to their row.
-        placed: a measurement's column to how many of its values are in a row, or were left out for another.
-    """
-
-    start: int
-    cells: dict[str, np.ndarray]
-    rivals: dict[str, int]
-    placed: dict[str, int]
+    start: int  # ns, the time of the first row
+    cells: dict[str, np.ndarray]  # (rows,) each, NaN where there is no value
+    rivals: dict[str, int]  # how many values of a measurement were left out, another being nearer to their row
+    placed: dict[str, int]  # how many are in a row, or were left out for another
 
     @property
     def rows(self) -> int:
@@ -57,22 +47,19 @@ class Piece:
 def in_rows(series: Sequence[Series], step: float, name: str = "bag") -> list[Piece]:
     """The pieces between pauses, each with rows from where all controls are known to its last measurement.
 
-    No measurement is in two pieces where a pause, longer than a control's `longest`, takes two steps or more.
-
-    Args:
-        series: of controls (none empty), measurements and states.
-        step: s between rows.
-        name: what an error message calls the bag.
+    No measurement is in two pieces where a pause, longer than a control's `longest`, takes two steps or more. No series
+    of a control may be empty.
 
     Raises:
-        DataError: there would be more rows than anybody wants.
+        DataError: there would be more rows than `MAX_ROWS`; it names the bag.
     """
     measured = [one.times for one in series if one.column.kind == "y" and len(one.times)]
     if not measured:
         return []
-    first, last = (min(times[0] for times in measured), max(times[-1] for times in measured))
     controls = [one for one in series if one.column.kind == "u"]
-    spans = [(min(one.times[0] for one in controls) if controls else first, last)]
+    first = min(times[0] for times in [one.times for one in controls] or measured)
+    last = max(times[-1] for times in measured)
+    spans = [(first, last)]
     for control in controls:
         spans = _intersection(spans, _stretches(control, last))
     return [_piece(series, int(start), int(end), step, name) for start, end in spans]
@@ -80,12 +67,10 @@ def in_rows(series: Sequence[Series], step: float, name: str = "bag") -> list[Pi
 
 def _stretches(control: Series, last: int) -> list[tuple[int, int]]:
     """From when to when a control is known: without a pause longer than is allowed; else to the last measurement."""
-    times, longest = control.times, control.column.longest
-    if longest is None:
-        return [(times[0], max(times[-1], last))]
-    pauses = np.flatnonzero(np.diff(times) > longest * 1e9)
+    times, longest = control.times, math.inf if control.column.longest is None else control.column.longest * 1e9
+    pauses = np.flatnonzero(np.diff(times) > longest)
     first, end = times[np.append(0, pauses + 1)], times[np.append(pauses, len(times) - 1)]
-    if last - end[-1] <= longest * 1e9:
+    if last - end[-1] <= longest:
         end[-1] = max(end[-1], last)
     return list(zip(first.tolist(), end.tolist(), strict=True))
 
@@ -99,13 +84,12 @@ def held_pauses(series: Sequence[Series], step: float) -> Iterator[str]:
         gaps = np.diff(np.append(control.times, max(control.times[-1], *measured)))
         usual = max(float(np.median(gaps)), step * 1e9)
         longest = int(gaps.argmax())
-        if gaps[longest] > UNUSUAL * usual:
+        if gaps[longest] > MAX_PAUSE_RATIO * usual:
             after = (control.times[longest] - control.times[0]) / 1e9
+            pause = f"no {control.column.topic} for {gaps[longest] / 1e9:.3g} s, {after:.3g} s after its first"
             what = "interpolated over it" if control.column.between == "interpolate" else "held as if it still acted"
-            yield (
-                f"no {control.column.topic} for {gaps[longest] / 1e9:.3g} s, {after:.3g} s after its first: "
-                f"{control.column.name} is {what}; `longest = {10 * usual / 1e9:.2g}` would end the trajectory there"
-            )
+            how = f"`longest = {10 * usual / 1e9:.2g}` would end the trajectory there"
+            yield f"{pause}: {control.column.name} is {what}; {how}"
 
 
 def _intersection(a: list[tuple[int, int]], b: list[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -125,27 +109,25 @@ def _intersection(a: list[tuple[int, int]], b: list[tuple[int, int]]) -> list[tu
 def _piece(series: Sequence[Series], start: int, end: int, step: float, name: str) -> Piece:
     spacing = step * 1e9
     last = int(np.floor((end - start) / spacing + 0.5))
-    if last >= MOST_ROWS:
-        raise DataError(
-            f"{name}: {(end - start) / 1e9:.6g} s in steps of {step} s are {last + 1} rows, more than {MOST_ROWS}; "
-            "take a larger step, or the same clock for controls and measurements"
-        )
-    measured = [(one, *_nearest(one, start, spacing, last)) for one in series if one.column.kind == "y"]
-    rows = 1 + max((int(at[-1]) for _, at, _, _ in measured if len(at)), default=-1)
-    time = _times(np.arange(rows), start, spacing)
-    cells, rivals, placed = {}, {}, {}
-    for one, at, values, count in measured:
-        cells[one.column.name] = np.full(rows, np.nan)
-        cells[one.column.name][at] = _scaled(one.column, values)
-        rivals[one.column.name], placed[one.column.name] = count - len(at), count
+    if last >= MAX_ROWS:
+        what = f"{(end - start) / 1e9:.6g} s in steps of {step} s are {last + 1} rows, more than {MAX_ROWS}"
+        raise DataError(f"{name}: {what}; take a larger step, or the same clock for controls and measurements")
+    nearest = {one.column.name: _nearest(one, start, spacing, last) for one in series if one.column.kind == "y"}
+    rows = 1 + max((int(at[-1]) for at, _, _ in nearest.values() if len(at)), default=-1)
+    time, cells = _times(np.arange(rows), start, spacing), {}
     for one in series:
-        if one.column.kind == "u" and one.column.between != "interpolate":
-            held = one.values[np.searchsorted(one.times, time, side="right") - 1]
-            cells[one.column.name] = _scaled(one.column, held)
-        elif one.column.kind != "y":
-            most = None if one.column.kind == "u" else 2 * spacing
-            cells[one.column.name] = _scaled(one.column, _interpolated(one, time, most))
-    return Piece(start, {one.column.name: cells[one.column.name] for one in series}, rivals, placed)
+        column = one.column
+        if column.kind == "y":
+            at, found, _ = nearest[column.name]
+            values = np.full(rows, np.nan)
+            values[at] = found
+        elif column.kind == "u" and column.between != "interpolate":
+            values = one.values[np.searchsorted(one.times, time, side="right") - 1]
+        else:
+            values = _interpolated(one, time, None if column.kind == "u" else 2 * spacing)
+        cells[column.name] = column.scale * values + column.offset
+    rivals = {name: count - len(at) for name, (at, _, count) in nearest.items()}
+    return Piece(start, cells, rivals, {name: count for name, (_, _, count) in nearest.items()})
 
 
 def _nearest(one: Series, start: int, spacing: float, last: int) -> tuple[np.ndarray, np.ndarray, int]:
@@ -189,40 +171,24 @@ def _interpolated(one: Series, time: np.ndarray, most: float | None) -> np.ndarr
     return found
 
 
-def _scaled(column: BagColumn, values: np.ndarray) -> np.ndarray:
-    return column.scale * values + column.offset
-
-
 @dataclass(frozen=True)
 class Alignment:
-    """Header stamps moved onto the bag's clock.
+    """Header stamps moved onto the bag's clock."""
 
-    Attributes:
-        times: `(messages,)` int64 ns, the moved stamps, in the order of the messages.
-        offset: s that are added to a stamp at the mean of the stamps; the smallest delay is in it.
-        drift: how much that grows with every second of the stamps' clock (1e-6 is one ppm).
-    """
-
-    times: np.ndarray
-    offset: float
-    drift: float
+    times: np.ndarray  # (messages,) int64 ns, the moved stamps, in the order of the messages
+    offset: float  # s that are added to a stamp at the mean of the stamps; the smallest delay is in it
+    drift: float  # how much that grows with every second of the stamps' clock; 1e-6 is one ppm
 
 
 def align(stamps: np.ndarray, received: np.ndarray) -> Alignment:
-    """Move header stamps onto the clock on which they were received.
-
-    Args:
-        stamps: `(messages,)` int64 ns, at least one.
-        received: `(messages,)` int64 ns, when the bag says that they arrived.
-
-    Returns:
-        No drift where all stamps are alike.
+    """Move header stamps onto the clock on which they were received, `(messages,)` int64 ns each, at least one.
 
     A bag keeps when a message arrived at the recorder; its header may keep when it was made, on the clock of the
     machine that made it. That clock is off by an offset and drifts, and what arrives has been on its way for a delay
     that is never negative. Of all lines offset + drift · stamp below the points (stamp, received − stamp), the nearest
     to them, summed over the points, is the edge of their lower convex hull over the mean of the stamps. Stamps moved by
-    that line are when messages were made, all late by the smallest delay that occurs.
+    that line are when messages were made, all late by the smallest delay that occurs. Stamps that are all alike have no
+    drift.
 
     Sue B. Moon, Paul Skelly and Don Towsley. Estimation and removal of clock skew from network delay measurements.
     INFOCOM 1999.
