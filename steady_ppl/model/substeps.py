@@ -14,10 +14,10 @@ counts as a tenth.
 from __future__ import annotations
 
 import copy
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from itertools import islice
 from numbers import Integral
 from typing import Any
 
@@ -87,7 +87,8 @@ def advance(program: Program, state: Tensor, control: Tensor, time: Tensor, step
     with seen, _at(parts[0]) as given:
         state = program.transition(state, *given)
     noise = {site: standardised(fn, seen.values[site], site) for site, fn in seen.distributions.items()}
-    return _through(program, state, parts[1:], noise)[0]
+    ((after, _),) = deque(_through(program, state, parts[1:], noise), maxlen=1)
+    return after
 
 
 def sample_channels(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> None:
@@ -103,7 +104,8 @@ def sample_row(program: Program, state: Tensor, control: Tensor, time: Tensor, s
     if program.substeps == 1:
         return program.transition(state, control, time, step)
     noise = _sample(program, state, control, time, step)
-    return _through(program, state, _parts(program, control, time, step), noise)[0]
+    ((after, _),) = deque(_through(program, state, _parts(program, control, time, step), noise), maxlen=1)
+    return after
 
 
 def channel_values(
@@ -126,7 +128,7 @@ def channel_scales(program: Program, state: Tensor, control: Tensor, time: Tenso
     `advance`.
     """
     found = []
-    for seen in _through(program, state, _parts(program, control, time, step), 0.0)[1]:
+    for _, seen in _through(program, state, _parts(program, control, time, step), 0.0):
         scales = {site: location_and_scale(fn, site)[1] for site, fn in seen.distributions.items()}
         found.append(_joined(scales, seen.distributions, state.shape[:-1]))
     return _mean(found)
@@ -235,7 +237,8 @@ def _sample(program: Program, state: Tensor, control: Tensor, time: Tensor, step
 def _on_average(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> dict[str, Any]:
     """Site → the distribution of its average over a row; with one substep its own."""
     given, left = (control, time, step), state.shape[:-1]
-    kinds = _through(program, state, islice(_parts(program, *given), 1), 0.0)[1][0].distributions
+    _, first = next(_through(program, state, _parts(program, *given), 0.0))
+    kinds = first.distributions
     if program.substeps == 1:
         return kinds
     moments = {site: location_and_scale(fn, site) for site, fn in kinds.items()}
@@ -244,8 +247,8 @@ def _on_average(program: Program, state: Tensor, control: Tensor, time: Tensor, 
     count = scale.shape[-1]
     units = torch.cat([scale.new_zeros(1, count), torch.eye(count).to(scale)]).view(1 + count, *[1] * len(left), count)
     states, noise = state.expand(1 + count, *state.shape), _parted(units * reach, kinds)
-    rows = _through(program, states, _parts(program, *given), noise)[1]
-    still, *pushed = _mean([_joined(row.values, kinds, (1 + count, *left)) for row in rows])
+    rows = _through(program, states, _parts(program, *given), noise)
+    still, *pushed = _mean([_joined(seen.values, kinds, (1 + count, *left)) for _, seen in rows])
     change = torch.stack([one[..., index] - still[..., index] for index, one in enumerate(pushed)], -1) / reach
     locs, scales = _parted(still, kinds), _parted(torch.maximum(change, MIN_SHARE_OF_SD * scale), kinds)
     return {site: with_moments(fn, locs[site], scales[site]) for site, fn in kinds.items()}
@@ -253,15 +256,13 @@ def _on_average(program: Program, state: Tensor, control: Tensor, time: Tensor, 
 
 def _through(
     program: Program, state: Tensor, parts: Iterable[_Part], noise: Mapping[str, Tensor] | float
-) -> tuple[Tensor, list[Recording]]:
-    """The state after substeps with given noise in scales, and what each of them samples."""
-    found = []
+) -> Iterator[tuple[Tensor, Recording]]:
+    """The state after each substep with given noise in scales, and what was sampled in it."""
     for part in parts:
         seen = Recording()
         with poutine.block(), seen, Held(noise), _at(part) as given:
             state = program.transition(state, *given)
-        found.append(seen)
-    return state, found
+        yield state, seen
 
 
 def _mean(values: Sequence[Tensor]) -> Tensor:
