@@ -123,7 +123,7 @@ def _changed(program: Program, data: Trajectories, states: Tensor, mean: Tensor,
     controls, times = acting_controls(program, data), data.elapsed
     if variant.effect.form == "push":
         means = dict(zip(program.channel_names, mean.unbind(-1), strict=True))
-        pushes = variant.push(program, states[:-1], controls[:-1], times[:-1], data.steps, c, means)
+        pushes = variant(program, states[:-1], controls[:-1], times[:-1], data.steps, c=c, mean=means)
         return mean + by_channel(program, pushes, 0.0, mean)
     if variant.effect.form == "command":
         acting = variant(program, states, controls, times, c=c)

@@ -25,6 +25,13 @@ def example(name: str, dtype: torch.dtype = torch.float64) -> Program:
     return load_program(f"{source}:{program}" if program else source).to(dtype)
 
 
+def short(name: str, rows: int = 9) -> Program:
+    """An example program whose drives have so many rows."""
+    program = example(name)
+    program.duration = (rows - 1) * program.step
+    return program
+
+
 def drives(program: Program, trajectories: int, rows: int, *, gaps: bool = False, seed: int = 0) -> Trajectories:
     """Drives for `program`, simulated at its own time step, so that it is right about them, and read by it: all cells
     measured on an even clock, or, with `gaps`, every other trajectory two rows shorter, a fifth of the cells missing

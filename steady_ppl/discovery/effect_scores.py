@@ -160,7 +160,7 @@ class Scoring:
         if few:
             points, given = points[:1, :, :1], (given[0][:, :1], given[1][:, :1], given[2][:, :1])
             means = {name: mean[:1, :, :1] for name, mean in means.items()}
-        return variant.push(self.program, points, *given, value, means)
+        return variant(self.program, points, *given, c=value, mean=means)
 
     def _channels(self, variant: Variant, value: Tensor) -> set[str]:
         return set(self._pushed(variant, value, 0, few=True))

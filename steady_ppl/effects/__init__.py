@@ -18,24 +18,6 @@ from steady_ppl.effects.codegen import write_program
 from steady_ppl.effects.declaration import Effect, Variant
 from steady_ppl.effects.registry import catalogue, chosen_variant, find, not_applicable, of_name, parsed, register
 
-__all__ = [
-    "Effect",
-    "Variant",
-    "added",
-    "attach",
-    "attached",
-    "catalogue",
-    "chosen_variant",
-    "coefficient",
-    "find",
-    "not_applicable",
-    "of_name",
-    "parsed",
-    "record",
-    "register",
-    "restore",
-    "set_coefficient",
-    "with_effect",
-    "write_program",
-    "written_class",
-]
+__all__ = ["Effect", "Variant", "added", "attach", "attached", "catalogue", "chosen_variant", "coefficient", "find"]
+__all__ += ["not_applicable", "of_name", "parsed", "record", "register", "restore", "set_coefficient", "with_effect"]
+__all__ += ["write_program", "written_class"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pyro
@@ -14,20 +15,17 @@ from pyro.distributions import constraints
 from pyro.nn import PyroParam
 from torch import Tensor
 
-from steady_ppl.effects.declaration import Effect, Variant
+from steady_ppl.effects.declaration import Effect, Value, Variant
 from steady_ppl.effects.registry import chosen_variant, is_known, parsed
 from steady_ppl.errors import UsageError
-from steady_ppl.model.interventions import Coloured, blurred, channel_means, heavy_tailed, misread, pushed, widened
+from steady_ppl.model import interventions
 from steady_ppl.model.program import Program, names
 
 Methods = dict[str, Any]
 
 
 def with_effect(
-    program: Program,
-    effect: str | Effect | Variant,
-    value: float | Sequence[float] | Tensor | None = None,
-    **options: Any,
+    program: Program, effect: str | Effect | Variant, value: Value | None = None, **options: Any
 ) -> Program:
     """A copy of a program with an effect, its coefficient a learnable parameter called `effect` or `effect_where`.
 
@@ -45,7 +43,7 @@ def with_effect(
     return attach(copy.deepcopy(program), variant, value)
 
 
-def attach(program: Program, variant: Variant, value: float | Sequence[float] | Tensor | None = None) -> Program:
+def attach(program: Program, variant: Variant, value: Value | None = None) -> Program:
     """Add an effect to this very program."""
     if variant.name in [known.name for known in attached(program)]:
         raise UsageError(f"program {type(program).__name__} has the effect {variant.name} already")
@@ -60,7 +58,8 @@ def attach(program: Program, variant: Variant, value: float | Sequence[float] | 
     with pyro.settings.context(module_local_params=True):
         setattr(program, name, PyroParam(start, _constraint(effect)))
     program.priors = {**program.priors, name: prior(effect)}  # type: ignore[misc]
-    program.rates = {name: _rate(variant), **program.rates}  # type: ignore[misc]
+    rate = float(variant.typical.abs().max()) if effect.null == 0 else 1.0  # Adam's steps are of this size in any unit
+    program.rates = {name: rate, **program.rates}  # type: ignore[misc]
     return program
 
 
@@ -73,12 +72,7 @@ def attach_listed(program: Program) -> Program:
     return program
 
 
-def _rate(variant: Variant) -> float:
-    """Its learning rate relative to the recipe's: Adam's steps are of the size of the rate, whatever the unit."""
-    return float(variant.typical.abs().max()) if variant.effect.null == 0 else 1.0
-
-
-def set_coefficient(program: Program, variant: Variant, value: float | Sequence[float] | Tensor) -> Program:
+def set_coefficient(program: Program, variant: Variant, value: Value) -> Program:
     """Give the coefficient of an effect that a program has another value."""
     variant.require_meaning(value)
     setattr(program, variant.parameter, _start(variant, value, coefficient(program, variant)))
@@ -89,7 +83,7 @@ def _constraint(effect: Effect) -> constraints.Constraint:
     return constraints.positive if effect.null != 0 else constraints.real  # a factor or a limit is positive
 
 
-def _start(variant: Variant, value: float | Sequence[float] | Tensor | None, like: Tensor) -> Tensor:
+def _start(variant: Variant, value: Value | None, like: Tensor) -> Tensor:
     """A value of the coefficient that can be one."""
     effect, start = variant.effect, variant.coefficient(value, like.detach())
     if not bool((_constraint(effect).check(start) & (start.isfinite() | (start == effect.null))).all()):
@@ -130,12 +124,10 @@ def _effects(program: Program) -> list[tuple[str, str | Variant]]:
 def written_class(program: Program) -> type[Program]:
     """The class of a program as its file has it, without the effects that were added."""
     return next(
-        one for one in type(program).__mro__ if not any(map(_is_variant, vars(one).get("attached", {}).values()))
+        one
+        for one in type(program).__mro__
+        if not any(isinstance(which, Variant) for which in vars(one).get("attached", {}).values())
     )
-
-
-def _is_variant(which: str | Variant) -> bool:
-    return isinstance(which, Variant)
 
 
 def record(program: Program) -> list[str]:
@@ -158,22 +150,18 @@ def coefficient(program: Program, variant: Variant) -> Tensor:
 
 
 def _push(base: Any, variant: Variant) -> Methods:
-    def transition(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-        def below() -> Tensor:
-            return base.transition(self, state, control, time, step)
-
-        mean = channel_means(self, below) if variant.needs_mean else {}
-        with pushed(self, variant.push(self, state, control, time, step, coefficient(self, variant), mean)):
-            return below()
+    def transition(self: Any, *given: Tensor) -> Tensor:
+        mean = interventions.channel_means(self, partial(base.transition, self), *given) if variant.needs_mean else None
+        with interventions.pushed(self, variant(self, *given, c=coefficient(self, variant), mean=mean)):
+            return base.transition(self, *given)
 
     return {"transition": transition}
 
 
 def _command(base: Any, variant: Variant) -> Methods:
     def transition(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-        return base.transition(
-            self, state, variant(self, state, control, time, c=coefficient(self, variant)), time, step
-        )
+        acting = variant(self, state, control, time, c=coefficient(self, variant))
+        return base.transition(self, state, acting, time, step)
 
     return {"transition": transition}
 
@@ -185,42 +173,9 @@ def _history(base: Any, variant: Variant) -> Methods:
     return {"actuators": actuators}
 
 
-def _measured(base: Any, variant: Variant) -> Methods:
-    def observe(self: Any, state: Tensor) -> None:
-        with misread(self, lambda measured: variant(self, state, measured, c=coefficient(self, variant))):
-            return base.observe(self, state)
-
-    return {"observe": observe}
-
-
 def _viewpoint(base: Any, variant: Variant) -> Methods:
     def observe(self: Any, state: Tensor) -> None:
         return base.observe(self, variant(self, state, c=coefficient(self, variant)))
-
-    return {"observe": observe}
-
-
-def _spread(base: Any, variant: Variant) -> Methods:
-    def transition(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-        factors = variant(self, state, control, time, step, c=coefficient(self, variant))
-        with widened(self, factors):
-            return base.transition(self, state, control, time, step)
-
-    return {"transition": transition}
-
-
-def _blur(base: Any, variant: Variant) -> Methods:
-    def observe(self: Any, state: Tensor) -> None:
-        with blurred(variant(self, state, c=coefficient(self, variant))):
-            return base.observe(self, state)
-
-    return {"observe": observe}
-
-
-def _tails(base: Any, variant: Variant) -> Methods:
-    def observe(self: Any, state: Tensor) -> None:
-        with heavy_tailed(variant(self, c=coefficient(self, variant))):
-            return base.observe(self, state)
 
     return {"observe": observe}
 
@@ -238,7 +193,7 @@ def _colour(base: Any, variant: Variant) -> Methods:
 
     def transition(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
         state, last = split(self, state)
-        colouring = Coloured(self, variant(self, c=coefficient(self, variant)), last)
+        colouring = interventions.Coloured(self, variant(self, c=coefficient(self, variant)), last)
         with colouring:
             state = base.transition(self, state, control, time, step)
         return colouring.beside(state)
@@ -246,26 +201,35 @@ def _colour(base: Any, variant: Variant) -> Methods:
     def observe(self: Any, state: Tensor) -> None:
         return base.observe(self, split(self, state)[0])
 
-    deviations = deviation_names(names(base.channels), names(base.states), variant)
+    deviations = tuple(f"deviation_{name}" for name in names(base.channels))
+    if set(deviations) & set(names(base.states)):  # of another coloured noise
+        deviations = tuple(f"deviation_{variant.at}_{name}" for name in names(base.channels))
     methods = {"initial": initial, "transition": transition, "observe": observe}
     return methods | {"states": (*base.states, *deviations), "resting": (*base.resting, *deviations)}
 
 
-def deviation_names(channels: Sequence[str], states: Sequence[str], variant: Variant) -> tuple[str, ...]:
-    """Names of the states that a coloured noise adds to a program, which may have those of another one."""
-    plain = tuple(f"deviation_{name}" for name in channels)
-    return tuple(f"deviation_{variant.at}_{name}" for name in channels) if set(plain) & set(states) else plain
+def _within(method: str, handler: Callable[..., interventions.Altering]) -> Callable[[Any, Variant], Methods]:
+    """The base's method under a handler, which is made of the program, its effect and the method's arguments."""
+
+    def around(base: Any, variant: Variant) -> Methods:
+        def altered(self: Any, *given: Tensor) -> Any:
+            with handler(self, partial(variant, self, c=coefficient(self, variant)), *given):
+                return getattr(base, method)(self, *given)
+
+        return {method: altered}
+
+    return around
 
 
 _AROUND: dict[str, Callable[[Any, Variant], Methods]] = {
     "push": _push,
     "command": _command,
     "history": _history,
-    "measured": _measured,
+    "measured": _within("observe", lambda program, act, state: interventions.misread(program, partial(act, state))),
     "viewpoint": _viewpoint,
-    "spread": _spread,
-    "blur": _blur,
-    "tails": _tails,
+    "spread": _within("transition", lambda program, act, *given: interventions.widened(program, act(*given))),
+    "blur": _within("observe", lambda program, act, state: interventions.blurred(act(state))),
+    "tails": _within("observe", lambda program, act, state: interventions.heavy_tailed(act())),
     "colour": _colour,
 }
 

@@ -79,11 +79,8 @@ def _docstring(program: Program, base: type[Program], listed: str) -> list[str]:
         lines.append(f"{variant.parameter}: {effect.text}" + (f", {told}" if told else ""))
         lines.append(f"    c in {variant.unit}; {effect.feels}" if variant.unit != "1" else f"    {effect.feels}")
     first = textwrap.wrap(f'"""{base.__name__} with {listed}.', WIDTH - 4)
-    wrapped = [
-        part
-        for line in lines
-        for part in textwrap.wrap(line, WIDTH - 4, subsequent_indent="    ", replace_whitespace=False)
-    ]
+    wrapper = textwrap.TextWrapper(WIDTH - 4, subsequent_indent="    ", replace_whitespace=False)
+    wrapped = [part for line in lines for part in wrapper.wrap(line)]
     return [*first, "", *(line.replace("\\", "\\\\").replace('"""', "'''") for line in wrapped), '"""']
 
 

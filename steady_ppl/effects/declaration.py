@@ -22,7 +22,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -33,26 +33,18 @@ from steady_ppl.model.program import Program
 
 VERDICTS = {
     "push": "dynamics",
-    "command": "actuator",
-    "history": "actuator",
-    "measured": "sensor",
-    "viewpoint": "sensor",
-    "spread": "noise",
-    "blur": "noise",
-    "tails": "noise",
-    "colour": "noise",
+    **dict.fromkeys(("command", "history"), "actuator"),
+    **dict.fromkeys(("measured", "viewpoint"), "sensor"),
+    **dict.fromkeys(("spread", "blur", "tails", "colour"), "noise"),
 }
 Choices = Callable[[Program, Trajectories | None], Sequence[Mapping[str, Any]]]
+Value = float | Sequence[float] | Tensor  # of a coefficient, before it is a tensor
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def power_of_two_below(size: float) -> float:
     """For a coefficient to be learned in units of; one where nothing has a size."""
     return 2.0 ** math.floor(math.log2(size)) if size > 0 else 1.0
-
-
-def one_choice(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
-    """An effect that acts in one way only."""
-    return [{}]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,25 +90,24 @@ class Effect:
     components: tuple[str, ...] = ()
     between: tuple[float, float] = (-math.inf, math.inf)
     probes: tuple[float, ...] = ()
-    choices: Choices = one_choice
+    choices: Choices = field(default=lambda program, data: [{}])
     profiled: tuple[str, ...] = ()
     prior: Any = None
     lacks: Callable[[Program], str | None] = field(default=lambda program: None)
 
     def __post_init__(self) -> None:
-        if self.form not in VERDICTS:
-            raise UsageError(f"effect {self.name}: no form {self.form!r}; there are {', '.join(VERDICTS)}")
-        if "c" not in inspect.signature(self.function).parameters:
-            raise UsageError(f"effect {self.name}: its function takes no coefficient c")
         typical = self.typical if isinstance(self.typical, tuple) else (self.typical,)
-        if len(typical) != self.size:
-            raise UsageError(f"effect {self.name}: {len(typical)} typical numbers for {self.size} components")
-        if not any(typical) or not all(map(math.isfinite, typical)):
-            raise UsageError(f"effect {self.name}: its typical coefficient is {self.typical}: none would feel it")
-        if self.components and self.sign:
-            raise UsageError(f"effect {self.name}: a coefficient of several components has no sign")
-        if not self.limit > 0:
-            raise UsageError(f"effect {self.name}: its limit is a magnitude above zero, got {self.limit}")
+        felt = any(typical) and all(map(math.isfinite, typical))
+        for holds, problem in (
+            (self.form in VERDICTS, f"no form {self.form!r}; there are {', '.join(VERDICTS)}"),
+            ("c" in inspect.signature(self.function).parameters, "its function takes no coefficient c"),
+            (len(typical) == self.size, f"{len(typical)} typical numbers for {self.size} components"),
+            (felt, f"its typical coefficient is {self.typical}: none would feel it"),
+            (not (self.components and self.sign), "a coefficient of several components has no sign"),
+            (self.limit > 0, f"its limit is a magnitude above zero, got {self.limit}"),
+        ):
+            if not holds:
+                raise UsageError(f"effect {self.name}: {problem}")
 
     @property
     def verdict(self) -> str:
@@ -138,6 +129,25 @@ class Effect:
     def variant(self, at: str = "", scale: float = 1.0, **options: Any) -> Variant:
         """The effect with everything settled but its coefficient."""
         return Variant(self, at, options, scale=scale, unit=self.unit)
+
+
+def declare(effects: list[Effect], form: str, unit: str, **more: Any) -> Callable[[Function], Function]:
+    """Append the effect that the function below is: its docstring begins with the `text` and labels what else is shown.
+
+    Args:
+        effects: what it is appended to.
+        form, unit, more: of the effect; it has the function's name unless `more` gives another one.
+    """
+
+    def append(function: Function) -> Function:
+        text, _, labelled = inspect.cleandoc(function.__doc__ or "").partition("\n\n")
+        told: dict[str, Any] = {"name": function.__name__, "equation": "", "feels": ""}  # no docstrings in python -OO
+        for label, phrase in re.findall(r"^(equation|feels|occurs): (.+(?:\n .+)*)", labelled, re.MULTILINE):
+            told[label] = " ".join(phrase.split())
+        effects.append(Effect(form=form, text=text, unit=unit, function=function, **{**told, **more}))
+        return function
+
+    return append
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +206,7 @@ class Variant:
         said = ", ".join(f"{name} {value:.3g}" for name, value in self.profiled.items())
         return f"{self.name} ({said})" if said else self.name
 
-    def coefficient(self, value: float | Sequence[float] | Tensor | None, like: Tensor) -> Tensor:
+    def coefficient(self, value: Value | None, like: Tensor) -> Tensor:
         """A value as a tensor, the typical one when None.
 
         Raises:
@@ -213,7 +223,7 @@ class Variant:
             )
         return given
 
-    def require_meaning(self, value: float | Sequence[float] | Tensor | None) -> None:
+    def require_meaning(self, value: Value | None) -> None:
         """Refuse a coefficient with which the effect's equation means nothing.
 
         Raises:
@@ -231,23 +241,10 @@ class Variant:
         shape = (self.effect.size,) if self.effect.components else ()
         return like.new_full(shape, self.effect.null)
 
-    def __call__(self, program: Program, *arguments: Any, c: Tensor) -> Any:
-        """The effect's function with its options."""
-        return self.effect.function(program, *arguments, c=c, **self.options)
-
-    def push(
-        self,
-        program: Program,
-        state: Tensor,
-        control: Tensor,
-        time: Tensor,
-        step: Tensor,
-        c: Tensor,
-        mean: Mapping[str, Tensor],
-    ) -> dict[str, Tensor]:
-        """What it adds to the channels' means, each `(...)`; `mean` is what they are without it, where it asks."""
-        more = {"mean": mean} if self.needs_mean else {}
-        return self.effect.function(program, state, control, time, step, c=c, **more, **self.options)
+    def __call__(self, program: Program, *arguments: Any, c: Tensor, mean: Mapping[str, Tensor] | None = None) -> Any:
+        """The effect's function with its options; `mean` is what the channels' means are without it, where it asks."""
+        options = {**self.options, "mean": mean} if self.needs_mean else self.options
+        return self.effect.function(program, *arguments, c=c, **options)
 
     @cached_property
     def needs_mean(self) -> bool:

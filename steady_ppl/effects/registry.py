@@ -17,6 +17,12 @@ from steady_ppl.effects.declaration import VERDICTS, Effect, Variant
 from steady_ppl.errors import UsageError
 from steady_ppl.model.program import Program
 
+HEAD = """# Effects
+
+What `steady effects` prints. `steady simulate MODEL --effect NAME[:AT][:OPTION=NUMBER][=NUMBER[,NUMBER]]` adds one to \
+a simulation, `steady add` writes it into a program, `program.with_effect(NAME, VALUE)` does so in Python. `c` is the \
+coefficient; without a value it is the typical one.
+"""
 _EFFECTS: list[Effect] = [*FORCES, *PLANAR_FORCES, *WHEELS, *ACTUATORS, *SENSORS, *NOISES]
 
 
@@ -35,11 +41,7 @@ def catalogue(program: Program | None = None) -> list[Effect]:
 def not_applicable(program: Program) -> dict[str, str]:
     """Why each other effect does not apply to a program."""
     known = {effect.name for effect in catalogue(program)}
-    return {
-        effect.name: reason
-        for effect in _EFFECTS
-        if effect.name not in known and (reason := effect.lacks(program)) is not None
-    }
+    return {effect.name: str(effect.lacks(program)) for effect in _EFFECTS if effect.name not in known}
 
 
 def is_known(text: str) -> bool:
@@ -67,11 +69,15 @@ def find(name: str, program: Program) -> Effect:
     Raises:
         UsageError: there is none; the nearest name is suggested.
     """
-    for effect in of_name(name):
+    return _applicable(of_name(name), program)
+
+
+def _applicable(effects: list[Effect], program: Program) -> Effect:
+    for effect in effects:
         reason = effect.lacks(program)
         if reason is None:
             return effect
-    raise UsageError(f"effect {name} does not apply to {type(program).__name__}: {reason}")
+    raise UsageError(f"effect {effect.name} does not apply to {type(program).__name__}: {reason}")
 
 
 def parsed(text: str) -> tuple[str, str, dict[str, float], tuple[float, ...] | None]:
@@ -113,9 +119,7 @@ def chosen_variant(program: Program, effect: str | Effect, at: str = "", **optio
             raise UsageError(f"the coefficient of {effect} is given apart from its name")
         at, options = at or said, {**more, **options}
         effect = find(effect, program)
-    reason = effect.lacks(program)
-    if reason:
-        raise UsageError(f"effect {effect.name} does not apply to {type(program).__name__}: {reason}")
+    _applicable([effect], program)
     unknown = set(options) - set(effect.profiled)
     if unknown:
         has = f"it has {', '.join(effect.profiled)}" if effect.profiled else "it has none"
@@ -147,14 +151,6 @@ def _numbers(text: str, numbers: str, most: int | None = None) -> tuple[float, .
     return found
 
 
-HEAD = """# Effects
-
-What `steady effects` prints. `steady simulate MODEL --effect NAME[:AT][:OPTION=NUMBER][=NUMBER[,NUMBER]]` adds one to \
-a simulation, `steady add` writes it into a program, `program.with_effect(NAME, VALUE)` does so in Python. `c` is the \
-coefficient; without a value it is the typical one.
-"""
-
-
 def page(program: Program | None = None) -> str:
     """All effects, or those that a program could have and why it could not have the others, in Markdown."""
     lines = [HEAD]
@@ -165,23 +161,14 @@ def page(program: Program | None = None) -> str:
             lines += [f"## {verdict.capitalize()}", "", f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
         for effect in chosen:
             typical = effect.typical if isinstance(effect.typical, tuple) else (effect.typical,)
-            cells = (
-                f"`{effect.name}`",
-                *([", ".join(_places(effect, program))] if program else []),
-                effect.text.replace("|", r"\|"),
-                effect.unit,
-                ", ".join(f"{value:.3g}" for value in typical),
-                ", ".join(effect.profiled),
-                effect.feels,
-            )
+            numbers = ", ".join(f"{value:.3g}" for value in typical)
+            cells = [effect.text.replace("|", r"\|"), effect.unit, numbers, ", ".join(effect.profiled), effect.feels]
+            if program:  # where it can act, the first where nothing is said
+                cells.insert(0, ", ".join(dict.fromkeys(one.at for one in effect.variants(program) if one.at)))
+            cells.insert(0, f"`{effect.name}`")
             lines.append(f"| {' | '.join(cells)} |".replace("|  |", "| |"))
         lines += [""] * bool(chosen)
     if program is not None:
         lines += [f"## Not for {type(program).__name__}", ""]
         lines += [f"- `{name}`: {reason}" for name, reason in not_applicable(program).items()]
     return "\n".join(lines).rstrip() + "\n"
-
-
-def _places(effect: Effect, program: Program) -> list[str]:
-    """Where it can act, the first where nothing is said."""
-    return list(dict.fromkeys(variant.at for variant in effect.variants(program) if variant.at))

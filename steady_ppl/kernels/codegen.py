@@ -174,7 +174,7 @@ class _Writer:
                 vector, k = arguments
                 if vector not in self.stored:
                     self._vector(vector)
-                value = Lanes(builder, builder.load(builder.gep(self.stored[vector], [LONG(k)])))
+                value = self._load(self.stored[vector], LONG(k))
             case _:
                 value = self._operate(operation, [self.scalar(n) for n in arguments])
         self.values[number] = value
@@ -193,18 +193,15 @@ class _Writer:
         if product.bias is None:
             return Lanes(self.builder, FLOAT(0))
         if run is not None:
-            return self._load(self.parameters, self.builder.add(LONG(run), LONG(k) if isinstance(k, int) else k))
+            return self._load(self.parameters, self.builder.add(LONG(run), _long(k)))
         if not isinstance(k, int):
             raise NotCompilable("a long product whose bias is no parameter")
         return self.scalar(product.bias[k])
 
     def _weight(self, product: Product, row: Any, column: Any) -> Lanes:
         builder = self.builder
-        places = [LONG(product.at)]
-        for index, stride in ((row, product.rows), (column, product.columns)):
-            index = LONG(index) if isinstance(index, int) else index
-            places.append(builder.mul(index, LONG(stride)))
-        return self._load(self.parameters, builder.add(builder.add(places[0], places[1]), places[2]))
+        down, across = builder.mul(_long(row), LONG(product.rows)), builder.mul(_long(column), LONG(product.columns))
+        return self._load(self.parameters, builder.add(builder.add(LONG(product.at), down), across))
 
     def _base(self, vector: int) -> None:
         """Bias and whatever else of a product does not differ between particles, once a trajectory."""
@@ -254,7 +251,7 @@ class _Writer:
                 so_far = Lanes(builder, builder.load(total))
                 builder.store((so_far + self._weight(product, row, k) * value).value, total)
         for row, total in zip(rows, sums, strict=True):
-            where = builder.gep(place, [LONG(row) if isinstance(row, int) else row])
+            where = builder.gep(place, [_long(row)])
             builder.store(builder.load(total), where)
 
     def _chain(self, vector: int) -> set[int]:
@@ -289,9 +286,9 @@ class _Writer:
         graph, builder = self.graph, self.builder
         what = graph.vectors[vector]
         if vector in self.stored:
-            value = Lanes(builder, builder.load(builder.gep(self.stored[vector], [k])))
+            value = self._load(self.stored[vector], k)
         elif isinstance(what, Product):
-            value = Lanes(builder, builder.load(builder.gep(self.bases[vector], [k])))
+            value = self._load(self.bases[vector], k)
             for i, n in enumerate(what.x):
                 if graph.levels[n] == PARTICLE:
                     value = value + self._weight(what, k, i) * self.scalar(n)
@@ -307,3 +304,7 @@ class _Writer:
             value = self._operate(what.operation, operands)
         done[vector] = value
         return value
+
+
+def _long(index: Any) -> Any:
+    return LONG(index) if isinstance(index, int) else index

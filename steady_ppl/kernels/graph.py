@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import torch
@@ -22,6 +23,9 @@ PARAMETERS, TRAJECTORY, PARTICLE = range(3)  # what a value depends on
 LEAVES = ("input", "parameter", "constant", "element")
 UNROLLED = 48  # the largest matrix whose product is written out element by element
 TOO_LONG = 3000  # scalar operations; compiling more takes longer than a fit
+FLAT = {"round", "floor", "ceil", "sign", "gt", "ge", "lt", "le", "eq", "ne"}  # their derivatives are zero
+FLAT |= {"logical_and", "logical_or", "logical_not"}
+Values = list[int]  # a scalar, or the elements of a vector
 
 
 class NotCompilable(SteadyError):
@@ -153,11 +157,7 @@ class ScalarGraph:
 
     def total(self, terms: Sequence[int]) -> int:
         """The sum of scalars, those that fewer things depend on first."""
-        ordered = sorted(terms, key=lambda term: self.levels[term])
-        total = ordered[0]
-        for term in ordered[1:]:
-            total = self.scalar("add", total, term)
-        return total
+        return reduce(partial(self.scalar, "add"), sorted(terms, key=lambda term: self.levels[term]))
 
     def product(self, matrix: Tensor, x: Sequence[int], bias: Sequence[int] | None) -> list[int]:
         """A matrix `(O, I)` of scalars' numbers times the vector x, plus a bias."""
@@ -208,22 +208,8 @@ class ScalarGraph:
         return x + [("scalar", n) for n in vector.bias or () if run is None]
 
 
-FLAT = (
-    *("round", "floor", "ceil", "sign", "gt", "ge", "lt", "le", "eq", "ne"),
-    *("logical_and", "logical_or", "logical_not"),
-)
-
-
-Values = list[int]  # a scalar, or the elements of a vector
-
-
 class Tangents:
-    """Derivatives along one input.
-
-    Args:
-        graph: is added to.
-        along: the input's number.
-    """
+    """Derivatives along one input, given by its number; they are added to the graph."""
 
     def __init__(self, graph: ScalarGraph, along: int) -> None:
         self.graph, self.along = graph, along
@@ -250,9 +236,8 @@ class Tangents:
     def _of_vector(self, vector: int) -> Values | None:
         if vector not in self.of_vectors:
             what = self.graph.vectors[vector]
-            self.of_vectors[vector] = (
-                self._of_product(what) if isinstance(what, Product) else self._of_each(vector, what)
-            )
+            found = self._of_product(what) if isinstance(what, Product) else self._of_each(vector, what)
+            self.of_vectors[vector] = found
         return self.of_vectors[vector]
 
     def _of_product(self, product: Product) -> Values | None:
@@ -301,10 +286,7 @@ class Tangents:
             for partial, tangent in zip(partials, tangents, strict=True)
             if tangent is not None
         ]
-        total = terms[0]
-        for term in terms[1:]:
-            total = self.do("add", total, term)
-        return total
+        return reduce(partial(self.do, "add"), terms)
 
     def _times(self, partial: Values, tangent: Values) -> Values:
         one = self.graph.constant(1.0)
@@ -320,9 +302,6 @@ class Tangents:
         length = max(len(operand) for operand in operands if isinstance(operand, list))
         lists = [o if isinstance(o, list) else [self.graph.constant(o)] * length for o in operands]
         return self.graph.each(operation, *lists)
-
-
-Partial = Callable[..., tuple[Values | None, ...]]
 
 
 def _over(d: Tangents, value: Values, x: Values) -> Values:
@@ -344,7 +323,7 @@ def _leg(d: Tangents, x: Values) -> Values:
 
 
 # what an operation's result changes by with each operand; None is one
-PARTIALS: dict[str, Partial] = {
+PARTIALS: dict[str, Callable[..., tuple[Values | None, ...]]] = {
     "add": lambda d, value, x, y: (None, None),
     "sub": lambda d, value, x, y: (None, d.constants(-1.0, value)),
     "mul": lambda d, value, x, y: (y, x),

@@ -7,7 +7,6 @@ import itertools
 from collections import ChainMap
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from operator import attrgetter
 from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
@@ -21,6 +20,15 @@ from steady_ppl.kernels.codegen import LANES, NAME, source
 from steady_ppl.kernels.graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph, jacobian
 from steady_ppl.kernels.lowering import Translation, evaluate
 from steady_ppl.utils.text import one_line
+
+TRACES = 8  # of one method of one program; each takes some tenths of a second
+ROWS_WORTH_COMPILING = 1000  # of all trajectories together
+KEEPS_CHANGING = "its settings or tensors change from run to run"
+DIFFERENT = "its kernel and its own lines come to different numbers"
+Compiled = TypeVar("Compiled")
+Array = np.ndarray
+Examples = dict[str, Tensor]  # of the arguments of a function
+_COMPILED: WeakKeyDictionary[nn.Module, dict[Any, Any]] = WeakKeyDictionary()
 
 
 class Kernel:
@@ -38,12 +46,7 @@ class Kernel:
         self._call = ctypes.CFUNCTYPE(None, *arguments)(self._engine.get_function_address(NAME))
 
     def __call__(
-        self,
-        parameters: np.ndarray,
-        uniform: np.ndarray,
-        inputs: Sequence[np.ndarray],
-        ancestors: np.ndarray | None,
-        out: np.ndarray,
+        self, parameters: Array, uniform: Array, inputs: Sequence[Array], ancestors: Array | None, out: Array
     ) -> None:
         """Compute `out`.
 
@@ -81,21 +84,6 @@ def _machine_code(text: str) -> Any:
     return engine
 
 
-TRACES = 8  # of one method of one program; each takes some tenths of a second
-
-
-KEEPS_CHANGING = "its settings or tensors change from run to run"
-
-
-DIFFERENT = "its kernel and its own lines come to different numbers"
-
-
-Compiled = TypeVar("Compiled")
-
-
-_COMPILED: WeakKeyDictionary[nn.Module, dict[Any, Any]] = WeakKeyDictionary()
-
-
 class _ReadsNumbers(TorchDispatchMode):
     """Refuses to trace what a number read from a tensor decides: it would be the same for ever."""
 
@@ -122,12 +110,7 @@ class Method:
     """
 
     def __init__(
-        self,
-        function: Callable[..., Any],
-        particle: dict[str, Tensor],
-        trajectory: dict[str, Tensor],
-        *,
-        along: Sequence[str] = (),
+        self, function: Callable[..., Any], particle: Examples, trajectory: Examples, *, along: Sequence[str] = ()
     ) -> None:
         try:
             with torch.no_grad():
@@ -138,11 +121,7 @@ class Method:
             raise NotCompilable(f"it cannot be compiled: {one_line(error)}") from error
 
     def _compile(
-        self,
-        function: Callable[..., Any],
-        particle: dict[str, Tensor],
-        trajectory: dict[str, Tensor],
-        along: Sequence[str],
+        self, function: Callable[..., Any], particle: Examples, trajectory: Examples, along: Sequence[str]
     ) -> None:
         from torch.fx.experimental.proxy_tensor import make_fx  # takes a second to import
 
@@ -159,28 +138,23 @@ class Method:
         columns, at = {}, 0
         for name, example in trajectory.items():
             columns[name], at = at, at + example.numel()
-        self.kernel = _kernel(self.graph, tuple(particle), columns)
+        text = source(self.graph, tuple(particle), columns)
+        self.kernel = _compiled(text, len(particle), len(self.graph.outputs))
 
-    def parameters(self) -> np.ndarray:
+    def parameters(self) -> Array:
         """What the kernel takes of the parameters, as they are now."""
         known: dict[fx.Node, Any] = {}
         with torch.no_grad():
             for node in self.by_parameters:
-                known[node] = (
-                    attrgetter(str(node.target))(self.traced) if node.op == "get_attr" else evaluate(node, known)
-                )
+                known[node] = evaluate(node, known)
             parts = [known[node].detach().to(torch.float32).flatten() for node in self.graph.parameters]
             return torch.cat([*parts, torch.zeros(1)]).numpy()
 
 
 @lru_cache(maxsize=64)
 def _compiled(text: str, inputs: int, outputs: int) -> Kernel:
+    """The kernel of a source, which programs share that differ in their parameters only."""
     return Kernel(text, inputs, outputs)
-
-
-def _kernel(graph: ScalarGraph, inputs: Sequence[str], columns: dict[str, int]) -> Kernel:
-    """The kernel of a graph; programs that differ in their parameters only share one."""
-    return _compiled(source(graph, inputs, columns), len(inputs), len(graph.outputs))
 
 
 def compiled(program: nn.Module, name: str, build: Callable[[], Compiled]) -> Compiled | str:
@@ -198,7 +172,7 @@ def compiled(program: nn.Module, name: str, build: Callable[[], Compiled]) -> Co
     return known[key]
 
 
-def distrust(program: nn.Module, name: str) -> str:
+def discard(program: nn.Module, name: str) -> str:
     """Give up what was compiled under a name."""
     _COMPILED[program][name, signature(program)] = DIFFERENT
     return DIFFERENT
@@ -231,16 +205,10 @@ def close(mine: Tensor, theirs: Tensor) -> bool:
     return float((same | (mine.isnan() & theirs.isnan())).float().mean()) > 0.98
 
 
-ROWS_WORTH_COMPILING = 1000  # of all trajectories together
-
-
-Function = Callable[..., Tensor]
-
-
 def on_all_rows(
     program: nn.Module,
     name: str,
-    function: Function,
+    function: Callable[..., Tensor],
     arguments: dict[str, Tensor],
     along: Sequence[str] = (),
     kernels: bool | None = None,
@@ -276,7 +244,7 @@ def on_all_rows(
     values, rest = found[..., : method.values], found[..., method.values :]
     plain = function(*(_a_few(value) for value in arguments.values()))
     if not close(_a_few(values), plain):
-        return distrust(program, name)
+        return discard(program, name)
     widths = [arguments[at].shape[-1] for at in along]
     return values, list(rest.unflatten(-1, (method.values, sum(widths))).split(widths, -1)) if along else []
 

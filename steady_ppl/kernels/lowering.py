@@ -56,13 +56,9 @@ class Translation:
         inputs = iter(self.graph.levels_of_inputs)
         for node in self.traced.graph.nodes:
             if node.op == "placeholder":
-                size = node.meta["val"].shape
-                name = next(inputs)
-                count = torch.Size(size).numel()
-                elements = [self.graph.scalar("input", name, k) for k in range(count)]
-                self.numbers[node] = torch.tensor(elements, dtype=torch.int64).view(size)
-            elif node.op == "get_attr":
-                self.known[node] = operator.attrgetter(str(node.target))(self.traced)
+                shape, name = node.meta["val"].shape, next(inputs)
+                elements = [self.graph.scalar("input", name, k) for k in range(shape.numel())]
+                self.numbers[node] = torch.tensor(elements, dtype=torch.int64).view(shape)
             elif node.op == "output":
                 for value in fx.node.map_arg(node.args[0], self._number):
                     self.graph.outputs += value.flatten().tolist()
@@ -121,11 +117,8 @@ class Translation:
 
     def _each(self, operation: str, *operands: Any) -> Tensor:
         """An elementwise operation on operands that broadcast; numbers of Python are constants."""
-        tensors = [
-            operand if isinstance(operand, Tensor) else torch.tensor(self.graph.constant(operand))
-            for operand in operands
-        ]
-        tensors = list(torch.broadcast_tensors(*tensors))
+        numbers = (one if isinstance(one, Tensor) else torch.tensor(self.graph.constant(one)) for one in operands)
+        tensors = torch.broadcast_tensors(*numbers)
         elements = self.graph.each(operation, *(tensor.flatten().tolist() for tensor in tensors))
         return torch.tensor(elements, dtype=torch.int64).view(tensors[0].shape)
 
@@ -165,9 +158,7 @@ class Translation:
             return power if exponent > 0 else self._each("reciprocal", power)
         if float(exponent).is_integer() and exponent:
             raise NotCompilable(f"a power of {exponent}")
-        named = (
-            {0.5: "sqrt", -0.5: "rsqrt", -1: "reciprocal"}.get(exponent) if isinstance(exponent, int | float) else None
-        )
+        named = {0.5: "sqrt", -0.5: "rsqrt"}.get(exponent)
         return self._each(named, base) if named else self._each("pow", base, exponent)
 
     def _softplus(self, value: Tensor, beta: float = 1, threshold: float = 20) -> Tensor:
@@ -242,7 +233,9 @@ class Translation:
 
 
 def evaluate(node: fx.Node, known: dict[fx.Node, Any]) -> Any:
-    """What torch makes of a node whose arguments are known."""
+    """What torch makes of a node whose arguments are known, or a tensor of the function's own."""
+    if node.op == "get_attr":
+        return operator.attrgetter(str(node.target))(node.graph.owning_module)
     arguments, keywords = fx.node.map_arg((node.args, dict(node.kwargs)), known.__getitem__)
     target: Callable[..., Any] = node.target  # type: ignore[assignment]
     return target(*arguments, **keywords)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
+from functools import partialmethod
 from typing import Any
 
 from llvmlite import ir
@@ -24,50 +24,55 @@ class Lanes:
     def type(self) -> Any:
         return self.value.type
 
+    @property
+    def lanes(self) -> int:
+        """How many; none of one number."""
+        return self.type.count if isinstance(self.type, ir.VectorType) else 0
+
+    @property
+    def element(self) -> Any:
+        """The type of one number."""
+        return self.type.element if self.lanes else self.type
+
+    def shaped(self, kind: Any) -> Any:
+        """The type of as many numbers of another kind."""
+        return ir.VectorType(kind, self.lanes) if self.lanes else kind
+
     def like(self, number: float | int, kind: Any = FLOAT) -> Lanes:
         """A constant of this value's shape."""
-        if isinstance(self.type, ir.VectorType):
-            kind = ir.VectorType(kind, self.type.count)
-            return Lanes(self.builder, ir.Constant(kind, [number] * kind.count))
-        return Lanes(self.builder, ir.Constant(kind, number))
-
-    def _pair(self, other: Any) -> tuple[Lanes, Lanes]:
-        if not isinstance(other, Lanes):
-            kind = self.type.element if isinstance(self.type, ir.VectorType) else self.type
-            return self, self.like(other, kind)
-        if isinstance(self.type, ir.VectorType) and not isinstance(other.type, ir.VectorType):
-            return self, other.spread(self.type.count)
-        if isinstance(other.type, ir.VectorType) and not isinstance(self.type, ir.VectorType):
-            return self.spread(other.type.count), other
-        return self, other
+        return Lanes(self.builder, ir.Constant(self.shaped(kind), [number] * self.lanes if self.lanes else number))
 
     def spread(self, lanes: int) -> Lanes:
         """One number in every lane."""
-        if isinstance(self.type, ir.VectorType):
+        if self.lanes or not lanes:
             return self
         kind = ir.VectorType(self.type, lanes)
         first = self.builder.insert_element(ir.Constant(kind, ir.Undefined), self.value, ir.Constant(INTEGER, 0))
         mask = ir.Constant(ir.VectorType(INTEGER, lanes), [0] * lanes)
         return Lanes(self.builder, self.builder.shuffle_vector(first, ir.Constant(kind, ir.Undefined), mask))
 
+    def pair(self, other: Any) -> tuple[Lanes, Lanes]:
+        """This value and another one or a number, both in as many lanes."""
+        other = other if isinstance(other, Lanes) else self.like(other, self.element)
+        lanes = max(self.lanes, other.lanes)
+        return self.spread(lanes), other.spread(lanes)
+
     def _do(self, name: str, other: Any) -> Lanes:
-        left, right = number(self)._pair(number(other) if isinstance(other, Lanes) else other)
+        left, right = number(self).pair(number(other) if isinstance(other, Lanes) else other)
         return Lanes(self.builder, getattr(self.builder, name)(left.value, right.value, flags=FLAGS))
 
-    def __add__(self, other: Any) -> Lanes:
-        return self._do("fadd", other)
+    def compare(self, how: str, other: Any) -> Lanes:
+        """A truth value; false where either is not a number, except for "!="."""
+        left, right = number(self).pair(number(other) if isinstance(other, Lanes) else other)
+        make = self.builder.fcmp_unordered if how == "!=" else self.builder.fcmp_ordered
+        return Lanes(self.builder, make(how, left.value, right.value))
 
-    def __sub__(self, other: Any) -> Lanes:
-        return self._do("fsub", other)
+    __add__, __sub__ = partialmethod(_do, "fadd"), partialmethod(_do, "fsub")
+    __mul__, __truediv__ = partialmethod(_do, "fmul"), partialmethod(_do, "fdiv")
+    __lt__, __gt__, __ge__ = partialmethod(compare, "<"), partialmethod(compare, ">"), partialmethod(compare, ">=")
 
     def __rsub__(self, other: Any) -> Lanes:
         return self.like(other) - self
-
-    def __mul__(self, other: Any) -> Lanes:
-        return self._do("fmul", other)
-
-    def __truediv__(self, other: Any) -> Lanes:
-        return self._do("fdiv", other)
 
     def __rtruediv__(self, other: Any) -> Lanes:
         return self.like(other) / self
@@ -75,60 +80,29 @@ class Lanes:
     def __neg__(self) -> Lanes:
         return Lanes(self.builder, self.builder.fneg(self.value))
 
-    def compare(self, how: str, other: Any) -> Lanes:
-        """A truth value; false where either is not a number, except for "!="."""
-        left, right = number(self)._pair(number(other) if isinstance(other, Lanes) else other)
-        unordered = how == "!="
-        make = self.builder.fcmp_unordered if unordered else self.builder.fcmp_ordered
-        return Lanes(self.builder, make(how, left.value, right.value))
-
-    def __lt__(self, other: Any) -> Lanes:
-        return self.compare("<", other)
-
-    def __gt__(self, other: Any) -> Lanes:
-        return self.compare(">", other)
-
-    def __ge__(self, other: Any) -> Lanes:
-        return self.compare(">=", other)
-
     def where(self, yes: Any, no: Any) -> Lanes:
         """`yes` where this truth value holds, else `no`."""
-        if not isinstance(yes, Lanes):
-            yes = no.like(yes)
-        yes, no = yes._pair(no)
-        condition, yes = self._pair(yes) if isinstance(yes.type, ir.VectorType) else (self, yes)
-        if isinstance(condition.type, ir.VectorType):
-            yes, no = yes.spread(condition.type.count), no.spread(condition.type.count)
+        yes, no = (yes if isinstance(yes, Lanes) else no.like(yes)).pair(no)
+        lanes = max(self.lanes, yes.lanes)
+        condition, yes, no = (value.spread(lanes) for value in (self, yes, no))
         return Lanes(self.builder, self.builder.select(condition.value, yes.value, no.value))
 
     def logical(self, name: str, other: Lanes) -> Lanes:
-        left, right = self._pair(other)
+        left, right = self.pair(other)
         return Lanes(self.builder, getattr(self.builder, name)(left.value, right.value))
 
     def call(self, name: str) -> Lanes:
         """A function of the processor, such as `sqrt`, `floor`, `fabs` or `rint`."""
-        kind = f"v{self.type.count}f32" if isinstance(self.type, ir.VectorType) else "f32"
-        name, module = f"llvm.{name}.{kind}", self.builder.module
+        name, module = f"llvm.{name}.{f'v{self.lanes}f32' if self.lanes else 'f32'}", self.builder.module
         declared = module.globals.get(name) or ir.Function(module, ir.FunctionType(self.type, [self.type]), name)
         return Lanes(self.builder, self.builder.call(declared, [self.value]))
 
-    def integer(self) -> Lanes:
-        return Lanes(self.builder, self.builder.fptosi(self.value, _shaped(self, INTEGER)))
-
-    def bits(self) -> Lanes:
-        return Lanes(self.builder, self.builder.bitcast(self.value, _shaped(self, INTEGER)))
-
-    def of_bits(self) -> Lanes:
-        return Lanes(self.builder, self.builder.bitcast(self.value, _shaped(self, FLOAT)))
-
-    def to_float(self) -> Lanes:
-        return Lanes(self.builder, self.builder.sitofp(self.value, _shaped(self, FLOAT)))
+    def converted(self, how: str, kind: Any) -> Lanes:
+        """Numbers of another kind: `fptosi` and `sitofp` round, `bitcast` keeps the bits."""
+        return Lanes(self.builder, getattr(self.builder, how)(self.value, self.shaped(kind)))
 
     def on_integers(self, name: str, number: int) -> Lanes:
         return Lanes(self.builder, getattr(self.builder, name)(self.value, self.like(number, INTEGER).value))
-
-    def added(self, other: Lanes) -> Lanes:
-        return Lanes(self.builder, self.builder.add(self.value, other.value))
 
     def has_bit(self, bit: int) -> Lanes:
         """Whether an integer has a bit."""
@@ -136,22 +110,14 @@ class Lanes:
         return Lanes(self.builder, self.builder.icmp_signed("!=", masked.value, zero.value))
 
 
-def _shaped(like: Lanes, kind: Any) -> Any:
-    return ir.VectorType(kind, like.type.count) if isinstance(like.type, ir.VectorType) else kind
-
-
 def truth(x: Lanes) -> Lanes:
     """Whether a number is not zero."""
-    kind = x.type.element if isinstance(x.type, ir.VectorType) else x.type
-    return x if kind == ir.IntType(1) else x.compare("!=", 0.0)
+    return x if x.element == ir.IntType(1) else x.compare("!=", 0.0)
 
 
 def number(x: Lanes) -> Lanes:
     """A truth value as 1 or 0."""
-    kind = x.type.element if isinstance(x.type, ir.VectorType) else x.type
-    if kind == FLOAT:
-        return x
-    return Lanes(x.builder, x.builder.uitofp(x.value, _shaped(x, FLOAT)))
+    return x if x.element == FLOAT else x.converted("uitofp", FLOAT)
 
 
 def polynomial(x: Lanes, *coefficients: float) -> Lanes:
@@ -173,17 +139,9 @@ def _turned(x: Lanes, quarters: int) -> Lanes:
     s = r * r
     sine = polynomial(s, -1.9515295891e-4, 8.3321608736e-3, -1.6666654611e-1) * s * r + r
     cosine = polynomial(s, 2.443315711809948e-5, -1.388731625493765e-3, 4.166664568298827e-2) * s * s - s * 0.5 + 1.0
-    turn = n.integer().on_integers("add", quarters)
+    turn = n.converted("fptosi", INTEGER).on_integers("add", quarters)
     value = turn.has_bit(1).where(cosine, sine)
     return turn.has_bit(2).where(-value, value)
-
-
-def sin(x: Lanes) -> Lanes:
-    return _turned(x, 0)
-
-
-def cos(x: Lanes) -> Lanes:
-    return _turned(x, 1)
 
 
 def exp(x: Lanes) -> Lanes:
@@ -195,17 +153,18 @@ def exp(x: Lanes) -> Lanes:
         r, 1.9875691500e-4, 1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1
     )
     value = p * r * r + r + 1.0
-    half = n.integer().on_integers("ashr", 1)  # 2ⁿ in two factors: 2¹²⁸ alone is no float
-    rest = Lanes(x.builder, x.builder.sub(n.integer().value, half.value))
+    half = n.converted("fptosi", INTEGER).on_integers("ashr", 1)  # 2ⁿ in two factors: 2¹²⁸ alone is no float
+    rest = Lanes(x.builder, x.builder.sub(n.converted("fptosi", INTEGER).value, half.value))
     for exponent in (half, rest):
-        value = value * exponent.on_integers("add", 127).on_integers("shl", 23).of_bits()
+        value = value * exponent.on_integers("add", 127).on_integers("shl", 23).converted("bitcast", FLOAT)
     return low.where(0.0, high.where(math.inf, value))
 
 
 def log(x: Lanes) -> Lanes:
-    bits = x.bits()
-    mantissa = bits.on_integers("and_", 0x007FFFFF).on_integers("or_", 0x3F000000).of_bits()  # in [0.5, 1)
-    exponent = bits.on_integers("ashr", 23).on_integers("sub", 126).to_float()
+    bits = x.converted("bitcast", INTEGER)
+    mantissa = bits.on_integers("and_", 0x007FFFFF).on_integers("or_", 0x3F000000)
+    mantissa = mantissa.converted("bitcast", FLOAT)  # in [0.5, 1)
+    exponent = bits.on_integers("ashr", 23).on_integers("sub", 126).converted("sitofp", FLOAT)
     small = mantissa < math.sqrt(0.5)
     exponent = small.where(exponent - 1.0, exponent)
     m = small.where(mantissa + mantissa, mantissa) - 1.0
@@ -228,10 +187,6 @@ def log1p(x: Lanes) -> Lanes:
     return finite.where(logarithm + (x - (u - 1.0)) / u, logarithm)
 
 
-def softplus(x: Lanes) -> Lanes:
-    return maximum(x, x.like(0.0)) + log1p(exp(-absolute(x)))
-
-
 def sigmoid(x: Lanes) -> Lanes:
     e = exp(-absolute(x))
     share = 1.0 / (e + 1.0)
@@ -246,7 +201,7 @@ def tanh(x: Lanes) -> Lanes:
 
 
 def atan2(y: Lanes, x: Lanes) -> Lanes:
-    y, x = y._pair(x)
+    y, x = y.pair(x)
     a, b = absolute(y), absolute(x)
     steep = a > b
     larger, smaller = steep.where(a, b), steep.where(b, a)
@@ -274,20 +229,11 @@ def expm1(x: Lanes) -> Lanes:
     return (absolute(x) < 0.5).where(half * 2.0 / (1.0 - half), exp(x) - 1.0)
 
 
-def power(x: Lanes, y: Lanes) -> Lanes:
-    """xʸ of x ≥ 0; of negative x not a number."""
-    return y.compare("==", 0.0).where(1.0, exp(log(x) * y))
-
-
 def remainder(x: Lanes, y: Lanes) -> Lanes:
     """x less the multiple of y below it; in [0, y) for positive y."""
     rest = x - (x / y).call("floor") * y
     rest = (rest < 0.0).logical("and_", y > y.like(0.0)).where(rest + y, rest)
     return (absolute(rest) < absolute(y)).where(rest, rest - y)
-
-
-def _compare(how: str, x: Lanes, y: Lanes) -> Lanes:
-    return x.compare(how, y)
 
 
 def _other_leg(x: Lanes) -> Lanes:
@@ -296,13 +242,16 @@ def _other_leg(x: Lanes) -> Lanes:
 
 OPERATIONS: dict[str, Any] = {
     "number": number,
-    "pow": power,
-    "tan": lambda x: sin(x) / cos(x),
+    "pow": lambda x, y: y.compare("==", 0.0).where(1.0, exp(log(x) * y)),  # of negative x not a number
+    "sin": lambda x: _turned(x, 0),
+    "cos": lambda x: _turned(x, 1),
+    "tan": lambda x: _turned(x, 0) / _turned(x, 1),
     "atan": lambda x: atan2(x, x.like(1.0)),
     "asin": lambda x: atan2(x, _other_leg(x)),
     "acos": lambda x: atan2(_other_leg(x), x),
     "hypot": lambda x, y: (x * x + y * y).call("sqrt"),
     "remainder": remainder,
+    "softplus": lambda x: maximum(x, x.like(0.0)) + log1p(exp(-absolute(x))),
     "silu": lambda x: x * sigmoid(x),
     "add": lambda x, y: x + y,
     "sub": lambda x, y: x - y,
@@ -323,9 +272,11 @@ OPERATIONS: dict[str, Any] = {
     "logical_and": lambda x, y: truth(x).logical("and_", truth(y)),
     "logical_or": lambda x, y: truth(x).logical("or_", truth(y)),
     "logical_not": lambda x: Lanes(x.builder, x.builder.not_(truth(x).value)),
-    **{
-        name: partial(_compare, how)
-        for name, how in {"gt": ">", "ge": ">=", "lt": "<", "le": "<=", "eq": "==", "ne": "!="}.items()
-    },
-    **{f.__name__: f for f in (sin, cos, exp, log, log1p, softplus, sigmoid, tanh, expm1, atan2, maximum, minimum)},
+    "lt": lambda x, y: x < y,
+    "le": lambda x, y: x.compare("<=", y),
+    "gt": lambda x, y: x > y,
+    "ge": lambda x, y: x >= y,
+    "eq": lambda x, y: x.compare("==", y),
+    "ne": lambda x, y: x.compare("!=", y),
+    **{f.__name__: f for f in (exp, log, log1p, sigmoid, tanh, expm1, atan2, maximum, minimum)},
 }

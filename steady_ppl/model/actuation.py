@@ -14,10 +14,10 @@ def lagged(control: Tensor, time: Tensor, constant: Tensor) -> Tensor:
         time: `(rows, trajectories)` s.
         constant: the time constant, s; none if it is not positive.
     """
-    constant = torch.as_tensor(constant, dtype=control.dtype, device=control.device).clamp(min=0.0)
-    steps = torch.cat([time[1:] - time[:-1], time[-1:] - time[-2:-1]]).unsqueeze(-1) if len(time) > 1 else None
-    if steps is None:
+    if len(time) < 2:
         return control
+    constant = torch.as_tensor(constant, dtype=control.dtype, device=control.device).clamp(min=0.0)
+    steps = row_spans(time).unsqueeze(-1)
     stays = (-steps / constant.clamp(min=1e-6)).exp()
     share = constant / steps * (1 - stays)
     at, means = control[0], []
@@ -38,8 +38,7 @@ def delayed(control: Tensor, time: Tensor, delay: Tensor) -> Tensor:
     if len(time) < 2:
         return control
     delay = torch.as_tensor(delay, dtype=control.dtype, device=control.device).clamp(min=0.0)
-    end = time[-1:] + (time[-1:] - time[-2:-1])
-    edges = torch.cat([time, end])
+    edges = torch.cat([time, time[-1:] + row_spans(time)[-1:]])
     held = (edges[1:] - edges[:-1]).unsqueeze(-1) * control
     total = torch.cat([torch.zeros_like(held[:1]), held.cumsum(0)])  # the control's integral from the first row
 
@@ -50,3 +49,8 @@ def delayed(control: Tensor, time: Tensor, delay: Tensor) -> Tensor:
     since = (ago - edges.gather(0, row)).unsqueeze(-1)  # negative before the first row, whose control was held
     integral = total.gather(0, wide) + since * control.gather(0, wide)
     return (integral[1:] - integral[:-1]) / (edges[1:] - edges[:-1]).unsqueeze(-1)
+
+
+def row_spans(time: Tensor) -> Tensor:
+    """Seconds from each row to the next, of the last row as of the one before it; shaped as the `time` of rows."""
+    return torch.cat([time[1:] - time[:-1], time[-1:] - time[-2:-1]])

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import reduce
 from typing import Any, Self, cast
 
 import pyro
@@ -129,11 +131,7 @@ def running(*left: int) -> Iterator[None]:
 
 
 class KnownStart(Messenger):
-    """Replace the prior of `initial` by certainty about the first state.
-
-    Args:
-        state: `(B, D)`.
-    """
+    """Replace the prior of `initial` by certainty about the first state, `(B, D)`."""
 
     def __init__(self, state: Tensor) -> None:
         super().__init__()
@@ -152,24 +150,15 @@ class KnownStart(Messenger):
 
 
 class Replaying(Messenger):
-    """Give latent sites the values that are already known.
+    """Give latent sites the values that are already known, site name → value."""
 
-    Args:
-        values: site name → value.
-        known: score the value as a certainty (log-density 0), as a known start is.
-    """
-
-    def __init__(self, values: Mapping[str, Tensor], *, known: bool = False) -> None:
+    def __init__(self, values: Mapping[str, Tensor]) -> None:
         super().__init__()
-        self.values, self.known = values, known
+        self.values = values
 
     def _pyro_sample(self, message: Any) -> None:
-        name = message["name"]
-        if name not in self.values:
-            return
-        message["value"] = self.values[name]
-        if self.known:
-            message["fn"] = dist.Delta(message["value"], event_dim=message["fn"].event_dim)
+        if message["name"] in self.values:
+            message["value"] = self.values[message["name"]]
 
 
 class AtMean(Messenger):
@@ -183,10 +172,7 @@ class AtMean(Messenger):
 class Standardised(ByColumn):
     """Give latent sites `mean + sd · noise`: the program as a function of standard normal noise.
 
-    The sites take the columns of the noise in the order in which they are met.
-
-    Args:
-        noise: `(..., C)`.
+    The sites take the columns of the noise, `(..., C)`, in the order in which they are met.
     """
 
     def __init__(self, noise: Tensor) -> None:
@@ -198,7 +184,7 @@ class Standardised(ByColumn):
             return
         mean, sd = normal_moments(message["fn"], message["name"])
         noise = self.noise[..., self.take(message["fn"])]
-        message["value"] = mean + sd * (noise if message["fn"].event_dim else noise[..., 0])
+        message["value"] = mean + sd * as_event(noise, message["fn"].event_dim)
 
 
 class Recording(Messenger):
@@ -220,10 +206,7 @@ class Recording(Messenger):
 
     def total(self) -> Tensor:
         """The sum of the observed sites' log-densities, `(...)`."""
-        total = self.log_likelihood[0]
-        for other in self.log_likelihood[1:]:
-            total = total + other
-        return total
+        return reduce(operator.add, self.log_likelihood)
 
     def _pyro_post_sample(self, message: Any) -> None:
         name = message["name"]
@@ -296,6 +279,18 @@ def tangent_normal(fn: Any, residual: Tensor, site: str) -> tuple[Tensor, Tensor
 def as_vector(value: Tensor, event_dim: int) -> Tensor:
     """A site's value with its event as the last dimension, scalars as vectors of one."""
     return value.unsqueeze(-1) if event_dim == 0 else value
+
+
+def as_event(values: Tensor, event_dim: int) -> Tensor:
+    """Columns `(..., C)` as a site's value, the one of a scalar site without its dimension; undoes `as_vector`."""
+    return values if event_dim else values.squeeze(-1)
+
+
+def with_moments(fn: Any, loc: Tensor, scale: Tensor) -> Any:
+    """A distribution of the kind of another one, with another location and scale."""
+    base = unwrapped(fn)
+    freedom = (base.df,) if isinstance(base, dist.StudentT) else ()
+    return type(base)(*freedom, loc, scale).to_event(fn.event_dim)
 
 
 def broadcast_event(value: Tensor, left: torch.Size, event_dim: int) -> Tensor:

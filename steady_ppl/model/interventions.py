@@ -15,7 +15,16 @@ from pyro import poutine
 from torch import Tensor
 
 from steady_ppl.model.distributions import WrappedNormal, WrappedStudentT
-from steady_ppl.model.handlers import AtMean, ByColumn, Recording, as_vector, normal_moments, unwrapped
+from steady_ppl.model.handlers import (
+    AtMean,
+    ByColumn,
+    Recording,
+    as_event,
+    as_vector,
+    normal_moments,
+    unwrapped,
+    with_moments,
+)
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import row_ends
 
@@ -43,26 +52,22 @@ def pushed(program: Program, pushes: Mapping[str, Tensor]) -> Altering:
     Args:
         pushes: channel → what is added, `(...)`, in the channel's unit.
     """
-    order = program.channel_names
-
-    def change(fn: Any, columns: slice) -> Any:
-        mean, _ = normal_moments(fn, "channel")
-        return _moved(fn, lambda loc: loc + _columns(pushes, order[columns], 0.0, fn.event_dim, mean))
-
-    return Altering(change)
+    return _by_channel(program, pushes, 0.0, lambda fn, push: _moved(fn, lambda loc: loc + push))
 
 
 def widened(program: Program, factors: Mapping[str, Tensor]) -> Altering:
-    """Multiply the standard deviations of a program's channels while its `transition` runs.
+    """Multiply the spreads of a program's channels, channel → factor `(...)`, while its `transition` runs."""
+    return _by_channel(program, factors, 1.0, _rescaled)
 
-    Args:
-        factors: channel → factor, `(...)`.
-    """
-    order = program.channel_names
+
+def _by_channel(
+    program: Program, values: Mapping[str, Tensor], missing: float, alter: Callable[[Any, Tensor], Any]
+) -> Altering:
+    """Alter each channel's distribution by its own value."""
 
     def change(fn: Any, columns: slice) -> Any:
         mean, _ = normal_moments(fn, "channel")
-        return _rescaled(fn, _columns(factors, order[columns], 1.0, fn.event_dim, mean))
+        return alter(fn, as_event(_side_by_side(values, program.channel_names[columns], missing, mean), fn.event_dim))
 
     return Altering(change)
 
@@ -80,8 +85,7 @@ def misread(program: Program, change: Callable[[Tensor], Tensor]) -> Altering:
             reading = as_vector(reading, fn.event_dim)
             whole = reading.new_zeros((*reading.shape[:-1], len(program.measurements)))
             whole = torch.cat([whole[..., : columns.start], reading, whole[..., columns.stop :]], -1)
-            changed = change(whole)[..., columns]
-            return changed if fn.event_dim else changed.squeeze(-1)
+            return as_event(change(whole)[..., columns], fn.event_dim)
 
         return _moved(fn, moved)
 
@@ -90,12 +94,7 @@ def misread(program: Program, change: Callable[[Tensor], Tensor]) -> Altering:
 
 def blurred(factors: Tensor) -> Altering:
     """Multiply the measurements' standard deviations by factors `(..., K)` while a program's `observe` runs."""
-
-    def change(fn: Any, columns: slice) -> Any:
-        chosen = factors[..., columns]
-        return _rescaled(fn, chosen if fn.event_dim else chosen.squeeze(-1))
-
-    return Altering(change)
+    return Altering(lambda fn, columns: _rescaled(fn, as_event(factors[..., columns], fn.event_dim)))
 
 
 def heavy_tailed(share: Tensor) -> Altering:
@@ -110,24 +109,16 @@ def heavy_tailed(share: Tensor) -> Altering:
 
 
 class Coloured(Altering):
-    """Let a share of each channel's last deviation stay, and keep the new deviations, `(..., C)`.
-
-    Args:
-        shares: channel → share.
-        last: the channels' last deviations, `(..., C)`.
-    """
+    """Let a share (channel → share) of each channel's last deviation stay; both deviations are `(..., C)`."""
 
     def __init__(self, program: Program, shares: Mapping[str, Tensor], last: Tensor) -> None:
-        order = program.channel_names
-        share = torch.stack(torch.broadcast_tensors(*(shares.get(name, last.new_zeros(())) for name in order)), -1)
+        share = _side_by_side(shares, program.channel_names, 0.0, last)
         super().__init__(self._change)
         self.last, self.pushes, self.factors = last, share * last, (1 - share.square()).sqrt()
         self.deviations: list[Tensor] = []
 
     def _change(self, fn: Any, columns: slice) -> Any:
-        pushes, factors = self.pushes[..., columns], self.factors[..., columns]
-        if not fn.event_dim:
-            pushes, factors = pushes.squeeze(-1), factors.squeeze(-1)
+        pushes, factors = (as_event(values[..., columns], fn.event_dim) for values in (self.pushes, self.factors))
         return _moved(_rescaled(fn, factors), lambda loc: loc + pushes)
 
     def beside(self, state: Tensor) -> Tensor:
@@ -155,26 +146,20 @@ def channel_means(program: Program, transition: Callable[..., Tensor], *argument
 
 def by_channel(program: Program, values: Mapping[str, Tensor], missing: float, like: Tensor) -> Tensor:
     """Values by channel side by side, `(..., C)` as `like`."""
-    return _columns(values, program.channel_names, missing, 1, like).expand_as(like)
+    return _side_by_side(values, program.channel_names, missing, like).expand_as(like)
 
 
 def _moved(fn: Any, change: Callable[[Tensor], Tensor]) -> Any:
     base = unwrapped(fn)
-    if isinstance(base, dist.StudentT):
-        return type(base)(base.df, change(base.loc), base.scale).to_event(fn.event_dim)
-    return type(base)(change(base.loc), base.scale).to_event(fn.event_dim)
+    return with_moments(fn, change(base.loc), base.scale)
 
 
 def _rescaled(fn: Any, factor: Tensor) -> Any:
     base = unwrapped(fn)
-    if isinstance(base, dist.StudentT):
-        return type(base)(base.df, base.loc, base.scale * factor).to_event(fn.event_dim)
-    return type(base)(base.loc, base.scale * factor).to_event(fn.event_dim)
+    return with_moments(fn, base.loc, base.scale * factor)
 
 
-def _columns(
-    values: Mapping[str, Tensor], wanted: tuple[str, ...], missing: float, event_dim: int, like: Tensor
-) -> Any:
-    """The values of a site's channels, `(...)` or side by side `(..., C)`."""
-    found = [values.get(name, like.new_tensor(missing)) for name in wanted]
-    return torch.stack(torch.broadcast_tensors(*found), -1) if event_dim else found[0]
+def _side_by_side(values: Mapping[str, Tensor], channels: tuple[str, ...], missing: float, like: Tensor) -> Tensor:
+    """Channels' values as columns, `(..., C)`."""
+    found = [values.get(name, like.new_tensor(missing)) for name in channels]
+    return torch.stack(torch.broadcast_tensors(*found), -1)

@@ -6,6 +6,7 @@ import importlib.util
 import inspect
 import itertools
 import sys
+import traceback
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import CodeType, ModuleType
@@ -98,10 +99,9 @@ def _place(folder: Path, file: Path, error: BaseException) -> str:
     """The last line in one of the folder's files on the way to an error."""
     if isinstance(error, SyntaxError) and error.lineno is not None:
         return f"line {error.lineno} of {Path(error.filename or file).name}"
-    place, trace = file.name, error.__traceback__
-    while trace is not None:
-        passed = Path(trace.tb_frame.f_code.co_filename)
+    place = file.name
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        passed = Path(frame.f_code.co_filename)
         if passed.resolve().parent == folder:
-            place = f"line {trace.tb_lineno} of {passed.name}"
-        trace = trace.tb_next
+            place = f"line {line} of {passed.name}"
     return place

@@ -22,6 +22,8 @@ from steady_ppl.utils import late
 if TYPE_CHECKING:
     from steady_ppl.data.trajectories import Trajectories
 
+MIN_STEP, MAX_STEP = 1e-10, 1e9  # s between two rows; beyond these the time has another unit
+
 
 def _then_effects(init: Callable[..., None]) -> Callable[..., None]:
     """An `__init__` after which the program, once the outermost is done, has the effects that its class lists."""
@@ -40,6 +42,32 @@ def _then_effects(init: Callable[..., None]) -> Callable[..., None]:
 
     wrapped.attaches_effects = True  # type: ignore[attr-defined]
     return wrapped
+
+
+def names(declared: Sequence[str]) -> tuple[str, ...]:
+    """The names in a declaration such as `("left [N]", "right [N]")`."""
+    return _parsed(tuple(declared))[0]
+
+
+def units(declared: Sequence[str]) -> tuple[str, ...]:
+    """The units in a declaration, empty where none is given."""
+    return _parsed(tuple(declared))[1]
+
+
+@cache
+def _parsed(declared: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    parts = [component.partition("[") for component in declared]
+    return tuple(name.strip() for name, _, _ in parts), tuple(unit.rstrip("] ") for _, _, unit in parts)
+
+
+class _Components:
+    """The names or the units of what a program declares."""
+
+    def __init__(self, declared: str, part: Callable[[Sequence[str]], tuple[str, ...]]) -> None:
+        self.declared, self.part = declared, part
+
+    def __get__(self, program: Any, kind: type) -> tuple[str, ...]:
+        return self if program is None else self.part(getattr(program, self.declared))  # type: ignore[return-value]
 
 
 class Program(PyroModule):
@@ -89,6 +117,7 @@ class Program(PyroModule):
         controls: names and units of the controls.
         measurements: names and units of the measurement's components, in the order of the observed sites.
         channels: names and units of the noise channels.
+        state_names, state_units, …, channel_units: the same apart, a unit empty where none is given.
         angles: the state components that live on a circle.
         motion: channel → the state components that are its position and its velocity; the generic effects go by it.
         error_groups: what an error is reported for: name → components whose Euclidean norm it is.
@@ -176,45 +205,10 @@ class Program(PyroModule):
         """
         return control
 
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """Of the state's components, without units."""
-        return names(self.states)
-
-    @property
-    def state_units(self) -> tuple[str, ...]:
-        """Of the state's components, empty where none is given."""
-        return units(self.states)
-
-    @property
-    def control_names(self) -> tuple[str, ...]:
-        """Of the controls, without units."""
-        return names(self.controls)
-
-    @property
-    def control_units(self) -> tuple[str, ...]:
-        """Of the controls, empty where none is given."""
-        return units(self.controls)
-
-    @property
-    def measurement_names(self) -> tuple[str, ...]:
-        """Of the measurement's components, without units."""
-        return names(self.measurements)
-
-    @property
-    def measurement_units(self) -> tuple[str, ...]:
-        """Of the measurement's components, empty where none is given."""
-        return units(self.measurements)
-
-    @property
-    def channel_names(self) -> tuple[str, ...]:
-        """Of the noise channels, without units."""
-        return names(self.channels)
-
-    @property
-    def channel_units(self) -> tuple[str, ...]:
-        """Of the noise channels, empty where none is given."""
-        return units(self.channels)
+    state_names, state_units = _Components("states", names), _Components("states", units)
+    control_names, control_units = _Components("controls", names), _Components("controls", units)
+    measurement_names, measurement_units = _Components("measurements", names), _Components("measurements", units)
+    channel_names, channel_units = _Components("channels", names), _Components("channels", units)
 
     @property
     def angle_indices(self) -> tuple[int, ...]:
@@ -234,25 +228,22 @@ class Program(PyroModule):
 
     def velocities(self, state: Tensor) -> dict[str, Tensor]:
         """The velocity that each channel accelerates, `(...)`."""
-        order = self.state_names
-        return {
-            channel: state[..., order.index(velocity)] for channel, (_, velocity) in self.motion.items() if velocity
-        }
+        return self._of_motion(state, 1)
 
     def positions(self, state: Tensor) -> dict[str, Tensor]:
         """The position that each channel moves, `(...)`, where it has one."""
-        order = self.state_names
-        return {
-            channel: state[..., order.index(position)] for channel, (position, _) in self.motion.items() if position
-        }
+        return self._of_motion(state, 0)
+
+    def _of_motion(self, state: Tensor, which: int) -> dict[str, Tensor]:
+        parts = {channel: moved[which] for channel, moved in self.motion.items() if moved[which]}
+        return {channel: state[..., self.state_names.index(part)] for channel, part in parts.items()}
 
     def earlier(self, state: Tensor, ago: Tensor) -> Tensor:
         """The state `ago` seconds before, at its velocity, `(..., D)`."""
         order = self.state_names
         moved = list(state.unbind(-1))
-        for position, velocity in self.motion.values():
-            if position and velocity:
-                moved[order.index(position)] = moved[order.index(position)] - ago * state[..., order.index(velocity)]
+        for position, velocity in self.derivatives.items():
+            moved[order.index(position)] = moved[order.index(position)] - ago * state[..., order.index(velocity)]
         return torch.stack(torch.broadcast_tensors(*moved), -1)
 
     def control_index(self, name: str) -> int:
@@ -277,32 +268,13 @@ class Program(PyroModule):
 
     def extra_repr(self) -> str:
         """The values of the program's own parameters."""
-        own = {
-            name.removesuffix("_unconstrained"): getattr(self, name.removesuffix("_unconstrained"))
-            for name, _ in self.named_parameters(recurse=False)
-        }
-        return ", ".join(f"{name}={_rounded(value)}" for name, value in own.items())
+        own = [name.removesuffix("_unconstrained") for name, _ in self.named_parameters(recurse=False)]
+        return ", ".join(f"{name}={_rounded(getattr(self, name))}" for name in own)
 
 
 def _rounded(value: Tensor) -> Any:
     values = [float(f"{v:.4g}") for v in value.detach().flatten().tolist()]
     return values[0] if value.dim() == 0 else values
-
-
-def names(declared: Sequence[str]) -> tuple[str, ...]:
-    """The names in a declaration such as `("left [N]", "right [N]")`."""
-    return _parsed(tuple(declared))[0]
-
-
-def units(declared: Sequence[str]) -> tuple[str, ...]:
-    """The units in a declaration, empty where none is given."""
-    return _parsed(tuple(declared))[1]
-
-
-@cache
-def _parsed(declared: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    parts = [component.partition("[") for component in declared]
-    return tuple(name.strip() for name, _, _ in parts), tuple(unit.rstrip("] ") for _, _, unit in parts)
 
 
 def error_groups(program: Program) -> dict[str, tuple[int, ...]]:
@@ -324,9 +296,6 @@ def for_program(program: Program, data: Trajectories) -> Trajectories:
     return _within(chosen.to(parameter.dtype, parameter.device))
 
 
-MIN_STEP, MAX_STEP = 1e-10, 1e9  # s between two rows; beyond these the time has another unit
-
-
 def _within(data: Trajectories) -> Trajectories:
     """The same drives, if every number is one in their precision (1e300 is infinite in single) and time is in seconds.
 
@@ -338,21 +307,17 @@ def _within(data: Trajectories) -> Trajectories:
         blocks.append(("x", data.states, data.state_names))
     for prefix, values, columns in blocks:
         for row, drive, index in values.isinf().nonzero()[:1].tolist():
-            most = torch.finfo(values.dtype).max
-            raise _beyond(
-                data, f"{prefix}.{columns[index]}", drive, row, f"the number is beyond {most:.2g}, the largest"
-            )
+            said = f"the number is beyond {torch.finfo(values.dtype).max:.2g}, the largest"
+            raise _beyond(data, f"{prefix}.{columns[index]}", drive, row, said)
     odd = data.transitions & ((data.steps < MIN_STEP) | (data.steps > MAX_STEP))
     for row, drive in odd.nonzero()[:1].tolist():
         step = float(data.time[row + 1, drive] - data.time[row, drive])
-        said = (
-            f"time goes on by {step:.3g} s, expected {MIN_STEP:g} to {MAX_STEP:g} s from row to row: is it in seconds?"
-        )
-        raise _beyond(data, "time", drive, row + 1, said)
+        said = f"time goes on by {step:.3g} s, expected {MIN_STEP:g} to {MAX_STEP:g} s from row to row"
+        raise _beyond(data, "time", drive, row + 1, f"{said}: is it in seconds?")
     return data
 
 
 def _beyond(data: Trajectories, column: str, drive: int, row: int, said: str) -> DataError:
     label = data.labels[drive]
-    where = f"column {column}, trajectory {label}, its row {row + 1}"
-    return DataError(f"{where}: {said}", column=column, trajectory=label)
+    message = f"column {column}, trajectory {label}, its row {row + 1}: {said}"
+    return DataError(message, column=column, trajectory=label)

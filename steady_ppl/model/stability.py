@@ -23,6 +23,7 @@ SHORTER = 64  # times, by which a step is shortened to see whether its result fo
 STATES, ROWS = 64, 16  # at which a transition is looked at
 COMMANDS = 256  # rows of commands, at which actuators are looked at
 AHEAD = 1600  # substeps that a program moves on to see where it comes: of 100 rows where it takes one
+_Given = tuple[Tensor, Tensor, Tensor]  # control, time and step
 
 
 @torch.no_grad()
@@ -32,11 +33,7 @@ def divergence(program: Program, data: Trajectories, rows: int | None = None) ->
     The eigenvalues of a row's derivative in the state are compared with those at `FINER` times as many substeps: where
     a deviation grows at the program's own step alone, the step is what makes it grow. They are looked at where drives
     begin and where the program comes from there in fine steps without noise: a drag may be too stiff at speed alone.
-
-    Args:
-        program: any.
-        data: as returned by `for_program`.
-        rows: how many of each drive are looked at, from its first; all when None.
+    Of each drive of `data`, as returned by `for_program`, its first `rows` are looked at; all when None.
     """
     steps = torch.where(data.transitions, data.steps, 0.0)[:rows]
     if not bool(steps.any()):
@@ -65,7 +62,7 @@ def divergence(program: Program, data: Trajectories, rows: int | None = None) ->
     )
 
 
-def _eigenvalues(program: Program, state: Tensor, given: tuple[Tensor, Tensor, Tensor]) -> Tensor | None:
+def _eigenvalues(program: Program, state: Tensor, given: _Given) -> Tensor | None:
     """Of the row's derivative in the state, `(..., D)` at states `(..., D)`; None where one is no number."""
     size = state.shape[-1]
     columns = []
@@ -75,16 +72,13 @@ def _eigenvalues(program: Program, state: Tensor, given: tuple[Tensor, Tensor, T
         for sign in (1.0, -1.0):
             moved = state.clone()
             moved[..., index] += sign * by
-            with running(*state.shape[:-1]), Held(0.0):
-                ends.append(advance(program, moved, *given).expand(*state.shape))
+            ends.append(_after(program, moved, given, 0.0).expand(*state.shape))
         columns.append((ends[0] - ends[1]) / (2 * by.unsqueeze(-1)))
     derivative = torch.stack(columns, -1).double()
-    if not bool(derivative.isfinite().all()):
-        return None
-    return torch.linalg.eigvals(derivative)
+    return torch.linalg.eigvals(derivative) if bool(derivative.isfinite().all()) else None
 
 
-def _visited(finer: Program, data: Trajectories, steps: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+def _visited(finer: Program, data: Trajectories, steps: Tensor) -> tuple[Tensor, _Given]:
     """States that a program comes to, `(STATES, R, 1, D)`, and control, time and step of these rows.
 
     The longest row of all is looked at from the start; the others are of the drive that it belongs to.
@@ -95,16 +89,13 @@ def _visited(finer: Program, data: Trajectories, steps: Tensor) -> tuple[Tensor,
     states = [_starts(finer, 1)]
     for row in rows[:-1].tolist():
         at = slice(row, row + 1)
-        ahead = _after(
-            finer, states[-1], (data.controls[at, [drive]], data.elapsed[at, [drive]], data.steps[at, [drive]]), 0.0
-        )
+        ahead = _after(finer, states[-1], _given(data, drive, at), 0.0)
         if not bool(ahead.isfinite().all()):
             break
         states.append(ahead)
     chosen = torch.linspace(0, len(states) - 1, min(ROWS, len(states))).long()
     looked = torch.cat([longest.to(rows), rows[chosen.to(rows.device)]])
-    given = (data.controls[:, [drive]][looked], data.elapsed[:, [drive]][looked], data.steps[:, [drive]][looked])
-    return torch.cat([states[0], *(states[index] for index in chosen.tolist())], 1), given
+    return torch.cat([states[0], *(states[index] for index in chosen.tolist())], 1), _given(data, drive, looked)
 
 
 @torch.no_grad()
@@ -112,11 +103,7 @@ def is_step(program: Program, data: Trajectories) -> bool:
     """Return whether `transition` is a step in `step`: it moves less and less as the step gets shorter.
 
     A program that holds something within each step (`-w / step`) or that counts rows (`0.8 * state`) is none: in
-    substeps it is another program.
-
-    Args:
-        program: any.
-        data: as returned by `for_program`; rows to look at, whose states are drawn from the program's start.
+    substeps it is another program. It is looked at in rows of `data`, as returned by `for_program`, from its start.
     """
     if not bool(data.transitions.any()) or counts_rows(program):
         return False
@@ -161,12 +148,7 @@ def counts_rows(program: Program) -> bool:
 
 @torch.no_grad()
 def can_be_cut(program: Program, data: Trajectories) -> bool:
-    """Return whether rows of drives can be taken in substeps; see `require_convergence`.
-
-    Args:
-        program: any.
-        data: as returned by `for_program`.
-    """
+    """Return whether rows of drives, as returned by `for_program`, can be taken in substeps: `require_convergence`."""
     if not bool(data.transitions.any()):
         return True
     state, given = _some(program, data)
@@ -179,11 +161,7 @@ def can_be_cut(program: Program, data: Trajectories) -> bool:
 
 @torch.no_grad()
 def require_convergence(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> None:
-    """Refuse substeps of a program whose rows go apart as they are cut more finely.
-
-    Args:
-        program: any.
-        state, control, time, step: of some rows, as `advance` takes them.
+    """Refuse substeps of a program whose rows, given as to `advance`, go apart as they are cut more finely.
 
     Raises:
         ProgramError: its result at K and 2 K substeps differs more for large K than for small ones, or its actuators
@@ -211,14 +189,18 @@ def require_convergence(program: Program, state: Tensor, control: Tensor, time: 
         )
 
 
-def _some(program: Program, data: Trajectories) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+def _some(program: Program, data: Trajectories) -> tuple[Tensor, _Given]:
     """States from a program's start, `(STATES, R, 1, D)`, and control, time and step of some rows of the longest
     drive."""
     drive = int(data.transitions.sum(0).argmax())
     rows = torch.where(data.transitions[:, drive])[0]
     rows = rows[torch.linspace(0, len(rows) - 1, min(ROWS, len(rows)), device=rows.device).long()]
-    given = (data.controls[:, [drive]][rows], data.elapsed[:, [drive]][rows], data.steps[:, [drive]][rows])
-    return _starts(program, len(rows)), given
+    return _starts(program, len(rows)), _given(data, drive, rows)
+
+
+def _given(data: Trajectories, drive: int, rows: Tensor | slice) -> _Given:
+    """Control, time and step of some rows of a drive."""
+    return data.controls[:, [drive]][rows], data.elapsed[:, [drive]][rows], data.steps[:, [drive]][rows]
 
 
 def _starts(program: Program, rows: int) -> Tensor:
@@ -228,7 +210,7 @@ def _starts(program: Program, rows: int) -> Tensor:
         return broadcast_event(program.initial(), left, 1)
 
 
-def _after(program: Program, state: Tensor, given: tuple[Tensor, Tensor, Tensor], noise: float) -> Tensor:
+def _after(program: Program, state: Tensor, given: _Given, noise: float) -> Tensor:
     """States after a row in which every channel is `noise` scales from its location."""
     with running(*state.shape[:-1]), Held(noise):
         return advance(program, state, *given)

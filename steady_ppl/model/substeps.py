@@ -14,10 +14,10 @@ counts as a tenth.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from itertools import islice
 from numbers import Integral
 from typing import Any
 
@@ -30,7 +30,8 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError, UsageError
-from steady_ppl.model.handlers import Recording, as_vector, unwrapped
+from steady_ppl.model.actuation import row_spans
+from steady_ppl.model.handlers import Recording, as_event, as_vector, unwrapped, with_moments
 from steady_ppl.model.program import Program
 
 MAX_SUBSTEPS = 1000  # of a row
@@ -86,10 +87,8 @@ def advance(program: Program, state: Tensor, control: Tensor, time: Tensor, step
     with seen, _at(parts[0]) as given:
         state = program.transition(state, *given)
     noise = {site: standardised(fn, seen.values[site], site) for site, fn in seen.distributions.items()}
-    for part in parts[1:]:
-        with poutine.block(), Held(noise), _at(part) as given:
-            state = program.transition(state, *given)
-    return state
+    ((after, _),) = deque(_through(program, state, parts[1:], noise), maxlen=1)
+    return after
 
 
 def sample_channels(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> None:
@@ -105,32 +104,21 @@ def sample_row(program: Program, state: Tensor, control: Tensor, time: Tensor, s
     if program.substeps == 1:
         return program.transition(state, control, time, step)
     noise = _sample(program, state, control, time, step)
-    for part in _parts(program, control, time, step):
-        with poutine.block(), Held(noise), _at(part) as given:
-            state = program.transition(state, *given)
-    return state
+    ((after, _),) = deque(_through(program, state, _parts(program, control, time, step), noise), maxlen=1)
+    return after
 
 
 def channel_values(
     program: Program, data: Trajectories, states: Tensor, noise: Mapping[str, Tensor]
 ) -> dict[str, Tensor]:
-    """Return what channels are along given states with given standardised noise.
+    """Return what channels are, by site as `noise`, along states `(M, T + 1, B, D)` of data for the program.
 
     Args:
-        program: the state-space model.
-        data: as returned by `for_program`.
-        states: `(M, T + 1, B, D)`.
         noise: site → `(M, T, B, ...)`, in standard deviations.
-
-    Returns:
-        Site → value, shaped as the noise.
     """
     given = (states[..., :-1, :, :], acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
-    found = {}
-    for site, fn in _on_average(program, *given).items():
-        loc, scale = location_and_scale(fn, site)
-        found[site] = loc + scale * noise[site]
-    return found
+    moments = {site: location_and_scale(fn, site) for site, fn in _on_average(program, *given).items()}
+    return {site: loc + scale * noise[site] for site, (loc, scale) in moments.items()}
 
 
 def channel_scales(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
@@ -140,7 +128,7 @@ def channel_scales(program: Program, state: Tensor, control: Tensor, time: Tenso
     `advance`.
     """
     found = []
-    for seen in _recorded(program, state, control, time, step, 0.0):
+    for _, seen in _through(program, state, _parts(program, control, time, step), 0.0):
         scales = {site: location_and_scale(fn, site)[1] for site, fn in seen.distributions.items()}
         found.append(_joined(scales, seen.distributions, state.shape[:-1]))
     return _mean(found)
@@ -152,24 +140,17 @@ def acting_controls(program: Program, data: Trajectories) -> Tensor:
 
 
 def acting(program: Program, commands: Tensor, elapsed: Tensor) -> Tensor:
-    """Return what actuators make of commands, for every substep.
+    """Return what actuators make of commands `(rows, B, U)` that are held over a row, at `elapsed` s `(rows, B)`.
 
-    Args:
-        program: the state-space model.
-        commands: `(rows, B, U)`, held over a row.
-        elapsed: `(rows, B)` s.
-
-    Returns:
-        `(rows, B, U)`, or where actuators change something within a row the substeps' controls side by side,
-        `(rows, B, K U)`.
+    It is `(rows, B, U)`, or where actuators change something within a row the substeps' controls side by side,
+    `(rows, B, K U)`.
     """
     count = program.substeps
     if count == 1 or type(program).actuators is Program.actuators or len(elapsed) < 2:
         return program.actuators(commands, elapsed)
     rows, drives, controls = commands.shape
-    steps = torch.cat([elapsed[1:] - elapsed[:-1], elapsed[-1:] - elapsed[-2:-1]])
     shares = torch.arange(count, dtype=elapsed.dtype, device=elapsed.device) / count
-    times = (elapsed.unsqueeze(1) + shares[:, None] * steps.unsqueeze(1)).flatten(0, 1)
+    times = (elapsed.unsqueeze(1) + shares[:, None] * row_spans(elapsed).unsqueeze(1)).flatten(0, 1)
     act = program.actuators(commands.repeat_interleave(count, 0), times)
     return act.unflatten(0, (rows, count)).movedim(1, 2).reshape(rows, drives, count * controls)
 
@@ -183,18 +164,17 @@ def row_controls(program: Program, control: Tensor) -> Tensor:
 
 
 @contextmanager
-def within_row() -> Iterator[None]:
-    """Run a `transition` as one that no row ends with: what counts rows stays as it is."""
-    with _row_ending(False):
+def within_row(ends: bool = False) -> Iterator[None]:
+    """Run a `transition` as one that no row ends with, so that what counts rows stays as it is; unless it `ends`."""
+    token = _ROW_ENDS.set(ends)
+    try:
         yield
+    finally:
+        _ROW_ENDS.reset(token)
 
 
 class Held(Messenger):
-    """Give channels the noise that a row already has.
-
-    Args:
-        noise: site → value in scales, or the same value for every site.
-    """
+    """Give channels the noise that a row already has: site → value in scales, or one value for every site."""
 
     def __init__(self, noise: Mapping[str, Tensor] | float) -> None:
         super().__init__()
@@ -245,30 +225,20 @@ def _parts(program: Program, control: Tensor, time: Tensor, step: Tensor) -> Ite
 @contextmanager
 def _at(part: _Part) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     *given, ends = part
-    with _row_ending(ends):
+    with within_row(ends):
         yield tuple(given)  # type: ignore[misc]
 
 
-@contextmanager
-def _row_ending(ends: bool) -> Iterator[None]:
-    token = _ROW_ENDS.set(ends)
-    try:
-        yield
-    finally:
-        _ROW_ENDS.reset(token)
-
-
 def _sample(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> dict[str, Tensor]:
-    found = {}
-    for site, fn in _on_average(program, state, control, time, step).items():
-        found[site] = standardised(fn, pyro.sample(site, fn), site)
-    return found
+    channels = _on_average(program, state, control, time, step)
+    return {site: standardised(fn, pyro.sample(site, fn), site) for site, fn in channels.items()}
 
 
 def _on_average(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> dict[str, Any]:
     """Site → the distribution of its average over a row; with one substep its own."""
     given, left = (control, time, step), state.shape[:-1]
-    kinds = _recorded(program, state, *given, 0.0, only=1)[0].distributions
+    _, first = next(_through(program, state, _parts(program, *given), 0.0))
+    kinds = first.distributions
     if program.substeps == 1:
         return kinds
     moments = {site: location_and_scale(fn, site) for site, fn in kinds.items()}
@@ -276,30 +246,23 @@ def _on_average(program: Program, state: Tensor, control: Tensor, time: Tensor, 
     reach = 1 + MIN_SHARE_OF_PUSH * (loc / torch.where(scale > 0, scale, torch.ones_like(scale))).abs().detach()
     count = scale.shape[-1]
     units = torch.cat([scale.new_zeros(1, count), torch.eye(count).to(scale)]).view(1 + count, *[1] * len(left), count)
-    rows = _recorded(program, state.expand(1 + count, *state.shape), *given, _parted(units * reach, kinds))
-    still, *pushed = _mean([_joined(row.values, kinds, (1 + count, *left)) for row in rows])
+    states, noise = state.expand(1 + count, *state.shape), _parted(units * reach, kinds)
+    rows = _through(program, states, _parts(program, *given), noise)
+    still, *pushed = _mean([_joined(seen.values, kinds, (1 + count, *left)) for _, seen in rows])
     change = torch.stack([one[..., index] - still[..., index] for index, one in enumerate(pushed)], -1) / reach
     locs, scales = _parted(still, kinds), _parted(torch.maximum(change, MIN_SHARE_OF_SD * scale), kinds)
-    return {site: _like(fn, locs[site], scales[site]) for site, fn in kinds.items()}
+    return {site: with_moments(fn, locs[site], scales[site]) for site, fn in kinds.items()}
 
 
-def _recorded(
-    program: Program,
-    state: Tensor,
-    control: Tensor,
-    time: Tensor,
-    step: Tensor,
-    noise: Mapping[str, Tensor] | float,
-    only: int | None = None,
-) -> list[Recording]:
-    """What each substep of a row with given noise in scales samples; of the first `only` ones."""
-    found = []
-    for part in islice(_parts(program, control, time, step), only):
+def _through(
+    program: Program, state: Tensor, parts: Iterable[_Part], noise: Mapping[str, Tensor] | float
+) -> Iterator[tuple[Tensor, Recording]]:
+    """The state after each substep with given noise in scales, and what was sampled in it."""
+    for part in parts:
         seen = Recording()
         with poutine.block(), seen, Held(noise), _at(part) as given:
             state = program.transition(state, *given)
-        found.append(seen)
-    return found
+        yield state, seen
 
 
 def _mean(values: Sequence[Tensor]) -> Tensor:
@@ -315,13 +278,4 @@ def _joined(values: Mapping[str, Tensor], kinds: Mapping[str, Any], left: Sequen
 def _parted(values: Tensor, kinds: Mapping[str, Any]) -> dict[str, Tensor]:
     """What `_joined` puts side by side, by site."""
     parts = values.split([fn.event_shape.numel() for fn in kinds.values()], -1)
-    return {
-        site: part if fn.event_dim else part.squeeze(-1) for (site, fn), part in zip(kinds.items(), parts, strict=True)
-    }
-
-
-def _like(fn: Any, loc: Tensor, scale: Tensor) -> Any:
-    """A distribution of the same kind."""
-    base = unwrapped(fn)
-    freedom = (base.df,) if isinstance(base, dist.StudentT) else ()
-    return type(base)(*freedom, loc, scale).to_event(fn.event_dim)
+    return {site: as_event(part, fn.event_dim) for (site, fn), part in zip(kinds.items(), parts, strict=True)}

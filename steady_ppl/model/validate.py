@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from typing import Any
 
@@ -30,7 +30,8 @@ def probe(program: Program) -> None:
         ProgramError: naming the method or site, what came and what was expected.
     """
     name = type(program).__name__
-    _check_declarations(program, name)
+    for problem in _misdeclared(program):
+        raise ProgramError(f"program {name}{problem}")
     size, width = len(program.states), len(program.measurements)
     parameter = next(program.parameters(), torch.zeros(()))
     with torch.random.fork_rng():
@@ -67,15 +68,10 @@ def probe(program: Program) -> None:
         one, moved = _call(name, "transition", lambda: program.transition(*single), (1, 1, 1), Replaying(alone))
         observing = Observing(measurements[row, drive], observing.observed[row, drive])
         _, again = _call(name, "observe", lambda: program.observe(single[0]), (1, 1, 1), observing)
-        for method, among, by_itself in (
-            ("transition", after[draw, row, drive], one),
-            *(
-                ("transition", _density(noise, site).expand(LEFT)[draw, row, drive], _density(moved, site))
-                for site in noise.values
-            ),
-            ("observe", density[draw, row, drive], again.total()),
-        ):
-            if not torch.allclose(among, by_itself, rtol=1e-3, atol=1e-4, equal_nan=True):
+        pairs = [("transition", after, one)]
+        pairs += [("transition", _density(noise, site).expand(LEFT), _density(moved, site)) for site in noise.values]
+        for method, among, by_itself in (*pairs, ("observe", density, again.total())):
+            if not torch.allclose(among[draw, row, drive], by_itself, rtol=1e-3, atol=1e-4, equal_nan=True):
                 raise ProgramError(
                     f"program {name}: {method} mixes draws, rows or trajectories: one alone gives another result than "
                     "among others; work on the last dimension only (no sum or mean over the others)",
@@ -83,33 +79,28 @@ def probe(program: Program) -> None:
                 )
 
 
-def _check_declarations(program: Program, name: str) -> None:
+def _misdeclared(program: Program) -> Iterator[str]:
+    """What is wrong with a program's declarations, the first of which is reported."""
     for what in ("states", "controls", "measurements", "channels"):
         declared = getattr(program, what)
         if isinstance(declared, str):
-            raise ProgramError(f"program {name}: {what} is the text {declared!r}; one component is ({declared!r},)")
+            yield f": {what} is the text {declared!r}; one component is ({declared!r},)"
         if len(set(names(declared))) != len(declared):
-            raise ProgramError(f"program {name}: {what} names a component twice: {', '.join(names(declared))}")
+            yield f": {what} names a component twice: {', '.join(names(declared))}"
     if not program.states or not program.measurements:
         missing = "states" if not program.states else "measurements (for a planar vehicle: landmarks)"
-        raise ProgramError(f"program {name} declares no {missing}; name another class of the file as FILE.py:NAME")
+        yield f" declares no {missing}; name another class of the file as FILE.py:NAME"
     known = program.state_names
     for what, members in (("angles", program.angles), *(("error_groups", g) for g in program.error_groups.values())):
         for member in members:
             if member not in known:
-                raise ProgramError(f"program {name}: {what} names {member!r}, no state component ({', '.join(known)})")
+                yield f": {what} names {member!r}, no state component ({', '.join(known)})"
     if not is_count(program.substeps):
-        raise ProgramError(
-            f"program {name}: substeps is {program.substeps!r}; expected a whole number from 1 to {MAX_SUBSTEPS}"
-        )
+        yield f": substeps is {program.substeps!r}; expected a whole number from 1 to {MAX_SUBSTEPS}"
     if not (isinstance(program.simulated_step, float | int) and program.simulated_step > 0):
-        raise ProgramError(
-            f"program {name}: simulated_step is {program.simulated_step!r}; expected seconds above 0, or infinity"
-        )
+        yield f": simulated_step is {program.simulated_step!r}; expected seconds above 0, or infinity"
     if not (program.step > 0 and program.duration >= program.step):
-        raise ProgramError(
-            f"program {name}: step is {program.step} s and duration {program.duration} s; expected 0 < step ≤ duration"
-        )
+        yield f": step is {program.step} s and duration {program.duration} s; expected 0 < step ≤ duration"
 
 
 def _check_noise(name: str, noise: Recording) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.kernels.codegen import LANES
 from steady_ppl.kernels.graph import NotCompilable
-from steady_ppl.kernels.jit import Method, close, compiled, distrust
+from steady_ppl.kernels.jit import Method, close, compiled, discard
 from steady_ppl.model.handlers import Observing, Recording, Standardised, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance, standardised
@@ -93,7 +93,7 @@ def stepping_for(
         return plain, methods
     stepping = CompiledStepping(methods, plain)
     if not stepping.agrees(state[:LANES]):
-        return plain, distrust(program, FILTER)
+        return plain, discard(program, FILTER)
     return stepping, None
 
 

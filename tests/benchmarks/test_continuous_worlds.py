@@ -187,7 +187,7 @@ def test_planar_forces_are_those_of_the_catalogue(name):
     ours = PLANAR[name](body, planted.size, planted.options)
     c = torch.tensor(value).squeeze()
     options = {key: one for key, one in variant.options.items() if key not in ("at", "scale")}
-    theirs = variant.effect.function(program, state, control, 0.0, 0.1, c, **options)
+    theirs = variant.effect.function(program, state, control, 0.0, 0.1, c=c, **options)
     for channel, pushed in zip(("forward", "lateral", "yaw"), ours, strict=True):
         assert np.allclose(pushed, np.asarray(theirs.get(channel, 0.0)), atol=1e-5)
 

@@ -141,7 +141,7 @@ def test_the_regression_of_smoothed_residuals_is_biased_and_the_scores_are_not()
     at, _ = at_rest(program, data)
     variant = chosen_variant(program, "linear_drag", "")
     states, noise = at.states[:-1], at.channels.mean
-    push = variant.push(program, states, data.controls[:-1], data.elapsed[:-1], data.steps, torch.ones(()).double(), {})
+    push = variant(program, states, data.controls[:-1], data.elapsed[:-1], data.steps, c=torch.ones(()).double())
     columns = torch.stack([push["forward"], push["lateral"]], -1) / program.noise[:2].detach()
     shortcut = float((columns * noise[..., :2]).sum() / columns.square().sum())
     score = Scoring(program, data, at)(Column(variant)).flatten()

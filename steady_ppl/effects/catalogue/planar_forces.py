@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.effects.declaration import Effect
+from steady_ppl.effects.declaration import Effect, declare
 from steady_ppl.model.handlers import broadcast_event, running
 from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.model.program import Program
@@ -50,14 +52,6 @@ def _needs_two_thrusters(program: Program) -> str | None:
     return "the controls are not a left and a right thrust"
 
 
-def _drags(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
-    return [{"drag": drag} for drag in (0.06, 0.02, 0.2)]
-
-
-def _slips(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
-    return [{"lead": lead} for lead in (0.2, 0.0, 0.5)]
-
-
 def _limits(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
     return [{"channels": program.axes["translation"]}, {"channels": program.axes["yaw"], "at": "yaw"}]
 
@@ -77,21 +71,47 @@ def _places(program: Program, data: Trajectories | None) -> Sequence[Mapping[str
 
 
 @torch.no_grad()
-def _starts(program: Program) -> torch.Tensor:
+def _starts(program: Program) -> Tensor:
     """Drawn from where drives begin, `(1, STARTS, D)`."""
     with seeded("starts"), running(1, STARTS):
         return broadcast_event(program.initial(), torch.Size((1, STARTS)), 1)
 
 
-def slope(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor) -> dict[str, Tensor]:
+PLANAR_FORCES: list[Effect] = []
+_force = partial(declare, PLANAR_FORCES, "push")
+_where_it_slips = partial(_force, lacks=_needs_slip)
+_on_any = partial(_force, lacks=not_planar)
+
+
+@_where_it_slips("m/s²", typical=(0.05, -0.03), limit=0.5, components=("x", "y"))
+def slope(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> dict[str, Tensor]:
+    r"""world-frame acceleration (c₁, c₂)
+
+    equation: \dot v_\mathrm{world} = (c_1, c_2)
+    feels: drifts the same way over ground, wherever it points
+    occurs: ramps and floors that are not level; what a current does to a boat that is slow to drift with it
+    """
     x, y = c.unbind(-1)
     cos, sin = state[..., 2].cos(), state[..., 2].sin()
     return {"forward": cos * x + sin * y, "lateral": cos * y - sin * x}
 
 
-def wind(
-    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, drag: Any
-) -> dict[str, Tensor]:
+@_where_it_slips(
+    "m/s",
+    typical=(1.0, 0.5),
+    limit=10.0,
+    components=("x", "y"),
+    profiled=("drag",),
+    choices=lambda program, data: [{"drag": drag} for drag in (0.06, 0.02, 0.2)],
+)
+def wind(self: Any, state: Tensor, *_: Tensor, c: Tensor, drag: Any) -> dict[str, Tensor]:
+    r"""a = -k (v-w)|v-w| + k v|v| per axis, w the world-frame wind (c₁, c₂) in the body frame
+
+    equation: a = -k\,(v - w)\,|v - w| + k\,v\,|v|,\quad w = R^\top(c_1, c_2)
+    feels: slower one way than the other, and more so when fast
+    occurs: boats in a current (w is the current, its drag found with it), multirotors and airships in wind, air tables
+        with a draught
+    """
     x, y = c.unbind(-1)
     cos, sin = state[..., 2].cos(), state[..., 2].sin()
     forward, lateral, _ = self.body_velocity(state)
@@ -102,189 +122,94 @@ def wind(
     }
 
 
-def lateral_coupling(
-    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor
-) -> dict[str, Tensor]:
+@_force("1/kg", typical=0.2, limit=1.0, lacks=_needs_two_thrusters)
+def lateral_coupling(self: Any, state: Tensor, control: Tensor, *_: Tensor, c: Tensor) -> dict[str, Tensor]:
+    r"""a_lateral = c (left - right)
+
+    equation: a_\mathrm{lateral} = c\,(u_\mathrm{left} - u_\mathrm{right})
+    feels: steps sideways when it is told to turn
+    occurs: propellers whose wash hits a skeg, a stern that swings, the paddle-wheel effect of a single screw
+    """
     left, right = control[..., self.control_index("left")], control[..., self.control_index("right")]
     return {"lateral": c * (left - right)}
 
 
-def weathervane(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor) -> dict[str, Tensor]:
+@_where_it_slips("rad/m²", typical=0.1, limit=1.0)
+def weathervane(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> dict[str, Tensor]:
+    r"""a_yaw = -c v_x v_y
+
+    equation: a_\mathrm{yaw} = -c\,v_x v_y
+    feels: turns its nose into (or out of) the way it slides
+    occurs: airframes with fins (positive) and hulls without (the Munk moment, negative)
+    """
     forward, lateral, _ = self.body_velocity(state)
     return {"yaw": -c * forward * lateral}
 
 
-def magnus(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor) -> dict[str, Tensor]:
+@_on_any("1", typical=0.15, limit=2.0)
+def magnus(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> dict[str, Tensor]:
+    r"""a_lateral = -c v_x ω
+
+    equation: a_\mathrm{lateral} = -c\,v_x\,\omega
+    feels: curves carry it to the inside (or outside)
+    occurs: spinning hulls and balls; the centripetal term of a program that forgot that its frame turns
+    """
     forward, _, yaw_rate = self.body_velocity(state)
     return {"lateral": -c * forward * yaw_rate}
 
 
-def lever_arm(
-    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Mapping[str, Tensor]
-) -> dict[str, Tensor]:
+@_where_it_slips("m", typical=0.15, limit=1.0)
+def lever_arm(self: Any, state: Tensor, *_: Tensor, c: Tensor, mean: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    r"""a_forward = c ω², a_lateral = -c a_yaw
+
+    equation: a_\mathrm{forward} = c\,\omega^2,\quad a_\mathrm{lateral} = -c\,a_\mathrm{yaw}
+    feels: the tracked point swings around another one when turning
+    occurs: a camera, a tag or a GPS antenna that is mounted away from the centre of mass
+    """
     yaw_rate = state[..., 5]
     return {"forward": c * yaw_rate**2, "lateral": -c * mean["yaw"]}
 
 
-def side_slip(
-    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, lead: Any
-) -> dict[str, Tensor]:
+@_where_it_slips(
+    "1/s",
+    typical=0.2,
+    limit=5.0,
+    sign=1,
+    profiled=("lead",),
+    choices=lambda program, data: [{"lead": lead} for lead in (0.2, 0.0, 0.5)],
+)
+def side_slip(self: Any, state: Tensor, *_: Tensor, c: Tensor, lead: Any) -> dict[str, Tensor]:
+    r"""a_lateral = -c (v_y - k ω)
+
+    equation: a_\mathrm{lateral} = -c\,(v_y - k\,\omega)
+    feels: sideways motion dies out, that of forward motion does not
+    occurs: keels, wheels and skids, which let forward motion go on and sideways motion die out
+    """
     _, lateral, yaw_rate = self.body_velocity(state)
     return {"lateral": -c * (lateral - lead * yaw_rate)}
 
 
-def sticky_patch(
-    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, x: Any, y: Any, radius: Any
-) -> dict[str, Tensor]:
+@_on_any("1/s", typical=0.5, limit=3.0, sign=1, profiled=("x", "y", "radius"), choices=_places)
+def sticky_patch(self: Any, state: Tensor, *_: Tensor, c: Tensor, x: Any, y: Any, radius: Any) -> dict[str, Tensor]:
+    r"""a = -c v exp(-d²/2r²), d the distance from a place
+
+    equation: a = -c\,v\,\exp(-d^2 / 2 r^2)
+    feels: is braked at one place of the ground
+    occurs: a carpet, a puddle, mud or a worn place of the floor
+    """
     forward, lateral, _ = self.body_velocity(state)
     inside = (-((state[..., 0] - x) ** 2 + (state[..., 1] - y) ** 2) / (2 * radius**2)).exp()
     return {"forward": -c * forward * inside, "lateral": -c * lateral * inside}
 
 
+@_on_any("m/s²", typical=0.6, limit=10.0, sign=1, null=math.inf, probes=(0.1, 0.2, 0.4, 0.8, 1.6, 3.2), choices=_limits)
 def acceleration_limit(
-    self: Any,
-    state: Tensor,
-    control: Tensor,
-    time: Tensor,
-    step: Tensor,
-    c: Tensor,
-    channels: Sequence[str],
-    mean: Mapping[str, Tensor],
+    self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Sequence[str], mean: Mapping[str, Tensor]
 ) -> dict[str, Tensor]:
+    r"""|a| ≤ c
+
+    equation: |a| \le c
+    feels: never jumps off the line, whatever it is told
+    occurs: motor drivers with a ramp or a current limit, tyres at the limit of grip
+    """
     return {channel: torch.minimum(torch.maximum(mean[channel], -c), c) - mean[channel] for channel in channels}
-
-
-PLANAR_FORCES = [
-    Effect(
-        name="slope",
-        form="push",
-        equation=r"\dot v_\mathrm{world} = (c_1, c_2)",
-        text="world-frame acceleration (c₁, c₂)",
-        unit="m/s²",
-        feels="drifts the same way over ground, wherever it points",
-        occurs="ramps and floors that are not level; what a current does to a boat that is slow to drift with it",
-        function=slope,
-        typical=(0.05, -0.03),
-        limit=0.5,
-        components=("x", "y"),
-        lacks=_needs_slip,
-    ),
-    Effect(
-        name="wind",
-        form="push",
-        equation=r"a = -k\,(v - w)\,|v - w| + k\,v\,|v|,\quad w = R^\top(c_1, c_2)",
-        text="a = -k (v-w)|v-w| + k v|v| per axis, w the world-frame wind (c₁, c₂) in the body frame",
-        unit="m/s",
-        feels="slower one way than the other, and more so when fast",
-        occurs="boats in a current (w is the current, its drag found with it), multirotors and airships in wind, air "
-        "tables with a draught",
-        function=wind,
-        profiled=("drag",),
-        typical=(1.0, 0.5),
-        limit=10.0,
-        components=("x", "y"),
-        choices=_drags,
-        lacks=_needs_slip,
-    ),
-    Effect(
-        name="lateral_coupling",
-        form="push",
-        equation=r"a_\mathrm{lateral} = c\,(u_\mathrm{left} - u_\mathrm{right})",
-        text="a_lateral = c (left - right)",
-        unit="1/kg",
-        feels="steps sideways when it is told to turn",
-        occurs="propellers whose wash hits a skeg, a stern that swings, the paddle-wheel effect of a single screw",
-        function=lateral_coupling,
-        typical=0.2,
-        limit=1.0,
-        lacks=_needs_two_thrusters,
-    ),
-    Effect(
-        name="weathervane",
-        form="push",
-        equation=r"a_\mathrm{yaw} = -c\,v_x v_y",
-        text="a_yaw = -c v_x v_y",
-        unit="rad/m²",
-        feels="turns its nose into (or out of) the way it slides",
-        occurs="airframes with fins (positive) and hulls without (the Munk moment, negative)",
-        function=weathervane,
-        typical=0.1,
-        limit=1.0,
-        lacks=_needs_slip,
-    ),
-    Effect(
-        name="magnus",
-        form="push",
-        equation=r"a_\mathrm{lateral} = -c\,v_x\,\omega",
-        text="a_lateral = -c v_x ω",
-        unit="1",
-        feels="curves carry it to the inside (or outside)",
-        occurs="spinning hulls and balls; the centripetal term of a program that forgot that its frame turns",
-        function=magnus,
-        typical=0.15,
-        limit=2.0,
-        lacks=not_planar,
-    ),
-    Effect(
-        name="lever_arm",
-        form="push",
-        equation=r"a_\mathrm{forward} = c\,\omega^2,\quad a_\mathrm{lateral} = -c\,a_\mathrm{yaw}",
-        text="a_forward = c ω², a_lateral = -c a_yaw",
-        unit="m",
-        feels="the tracked point swings around another one when turning",
-        occurs="a camera, a tag or a GPS antenna that is mounted away from the centre of mass",
-        function=lever_arm,
-        typical=0.15,
-        limit=1.0,
-        lacks=_needs_slip,
-    ),
-    Effect(
-        name="side_slip",
-        form="push",
-        equation=r"a_\mathrm{lateral} = -c\,(v_y - k\,\omega)",
-        text="a_lateral = -c (v_y - k ω)",
-        unit="1/s",
-        feels="sideways motion dies out, that of forward motion does not",
-        occurs="keels, wheels and skids, which let forward motion go on and sideways motion die out",
-        function=side_slip,
-        profiled=("lead",),
-        typical=0.2,
-        limit=5.0,
-        sign=1,
-        choices=_slips,
-        lacks=_needs_slip,
-    ),
-    Effect(
-        name="sticky_patch",
-        form="push",
-        equation=r"a = -c\,v\,\exp(-d^2 / 2 r^2)",
-        text="a = -c v exp(-d²/2r²), d the distance from a place",
-        unit="1/s",
-        feels="is braked at one place of the ground",
-        occurs="a carpet, a puddle, mud or a worn place of the floor",
-        function=sticky_patch,
-        profiled=("x", "y", "radius"),
-        typical=0.5,
-        limit=3.0,
-        sign=1,
-        choices=_places,
-        lacks=not_planar,
-    ),
-    Effect(
-        name="acceleration_limit",
-        form="push",
-        equation=r"|a| \le c",
-        text="|a| ≤ c",
-        unit="m/s²",
-        feels="never jumps off the line, whatever it is told",
-        occurs="motor drivers with a ramp or a current limit, tyres at the limit of grip",
-        function=acceleration_limit,
-        typical=0.6,
-        limit=10.0,
-        sign=1,
-        null=float("inf"),
-        probes=(0.1, 0.2, 0.4, 0.8, 1.6, 3.2),
-        choices=_limits,
-        lacks=not_planar,
-    ),
-]
