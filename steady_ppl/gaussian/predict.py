@@ -87,8 +87,7 @@ def states_ahead(program: Program, data: Trajectories, tracked: Tracked, most: i
 
 def errors(program: Program, states: Tensor, measurements: Tensor, observed: Tensor) -> Tensor:
     """Measured less what the program measures in these states, `(..., K)`, on the circle for angles."""
-    seen = Recording()
-    with running(*states.shape[:-1]), seen, Observing(measurements, observed):
+    with running(*states.shape[:-1]), Recording() as seen, Observing(measurements, observed):
         program.observe(states)
     parts = [as_vector(residual(fn, seen.observed[site]), fn.event_dim) for site, fn in seen.distributions.items()]
     return torch.cat(parts, -1)

@@ -8,7 +8,7 @@ Roweis 1999).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -36,7 +36,7 @@ from steady_ppl.smc.genealogy import Paths
 from steady_ppl.utils.angles import wrap_angles
 
 MAX_INCREASE = 10.0
-"""Nats by which a step may leave a path worse off, see `_Merit`: some such steps lead out of a bad place."""
+"""Nats by which a step may leave a path worse off, see `_merit`: some such steps lead out of a bad place."""
 REST_TOLERANCE = 0.05  # a trajectory is at rest where no noise moves by more, in standard deviations of its channel
 
 
@@ -54,7 +54,7 @@ def smooth(
 ) -> Lookahead:
     """Move a path to the mode of the posterior and look ahead along it.
 
-    Gauss and Newton's method. A step is halved while its end is worse by more than `MAX_INCREASE` nats, see `_Merit`.
+    Gauss and Newton's method. A step is halved while its end is worse by more than `MAX_INCREASE` nats, see `_merit`.
 
     Args:
         program: with normal noise; see `linearize`.
@@ -71,11 +71,8 @@ def smooth(
     """
 
     def look(path: ReferencePath) -> Lookahead:
-        return look_ahead(
-            linearize(
-                program, data, path, known_start=known_start, observation_weight=observation_weight, kernels=kernels
-            )
-        )
+        given: Any = {"known_start": known_start, "observation_weight": observation_weight, "kernels": kernels}
+        return look_ahead(linearize(program, data, path, **given))
 
     if passes == 1:
         return look(path)
@@ -84,8 +81,8 @@ def smooth(
     most = torch.full((len(data),), torch.inf, dtype=torch.float64, device=path.states.device)
     for index in range(passes):
         ahead = look(path)
-        merit = _merit(ahead)
-        worse = torch.isfinite(most) & ~(merit.cost(penalty) <= most)  # or not a number
+        density, defect = _merit(ahead)
+        worse = torch.isfinite(most) & ~(_cost(density, defect, penalty) <= most)  # or not a number
         accepted = _either(worse, accepted, path)
         if index == passes - 1:
             break
@@ -93,36 +90,21 @@ def smooth(
         moved = _either(worse, halfway, means_as_path(ahead, data))
         change = torch.nan_to_num((moved.noise - path.noise).abs(), nan=0.0).max()  # of those that have not blown up
         penalty = torch.where(worse[:, None], penalty, _penalty(ahead, moved))
-        most = torch.where(worse, most, merit.cost(penalty) + MAX_INCREASE)
+        most = torch.where(worse, most, _cost(density, defect, penalty) + MAX_INCREASE)
         path = moved
         if not bool(change > tolerance):
             break
     return look(accepted) if bool(worse.any()) else ahead
 
 
-@dataclass(frozen=True)
-class _Merit:
-    """What paths are compared by.
+def _merit(ahead: Lookahead) -> tuple[Tensor, Tensor]:
+    """What paths are compared by: less a path's log-density given its own noise, less the linearised log p(y), `(B,)`,
+    and how far its states are from where its noise leads, `(T + 1, B, D)`.
 
     The path's own negative log-density alone would lead through a beacon, where nothing is linear and what is drawn
     from the linearised program is useless. The linearised log p(y) alone may be high far from the measurements. So the
     merit is the one less the other: small where a path is likely and its surroundings are linear.
-
-    Attributes:
-        density: less the path's log-density given its own noise, less the linearised log p(y), `(B,)`.
-        defect: how far its states are from where its noise leads, `(T + 1, B, D)`.
     """
-
-    density: Tensor
-    defect: Tensor
-
-    def cost(self, penalty: Tensor) -> Tensor:
-        """Nats, `(B,)`, a unit of each defect counting `penalty`, `(T + 1, B, D)` (an l₁ penalty: Nocedal and Wright
-        2006, chapter 17)."""
-        return self.density + (penalty * self.defect).sum((0, 2))
-
-
-def _merit(ahead: Lookahead) -> _Merit:
     linear = ahead.linearization
     noise = linear.path.noise.double()
     gram = linear.start_noise.mT @ linear.start_noise
@@ -134,7 +116,12 @@ def _merit(ahead: Lookahead) -> _Merit:
     seen = 0.5 * (linear.precision * linear.residual.square()).sum((0, 2)) - linear.log_scale.sum(0)
     drawn = 0.5 * (noise.square().sum((0, 2)) + start.square().sum((1, 2)))
     defect = wrap_angles(torch.cat([begins.unsqueeze(0), rows]), linear.angles).abs()
-    return _Merit(seen + drawn - ahead.log_likelihood, defect)
+    return seen + drawn - ahead.log_likelihood, defect
+
+
+def _cost(density: Tensor, defect: Tensor, penalty: Tensor) -> Tensor:
+    """Nats, `(B,)`, a unit of each defect counting its penalty (an l₁ penalty: Nocedal and Wright 2006, chapter 17)."""
+    return density + (penalty * defect).sum((0, 2))
 
 
 def _penalty(ahead: Lookahead, moved: ReferencePath) -> Tensor:
@@ -193,13 +180,8 @@ def require_found(ahead: Lookahead, program: Program, data: Trajectories) -> Non
 
 
 def means_as_path(ahead: Lookahead, data: Trajectories) -> ReferencePath:
-    """The posterior mean as a path to linearise along, the padding filled with the first row."""
-    states, noise = ahead.means()
-    kind = data.controls.dtype
-    return ReferencePath(
-        states=torch.where(data.rows[..., None], states, states[:1]).to(kind),
-        noise=torch.where(data.transitions[..., None], noise, 0.0).to(kind),
-    )
+    """The posterior mean as a path to linearise along."""
+    return ReferencePath.of_means(*ahead.means(), data)
 
 
 def resting_path(ahead: Lookahead, data: Trajectories) -> ReferencePath:
@@ -242,14 +224,9 @@ def find_path(
         program, copies, particles=particles, observation_weight=weights, known_start=known_start
     )
     found = filtered.paths(1).within(copies)
-    ahead = smooth(
-        program,
-        copies,
-        ReferencePath(found.states[0], standard_noise(program, copies, found)[0]),
-        known_start=known_start,
-        observation_weight=observation_weight,
-        passes=passes,
-    )
+    path = ReferencePath(found.states[0], standard_noise(program, copies, found)[0])
+    given: Any = {"known_start": known_start, "observation_weight": observation_weight}
+    ahead = smooth(program, copies, path, passes=passes, **given)
     likely = torch.nan_to_num(ahead.log_likelihood, nan=-torch.inf).view(len(tempering), len(data))
     chosen = likely.argmax(0) * len(data) + torch.arange(len(data), device=likely.device)
     best = ahead.linearization.path  # whose likelihood is known; a step further may be too far
@@ -259,8 +236,8 @@ def find_path(
 @torch.no_grad()
 def standard_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor:
     """The channel noise of paths in its standard deviations, `(M, T, B, C)`."""
-    seen, states = Recording(), paths.states[:, :-1]
-    with running(*states.shape[:-1]), seen, Replaying(paths.noise):
+    states = paths.states[:, :-1]
+    with running(*states.shape[:-1]), Recording() as seen, Replaying(paths.noise):
         sample_channels(program, states, acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
     parts = []
     for site, fn in seen.distributions.items():
@@ -286,12 +263,11 @@ def smoother_paths(
     """
     start_noise, states, noise = (values.to(data.controls.dtype) for values in ahead.draws(draws))
     trajectories = len(data)
-    start, moving = Recording(), Recording()
     certain = KnownStart(data.known_start) if known_start else Standardised(start_noise.unsqueeze(1))
-    with running(draws, 1, trajectories), start, certain:
+    with running(draws, 1, trajectories), Recording() as start, certain:
         program.initial()
     few = slice(0, 1)  # one transition says which sites there are
-    with running(1, 1, trajectories), moving, Standardised(noise[few, few]):
+    with running(1, 1, trajectories), Recording() as moving, Standardised(noise[few, few]):
         sample_channels(program, states[few, few], data.controls[few], data.elapsed[few], data.steps[few])
     event_dims = {site: fn.event_dim for site, fn in (start.distributions | moving.distributions).items()}
     first = torch.Size((draws, 1, trajectories))
@@ -312,8 +288,7 @@ def _noise_along(
     kernel served."""
 
     def drawn(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-        seen = Recording()
-        with running(*state.shape[:-1]), seen, Standardised(noise):
+        with running(*state.shape[:-1]), Recording() as seen, Standardised(noise):
             sample_channels(program, state, control, time, step)
         values = [as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()]
         return torch.cat([value.expand(*state.shape[:-1], value.shape[-1]) for value in values], -1)
