@@ -32,7 +32,7 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.stability import divergence
 from steady_ppl.model.substeps import acting_controls, sample_channels
 from steady_ppl.smc.filter import particle_filter
-from steady_ppl.smc.genealogy import Paths
+from steady_ppl.smc.genealogy import Paths, event_dims
 from steady_ppl.utils.angles import wrap_angles
 
 MAX_INCREASE = 10.0
@@ -269,14 +269,14 @@ def smoother_paths(
     few = slice(0, 1)  # one transition says which sites there are
     with running(1, 1, trajectories), Recording() as moving, Standardised(noise[few, few]):
         sample_channels(program, states[few, few], data.controls[few], data.elapsed[few], data.steps[few])
-    event_dims = {site: fn.event_dim for site, fn in (start.distributions | moving.distributions).items()}
+    dims = event_dims(start, moving)
     first = torch.Size((draws, 1, trajectories))
     values, reason = _noise_along(program, data, states, noise, moving, kernels)
     return Paths(
         states=states,
-        start={site: broadcast_event(value, first, event_dims[site]) for site, value in start.values.items()},
+        start={site: broadcast_event(value, first, dims[site]) for site, value in start.values.items()},
         noise=values,
-        event_dims=event_dims | {"states": 1},
+        event_dims=dims | {"states": 1},
         in_plain_torch=reason,
     )
 

@@ -19,11 +19,14 @@ from steady_ppl.model.handlers import Recording, Replaying, masked, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, sample_row
 from steady_ppl.smc.filter import STEPS_WORTH_COMPILING, particle_filter
-from steady_ppl.smc.genealogy import Paths
+from steady_ppl.smc.genealogy import Paths, event_dims
 from steady_ppl.smc.proposal import Proposal
-from steady_ppl.utils.angles import wrap
+from steady_ppl.utils.angles import wrap_angles
 
 HUNDREDS = 100  # of E steps are in a training
+PASSES = 30  # of Gauss and Newton's method
+AT_REST = 1e-9  # of a channel's size and unit, by which noise may still move when it is found
+Noise = dict[str, Tensor]
 
 
 class PathGuide:
@@ -40,7 +43,7 @@ class PathGuide:
         require(draws >= 1, "draws", draws, "at least 1")
         self.draws = draws
         self.paths: Paths | None = None
-        self.memory: dict[str, torch.Tensor] = {}
+        self.memory: dict[str, Tensor] = {}
         self.in_plain_torch: str | None = None
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
@@ -162,7 +165,7 @@ def sample_known(paths: Paths, data: Trajectories) -> None:
     rows, trajectories = data.time.shape
     several = len(paths.states) > 1
 
-    def known(site: str, value: torch.Tensor) -> None:
+    def known(site: str, value: Tensor) -> None:
         pyro.sample(site, dist.Delta(value if several else value[0], event_dim=paths.event_dims[site]))
 
     with pyro.plate("trajectory", trajectories, dim=-1):
@@ -174,15 +177,6 @@ def sample_known(paths: Paths, data: Trajectories) -> None:
         with pyro.plate("interval", rows - 1, dim=-2), masked(data.transitions):
             for site, value in paths.noise.items():
                 known(site, value)
-
-
-PASSES = 30  # of Gauss and Newton's method
-
-
-AT_REST = 1e-9  # of a channel's size and unit, by which noise may still move when it is found
-
-
-Noise = dict[str, Tensor]
 
 
 @torch.no_grad()
@@ -210,11 +204,9 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
     before, after = states[:-1].double(), states[1:].double()
     controls = acting_controls(exact, within)[:-1]
 
-    def run(noise: dict[str, Tensor]) -> tuple[Tensor, Recording]:
-        recording = Recording()
-        with running(*before.shape[:-1]), recording, Replaying(noise):
-            after = sample_row(exact, before, controls, within.elapsed[:-1], within.steps)
-        return after, recording
+    def run(noise: Noise) -> tuple[Tensor, Recording]:
+        with running(*before.shape[:-1]), Recording() as recording, Replaying(noise):
+            return sample_row(exact, before, controls, within.elapsed[:-1], within.steps), recording
 
     _, probe = run({})
     noise = {site: value.new_zeros(value.shape) for site, value in probe.values.items()}
@@ -229,20 +221,17 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
             "(transition bends too much in its noise): supervised learning cannot tell which it was",
             site="transition",
         )
-
-    start = Recording()
-    with running(1, before.shape[1]), start:
+    with running(1, before.shape[1]), Recording() as start:
         program.initial()
     if len(start.values) != 1:
         raise ProgramError("supervised learning needs initial() to sample the whole state as one site", site="initial")
     (site,) = start.values
     width = start.distributions[site].event_shape.numel()  # other states rest at the start
-    event_dims = {s: fn.event_dim for s, fn in (start.distributions | probe.distributions).items()} | {"states": 1}
     return Paths(
         states=states[None],
         start={site: states[None, :1, :, :width]},
         noise={s: value[None].to(states.dtype) for s, value in noise.items()},
-        event_dims=event_dims,
+        event_dims=event_dims(start, probe) | {"states": 1},
     )
 
 
@@ -258,10 +247,8 @@ def _improved(
             _channel(unit[site], channel).add_(1.0)
             columns.append(run(unit)[0] - base)
             places.append((site, channel))
-    effect, difference = torch.stack(columns, -1).double(), after - base
-    for index in angles:
-        difference[..., index] = wrap(difference[..., index])
-    change = (torch.linalg.pinv(effect) @ difference.double().unsqueeze(-1)).squeeze(-1).to(after.dtype)
+    difference = wrap_angles(after - base, angles)
+    change = (torch.linalg.pinv(torch.stack(columns, -1)) @ difference.unsqueeze(-1)).squeeze(-1)
     found = {site: value.clone() for site, value in noise.items()}
     for index, (site, channel) in enumerate(places):
         _channel(found[site], channel).add_(change[..., index])

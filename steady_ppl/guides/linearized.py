@@ -147,14 +147,9 @@ class GaussianGuide(LinearizedGuide):
         weight = self.tempering(progress)
         ahead = self.look_ahead(data, progress)
         require_found(ahead, self.program, data)
-        paths = smoother_paths(
-            self.program,
-            data,
-            ahead,
-            self.draws,
-            known_start=self.known_start,
-            kernels=data.time.numel() >= WORTH_COMPILING,
-        )
+        kernels = data.time.numel() >= WORTH_COMPILING
+        given = (self.program, data, ahead, self.draws)
+        paths = smoother_paths(*given, known_start=self.known_start, kernels=kernels)
         self.in_plain_torch = self.in_plain_torch or paths.in_plain_torch
         self.keep(paths, data)
         return {"observation_weight": weight} | self._figures(ahead)
@@ -167,6 +162,7 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
         particles: N, for each trajectory.
         resample_below: share of N under which the effective sample size triggers resampling.
         untwisted, tempered: see `Twist`.
+        more: of `LinearizedGuide`.
     """
 
     def __init__(
@@ -175,22 +171,12 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
         *,
         particles: int = 100,
         draws: int = 100,
-        tempering: Tempering | None = None,
-        known_start: bool = False,
-        passes: int = 1,
-        search_again: float = 0.2,
         resample_below: float = 0.5,
         untwisted: float = 0.01,
         tempered: float = 1.0,
+        **more: Any,
     ) -> None:
-        super().__init__(
-            program,
-            draws=draws,
-            tempering=tempering,
-            known_start=known_start,
-            passes=passes,
-            search_again=search_again,
-        )
+        super().__init__(program, draws=draws, **more)
         require(particles >= 1, "particles", particles, "at least 1")
         self.particles, self.resample_below = particles, resample_below
         self.untwisted, self.tempered = untwisted, tempered
@@ -253,10 +239,7 @@ class _Steered(nn.Module):
 
     def __init__(self, steering: Steering, kind: torch.dtype, winding: int | None = None) -> None:
         super().__init__()
-        shift, gain, factor = (
-            (part if winding is None else part[winding]).to(kind)
-            for part in (steering.shift, steering.gain, steering.factor)
-        )
+        shift, gain, factor = ((part if winding is None else part[winding]).to(kind) for part in steering)
         self.shift, self.gain = nn.Parameter(shift.clone()), nn.Parameter(gain.clone())
         self.log_scale = nn.Parameter(factor.diagonal(dim1=-2, dim2=-1).abs().log().clone())
         self.above = nn.Parameter(factor.triu(1).clone())

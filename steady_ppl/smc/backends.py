@@ -15,6 +15,7 @@ from steady_ppl.kernels.jit import Method, close, compiled, distrust
 from steady_ppl.model.handlers import Observing, Recording, Standardised, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance, standardised
+from steady_ppl.smc.genealogy import event_dims
 from steady_ppl.smc.resampling import by_component, take
 
 
@@ -56,7 +57,7 @@ class Stepping:
         control, time, step = self.controls[row, None], self.elapsed[row, None], self.steps[row, None]
         with running(state.shape[0], 1, state.shape[1]), Recording() as recording, given:
             moved = advance(self.program, state.unsqueeze(1), control, time, step)
-        self.event_dims = {site: fn.event_dim for site, fn in recording.distributions.items()}
+        self.event_dims = event_dims(recording)
         values = recording.values
         if self.program.substeps > 1:
             values = {site: standardised(fn, values[site], site) for site, fn in recording.distributions.items()}
@@ -73,38 +74,34 @@ class Stepping:
 FILTER = "filter"  # the name of what is compiled for it
 
 
-def stepping_for(
-    program: Program, data: Trajectories, state: Tensor, observation_weight: float | Tensor
-) -> tuple[Stepping, str | None]:
+def stepping_for(plain: Stepping, state: Tensor) -> tuple[Stepping, str | None]:
     """Kernels where they can serve, and otherwise the program as written and why.
 
-    Args:
-        state: `(N, B, D)`, the particles' starts, on some of which kernels are compared with the program's lines.
+    On some of the particles' starts, `(N, B, D)`, kernels are compared with the program's lines.
     """
-    plain = Stepping(program, data, observation_weight)
     if state.device.type != "cpu" or state.dtype != torch.float32:
         return plain, f"{str(state.dtype).removeprefix('torch.')} on {state.device.type}"
     if state.shape[0] < LANES:
         return plain, f"fewer than {LANES} particles"
-    methods = compiled(program, FILTER, lambda: _Methods(program, data, plain.controls, state))
+    methods = compiled(plain.program, FILTER, lambda: _Methods(plain, state))
     if isinstance(methods, str):
         return plain, methods
     stepping = CompiledStepping(methods, plain)
     if not stepping.agrees(state[:LANES]):
-        return plain, distrust(program, FILTER)
+        return plain, distrust(plain.program, FILTER)
     return stepping, None
 
 
 class _Methods:
     """`transition` and `observe` of a program."""
 
-    def __init__(self, program: Program, data: Trajectories, controls: Tensor, state: Tensor) -> None:
-        one, first = (1, 1, 1), state[:1, :1].unsqueeze(1)
-        by_row = {"control": controls, "time": data.elapsed, "step": data.steps}
+    def __init__(self, plain: Stepping, state: Tensor) -> None:
+        program, data, one, first = plain.program, plain.data, (1, 1, 1), state[:1, :1].unsqueeze(1)
+        by_row = {"control": plain.controls, "time": data.elapsed, "step": data.steps}
         inputs = {name: values[:1, :1].unsqueeze(0) for name, values in by_row.items()}
         with torch.no_grad(), running(*one), Recording() as seen:
             advance(program, first, *inputs.values())
-        self.event_dims = {site: fn.event_dim for site, fn in seen.distributions.items()}
+        self.event_dims = event_dims(seen)
         self.sizes = {site: value.numel() for site, value in seen.values.items()}
         self.channels, self.width = sum(self.sizes.values()), state.shape[-1]
         self.held = program.substeps > 1

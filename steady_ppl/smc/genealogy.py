@@ -9,9 +9,15 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.model.handlers import Recording
 from steady_ppl.smc.resampling import systematic, take
 
 FEW = 10  # particles in effect: with fewer, what a filter says hangs on a handful of draws
+
+
+def event_dims(*seen: Recording) -> dict[str, int]:
+    """Event dimension of every site that was met."""
+    return {site: fn.event_dim for recording in seen for site, fn in recording.distributions.items()}
 
 
 @dataclass(frozen=True)
@@ -97,10 +103,8 @@ class Filtered:
             if ancestors is not None:
                 index = take(ancestors, index)
             states.append(take(self.states[row], index))
-        path, along = (
-            torch.stack(states[::-1], 1),
-            {site: torch.stack(values[::-1], 1) for site, values in noise.items()},
-        )
+        path = torch.stack(states[::-1], 1)
+        along = {site: torch.stack(values[::-1], 1) for site, values in noise.items()}
         return Paths(
             states=path,
             start={site: take(value, index).unsqueeze(1) for site, value in self.start.items()},
