@@ -20,8 +20,8 @@ from torch import Tensor, nn
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, require
-from steady_ppl.guides.base import Constant, Tempering, sample_known
-from steady_ppl.model.handlers import ByColumn, KnownStart, Recording, Replaying, Standardised, broadcast_event, running
+from steady_ppl.guides.base import Constant, Taking, Tempering, sample_known
+from steady_ppl.model.handlers import KnownStart, Recording, Replaying, Standardised, broadcast_event, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, sample_channels, sample_row
 from steady_ppl.model.validate import start_size, step_size
@@ -132,18 +132,6 @@ class VariationalGuide(nn.Module):
             event_dims=dims | {"states": 1},
         )
         return paths, at_start, later
-
-
-class Taking(ByColumn):
-    """Give latent sites the columns of some values, `(..., C)`, in the order in which the sites are met."""
-
-    def __init__(self, values: Tensor) -> None:
-        super().__init__()
-        self.values = values
-
-    def _pyro_sample(self, message: Any) -> None:
-        taken = self.values[..., self.take(message["fn"])]
-        message["value"] = taken if message["fn"].event_dim else taken[..., 0]
 
 
 def _prior_of_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor:
