@@ -22,16 +22,7 @@ from numba import njit
 from torch import Tensor
 
 from steady_ppl.gaussian.linearize import LinearArrays, Linearization
-from steady_ppl.gaussian.matrices import (
-    Array,
-    add_product,
-    add_times,
-    array,
-    arrays,
-    propagate,
-    set_product,
-    set_times,
-)
+from steady_ppl.gaussian.matrices import Array, add_product, add_times, array, arrays, propagate, set_product, set_times
 
 
 class Potential(NamedTuple):

@@ -21,7 +21,6 @@ from steady_ppl.kernels.jit import on_all_rows
 from steady_ppl.model.handlers import (
     KnownStart,
     Recording,
-    Replaying,
     Standardised,
     as_vector,
     broadcast_event,
@@ -142,28 +141,23 @@ def _either(which: Tensor, one: ReferencePath, other: ReferencePath) -> Referenc
 
 
 def find_and_smooth(
-    program: Program, data: Trajectories, *, known_start: bool = False, observation_weight: float = 1.0
+    program: Program,
+    data: Trajectories,
+    *,
+    known_start: bool = False,
+    observation_weight: float = 1.0,
+    may_fail: bool = False,
 ) -> Lookahead:
     """Find paths from the measurements alone and look ahead along them.
 
     Raises:
-        FilterError: the bootstrap filter of the search or the linearised program broke down.
-    """
-    ahead = find_and_try(program, data, known_start=known_start, observation_weight=observation_weight)
-    require_found(ahead, program, data)
-    return ahead
-
-
-def find_and_try(
-    program: Program, data: Trajectories, *, known_start: bool = False, observation_weight: float = 1.0
-) -> Lookahead:
-    """`find_and_smooth` whose log p(y) need not be finite.
-
-    Raises:
-        FilterError: the bootstrap filter of the search broke down.
+        FilterError: the bootstrap filter of the search broke down, or the linearised program unless it `may_fail`.
     """
     path = find_path(program, data, known_start=known_start, observation_weight=observation_weight)
-    return smooth(program, data, path, known_start=known_start, observation_weight=observation_weight)
+    ahead = smooth(program, data, path, known_start=known_start, observation_weight=observation_weight)
+    if not may_fail:
+        require_found(ahead, program, data)
+    return ahead
 
 
 def require_found(ahead: Lookahead, program: Program, data: Trajectories) -> None:
@@ -220,13 +214,11 @@ def find_path(
     """
     copies = data.subset(torch.arange(len(data)).repeat(len(tempering)))
     weights = observation_weight * data.controls.new_tensor(tempering).repeat_interleave(len(data))
-    filtered = particle_filter(
-        program, copies, particles=particles, observation_weight=weights, known_start=known_start
-    )
+    known: Any = {"known_start": known_start}
+    filtered = particle_filter(program, copies, particles=particles, observation_weight=weights, **known)
     found = filtered.paths(1).within(copies)
     path = ReferencePath(found.states[0], standard_noise(program, copies, found)[0])
-    given: Any = {"known_start": known_start, "observation_weight": observation_weight}
-    ahead = smooth(program, copies, path, passes=passes, **given)
+    ahead = smooth(program, copies, path, observation_weight=observation_weight, passes=passes, **known)
     likely = torch.nan_to_num(ahead.log_likelihood, nan=-torch.inf).view(len(tempering), len(data))
     chosen = likely.argmax(0) * len(data) + torch.arange(len(data), device=likely.device)
     best = ahead.linearization.path  # whose likelihood is known; a step further may be too far
@@ -236,11 +228,8 @@ def find_path(
 @torch.no_grad()
 def standard_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor:
     """The channel noise of paths in its standard deviations, `(M, T, B, C)`."""
-    states = paths.states[:, :-1]
-    with running(*states.shape[:-1]), Recording() as seen, Replaying(paths.noise):
-        sample_channels(program, states, acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
     parts = []
-    for site, fn in seen.distributions.items():
+    for site, fn in paths.channels(program, data).items():
         mean, sd = normal_moments(fn, site)
         parts.append(as_vector((paths.noise[site] - mean) / sd, fn.event_dim))
     return torch.cat(parts, -1)

@@ -14,7 +14,6 @@ from steady_ppl.gaussian.information_filter import Lookahead, Steering
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import (
     find_and_smooth,
-    find_and_try,
     means_as_path,
     require_found,
     resting_path,
@@ -91,9 +90,8 @@ class LinearizedGuide(PathGuide):
         for label in part.labels:
             self.memory[f"searched/{label}"] = torch.tensor(progress, dtype=torch.float64)
         weight = self.tempering(progress)
-        ahead = find_and_try(self.program, part, known_start=self.known_start, observation_weight=weight)
-        if known is None:
-            require_found(ahead, self.program, part)
+        given: Any = {"known_start": self.known_start, "observation_weight": weight, "may_fail": known is not None}
+        ahead = find_and_smooth(self.program, part, **given)
         found = resting_path(ahead, part)
         better = ahead.log_likelihood > (-torch.inf if known is None else known[trajectories])  # not where it is a nan
         kept = better.nonzero().flatten().tolist()

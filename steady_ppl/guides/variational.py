@@ -23,7 +23,7 @@ from steady_ppl.errors import UsageError, require
 from steady_ppl.guides.base import Constant, Taking, Tempering, sample_known
 from steady_ppl.model.handlers import KnownStart, Recording, Replaying, Standardised, broadcast_event, running
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, sample_channels, sample_row
+from steady_ppl.model.substeps import acting_controls, sample_row
 from steady_ppl.model.validate import start_size, step_size
 from steady_ppl.smc.genealogy import Paths, event_dims
 
@@ -136,10 +136,7 @@ class VariationalGuide(nn.Module):
 
 def _prior_of_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor:
     """Log-density of the channel noise under the program, as `Joint` scores it, `(M,)`."""
-    states = paths.states[:, :-1]
-    with running(*states.shape[:-1]), Recording() as seen, Replaying(paths.noise):
-        sample_channels(program, states, acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
-    logs = [fn.log_prob(paths.noise[site]) for site, fn in seen.distributions.items()]
+    logs = [fn.log_prob(paths.noise[site]) for site, fn in paths.channels(program, data).items()]
     return torch.where(data.transitions, torch.stack(logs).sum(0), 0.0).sum((1, 2))
 
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.model.handlers import Recording
+from steady_ppl.model.handlers import Recording, Replaying, running
+from steady_ppl.model.program import Program
+from steady_ppl.model.substeps import acting_controls, sample_channels
 from steady_ppl.smc.resampling import systematic, take
 
 FEW = 10  # particles in effect: with fewer, what a filter says hangs on a handful of draws
@@ -43,6 +46,13 @@ class Paths:
         index = list(trajectories)
         start, noise = ({site: value[:, :, index] for site, value in part.items()} for part in (self.start, self.noise))
         return replace(self, states=self.states[:, :, index], start=start, noise=noise)
+
+    def channels(self, program: Program, data: Trajectories) -> dict[str, Any]:
+        """Each channel's distribution along the paths of `data`, given the noise of those before it."""
+        states = self.states[:, :-1]
+        with running(*states.shape[:-1]), Recording() as seen, Replaying(self.noise):
+            sample_channels(program, states, acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
+        return seen.distributions
 
     def within(self, data: Trajectories) -> Paths:
         """Fill the rows past each trajectory's end with its first row, where the program is known to be finite: what
