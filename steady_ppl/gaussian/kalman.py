@@ -88,15 +88,9 @@ def track(
     passes: int = 2,
     kernels: bool | None = None,
 ) -> Tracked:
-    """Linearise along a path, filter and smooth, and again along what was smoothed.
+    """Linearise along a path near the posterior's mode, filter and smooth, and again along what was smoothed.
 
-    Args:
-        program: with normal noise; see `linearize`.
-        data: as returned by `for_program`.
-        path: near the posterior's mode.
-        known_start: the first state is certain.
-        passes: linearisations.
-        kernels: see `linearize`.
+    There are so many passes; the other arguments are those of `linearize`.
     """
     tracked = filter_and_smooth(linearize(program, data, path, known_start=known_start, kernels=kernels))
     for _ in range(passes - 1):

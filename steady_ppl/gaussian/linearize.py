@@ -114,6 +114,11 @@ class Linearization(Sensors):
     state: Tensor
     noise: Tensor
 
+    @property
+    def circular(self) -> Tensor:
+        """Which of the state's components are `angles`, `(D,)`."""
+        return torch.tensor([i in self.angles for i in range(self.state.shape[-1])], device=self.state.device)
+
     def arrays(self) -> LinearArrays:
         return LinearArrays(*(array(getattr(self, name)) for name in LinearArrays._fields))
 

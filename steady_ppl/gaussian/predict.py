@@ -52,9 +52,7 @@ def predict(
     """Run the program without noise from the filtered state of every row, with the recorded controls.
 
     Args:
-        program: the state-space model.
-        data: as returned by `for_program`.
-        tracked: of these drives.
+        program, data, tracked: the drives as they were tracked.
         horizons: how many rows ahead.
         bands: the horizons whose variances are wanted, the others' are NaN; None: all.
 
@@ -99,14 +97,8 @@ def simulate_again(
 ) -> tuple[Trajectories, ReferencePath]:
     """Drives that the program makes of the same controls, with the same gaps in the measurements.
 
-    Args:
-        program: the state-space model.
-        data: `B` drives, as returned by `for_program`.
-        starts: `(M, B, D)`.
-        channels: C, how many numbers a step's noise has.
-
-    Returns:
-        `M · B` drives, all of the first set first, and their true paths.
+    From starts `(M, B, D)` and with C noise channels it makes `M · B` drives, all of the first set first, and their
+    true paths.
     """
     sets, drives, _ = starts.shape
     stepping = Stepping(program, data, 1.0)

@@ -56,14 +56,10 @@ def smooth(
     Gauss and Newton's method. A step is halved while its end is worse by more than `MAX_INCREASE` nats, see `_merit`.
 
     Args:
-        program: with normal noise; see `linearize`.
-        data: as returned by `for_program`.
+        program, data, known_start, observation_weight, kernels: of `linearize`.
         path: where to begin; the better, the fewer passes.
-        known_start: the first state is certain.
-        observation_weight: tempers the observations.
         passes: linearisations at most.
         tolerance: stop when no noise moves by more, in standard deviations of its channel.
-        kernels: see `linearize`.
 
     Returns:
         The lookahead along the last path that was accepted, so that its linearization and its means agree.

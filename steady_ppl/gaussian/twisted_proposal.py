@@ -225,8 +225,7 @@ class Twist(Proposal):
         self.lookahead, self.untwisted = lookahead, untwisted
         path, steps = lookahead.linearization.path.states, lookahead.steps
         self.dtype, self.path = path.dtype, path.double()
-        self.angles = torch.zeros(path.shape[-1], dtype=torch.bool, device=path.device)
-        self.angles[list(lookahead.linearization.angles)] = True
+        self.angles = lookahead.linearization.circular
         self.steering = (steps.shift, steps.gain, steps.factor, inverse(steps.factor))
 
     def log_future(self, row: int, state: Tensor) -> Tensor:

@@ -210,9 +210,7 @@ class SmootherGuide(VariationalGuide):
         kind, self.labels = data.controls.dtype, data.labels
         ahead = find_and_smooth(program, data, known_start=self.known_start)
         self.register_buffer("path", ahead.linearization.path.states.to(kind))
-        angles = torch.zeros(self.path.shape[-1], dtype=torch.bool, device=self.path.device)
-        angles[list(ahead.linearization.angles)] = True
-        self.register_buffer("angles", angles)
+        self.register_buffer("angles", ahead.linearization.circular)
         self.steps = _Steered(ahead.steps, kind)
         self.starts = _Steered(ahead.starts, kind, winding=0)
         self.index: list[int] = []

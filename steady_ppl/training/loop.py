@@ -326,9 +326,8 @@ class Validation:
     @property
     def notes(self) -> list[str]:
         """What a fit should say of it."""
-        if self.reason is None:
-            return []
-        return [f"held-out drives were judged by the bootstrap filter at every tenth row: {self.reason}"]
+        said = f"held-out drives were judged by the bootstrap filter at every tenth row: {self.reason}"
+        return [] if self.reason is None else [said]
 
     @classmethod
     def suited(
