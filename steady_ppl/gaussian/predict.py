@@ -24,13 +24,11 @@ class Prediction:
     """Measured less predicted, of rows `horizon`, `horizon` + 1, … from what was measured up to `horizon` rows before.
 
     Attributes:
-        horizon: in rows.
         error: `(T + 1 − horizon, B, K)`, on the circle where the measurement is an angle.
         variance: of the same shape, of the linearised program, measurement noise included; NaN where missing.
         observed: of the same shape, where there is something to compare.
     """
 
-    horizon: int
     error: Tensor
     variance: Tensor
     observed: Tensor
@@ -67,7 +65,7 @@ def predict(
             variance = tracked.variances_ahead(horizon) if wanted else torch.full(seen.shape, torch.nan).double()
             observed = data.observed[horizon:] & seen
             error = errors(program, state, data.measurements[horizon:], observed).double()
-            found[horizon] = Prediction(horizon, torch.where(observed, error, 0.0), variance, observed)
+            found[horizon] = Prediction(torch.where(observed, error, 0.0), variance, observed)
     return found
 
 
