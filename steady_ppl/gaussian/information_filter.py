@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -22,9 +21,8 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from steady_ppl.gaussian.linearize import Linearization
-
-Array = np.ndarray[Any, np.dtype[np.float64]]
+from steady_ppl.gaussian.linearize import LinearArrays, Linearization
+from steady_ppl.gaussian.matrices import Array, add_product, add_times, array, arrays, propagate, set_product, set_times
 
 
 class Potential(NamedTuple):
@@ -35,17 +33,8 @@ class Potential(NamedTuple):
     log_scale: Array
 
 
-class SteeringArrays(NamedTuple):
-    """`Steering` as the recursions fill it, `(..., C)`, `(..., C, D)` and `(..., C, C)`."""
-
-    shift: Array
-    gain: Array
-    factor: Array
-
-
-@dataclass(frozen=True)
-class Steering:
-    """Noise that leads to the later measurements, ε ~ N(shift − gain δ, factor factorᵀ).
+class Steering(NamedTuple):
+    """Noise that leads to the later measurements, ε ~ N(shift − gain δ, factor factorᵀ); tensors or arrays.
 
     Attributes:
         shift: `(..., C)`.
@@ -53,22 +42,19 @@ class Steering:
         factor: `(..., C, C)`, upper triangular.
     """
 
-    shift: Tensor
-    gain: Tensor
-    factor: Tensor
+    shift: Any
+    gain: Any
+    factor: Any
 
-    @staticmethod
-    def empty(noise: Tensor) -> Steering:
+    @classmethod
+    def empty(cls, noise: Tensor) -> Steering:
         """Room in the host's memory for the steering of noise that enters by `(..., D, C)`."""
         *left, dimension, channels = noise.shape
         shapes = ((channels,), (channels, dimension), (channels, channels))
-        return Steering(*(torch.empty(*left, *shape, dtype=noise.dtype) for shape in shapes))
-
-    def arrays(self) -> SteeringArrays:
-        return SteeringArrays(_array(self.shift), _array(self.gain), _array(self.factor))
+        return cls(*(torch.empty(*left, *shape, dtype=noise.dtype) for shape in shapes))
 
     def to(self, device: torch.device) -> Steering:
-        return Steering(self.shift.to(device), self.gain.to(device), self.factor.to(device))
+        return Steering(*(part.to(device) for part in self))
 
 
 @dataclass(frozen=True)
@@ -125,15 +111,10 @@ class Lookahead:
         linear, steps = self.linearization, self.steps
         spread = linear.start_noise @ self.starts.factor[0]
         rows, (trajectories, dimension, channels) = len(linear.offset) + 1, linear.noise.shape[1:]
-        shapes = ((dimension, dimension), (channels, channels), (dimension, channels))
-        lengths = (rows, rows - 1, rows - 1)
-        found = [
-            torch.empty(length, trajectories, *shape, dtype=linear.offset.dtype)
-            for length, shape in zip(lengths, shapes, strict=True)
-        ]
+        shapes = ((rows, dimension, dimension), (rows - 1, channels, channels), (rows - 1, dimension, channels))
+        found = [linear.offset.new_empty((shape[0], trajectories, *shape[1:]), device="cpu") for shape in shapes]
         found[0][0] = spread @ spread.mT
-        given = _arrays((linear.state, linear.noise, steps.gain, steps.factor))
-        covariances(*given, _arrays(found))  # type: ignore[call-arg]
+        covariances(linear.arrays(), array(steps.gain), array(steps.factor), arrays(*found))
         states, noises, across = (part.to(linear.offset.device) for part in found)
         return states, noises, across
 
@@ -147,7 +128,7 @@ class Lookahead:
         deviations = begin.new_empty((*pushed.shape[:-3], len(moved) + 1, *begin.shape[-2:]), device="cpu")
         deviations[..., 0, :, :] = begin
         draws, filled = (values.reshape(-1, *values.shape[-3:]) for values in (pushed, deviations))
-        roll_out(_array(moved), _array(draws), filled.numpy())
+        roll_out(array(moved), array(draws), filled.numpy())
         deviations = deviations.to(begin.device)
         return linear.path.states + deviations, random - _times(steps.gain, deviations[..., :-1, :, :])
 
@@ -161,8 +142,8 @@ def look_ahead(linear: Linearization) -> Lookahead:
         linear.log_scale - 0.5 * (linear.precision * linear.residual.square()).sum(-1),
     )
     futures, steps = tuple(torch.empty_like(part, device="cpu") for part in seen), Steering.empty(linear.noise)
-    state, noise, offset = _arrays((linear.state, linear.noise, linear.offset))
-    backward(Potential(*_arrays(seen)), state, noise, offset, Potential(*_arrays(futures)), steps.arrays())
+    given = linear.arrays()
+    backward(given, Potential(*arrays(*seen)), Potential(*arrays(*futures)), Steering(*arrays(*steps)))
     device = linear.offset.device
     precision, information, log_scale = (part.to(device) for part in futures)
     windings = _windings(linear)
@@ -170,8 +151,8 @@ def look_ahead(linear: Linearization) -> Lookahead:
     starts = Steering.empty(linear.start_noise.expand(len(windings), *linear.start_noise.shape))
     masses = torch.empty(offsets.shape[:-1], dtype=offsets.dtype)
     ahead = (precision[0] + seen[0][0], information[0] + seen[1][0], log_scale[0] + seen[2][0])
-    first = Potential(*_arrays(ahead))
-    integrate_starts(first, _array(linear.start_noise), _array(offsets), starts.arrays(), masses.numpy())
+    first, filled = Potential(*arrays(*ahead)), Steering(*arrays(*starts))
+    integrate_starts(given, first, array(offsets), filled, masses.numpy())
     spread = (linear.start_noise @ starts.factor[0].to(device)).square().sum(-1)[:, list(linear.angles)]
     vague = (spread > 1).any(-1).cpu()  # the measurements leave an angle open: one turn's integral covers the others
     masses[1:, vague] = -torch.inf
@@ -187,15 +168,6 @@ def look_ahead(linear: Linearization) -> Lookahead:
         steps=steps.to(device),
         log_likelihood=log_likelihood.to(device),
     )
-
-
-def _arrays(tensors: Sequence[Tensor]) -> Any:
-    return tuple(_array(tensor) for tensor in tensors)
-
-
-def _array(tensor: Tensor) -> Array:
-    """A C-contiguous array; of a contiguous tensor in the host's memory it is that memory."""
-    return tensor.contiguous().numpy(force=True)
 
 
 def _windings(linear: Linearization) -> Tensor:
@@ -217,9 +189,7 @@ def _times(matrix: Tensor, vectors: Tensor) -> Tensor:
 
 
 @njit(cache=True, error_model="numpy")
-def integrate(
-    precision: Array, information: Array, noise: Array, offset: Array, out: tuple[Array, Array, Array]
-) -> float:
+def integrate(precision: Array, information: Array, noise: Array, offset: Array, out: Steering) -> float:
     """∫ ψ(μ + offset + G ε) N(ε; 0, I) dε as a function of μ, and the noise's conditional given μ.
 
     ψ(x) = exp(−½ xᵀ Λ x + λᵀ x). With S = (I + GᵀΛG)⁻¹ and u = λ − Λ offset the integral is again of that form, with
@@ -228,224 +198,127 @@ def integrate(
     Args:
         precision, information: Λ `(D, D)` and λ `(D,)`, overwritten by those of the integral.
         noise, offset: G `(D, C)` and `(D,)`.
-        out: shift `(C,)`, gain `(C, D)` and factor `(C, C)` of ε ~ N(shift − gain μ, factor factorᵀ).
+        out: filled with ε ~ N(shift − gain μ, factor factorᵀ).
 
     Returns:
         The logarithm of the constant.
     """
-    shift, gain, factor = out
     dimension, channels = noise.shape
-    by_noise = np.zeros((channels, dimension))
-    for c in range(channels):
-        for i in range(dimension):
-            for j in range(dimension):
-                by_noise[c, i] += precision[i, j] * noise[j, c]
     constant = 0.0
+    pushed = np.zeros(dimension)
+    add_times(pushed, precision, offset)
     for i in range(dimension):
-        pushed = 0.0
-        for j in range(dimension):
-            pushed += precision[i, j] * offset[j]
-        constant += (information[i] - 0.5 * pushed) * offset[i]
-        information[i] -= pushed
-    root = np.zeros((channels, channels))
+        constant += (information[i] - 0.5 * pushed[i]) * offset[i]
+        information[i] -= pushed[i]
+    # root rootᵀ = I + GᵀΛG; the columns of `half` are root⁻¹ (Gᵀu, GᵀΛ), by forward substitution
+    half, root = np.zeros((channels, 1 + dimension)), np.eye(channels)
+    by_noise = half[:, 1:]
+    add_product(by_noise, noise.T, precision.T)
+    add_product(root, noise.T, by_noise.T)
+    add_times(half[:, 0], noise.T, information)
     for a in range(channels):
-        for b in range(a + 1):
-            entry = 1.0 if a == b else 0.0
-            for i in range(dimension):
-                entry += noise[i, a] * by_noise[b, i]
-            for c in range(b):
-                entry -= root[a, c] * root[b, c]
-            root[a, b] = math.sqrt(entry) if a == b else entry / root[b, b]
-        constant -= math.log(root[a, a])
-    # forward substitution, in place: half = root⁻¹ (Gᵀu, GᵀΛ)
-    half = np.zeros(channels)
-    for a in range(channels):
-        entry = 0.0
-        for i in range(dimension):
-            entry += noise[i, a] * information[i]
         for b in range(a):
-            entry -= root[a, b] * half[b]
-            for i in range(dimension):
-                by_noise[a, i] -= root[a, b] * by_noise[b, i]
-        half[a] = entry / root[a, a]
-        for i in range(dimension):
-            by_noise[a, i] /= root[a, a]
-        constant += 0.5 * half[a] * half[a]
-    for i in range(dimension):
-        for a in range(channels):
-            information[i] -= by_noise[a, i] * half[a]
-            for j in range(dimension):
-                precision[i, j] -= by_noise[a, i] * by_noise[a, j]
+            for c in range(b):
+                root[a, b] -= root[a, c] * root[b, c]
+            root[a, b] /= root[b, b]
+        for c in range(a):
+            root[a, a] -= root[a, c] * root[a, c]
+        root[a, a] = math.sqrt(root[a, a])
+        constant -= math.log(root[a, a])
+    for a in range(channels):
+        for i in range(1 + dimension):
+            for b in range(a):
+                half[a, i] -= root[a, b] * half[b, i]
+            half[a, i] /= root[a, a]
+        constant += 0.5 * half[a, 0] * half[a, 0]
+    add_times(information, by_noise.T, half[:, 0], -1.0)
+    add_product(precision, by_noise.T, by_noise, -1.0)
     # back substitution: root⁻ᵀ (half, I)
+    out.shift[:], out.gain[:], out.factor[:] = half[:, 0], by_noise, np.eye(channels)
     for a in range(channels - 1, -1, -1):
-        shift[a] = half[a]
-        gain[a] = by_noise[a]
-        for c in range(channels):
-            factor[a, c] = 1.0 if a == c else 0.0
         for b in range(a + 1, channels):
-            shift[a] -= root[b, a] * shift[b]
+            out.shift[a] -= root[b, a] * out.shift[b]
             for i in range(dimension):
-                gain[a, i] -= root[b, a] * gain[b, i]
+                out.gain[a, i] -= root[b, a] * out.gain[b, i]
             for c in range(channels):
-                factor[a, c] -= root[b, a] * factor[b, c]
-        shift[a] /= root[a, a]
+                out.factor[a, c] -= root[b, a] * out.factor[b, c]
+        out.shift[a] /= root[a, a]
         for i in range(dimension):
-            gain[a, i] /= root[a, a]
+            out.gain[a, i] /= root[a, a]
         for c in range(channels):
-            factor[a, c] /= root[a, a]
+            out.factor[a, c] /= root[a, a]
     return constant
 
 
 @njit(cache=True, error_model="numpy")
-def integrate_starts(ahead: Potential, noise: Array, offset: Array, steering: SteeringArrays, total: Array) -> None:
-    """`integrate` for every start: of each trajectory, on each of several turns.
+def integrate_starts(given: LinearArrays, ahead: Potential, offset: Array, steering: Steering, total: Array) -> None:
+    """`integrate` for every start: of each trajectory `(B, ...)`, on each of several turns.
 
-    Args:
-        ahead: what all rows' measurements say of the first state: `(B, D, D)`, `(B, D)` and `(B,)`.
-        noise, offset: `(B, D, C)` and `(W, B, D)`.
-        steering: filled, `(W, B, ...)`.
-        total: filled with the logarithm of the integral, `(W, B)`.
+    `ahead` is what all rows' measurements say of the first state. The offsets are `(W, B, D)`. Fills the steering and
+    the logarithm of the integral, `(W, B)`.
     """
     for w in range(offset.shape[0]):
         for b in range(offset.shape[1]):
-            out = (steering.shift[w, b], steering.gain[w, b], steering.factor[w, b])
+            out = Steering(steering.shift[w, b], steering.gain[w, b], steering.factor[w, b])
             precision, information = ahead.precision[b].copy(), ahead.information[b].copy()
-            total[w, b] = ahead.log_scale[b] + integrate(precision, information, noise[b], offset[w, b], out)
+            total[w, b] = ahead.log_scale[b] + integrate(
+                precision, information, given.start_noise[b], offset[w, b], out
+            )
 
 
 @njit(cache=True, error_model="numpy")
-def backward(
-    seen: Potential,
-    state: Array,
-    noise: Array,
-    offset: Array,
-    futures: Potential,
-    steering: SteeringArrays,
-) -> None:
+def backward(given: LinearArrays, seen: Potential, futures: Potential, steering: Steering) -> None:
     """The backward information filter of δ' = F δ + offset + G ε, for every trajectory.
 
-    Args:
-        seen: what each row's own measurements say.
-        state, noise, offset: F `(T, B, D, D)`, G `(T, B, D, C)` and `(T, B, D)`.
-        futures: filled with what all later rows' measurements say of a row's state.
-        steering: filled with the noise that they ask for in each interval, `(T, B, ...)`.
+    From what each row's own measurements say, `seen`, it fills what all later ones say of a row's state, `futures`, and
+    the noise that they ask for in each interval.
     """
-    intervals, trajectories, dimension = offset.shape
-    channels = noise.shape[3]
+    intervals, trajectories, dimension = given.offset.shape
     precision, information = np.zeros((dimension, dimension)), np.zeros(dimension)
-    half, row_of_gain = np.zeros((dimension, dimension)), np.zeros(dimension)
+    half, gain = np.zeros((dimension, dimension)), np.zeros(steering.gain.shape[2:])
     for b in range(trajectories):
-        precision[:] = 0.0
-        information[:] = 0.0
-        scale = 0.0
-        futures.precision[intervals, b] = 0.0
-        futures.information[intervals, b] = 0.0
-        futures.log_scale[intervals, b] = 0.0
-        for t in range(intervals - 1, -1, -1):
-            precision += seen.precision[t + 1, b]
-            information += seen.information[t + 1, b]
-            out = (steering.shift[t, b], steering.gain[t, b], steering.factor[t, b])
-            scale += seen.log_scale[t + 1, b] + integrate(precision, information, noise[t, b], offset[t, b], out)
-            forward = state[t, b]
-            for i in range(dimension):
-                for j in range(dimension):
-                    half[i, j] = 0.0
-                    for k in range(dimension):
-                        half[i, j] += precision[i, k] * forward[k, j]
-            for i in range(dimension):
-                futures.information[t, b, i] = 0.0
-                for k in range(dimension):
-                    futures.information[t, b, i] += forward[k, i] * information[k]
-                for j in range(dimension):
-                    precision[i, j] = 0.0
-                    for k in range(dimension):
-                        precision[i, j] += forward[k, i] * half[k, j]
-            information[:] = futures.information[t, b]
-            for a in range(channels):
-                row_of_gain[:] = steering.gain[t, b, a]
-                for j in range(dimension):
-                    steering.gain[t, b, a, j] = 0.0
-                    for k in range(dimension):
-                        steering.gain[t, b, a, j] += row_of_gain[k] * forward[k, j]
-            futures.precision[t, b] = precision
-            futures.log_scale[t, b] = scale
+        precision[:], information[:], scale = 0.0, 0.0, 0.0
+        for t in range(intervals, -1, -1):
+            futures.precision[t, b], futures.information[t, b], futures.log_scale[t, b] = precision, information, scale
+            if t > 0:
+                precision += seen.precision[t, b]
+                information += seen.information[t, b]
+                out = Steering(steering.shift[t - 1, b], gain, steering.factor[t - 1, b])
+                noise, offset, forward = given.noise[t - 1, b], given.offset[t - 1, b], given.state[t - 1, b]
+                scale += seen.log_scale[t, b] + integrate(precision, information, noise, offset, out)
+                set_product(steering.gain[t - 1, b], gain, forward)
+                set_product(half, precision, forward)
+                set_product(precision, forward.T, half)
+                futures.information[t - 1, b] = information
+                set_times(information, forward.T, futures.information[t - 1, b])
 
 
 @njit(cache=True, error_model="numpy")
 def roll_out(moved: Array, pushed: Array, deviations: Array) -> None:
-    """Fill δ' = moved δ + pushed row by row.
-
-    Args:
-        moved: `(T, B, D, D)`.
-        pushed: `(M, T, B, D)`.
-        deviations: `(M, T + 1, B, D)`, its first row given.
-    """
-    draws, intervals, trajectories, dimension = pushed.shape
+    """Fill δ' = moved δ + pushed row by row: `(T, B, D, D)`, `(M, T, B, D)` and δ `(M, T + 1, B, D)`, its first row
+    given."""
+    draws, intervals, trajectories, _ = pushed.shape
     for m in range(draws):
         for t in range(intervals):
+            deviations[m, t + 1] = pushed[m, t]
             for b in range(trajectories):
-                for i in range(dimension):
-                    entry = pushed[m, t, b, i]
-                    for j in range(dimension):
-                        entry += moved[t, b, i, j] * deviations[m, t, b, j]
-                    deviations[m, t + 1, b, i] = entry
+                add_times(deviations[m, t + 1, b], moved[t, b], deviations[m, t, b])
 
 
 @njit(cache=True, error_model="numpy")
-def covariances(state: Array, noise: Array, gain: Array, factor: Array, found: tuple[Array, Array, Array]) -> None:
-    """Posterior covariances of δ' = F δ + G ε with ε ~ N(shift − gain δ, factor factorᵀ).
-
-    Args:
-        state, noise: F `(T, B, D, D)` and G `(T, B, D, C)`.
-        gain, factor: `(T, B, C, D)` and `(T, B, C, C)`.
-        found: of the states, `(T + 1, B, D, D)`, the first given; filled, as are those of the noise with itself,
-            `(T, B, C, C)`, and of each state with the noise that moves it, `(T, B, D, C)`.
-    """
+def covariances(given: LinearArrays, gain: Array, factor: Array, found: tuple[Array, Array, Array]) -> None:
+    """Fill the posterior covariances of δ' = F δ + G ε with ε ~ N(shift − gain δ, factor factorᵀ), as
+    `Lookahead.covariances` returns them, that of the first state given."""
     states, noises, across = found
-    intervals, trajectories, dimension, channels = noise.shape
-    moved = np.zeros((dimension, dimension))
-    spread = np.zeros((dimension, channels))
-    half = np.zeros((dimension, dimension))
+    intervals, trajectories, dimension, channels = given.noise.shape
+    moved, spread = np.zeros((dimension, dimension)), np.zeros((dimension, channels))
     for t in range(intervals):
         for b in range(trajectories):
-            now = states[t, b]
-            for i in range(dimension):
-                for a in range(channels):
-                    entry = 0.0
-                    for j in range(dimension):
-                        entry -= now[i, j] * gain[t, b, a, j]
-                    across[t, b, i, a] = entry
-            for a in range(channels):
-                for c in range(channels):
-                    entry = 0.0
-                    for k in range(channels):
-                        entry += factor[t, b, a, k] * factor[t, b, c, k]
-                    for j in range(dimension):
-                        entry -= gain[t, b, a, j] * across[t, b, j, c]
-                    noises[t, b, a, c] = entry
-            for i in range(dimension):
-                for j in range(dimension):
-                    entry = state[t, b, i, j]
-                    for a in range(channels):
-                        entry -= noise[t, b, i, a] * gain[t, b, a, j]
-                    moved[i, j] = entry
-                for k in range(channels):
-                    entry = 0.0
-                    for a in range(channels):
-                        entry += noise[t, b, i, a] * factor[t, b, a, k]
-                    spread[i, k] = entry
-            for i in range(dimension):
-                for j in range(dimension):
-                    entry = 0.0
-                    for k in range(dimension):
-                        entry += moved[i, k] * now[k, j]
-                    half[i, j] = entry
-            for i in range(dimension):
-                for j in range(i + 1):
-                    entry = 0.0
-                    for k in range(dimension):
-                        entry += half[i, k] * moved[j, k]
-                    for k in range(channels):
-                        entry += spread[i, k] * spread[j, k]
-                    states[t + 1, b, i, j] = entry
-                    states[t + 1, b, j, i] = entry
+            across[t, b] = 0.0
+            add_product(across[t, b], states[t, b], gain[t, b].T, -1.0)
+            set_product(noises[t, b], factor[t, b], factor[t, b].T)
+            add_product(noises[t, b], gain[t, b], across[t, b], -1.0)
+            moved[:] = given.state[t, b]
+            add_product(moved, given.noise[t, b], gain[t, b], -1.0)
+            set_product(spread, given.noise[t, b], factor[t, b])
+            propagate(states[t + 1, b], states[t, b], moved, spread)

@@ -9,14 +9,16 @@ residual r(x) for every measurement. Around a path of states x̄ and noise ε̄,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError
+from steady_ppl.gaussian.matrices import Array, array
 from steady_ppl.kernels.jit import on_all_rows
 from steady_ppl.model.handlers import (
     AtMean,
@@ -47,6 +49,15 @@ class ReferencePath:
     states: Tensor
     noise: Tensor
 
+    @classmethod
+    def of_means(cls, states: Tensor, noise: Tensor, data: Trajectories) -> ReferencePath:
+        """Posterior means as a path to linearise along, the padding filled with the first row."""
+        kind = data.controls.dtype
+        return cls(
+            states=torch.where(data.rows[..., None], states, states[:1]).to(kind),
+            noise=torch.where(data.transitions[..., None], noise, 0.0).to(kind),
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class Sensors:
@@ -65,6 +76,19 @@ class Sensors:
     precision: Tensor
     log_scale: Tensor
     in_plain_torch: str | None = None
+
+
+class LinearArrays(NamedTuple):
+    """What the recursions read of a `Linearization`, see there."""
+
+    start_offset: Array
+    start_noise: Array
+    offset: Array
+    state: Array
+    noise: Array
+    residual: Array
+    measurement: Array
+    precision: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,6 +114,14 @@ class Linearization(Sensors):
     state: Tensor
     noise: Tensor
 
+    @property
+    def circular(self) -> Tensor:
+        """Which of the state's components are `angles`, `(D,)`."""
+        return torch.tensor([i in self.angles for i in range(self.state.shape[-1])], device=self.state.device)
+
+    def arrays(self) -> LinearArrays:
+        return LinearArrays(*(array(getattr(self, name)) for name in LinearArrays._fields))
+
 
 @torch.no_grad()
 def linearize(
@@ -114,18 +146,24 @@ def linearize(
     Raises:
         ProgramError: a site has another distribution, or an operation has no derivative.
     """
+
+    def step(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
+        with running(*state.shape[:-1]), Standardised(noise):
+            return advance(program, state, control, time, step)
+
     states, noise = path.states, path.noise
     angles = _on_a_circle(program, data, states[0, :1])
-    moved = _transition(program, data, states, noise, kernels)
-    by_state, by_noise = moved.by
-    offset = (moved.value - (by_noise @ noise.unsqueeze(-1)).squeeze(-1) - states[1:]).double()
+    along = {"state": states[:-1], "noise": noise}
+    given = {"control": acting_controls(program, data)[:-1], "time": data.elapsed[:-1], "step": data.steps}
+    moved, (by_state, by_noise), in_plain_torch = _jacobians(program, step, along, given, kernels)
+    offset = (moved - (by_noise @ noise.unsqueeze(-1)).squeeze(-1) - states[1:]).double()
     offset[..., angles] = wrap(offset[..., angles])  # a program may keep its angles on the circle, and so may a path
     start_offset, start_noise = _start(program, data, states[0], known_start)
     start_turn = torch.zeros_like(start_offset, dtype=torch.float64)
     for angle in angles:
         start_turn[:, angle] = start_offset[:, angle].double() - wrap(start_offset[:, angle].double())
     seen = linearize_sensors(program, data, states, observation_weight=observation_weight, kernels=kernels)
-    both = vars(seen) | {"in_plain_torch": moved.in_plain_torch or seen.in_plain_torch}
+    both = vars(seen) | {"in_plain_torch": in_plain_torch or seen.in_plain_torch}
     return Linearization(
         path=path,
         angles=angles,
@@ -149,60 +187,45 @@ def linearize_sensors(
     kernels: bool | None = None,
 ) -> Sensors:
     """The part of `linearize` that is about what is measured, around states `(T + 1, B, D)`."""
-    measured = _measurement(program, data, states, kernels)
-    residuals, log_sd, log_density = measured.value.chunk(3, -1)
-    by_measured = -measured.by[0][..., : residuals.shape[-1], :]
+
+    def measure(state: Tensor, measurement: Tensor, observed: Tensor) -> Tensor:
+        return _residuals(program, state, measurement, observed)
+
+    given, count = {"measurement": data.measurements, "observed": data.observed}, data.measurements.shape[-1]
+    measured, by, in_plain_torch = _jacobians(program, measure, {"state": states}, given, kernels, outputs=count)
+    residuals, log_sd, log_density = measured.chunk(3, -1)
+    by_measured = -by[0][..., :count, :]
     observed = data.observed & torch.isfinite(by_measured).all(-1)  # a bearing to where one stands has no derivative
     return Sensors(
         residual=torch.where(observed, residuals, 0.0).double(),
         measurement=torch.where(observed[..., None], by_measured, 0.0).double(),
         precision=observation_weight * torch.where(observed, (-2 * log_sd).exp(), 0.0).double(),
         log_scale=observation_weight * torch.where(observed, log_density, 0.0).double().sum(-1),
-        in_plain_torch=measured.in_plain_torch,
+        in_plain_torch=in_plain_torch,
     )
 
 
 @torch.no_grad()
 def why_not_linear(program: Program, data: Trajectories, *, known_start: bool = False) -> str | None:
     """What keeps a program from being linearised, None if nothing does; tried on the first two rows of a trajectory."""
-    rows = min(2, data.time.shape[0])
-    head = replace(
-        data.subset([0]),
-        **{
-            name: getattr(data, name)[:rows, :1]
-            for name in ("time", "controls", "measurements", "observed", "states")
-            if getattr(data, name) is not None
-        },
-        lengths=data.lengths[:1].clamp(max=rows),
-    )
+    rows, first = min(2, data.time.shape[0]), data.subset([0])
+    by_row = {name: getattr(first, name) for name in ("time", "controls", "measurements", "observed", "states")}
+    head = {name: values[:rows] for name, values in by_row.items() if values is not None}
+    data = replace(first, **head, lengths=first.lengths.clamp(max=rows))
     with running(rows - 1, 1):
         state = broadcast_event(program.initial(), torch.Size((rows - 1, 1)), 1)
-    channels = step_size(program)
-    path = ReferencePath(state[:1].expand(rows, -1, -1), state.new_zeros((rows - 1, 1, channels)))
+    path = ReferencePath(state[:1].expand(rows, -1, -1), state.new_zeros((rows - 1, 1, step_size(program))))
     try:
-        linearize(program, head, path, known_start=known_start)
+        linearize(program, data, path, known_start=known_start)
     except ProgramError as error:
         return str(error)
     return None
 
 
-def _transition(
-    program: Program, data: Trajectories, states: Tensor, noise: Tensor, kernels: bool | None
-) -> _Jacobians:
-    def step(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-        with running(*state.shape[:-1]), Standardised(noise):
-            return advance(program, state, control, time, step)
-
-    along = {"state": states[:-1], "noise": noise}
-    given = {"control": acting_controls(program, data)[:-1], "time": data.elapsed[:-1], "step": data.steps}
-    return _jacobians(program, step, along, given, kernels)
-
-
 def _residuals(program: Program, state: Tensor, measurement: Tensor, observed: Tensor) -> Tensor:
     """Residuals and, beside them, log standard deviations and log-densities at residual zero, `(..., 3 K)`; where the
     noise is not normal, of the normal that touches it."""
-    seen = Recording()
-    with running(*state.shape[:-1]), seen, Observing(measurement, observed):
+    with running(*state.shape[:-1]), Recording() as seen, Observing(measurement, observed):
         program.observe(state)
     residuals, log_sds, heights = [], [], []
     for site, fn in seen.distributions.items():
@@ -225,16 +248,6 @@ def _start(program: Program, data: Trajectories, first: Tensor, known_start: boo
         return data.known_start - first, first.new_zeros((*first.shape, 1))
     began, (start_noise,) = _derivatives(start, first.new_zeros((first.shape[0], start_size(program))))
     return began - first, start_noise
-
-
-def _measurement(program: Program, data: Trajectories, states: Tensor, kernels: bool | None) -> _Jacobians:
-    """Of all that `_residuals` returns."""
-
-    def measure(state: Tensor, measurement: Tensor, observed: Tensor) -> Tensor:
-        return _residuals(program, state, measurement, observed)
-
-    given = {"measurement": data.measurements, "observed": data.observed}
-    return _jacobians(program, measure, {"state": states}, given, kernels, outputs=data.measurements.shape[-1])
 
 
 def _on_a_circle(program: Program, data: Trajectories, state: Tensor) -> tuple[int, ...]:
@@ -261,15 +274,6 @@ def _on_a_circle(program: Program, data: Trajectories, state: Tensor) -> tuple[i
     return tuple(angle for angle, periodic in zip(angles, same[1:].tolist(), strict=True) if periodic)
 
 
-@dataclass(frozen=True)
-class _Jacobians:
-    """A function's value `(..., V)`, its Jacobians `(..., V, ·)`, and why they had to come from plain torch, if so."""
-
-    value: Tensor
-    by: list[Tensor]
-    in_plain_torch: str | None = None
-
-
 def _jacobians(
     program: Program,
     function: Callable[..., Tensor],
@@ -277,13 +281,16 @@ def _jacobians(
     given: dict[str, Tensor],
     kernels: bool | None,
     outputs: int | None = None,
-) -> _Jacobians:
-    """By a kernel where it can serve, else by torch, which differentiates the first `outputs` components only."""
+) -> tuple[Tensor, list[Tensor], str | None]:
+    """A function's value `(..., V)`, its Jacobians `(..., V, ·)`, and why they had to come from plain torch, if so.
+
+    Torch differentiates the first `outputs` components only.
+    """
     found = on_all_rows(program, function.__name__, function, along | given, tuple(along), kernels)
     if isinstance(found, tuple):
-        return _Jacobians(*found)
+        return (*found, None)
     value, by = _derivatives(lambda *inputs: function(*inputs, *given.values()), *along.values(), outputs=outputs)
-    return _Jacobians(value, by, found)
+    return value, by, found
 
 
 def _derivatives(
@@ -294,24 +301,17 @@ def _derivatives(
     leaves = [value.detach().clone().requires_grad_() for value in inputs]
     with torch.enable_grad():
         value = function(*leaves)
-        components = value.unbind(-1)[:outputs]
-        rows = []
-        for index, component in enumerate(components):
-            if component.requires_grad:
-                last = index == len(components) - 1
-                rows.append(_gradients(component, leaves, not last))
-            else:
-                rows.append([torch.zeros_like(leaf) for leaf in leaves])
-    by = [torch.stack([row[i] for row in rows], -2) for i in range(len(leaves))]
-    return value.detach(), by
+        rows = [_gradients(component, leaves) for component in value.unbind(-1)[:outputs]]
+    return value.detach(), [torch.stack(column, -2) for column in zip(*rows, strict=True)]
 
 
-def _gradients(component: Tensor, leaves: list[Tensor], again: bool) -> list[Tensor]:
+def _gradients(component: Tensor, leaves: list[Tensor]) -> Sequence[Tensor]:
+    if not component.requires_grad:
+        return [torch.zeros_like(leaf) for leaf in leaves]
     try:
-        found = torch.autograd.grad(component.sum(), leaves, retain_graph=again, allow_unused=True)
+        return torch.autograd.grad(component.sum(), leaves, retain_graph=True, materialize_grads=True)
     except (NotImplementedError, RuntimeError) as error:
         why = str(error).splitlines()[0]
         raise ProgramError(
             f"the program cannot be linearised: {why} (--recipe steady --guide bootstrap takes any)"
         ) from error
-    return [torch.zeros_like(leaf) if part is None else part.detach() for leaf, part in zip(leaves, found, strict=True)]

@@ -24,13 +24,11 @@ class Prediction:
     """Measured less predicted, of rows `horizon`, `horizon` + 1, … from what was measured up to `horizon` rows before.
 
     Attributes:
-        horizon: in rows.
         error: `(T + 1 − horizon, B, K)`, on the circle where the measurement is an angle.
         variance: of the same shape, of the linearised program, measurement noise included; NaN where missing.
         observed: of the same shape, where there is something to compare.
     """
 
-    horizon: int
     error: Tensor
     variance: Tensor
     observed: Tensor
@@ -52,9 +50,7 @@ def predict(
     """Run the program without noise from the filtered state of every row, with the recorded controls.
 
     Args:
-        program: the state-space model.
-        data: as returned by `for_program`.
-        tracked: of these drives.
+        program, data, tracked: the drives as they were tracked.
         horizons: how many rows ahead.
         bands: the horizons whose variances are wanted, the others' are NaN; None: all.
 
@@ -69,7 +65,7 @@ def predict(
             variance = tracked.variances_ahead(horizon) if wanted else torch.full(seen.shape, torch.nan).double()
             observed = data.observed[horizon:] & seen
             error = errors(program, state, data.measurements[horizon:], observed).double()
-            found[horizon] = Prediction(horizon, torch.where(observed, error, 0.0), variance, observed)
+            found[horizon] = Prediction(torch.where(observed, error, 0.0), variance, observed)
     return found
 
 
@@ -87,8 +83,7 @@ def states_ahead(program: Program, data: Trajectories, tracked: Tracked, most: i
 
 def errors(program: Program, states: Tensor, measurements: Tensor, observed: Tensor) -> Tensor:
     """Measured less what the program measures in these states, `(..., K)`, on the circle for angles."""
-    seen = Recording()
-    with running(*states.shape[:-1]), seen, Observing(measurements, observed):
+    with running(*states.shape[:-1]), Recording() as seen, Observing(measurements, observed):
         program.observe(states)
     parts = [as_vector(residual(fn, seen.observed[site]), fn.event_dim) for site, fn in seen.distributions.items()]
     return torch.cat(parts, -1)
@@ -100,14 +95,8 @@ def simulate_again(
 ) -> tuple[Trajectories, ReferencePath]:
     """Drives that the program makes of the same controls, with the same gaps in the measurements.
 
-    Args:
-        program: the state-space model.
-        data: `B` drives, as returned by `for_program`.
-        starts: `(M, B, D)`.
-        channels: C, how many numbers a step's noise has.
-
-    Returns:
-        `M · B` drives, all of the first set first, and their true paths.
+    From starts `(M, B, D)` and with C noise channels it makes `M · B` drives, all of the first set first, and their
+    true paths.
     """
     sets, drives, _ = starts.shape
     stepping = Stepping(program, data, 1.0)

@@ -7,9 +7,6 @@ the program would visit, unobserved, from its `initial`. How it moves there says
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
@@ -46,8 +43,10 @@ def fixes(program: Program, data: Trajectories, *, places: int = 32, passes: int
     guesses = _guesses(program, data, places)
     told = _told(program, data, guesses[:, 0])
     _require_enough(program, data, told)
-    angles = program.angle_indices
-    prior = _Prior.of(guesses[data.rows[:, None].expand(guesses.shape[:3])], angles)
+    drawn = guesses[data.rows[:, None].expand(guesses.shape[:3])].double()
+    precision = 1 / drawn.var(0).clamp(min=1e-12)
+    precision[list(program.angle_indices)] = 0.0  # normal, flat over angles
+    prior = drawn.mean(0), precision
     drives = max(1, AT_ONCE // (places * len(data.time)))
     parts = torch.arange(len(data)).split(drives)
     states = torch.cat(
@@ -85,8 +84,12 @@ def _require_enough(program: Program, data: Trajectories, told: Tensor) -> None:
         )
 
 
-def _found(program: Program, data: Trajectories, guesses: Tensor, told: Tensor, prior: _Prior, passes: int) -> Tensor:
-    """The most probable states `(T + 1, B, D)` of some drives, from guesses `(T + 1, S, B, D)`."""
+def _found(
+    program: Program, data: Trajectories, guesses: Tensor, told: Tensor, prior: tuple[Tensor, Tensor], passes: int
+) -> Tensor:
+    """The most probable states `(T + 1, B, D)` of some drives, from guesses `(T + 1, S, B, D)` under a prior's mean and
+    precision, each `(D,)`."""
+    mean, precision = prior
     left = guesses.shape[1:3]
     copies = data.subset(torch.arange(len(data)).repeat(left[0]))
 
@@ -94,11 +97,11 @@ def _found(program: Program, data: Trajectories, guesses: Tensor, told: Tensor, 
         """The states, the cost there, and its negative gradient and curvature."""
         seen = linearize_sensors(program, copies, states)
         weighted = seen.measurement.mT * seen.precision.unsqueeze(-2)
-        apart = prior.mean - states
+        apart = mean - states
         cost = (seen.precision * seen.residual.square()).sum(-1) / 2 - seen.log_scale
-        cost = cost + (prior.precision * apart.square()).sum(-1) / 2
-        downhill = (weighted @ seen.residual.unsqueeze(-1)).squeeze(-1) + prior.precision * apart
-        return states, cost, downhill, weighted @ seen.measurement + torch.diag_embed(prior.precision)
+        cost = cost + (precision * apart.square()).sum(-1) / 2
+        downhill = (weighted @ seen.residual.unsqueeze(-1)).squeeze(-1) + precision * apart
+        return states, cost, downhill, weighted @ seen.measurement + torch.diag_embed(precision)
 
     best = judged(guesses.flatten(1, 2))
     damping = torch.full_like(best[1], DAMPING)
@@ -112,25 +115,6 @@ def _found(program: Program, data: Trajectories, guesses: Tensor, told: Tensor, 
     states, cost = (part.unflatten(1, left) for part in best[:2])
     chosen = cost.nan_to_num(torch.inf).argmin(1)
     return states.take_along_dim(chosen[:, None, :, None], 1).squeeze(1)
-
-
-@dataclass(frozen=True)
-class _Prior:
-    """Normal, flat over angles.
-
-    Attributes:
-        mean, precision: `(D,)`.
-    """
-
-    mean: Tensor
-    precision: Tensor
-
-    @classmethod
-    def of(cls, drawn: Tensor, angles: Sequence[int]) -> _Prior:
-        """Of states `(·, D)`."""
-        precision = 1 / drawn.double().var(0).clamp(min=1e-12)
-        precision[list(angles)] = 0.0
-        return cls(drawn.double().mean(0), precision)
 
 
 def _where(which: Tensor, one: Tensor, other: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ Roweis 1999).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +21,6 @@ from steady_ppl.kernels.jit import on_all_rows
 from steady_ppl.model.handlers import (
     KnownStart,
     Recording,
-    Replaying,
     Standardised,
     as_vector,
     broadcast_event,
@@ -32,11 +31,11 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.stability import divergence
 from steady_ppl.model.substeps import acting_controls, sample_channels
 from steady_ppl.smc.filter import particle_filter
-from steady_ppl.smc.genealogy import Paths
+from steady_ppl.smc.genealogy import Paths, event_dims
 from steady_ppl.utils.angles import wrap_angles
 
 MAX_INCREASE = 10.0
-"""Nats by which a step may leave a path worse off, see `_Merit`: some such steps lead out of a bad place."""
+"""Nats by which a step may leave a path worse off, see `_merit`: some such steps lead out of a bad place."""
 REST_TOLERANCE = 0.05  # a trajectory is at rest where no noise moves by more, in standard deviations of its channel
 
 
@@ -54,28 +53,21 @@ def smooth(
 ) -> Lookahead:
     """Move a path to the mode of the posterior and look ahead along it.
 
-    Gauss and Newton's method. A step is halved while its end is worse by more than `MAX_INCREASE` nats, see `_Merit`.
+    Gauss and Newton's method. A step is halved while its end is worse by more than `MAX_INCREASE` nats, see `_merit`.
 
     Args:
-        program: with normal noise; see `linearize`.
-        data: as returned by `for_program`.
+        program, data, known_start, observation_weight, kernels: of `linearize`.
         path: where to begin; the better, the fewer passes.
-        known_start: the first state is certain.
-        observation_weight: tempers the observations.
         passes: linearisations at most.
         tolerance: stop when no noise moves by more, in standard deviations of its channel.
-        kernels: see `linearize`.
 
     Returns:
         The lookahead along the last path that was accepted, so that its linearization and its means agree.
     """
 
     def look(path: ReferencePath) -> Lookahead:
-        return look_ahead(
-            linearize(
-                program, data, path, known_start=known_start, observation_weight=observation_weight, kernels=kernels
-            )
-        )
+        given: Any = {"known_start": known_start, "observation_weight": observation_weight, "kernels": kernels}
+        return look_ahead(linearize(program, data, path, **given))
 
     if passes == 1:
         return look(path)
@@ -84,8 +76,8 @@ def smooth(
     most = torch.full((len(data),), torch.inf, dtype=torch.float64, device=path.states.device)
     for index in range(passes):
         ahead = look(path)
-        merit = _merit(ahead)
-        worse = torch.isfinite(most) & ~(merit.cost(penalty) <= most)  # or not a number
+        density, defect = _merit(ahead)
+        worse = torch.isfinite(most) & ~(_cost(density, defect, penalty) <= most)  # or not a number
         accepted = _either(worse, accepted, path)
         if index == passes - 1:
             break
@@ -93,36 +85,21 @@ def smooth(
         moved = _either(worse, halfway, means_as_path(ahead, data))
         change = torch.nan_to_num((moved.noise - path.noise).abs(), nan=0.0).max()  # of those that have not blown up
         penalty = torch.where(worse[:, None], penalty, _penalty(ahead, moved))
-        most = torch.where(worse, most, merit.cost(penalty) + MAX_INCREASE)
+        most = torch.where(worse, most, _cost(density, defect, penalty) + MAX_INCREASE)
         path = moved
         if not bool(change > tolerance):
             break
     return look(accepted) if bool(worse.any()) else ahead
 
 
-@dataclass(frozen=True)
-class _Merit:
-    """What paths are compared by.
+def _merit(ahead: Lookahead) -> tuple[Tensor, Tensor]:
+    """What paths are compared by: less a path's log-density given its own noise, less the linearised log p(y), `(B,)`,
+    and how far its states are from where its noise leads, `(T + 1, B, D)`.
 
     The path's own negative log-density alone would lead through a beacon, where nothing is linear and what is drawn
     from the linearised program is useless. The linearised log p(y) alone may be high far from the measurements. So the
     merit is the one less the other: small where a path is likely and its surroundings are linear.
-
-    Attributes:
-        density: less the path's log-density given its own noise, less the linearised log p(y), `(B,)`.
-        defect: how far its states are from where its noise leads, `(T + 1, B, D)`.
     """
-
-    density: Tensor
-    defect: Tensor
-
-    def cost(self, penalty: Tensor) -> Tensor:
-        """Nats, `(B,)`, a unit of each defect counting `penalty`, `(T + 1, B, D)` (an l₁ penalty: Nocedal and Wright
-        2006, chapter 17)."""
-        return self.density + (penalty * self.defect).sum((0, 2))
-
-
-def _merit(ahead: Lookahead) -> _Merit:
     linear = ahead.linearization
     noise = linear.path.noise.double()
     gram = linear.start_noise.mT @ linear.start_noise
@@ -134,7 +111,12 @@ def _merit(ahead: Lookahead) -> _Merit:
     seen = 0.5 * (linear.precision * linear.residual.square()).sum((0, 2)) - linear.log_scale.sum(0)
     drawn = 0.5 * (noise.square().sum((0, 2)) + start.square().sum((1, 2)))
     defect = wrap_angles(torch.cat([begins.unsqueeze(0), rows]), linear.angles).abs()
-    return _Merit(seen + drawn - ahead.log_likelihood, defect)
+    return seen + drawn - ahead.log_likelihood, defect
+
+
+def _cost(density: Tensor, defect: Tensor, penalty: Tensor) -> Tensor:
+    """Nats, `(B,)`, a unit of each defect counting its penalty (an l₁ penalty: Nocedal and Wright 2006, chapter 17)."""
+    return density + (penalty * defect).sum((0, 2))
 
 
 def _penalty(ahead: Lookahead, moved: ReferencePath) -> Tensor:
@@ -155,28 +137,23 @@ def _either(which: Tensor, one: ReferencePath, other: ReferencePath) -> Referenc
 
 
 def find_and_smooth(
-    program: Program, data: Trajectories, *, known_start: bool = False, observation_weight: float = 1.0
+    program: Program,
+    data: Trajectories,
+    *,
+    known_start: bool = False,
+    observation_weight: float = 1.0,
+    may_fail: bool = False,
 ) -> Lookahead:
     """Find paths from the measurements alone and look ahead along them.
 
     Raises:
-        FilterError: the bootstrap filter of the search or the linearised program broke down.
-    """
-    ahead = find_and_try(program, data, known_start=known_start, observation_weight=observation_weight)
-    require_found(ahead, program, data)
-    return ahead
-
-
-def find_and_try(
-    program: Program, data: Trajectories, *, known_start: bool = False, observation_weight: float = 1.0
-) -> Lookahead:
-    """`find_and_smooth` whose log p(y) need not be finite.
-
-    Raises:
-        FilterError: the bootstrap filter of the search broke down.
+        FilterError: the bootstrap filter of the search broke down, or the linearised program unless it `may_fail`.
     """
     path = find_path(program, data, known_start=known_start, observation_weight=observation_weight)
-    return smooth(program, data, path, known_start=known_start, observation_weight=observation_weight)
+    ahead = smooth(program, data, path, known_start=known_start, observation_weight=observation_weight)
+    if not may_fail:
+        require_found(ahead, program, data)
+    return ahead
 
 
 def require_found(ahead: Lookahead, program: Program, data: Trajectories) -> None:
@@ -193,13 +170,8 @@ def require_found(ahead: Lookahead, program: Program, data: Trajectories) -> Non
 
 
 def means_as_path(ahead: Lookahead, data: Trajectories) -> ReferencePath:
-    """The posterior mean as a path to linearise along, the padding filled with the first row."""
-    states, noise = ahead.means()
-    kind = data.controls.dtype
-    return ReferencePath(
-        states=torch.where(data.rows[..., None], states, states[:1]).to(kind),
-        noise=torch.where(data.transitions[..., None], noise, 0.0).to(kind),
-    )
+    """The posterior mean as a path to linearise along."""
+    return ReferencePath.of_means(*ahead.means(), data)
 
 
 def resting_path(ahead: Lookahead, data: Trajectories) -> ReferencePath:
@@ -238,18 +210,11 @@ def find_path(
     """
     copies = data.subset(torch.arange(len(data)).repeat(len(tempering)))
     weights = observation_weight * data.controls.new_tensor(tempering).repeat_interleave(len(data))
-    filtered = particle_filter(
-        program, copies, particles=particles, observation_weight=weights, known_start=known_start
-    )
+    known: Any = {"known_start": known_start}
+    filtered = particle_filter(program, copies, particles=particles, observation_weight=weights, **known)
     found = filtered.paths(1).within(copies)
-    ahead = smooth(
-        program,
-        copies,
-        ReferencePath(found.states[0], standard_noise(program, copies, found)[0]),
-        known_start=known_start,
-        observation_weight=observation_weight,
-        passes=passes,
-    )
+    path = ReferencePath(found.states[0], standard_noise(program, copies, found)[0])
+    ahead = smooth(program, copies, path, observation_weight=observation_weight, passes=passes, **known)
     likely = torch.nan_to_num(ahead.log_likelihood, nan=-torch.inf).view(len(tempering), len(data))
     chosen = likely.argmax(0) * len(data) + torch.arange(len(data), device=likely.device)
     best = ahead.linearization.path  # whose likelihood is known; a step further may be too far
@@ -259,11 +224,8 @@ def find_path(
 @torch.no_grad()
 def standard_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor:
     """The channel noise of paths in its standard deviations, `(M, T, B, C)`."""
-    seen, states = Recording(), paths.states[:, :-1]
-    with running(*states.shape[:-1]), seen, Replaying(paths.noise):
-        sample_channels(program, states, acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
     parts = []
-    for site, fn in seen.distributions.items():
+    for site, fn in paths.channels(program, data).items():
         mean, sd = normal_moments(fn, site)
         parts.append(as_vector((paths.noise[site] - mean) / sd, fn.event_dim))
     return torch.cat(parts, -1)
@@ -286,21 +248,20 @@ def smoother_paths(
     """
     start_noise, states, noise = (values.to(data.controls.dtype) for values in ahead.draws(draws))
     trajectories = len(data)
-    start, moving = Recording(), Recording()
     certain = KnownStart(data.known_start) if known_start else Standardised(start_noise.unsqueeze(1))
-    with running(draws, 1, trajectories), start, certain:
+    with running(draws, 1, trajectories), Recording() as start, certain:
         program.initial()
     few = slice(0, 1)  # one transition says which sites there are
-    with running(1, 1, trajectories), moving, Standardised(noise[few, few]):
+    with running(1, 1, trajectories), Recording() as moving, Standardised(noise[few, few]):
         sample_channels(program, states[few, few], data.controls[few], data.elapsed[few], data.steps[few])
-    event_dims = {site: fn.event_dim for site, fn in (start.distributions | moving.distributions).items()}
+    dims = event_dims(start, moving)
     first = torch.Size((draws, 1, trajectories))
     values, reason = _noise_along(program, data, states, noise, moving, kernels)
     return Paths(
         states=states,
-        start={site: broadcast_event(value, first, event_dims[site]) for site, value in start.values.items()},
+        start={site: broadcast_event(value, first, dims[site]) for site, value in start.values.items()},
         noise=values,
-        event_dims=event_dims | {"states": 1},
+        event_dims=dims | {"states": 1},
         in_plain_torch=reason,
     )
 
@@ -312,8 +273,7 @@ def _noise_along(
     kernel served."""
 
     def drawn(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-        seen = Recording()
-        with running(*state.shape[:-1]), seen, Standardised(noise):
+        with running(*state.shape[:-1]), Recording() as seen, Standardised(noise):
             sample_channels(program, state, control, time, step)
         values = [as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()]
         return torch.cat([value.expand(*state.shape[:-1], value.shape[-1]) for value in values], -1)

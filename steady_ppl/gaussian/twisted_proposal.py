@@ -18,12 +18,12 @@ from numba import njit
 from torch import Tensor
 
 from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
+from steady_ppl.gaussian.matrices import Array
 from steady_ppl.smc.proposal import Proposal
 from steady_ppl.smc.resampling import by_component
 from steady_ppl.utils.angles import wrap
 
 Steering = tuple[Tensor, Tensor, Tensor, Tensor]
-Array = np.ndarray[Any, Any]
 
 
 def log_future(
@@ -112,9 +112,8 @@ def _steer(
     shift, gain, factor, whitening = steering
     noise, log_ratio = out
     dimension, trajectories, particles = state.shape
-    channels = len(own)
-    deviation, wide = np.empty((dimension, particles)), np.empty((channels, particles))
-    mean, drawn, white = np.empty((channels, particles)), np.empty((channels, particles)), np.empty(particles)
+    channels, deviation, white = len(own), np.empty((dimension, particles)), np.empty(particles)
+    wide, mean, drawn = np.empty((3, channels, particles))
     for b in range(trajectories):
         _deviations(state, path, angles, b, deviation)
         ratio = log_ratio[b]
@@ -226,8 +225,7 @@ class Twist(Proposal):
         self.lookahead, self.untwisted = lookahead, untwisted
         path, steps = lookahead.linearization.path.states, lookahead.steps
         self.dtype, self.path = path.dtype, path.double()
-        self.angles = torch.zeros(path.shape[-1], dtype=torch.bool, device=path.device)
-        self.angles[list(lookahead.linearization.angles)] = True
+        self.angles = lookahead.linearization.circular
         self.steering = (steps.shift, steps.gain, steps.factor, inverse(steps.factor))
 
     def log_future(self, row: int, state: Tensor) -> Tensor:
@@ -261,6 +259,5 @@ class Twist(Proposal):
         if self.untwisted:
             stays = torch.rand(trajectories, particles, **kind).t() < self.untwisted
         steered = steer if state.device.type == "cpu" else steer_in_parallel
-        shift, gain, factor, whitening = (part[row] for part in self.steering)
-        steering = shift, gain, factor, whitening
+        steering: Any = tuple(part[row] for part in self.steering)
         return steered(state, self.path[row], self.angles, steering, own, stays, self.untwisted)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import pyro
 import pyro.distributions as dist
@@ -15,15 +14,18 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, FilterError, ProgramError, require
-from steady_ppl.model.handlers import Recording, Replaying, masked, running
+from steady_ppl.model.handlers import ByColumn, Recording, masked, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, sample_row
+from steady_ppl.model.validate import step_size
 from steady_ppl.smc.filter import STEPS_WORTH_COMPILING, particle_filter
-from steady_ppl.smc.genealogy import Paths
+from steady_ppl.smc.genealogy import Paths, event_dims
 from steady_ppl.smc.proposal import Proposal
-from steady_ppl.utils.angles import wrap
+from steady_ppl.utils.angles import wrap_angles
 
 HUNDREDS = 100  # of E steps are in a training
+PASSES = 30  # of Gauss and Newton's method
+AT_REST = 1e-9  # of a channel's size and unit, by which noise may still move when it is found
 
 
 class PathGuide:
@@ -40,7 +42,7 @@ class PathGuide:
         require(draws >= 1, "draws", draws, "at least 1")
         self.draws = draws
         self.paths: Paths | None = None
-        self.memory: dict[str, torch.Tensor] = {}
+        self.memory: dict[str, Tensor] = {}
         self.in_plain_torch: str | None = None
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
@@ -162,7 +164,7 @@ def sample_known(paths: Paths, data: Trajectories) -> None:
     rows, trajectories = data.time.shape
     several = len(paths.states) > 1
 
-    def known(site: str, value: torch.Tensor) -> None:
+    def known(site: str, value: Tensor) -> None:
         pyro.sample(site, dist.Delta(value if several else value[0], event_dim=paths.event_dims[site]))
 
     with pyro.plate("trajectory", trajectories, dim=-1):
@@ -174,15 +176,6 @@ def sample_known(paths: Paths, data: Trajectories) -> None:
         with pyro.plate("interval", rows - 1, dim=-2), masked(data.transitions):
             for site, value in paths.noise.items():
                 known(site, value)
-
-
-PASSES = 30  # of Gauss and Newton's method
-
-
-AT_REST = 1e-9  # of a channel's size and unit, by which noise may still move when it is found
-
-
-Noise = dict[str, Tensor]
 
 
 @torch.no_grad()
@@ -210,18 +203,19 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
     before, after = states[:-1].double(), states[1:].double()
     controls = acting_controls(exact, within)[:-1]
 
-    def run(noise: dict[str, Tensor]) -> tuple[Tensor, Recording]:
-        recording = Recording()
-        with running(*before.shape[:-1]), recording, Replaying(noise):
-            after = sample_row(exact, before, controls, within.elapsed[:-1], within.steps)
-        return after, recording
+    def run(noise: Tensor) -> tuple[Tensor, Recording]:
+        with running(*before.shape[:-1]), Recording() as recording, Taking(noise):
+            return sample_row(exact, before, controls, within.elapsed[:-1], within.steps), recording
 
-    _, probe = run({})
-    noise = {site: value.new_zeros(value.shape) for site, value in probe.values.items()}
-    angles = program.angle_indices
+    channels = torch.eye(step_size(program)).to(before)
+    noise = before.new_zeros(*before.shape[:-1], len(channels))
     for _ in range(PASSES):
-        noise, moved = _improved(run, noise, after, angles)
-        if not moved:
+        base, _ = run(noise)
+        effect = torch.stack([run(noise + channel)[0] - base for channel in channels], -1)
+        difference = wrap_angles(after - base, program.angle_indices)
+        change = (torch.linalg.pinv(effect) @ difference.unsqueeze(-1)).squeeze(-1)
+        noise = noise + change
+        if not bool((change.abs() > AT_REST * (1 + noise.abs())).any()):
             break
     else:
         raise ProgramError(
@@ -229,49 +223,31 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
             "(transition bends too much in its noise): supervised learning cannot tell which it was",
             site="transition",
         )
-
-    start = Recording()
-    with running(1, before.shape[1]), start:
+    _, moving = run(noise)
+    with running(1, before.shape[1]), Recording() as start:
         program.initial()
     if len(start.values) != 1:
         raise ProgramError("supervised learning needs initial() to sample the whole state as one site", site="initial")
     (site,) = start.values
     width = start.distributions[site].event_shape.numel()  # other states rest at the start
-    event_dims = {s: fn.event_dim for s, fn in (start.distributions | probe.distributions).items()} | {"states": 1}
     return Paths(
         states=states[None],
         start={site: states[None, :1, :, :width]},
-        noise={s: value[None].to(states.dtype) for s, value in noise.items()},
-        event_dims=event_dims,
+        noise={s: value[None].to(states.dtype) for s, value in moving.values.items()},
+        event_dims=event_dims(start, moving) | {"states": 1},
     )
 
 
-def _improved(
-    run: Callable[[Noise], tuple[Tensor, Recording]], noise: Noise, after: Tensor, angles: Sequence[int]
-) -> tuple[Noise, bool]:
-    """Noise after one pass towards the states `after`, and whether it moved."""
-    base, _ = run(noise)
-    columns, places = [], []
-    for site, value in noise.items():
-        for channel in range(value[0, 0].numel()):
-            unit = noise | {site: value.clone()}
-            _channel(unit[site], channel).add_(1.0)
-            columns.append(run(unit)[0] - base)
-            places.append((site, channel))
-    effect, difference = torch.stack(columns, -1).double(), after - base
-    for index in angles:
-        difference[..., index] = wrap(difference[..., index])
-    change = (torch.linalg.pinv(effect) @ difference.double().unsqueeze(-1)).squeeze(-1).to(after.dtype)
-    found = {site: value.clone() for site, value in noise.items()}
-    for index, (site, channel) in enumerate(places):
-        _channel(found[site], channel).add_(change[..., index])
-    reached = torch.stack([_channel(found[site], channel) for site, channel in places], -1)
-    return found, bool((change.abs() > AT_REST * (1 + reached.abs())).any())
+class Taking(ByColumn):
+    """Give latent sites the columns of some values, `(..., C)`, in the order in which the sites are met."""
 
+    def __init__(self, values: Tensor) -> None:
+        super().__init__()
+        self.values = values
 
-def _channel(value: Tensor, channel: int) -> Tensor:
-    """A view of one channel of a site's value, `(T, B)`."""
-    return value.reshape(*value.shape[:2], -1)[..., channel]
+    def _pyro_sample(self, message: Any) -> None:
+        taken = self.values[..., self.take(message["fn"])]
+        message["value"] = taken if message["fn"].event_dim else taken[..., 0]
 
 
 class Tempering(Protocol):

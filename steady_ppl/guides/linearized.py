@@ -14,7 +14,6 @@ from steady_ppl.gaussian.information_filter import Lookahead, Steering
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import (
     find_and_smooth,
-    find_and_try,
     means_as_path,
     require_found,
     resting_path,
@@ -91,9 +90,8 @@ class LinearizedGuide(PathGuide):
         for label in part.labels:
             self.memory[f"searched/{label}"] = torch.tensor(progress, dtype=torch.float64)
         weight = self.tempering(progress)
-        ahead = find_and_try(self.program, part, known_start=self.known_start, observation_weight=weight)
-        if known is None:
-            require_found(ahead, self.program, part)
+        given: Any = {"known_start": self.known_start, "observation_weight": weight, "may_fail": known is not None}
+        ahead = find_and_smooth(self.program, part, **given)
         found = resting_path(ahead, part)
         better = ahead.log_likelihood > (-torch.inf if known is None else known[trajectories])  # not where it is a nan
         kept = better.nonzero().flatten().tolist()
@@ -147,14 +145,9 @@ class GaussianGuide(LinearizedGuide):
         weight = self.tempering(progress)
         ahead = self.look_ahead(data, progress)
         require_found(ahead, self.program, data)
-        paths = smoother_paths(
-            self.program,
-            data,
-            ahead,
-            self.draws,
-            known_start=self.known_start,
-            kernels=data.time.numel() >= WORTH_COMPILING,
-        )
+        kernels = data.time.numel() >= WORTH_COMPILING
+        given = (self.program, data, ahead, self.draws)
+        paths = smoother_paths(*given, known_start=self.known_start, kernels=kernels)
         self.in_plain_torch = self.in_plain_torch or paths.in_plain_torch
         self.keep(paths, data)
         return {"observation_weight": weight} | self._figures(ahead)
@@ -167,6 +160,7 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
         particles: N, for each trajectory.
         resample_below: share of N under which the effective sample size triggers resampling.
         untwisted, tempered: see `Twist`.
+        more: of `LinearizedGuide`.
     """
 
     def __init__(
@@ -175,22 +169,12 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
         *,
         particles: int = 100,
         draws: int = 100,
-        tempering: Tempering | None = None,
-        known_start: bool = False,
-        passes: int = 1,
-        search_again: float = 0.2,
         resample_below: float = 0.5,
         untwisted: float = 0.01,
         tempered: float = 1.0,
+        **more: Any,
     ) -> None:
-        super().__init__(
-            program,
-            draws=draws,
-            tempering=tempering,
-            known_start=known_start,
-            passes=passes,
-            search_again=search_again,
-        )
+        super().__init__(program, draws=draws, **more)
         require(particles >= 1, "particles", particles, "at least 1")
         self.particles, self.resample_below = particles, resample_below
         self.untwisted, self.tempered = untwisted, tempered
@@ -226,9 +210,7 @@ class SmootherGuide(VariationalGuide):
         kind, self.labels = data.controls.dtype, data.labels
         ahead = find_and_smooth(program, data, known_start=self.known_start)
         self.register_buffer("path", ahead.linearization.path.states.to(kind))
-        angles = torch.zeros(self.path.shape[-1], dtype=torch.bool, device=self.path.device)
-        angles[list(ahead.linearization.angles)] = True
-        self.register_buffer("angles", angles)
+        self.register_buffer("angles", ahead.linearization.circular)
         self.steps = _Steered(ahead.steps, kind)
         self.starts = _Steered(ahead.starts, kind, winding=0)
         self.index: list[int] = []
@@ -253,10 +235,7 @@ class _Steered(nn.Module):
 
     def __init__(self, steering: Steering, kind: torch.dtype, winding: int | None = None) -> None:
         super().__init__()
-        shift, gain, factor = (
-            (part if winding is None else part[winding]).to(kind)
-            for part in (steering.shift, steering.gain, steering.factor)
-        )
+        shift, gain, factor = ((part if winding is None else part[winding]).to(kind) for part in steering)
         self.shift, self.gain = nn.Parameter(shift.clone()), nn.Parameter(gain.clone())
         self.log_scale = nn.Parameter(factor.diagonal(dim1=-2, dim2=-1).abs().log().clone())
         self.above = nn.Parameter(factor.triu(1).clone())

@@ -58,13 +58,8 @@ class InferenceNetwork(VariationalGuide):
         self.register_buffer("reach", squares.sqrt() if centred else torch.ones_like(squares))
         self.register_buffer("scale", spread.mean(0) if centred else torch.ones_like(squares))
         inside, features = data.rows[..., None], self._features(states)
-        self.scales = nn.ModuleDict(
-            {
-                "measurement": _Standard(data.measurements, data.observed),
-                "control": _Standard(data.controls, inside),
-                "state": _Standard(features, inside),
-            }
-        )
+        scales = {"control": _Standard(data.controls, inside), "state": _Standard(features, inside)}
+        self.scales = nn.ModuleDict({"measurement": _Standard(data.measurements, data.observed), **scales})
         first, later, size = start_size(program), step_size(program), features.shape[-1]
         acting = data.controls.shape[-1] + 1
         inputs = 3 * data.measurements.shape[-1] + acting
@@ -151,12 +146,7 @@ def _factor(log_diagonal: Tensor, below: Tensor) -> Tensor:
 
 
 class _Standard(nn.Module):
-    """Scales to mean zero and standard deviation one.
-
-    Args:
-        values: `(..., F)`.
-        counted: which of them exist.
-    """
+    """Scales to mean zero and standard deviation one of those values, `(..., F)`, that are counted."""
 
     mean: Tensor
     sd: Tensor

@@ -20,12 +20,12 @@ from torch import Tensor, nn
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, require
-from steady_ppl.guides.base import Constant, Tempering, sample_known
-from steady_ppl.model.handlers import ByColumn, KnownStart, Recording, Replaying, Standardised, broadcast_event, running
+from steady_ppl.guides.base import Constant, Taking, Tempering, sample_known
+from steady_ppl.model.handlers import KnownStart, Recording, Replaying, Standardised, broadcast_event, running
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, sample_channels, sample_row
+from steady_ppl.model.substeps import acting_controls, sample_row
 from steady_ppl.model.validate import start_size, step_size
-from steady_ppl.smc.genealogy import Paths
+from steady_ppl.smc.genealogy import Paths, event_dims
 
 
 class VariationalGuide(nn.Module):
@@ -102,8 +102,7 @@ class VariationalGuide(nn.Module):
         """Paths of `data`; log-densities of start and noise as `start` and `step` give them, each summed, `(M,)`."""
         trajectories = len(data)
         later, at_start = self.begin(data), data.controls.new_zeros(self.draws)
-        left = torch.Size((self.draws, 1, trajectories))
-        started, moving = Recording(), Recording()
+        left, moving = torch.Size((self.draws, 1, trajectories)), Recording()
         certain: Messenger
         if self.known_start:
             certain = KnownStart(data.known_start)
@@ -111,62 +110,39 @@ class VariationalGuide(nn.Module):
             noise, apart = self.start()
             at_start, certain = apart.sum(1), Standardised(noise.unsqueeze(1))
         with running(*left):
-            with started, certain:
+            with Recording() as started, certain:
                 state = broadcast_event(self.program.initial(), left, 1).squeeze(1)
             states, values = [state], dict[str, list[Tensor]]()
-            controls = acting_controls(self.program, data)[:-1]
-            for row, given in enumerate(
-                zip(controls.split(1), data.elapsed[:-1].split(1), data.steps.split(1), strict=True)
-            ):
+            over_time = (acting_controls(self.program, data)[:-1], data.elapsed[:-1], data.steps)
+            for row, given in enumerate(zip(*(values.split(1) for values in over_time), strict=True)):
                 noise, density = self.step(row, state)
                 inside = data.transitions[row]
                 later = later + torch.where(inside, density, 0.0).sum(-1)
-                moving = Recording()
-                with moving, (Taking if self.centred else Standardised)(noise.unsqueeze(1)):
+                with Recording() as moving, (Taking if self.centred else Standardised)(noise.unsqueeze(1)):
                     moved = sample_row(self.program, state.unsqueeze(1), *given).squeeze(1)
                 state = torch.where(inside[:, None], moved, state)
                 states.append(state)
                 for site, value in moving.values.items():
                     values.setdefault(site, []).append(value)
-        event_dims = {site: fn.event_dim for site, fn in (started.distributions | moving.distributions).items()}
+        dims = event_dims(started, moving)
         paths = Paths(
             states=torch.stack(states, 1),
-            start={site: broadcast_event(value, left, event_dims[site]) for site, value in started.values.items()},
+            start={site: broadcast_event(value, left, dims[site]) for site, value in started.values.items()},
             noise={site: torch.cat(parts, 1) for site, parts in values.items()},
-            event_dims=event_dims | {"states": 1},
+            event_dims=dims | {"states": 1},
         )
         return paths, at_start, later
 
 
-class Taking(ByColumn):
-    """Give latent sites the columns of some values in the order in which the sites are met.
-
-    Args:
-        values: `(..., C)`.
-    """
-
-    def __init__(self, values: Tensor) -> None:
-        super().__init__()
-        self.values = values
-
-    def _pyro_sample(self, message: Any) -> None:
-        taken = self.values[..., self.take(message["fn"])]
-        message["value"] = taken if message["fn"].event_dim else taken[..., 0]
-
-
 def _prior_of_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor:
     """Log-density of the channel noise under the program, as `Joint` scores it, `(M,)`."""
-    states, seen = paths.states[:, :-1], Recording()
-    with running(*states.shape[:-1]), seen, Replaying(paths.noise):
-        sample_channels(program, states, acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
-    logs = [fn.log_prob(paths.noise[site]) for site, fn in seen.distributions.items()]
+    logs = [fn.log_prob(paths.noise[site]) for site, fn in paths.channels(program, data).items()]
     return torch.where(data.transitions, torch.stack(logs).sum(0), 0.0).sum((1, 2))
 
 
 def _prior_of_start(program: Program, paths: Paths) -> Tensor:
     draws, _, trajectories, _ = paths.states.shape
-    seen = Recording()
-    with running(draws, 1, trajectories), seen, Replaying(paths.start):
+    with running(draws, 1, trajectories), Recording() as seen, Replaying(paths.start):
         program.initial()
     logs = [fn.log_prob(paths.start[site]) for site, fn in seen.distributions.items()]
     return torch.stack(logs).sum((0, 2, 3))
@@ -218,9 +194,7 @@ class AutoRollout(VariationalGuide):
         for _ in range(self.draws):
             with pyro.settings.context(module_local_params=True), poutine.block():
                 trace = poutine.trace(self.auto).get_trace(data)
-            drawn: dict[str, Any] = {
-                name: trace.nodes[name]["value"] for name in ("start", "noise") if name in trace.nodes
-            }
+            drawn: dict[str, Any] = {name: trace.nodes[name]["value"] for name in self._shapes(data)}
             values.append(drawn)
             normal = [dist.Normal(0.0, 1.0).log_prob(value).sum() for value in drawn.values()]
             ratios.append(trace.log_prob_sum() - torch.stack(normal).sum())

@@ -15,6 +15,7 @@ from steady_ppl.kernels.jit import Method, close, compiled, discard
 from steady_ppl.model.handlers import Observing, Recording, Standardised, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance, standardised
+from steady_ppl.smc.genealogy import event_dims
 from steady_ppl.smc.resampling import by_component, take
 
 
@@ -52,12 +53,11 @@ class Stepping:
         """
         if ancestors is not None:
             state = take(state, ancestors)
-        recording = Recording()
         given = nullcontext() if noise is None else Standardised(noise.unsqueeze(1))
         control, time, step = self.controls[row, None], self.elapsed[row, None], self.steps[row, None]
-        with running(state.shape[0], 1, state.shape[1]), recording, given:
+        with running(state.shape[0], 1, state.shape[1]), Recording() as recording, given:
             moved = advance(self.program, state.unsqueeze(1), control, time, step)
-        self.event_dims = {site: fn.event_dim for site, fn in recording.distributions.items()}
+        self.event_dims = event_dims(recording)
         values = recording.values
         if self.program.substeps > 1:
             values = {site: standardised(fn, values[site], site) for site, fn in recording.distributions.items()}
@@ -65,9 +65,8 @@ class Stepping:
 
     def log_density(self, row: int, state: Tensor) -> Tensor:
         """Tempered log-density of a row's measurements, `(N, B)`."""
-        recording = Recording()
         measured = Observing(self.data.measurements[row, None], self.data.observed[row, None], self.observation_weight)
-        with running(state.shape[0], 1, state.shape[1]), recording, measured:
+        with running(state.shape[0], 1, state.shape[1]), Recording() as recording, measured:
             self.program.observe(state.unsqueeze(1))
         return recording.total().squeeze(-2)
 
@@ -75,69 +74,56 @@ class Stepping:
 FILTER = "filter"  # the name of what is compiled for it
 
 
-def stepping_for(
-    program: Program, data: Trajectories, state: Tensor, observation_weight: float | Tensor
-) -> tuple[Stepping, str | None]:
+def stepping_for(plain: Stepping, state: Tensor) -> tuple[Stepping, str | None]:
     """Kernels where they can serve, and otherwise the program as written and why.
 
-    Args:
-        state: `(N, B, D)`, the particles' starts, on some of which kernels are compared with the program's lines.
+    On some of the particles' starts, `(N, B, D)`, kernels are compared with the program's lines.
     """
-    plain = Stepping(program, data, observation_weight)
     if state.device.type != "cpu" or state.dtype != torch.float32:
         return plain, f"{str(state.dtype).removeprefix('torch.')} on {state.device.type}"
     if state.shape[0] < LANES:
         return plain, f"fewer than {LANES} particles"
-    methods = compiled(program, FILTER, lambda: _Methods(program, data, plain.controls, state))
+    methods = compiled(plain.program, FILTER, lambda: _Methods(plain, state))
     if isinstance(methods, str):
         return plain, methods
     stepping = CompiledStepping(methods, plain)
     if not stepping.agrees(state[:LANES]):
-        return plain, discard(program, FILTER)
+        return plain, discard(plain.program, FILTER)
     return stepping, None
 
 
 class _Methods:
     """`transition` and `observe` of a program."""
 
-    def __init__(self, program: Program, data: Trajectories, controls: Tensor, state: Tensor) -> None:
-        one = (1, 1, 1)
-        seen = Recording()
-        first = state[:1, :1].unsqueeze(1)
-        inputs = {
-            "control": controls[:1, :1].unsqueeze(0),
-            "time": data.elapsed[:1, :1].unsqueeze(0),
-            "step": data.steps[:1, :1].unsqueeze(0),
-        }
-        with torch.no_grad(), running(*one), seen:
+    def __init__(self, plain: Stepping, state: Tensor) -> None:
+        program, data, one, first = plain.program, plain.data, (1, 1, 1), state[:1, :1].unsqueeze(1)
+        by_row = {"control": plain.controls, "time": data.elapsed, "step": data.steps}
+        inputs = {name: values[:1, :1].unsqueeze(0) for name, values in by_row.items()}
+        with torch.no_grad(), running(*one), Recording() as seen:
             advance(program, first, *inputs.values())
-        self.event_dims = {site: fn.event_dim for site, fn in seen.distributions.items()}
+        self.event_dims = event_dims(seen)
         self.sizes = {site: value.numel() for site, value in seen.values.items()}
         self.channels, self.width = sum(self.sizes.values()), state.shape[-1]
         self.held = program.substeps > 1
-        self.values = 0 if self.held else self.channels
+        values = 0 if self.held else self.channels
+        self.results = self.width + values
 
         def transition(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Any:
-            recording = Recording()
-            with running(*one), recording, Standardised(noise):
+            with running(*one), Recording() as recording, Standardised(noise):
                 moved = advance(program, state, control, time, step)
             return (moved,) if self.held else (moved, *recording.values.values())
 
         def observe(state: Tensor, measurement: Tensor, observed: Tensor, weight: Tensor) -> Any:
-            recording = Recording()
-            with running(*one), recording, Observing(measurement, observed, weight):
+            with running(*one), Recording() as recording, Observing(measurement, observed, weight):
                 program.observe(state)
             return (recording.total(),)
 
         noise = torch.zeros(*one, self.channels)
         self.transition = Method(transition, {"state": first, "noise": noise}, inputs)
-        measured = {
-            "measurement": data.measurements[:1, :1].unsqueeze(0),
-            "observed": torch.ones_like(data.observed[:1, :1].unsqueeze(0)),
-            "weight": torch.ones(()),
-        }
+        measurement, observed = data.measurements[:1, :1].unsqueeze(0), torch.ones_like(data.observed[:1, :1])
+        measured = {"measurement": measurement, "observed": observed.unsqueeze(0), "weight": torch.ones(())}
         self.observe = Method(observe, {"state": first}, measured)
-        if self.transition.values != self.width + self.values or self.observe.values != 1:
+        if self.transition.values != self.results or self.observe.values != 1:
             raise NotCompilable("its results for one particle have other shapes: it mixes particles or trajectories")
 
 
@@ -147,9 +133,7 @@ class CompiledStepping(Stepping):
     def __init__(self, methods: _Methods, plain: Stepping) -> None:
         super().__init__(plain.program, plain.data, plain.observation_weight)
         self.methods, self.plain, self.event_dims = methods, plain, methods.event_dims
-        data = plain.data
-        self.moving = methods.transition.parameters()
-        self.observing = methods.observe.parameters()
+        data, self.moving, self.observing = plain.data, methods.transition.parameters(), methods.observe.parameters()
         moved = (plain.controls[:-1], data.elapsed[:-1, :, None], data.steps[..., None])
         self.moved = torch.cat(moved, -1).float().contiguous().numpy()
         weight = torch.as_tensor(self.observation_weight, dtype=torch.float32).expand(data.time.shape).unsqueeze(-1)
@@ -160,15 +144,12 @@ class CompiledStepping(Stepping):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         methods = self.methods
         particles, trajectories = state.shape[:2]
-        if noise is None:
-            drawn = torch.randn(methods.channels, trajectories, particles)
-        else:
-            drawn = noise.permute(2, 1, 0).contiguous()
-        out = torch.empty(methods.width + methods.values, trajectories, particles)
+        drawn = torch.randn(methods.channels, trajectories, particles) if noise is None else by_component(noise)
+        out = torch.empty(methods.results, trajectories, particles)
         came_from = None if ancestors is None else ancestors.t().contiguous().numpy()
         inputs = [by_component(state).numpy(), drawn.numpy()]
         methods.transition.kernel(self.moving, self.moved[row], inputs, came_from, out.numpy())
-        moved, values = out.split([methods.width, methods.values])
+        moved, values = out.tensor_split([methods.width])
         values = drawn if methods.held else values
         noises = {
             site: value.permute(2, 1, 0) if self.event_dims[site] else value[0].t()
@@ -184,14 +165,12 @@ class CompiledStepping(Stepping):
 
     def agrees(self, state: Tensor) -> bool:
         """Whether the kernels come to the numbers of the program's own lines, from a few states at two rows."""
-        generator = torch.Generator().manual_seed(0)
-        last = len(self.moved) - 1
-        return all(self._agrees_at(row, state, generator) for row in {last // 2, last})
-
-    def _agrees_at(self, row: int, state: Tensor, generator: torch.Generator) -> bool:
-        noise = torch.randn(*state.shape[:2], self.methods.channels, generator=generator)
-        moved, values = self.transition(row, state, None, noise)
-        plain, plain_values = self.plain.transition(row, state, None, noise)
-        density, plain_density = self.log_density(row, moved), self.plain.log_density(row, moved)
-        pairs = [(moved, plain), (density, plain_density), *((values[s], plain_values[s]) for s in values)]
+        generator, last = torch.Generator().manual_seed(0), len(self.moved) - 1
+        pairs = []
+        for row in {last // 2, last}:
+            noise = torch.randn(*state.shape[:2], self.methods.channels, generator=generator)
+            moved, values = self.transition(row, state, None, noise)
+            plain, plain_values = self.plain.transition(row, state, None, noise)
+            pairs += [(moved, plain), *((values[site], plain_values[site]) for site in values)]
+            pairs.append((self.log_density(row, moved), self.plain.log_density(row, moved)))
         return all(close(mine, theirs.expand_as(mine)) for mine, theirs in pairs)

@@ -24,7 +24,7 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.stability import divergence
 from steady_ppl.model.substeps import advance, channel_values
 from steady_ppl.smc.backends import Stepping, stepping_for
-from steady_ppl.smc.genealogy import Filtered
+from steady_ppl.smc.genealogy import Filtered, event_dims
 from steady_ppl.smc.proposal import Proposal
 from steady_ppl.smc.resampling import Resampler, effective_sample_size, normalise, systematic, take
 
@@ -83,9 +83,7 @@ class _Weighed(NamedTuple):
 class ParticleFilter:
     """A particle filter that goes through a table row by row: `init`, then a `step` a row, under `torch.no_grad()`.
 
-    Args:
-        program, data, particles, observation_weight, known_start, resample_below, proposal, resampler, kernels,
-            on_frame: see `particle_filter`.
+    Its arguments are those of `particle_filter`.
 
     Attributes:
         start: the sites of `initial`, known after `init`.
@@ -120,8 +118,7 @@ class ParticleFilter:
             )
         self.bootstrap = type(self.proposal) is Proposal
         self.kernels = particles * data.time.numel() >= STEPS_WORTH_COMPILING if kernels is None else kernels
-        rows, trajectories = data.time.shape
-        self.last, self.left = rows - 1, torch.Size((particles, 1, trajectories))
+        self.last, self.left = len(data.time) - 1, torch.Size((particles, 1, len(data)))
         self.inside = data.rows
         self.ended = (~self.inside).any(1).tolist()  # rows past a trajectory's end
         self.observed = data.observed.any(-1).any(-1).tolist()
@@ -135,8 +132,7 @@ class ParticleFilter:
         program, data, trajectories = self.program, self.data, self.left[-1]
         noise, log_ratio = (None, 0.0) if self.known_start else self.proposal.start(self.particles)
         drawing = KnownStart(data.known_start) if self.known_start else _given(noise)
-        self.start = Recording()
-        with running(*self.left), self.start, drawing:
+        with running(*self.left), Recording() as self.start, drawing:
             states = program.initial()
         states = broadcast_event(states, self.left, 1).squeeze(1)
         if self.known_start and not bool((states == data.known_start).all()):
@@ -145,7 +141,7 @@ class ParticleFilter:
             )
         self.stepping = Stepping(program, data, self.observation_weight)
         if self.kernels and self.last > 0:
-            self.stepping, self.in_plain_torch = stepping_for(program, data, states, self.observation_weight)
+            self.stepping, self.in_plain_torch = stepping_for(self.stepping, states)
         even = states.new_full((trajectories, self.particles), -math.log(self.particles), dtype=torch.float64).t()
         self._unmoved = torch.arange(self.particles, device=states.device).expand(trajectories, -1).t()
         self._none, self._all = even.new_zeros(trajectories), even.new_full((trajectories,), float(self.particles))
@@ -273,8 +269,7 @@ def particle_filter(
         steps.append(step if keep_history else step._replace(ancestors=None, noise={}))
     blown_up = torch.stack([step.blown_up for step in steps])
     _raise_if_broken(program, torch.stack(state.evidence), blown_up, data)
-    start, left = along.start, along.left
-    event_dims = {site: fn.event_dim for site, fn in start.distributions.items()}
+    start, left, dims = along.start, along.left, event_dims(along.start)
     return Filtered(
         log_likelihood=state.log_likelihood,
         log_weights=state.log_weights,
@@ -282,10 +277,10 @@ def particle_filter(
         roots=torch.zeros_like(state.log_weights).scatter_(0, state.roots, 1.0).sum(0),
         blown_up=blown_up.sum(0),
         states=history,
-        start={site: broadcast_event(value, left, event_dims[site]).squeeze(1) for site, value in start.values.items()},
+        start={site: broadcast_event(value, left, dims[site]).squeeze(1) for site, value in start.values.items()},
         noise={site: [step.noise[site] for step in steps[:-1]] for site in steps[0].noise},
         ancestors=[step.ancestors for step in steps] if keep_history else [],
-        event_dims={"states": 1} | event_dims | along.stepping.event_dims,
+        event_dims={"states": 1} | dims | along.stepping.event_dims,
         in_plain_torch=along.in_plain_torch,
         channels=None if program.substeps == 1 else partial(_channels, program, data),
     )

@@ -4,14 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.model.handlers import Recording, Replaying, running
+from steady_ppl.model.program import Program
+from steady_ppl.model.substeps import acting_controls, sample_channels
 from steady_ppl.smc.resampling import systematic, take
 
 FEW = 10  # particles in effect: with fewer, what a filter says hangs on a handful of draws
+
+
+def event_dims(*seen: Recording) -> dict[str, int]:
+    """Event dimension of every site that was met."""
+    return {site: fn.event_dim for recording in seen for site, fn in recording.distributions.items()}
 
 
 @dataclass(frozen=True)
@@ -37,6 +46,13 @@ class Paths:
         index = list(trajectories)
         start, noise = ({site: value[:, :, index] for site, value in part.items()} for part in (self.start, self.noise))
         return replace(self, states=self.states[:, :, index], start=start, noise=noise)
+
+    def channels(self, program: Program, data: Trajectories) -> dict[str, Any]:
+        """Each channel's distribution along the paths of `data`, given the noise of those before it."""
+        states = self.states[:, :-1]
+        with running(*states.shape[:-1]), Recording() as seen, Replaying(self.noise):
+            sample_channels(program, states, acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
+        return seen.distributions
 
     def within(self, data: Trajectories) -> Paths:
         """Fill the rows past each trajectory's end with its first row, where the program is known to be finite: what
@@ -97,10 +113,8 @@ class Filtered:
             if ancestors is not None:
                 index = take(ancestors, index)
             states.append(take(self.states[row], index))
-        path, along = (
-            torch.stack(states[::-1], 1),
-            {site: torch.stack(values[::-1], 1) for site, values in noise.items()},
-        )
+        path = torch.stack(states[::-1], 1)
+        along = {site: torch.stack(values[::-1], 1) for site, values in noise.items()}
         return Paths(
             states=path,
             start={site: take(value, index).unsqueeze(1) for site, value in self.start.items()},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -45,60 +46,45 @@ def simulate(
     """
     with seeded(seed, "simulate"):
         if like is None:
-            rows = round(program.duration / program.step) + 1
-            time = (torch.arange(rows, dtype=torch.float64) * program.step)[:, None].repeat(1, trajectories or 1)
-            controls = _example_controls(program, time)
-            data = Trajectories(
+            rows, count = round(program.duration / program.step) + 1, trajectories or 1
+            time = (torch.arange(rows, dtype=torch.float64) * program.step)[:, None].repeat(1, count)
+            measurements = time.new_zeros((rows, count, len(program.measurements)))
+            like = Trajectories(
                 time=time,
-                controls=controls,
-                measurements=time.new_zeros((*time.shape, len(program.measurements))),
-                observed=torch.ones((*time.shape, len(program.measurements)), dtype=torch.bool),
-                lengths=torch.full((time.shape[1],), rows),
-                labels=tuple(str(i + 1) for i in range(time.shape[1])),
+                controls=_example_controls(program, time),
+                measurements=measurements,
+                observed=torch.ones_like(measurements, dtype=torch.bool),
+                lengths=torch.full((count,), rows),
                 control_names=program.control_names,
                 measurement_names=program.measurement_names,
                 state_names=program.state_names,
             )
-        else:
-            data = like
-        run = for_program(program, data)
+        run = for_program(program, like)
         program = with_substeps(program, simulated_substeps(program, run) if substeps is None else substeps)
         rows, drives = run.time.shape
         with running(1, drives):
             start = broadcast_event(program.initial(), torch.Size((1, drives)), 1)
         states = [start]
-        controls_over_time = acting_controls(program, run)[:-1].unsqueeze(1)
+        over_time = (acting_controls(program, run)[:-1], run.elapsed[:-1], run.steps)
         with stages(*[("", 1)] * (rows - 1)) as begin:
-            for state in roll_out(
-                program, start, controls_over_time, run.elapsed[:-1].unsqueeze(1), run.steps.unsqueeze(1)
-            ):
+            for state in roll_out(program, start, *(values.unsqueeze(1) for values in over_time)):
                 begin()
                 states.append(state)
         path = torch.cat(states)
         _require_finite(program, path, run)
         measurements = measure(program, path)
-    nothing = path.new_full((), torch.nan)
-    return Trajectories(
-        time=data.time,
+    return replace(
+        run,
+        time=like.time,
         controls=run.controls.double(),
         measurements=torch.where(run.observed, measurements, 0.0).double(),
-        observed=run.observed,
-        lengths=run.lengths,
-        states=torch.where(run.rows[..., None], path, nothing).double(),
-        labels=run.labels,
-        control_names=run.control_names,
-        measurement_names=run.measurement_names,
+        states=torch.where(run.rows[..., None], path, torch.nan).double(),
         state_names=program.state_names,
     )
 
 
 def simulated_substeps(program: Program, data: Trajectories) -> int:
-    """Return in how many substeps a row of drives is simulated.
-
-    Args:
-        program: what is simulated.
-        data: as returned by `for_program`.
-    """
+    """Return in how many substeps a row of drives, as returned by `for_program`, is simulated."""
     longest = _usual_step(data)
     wanted = min(MAX_SUBSTEPS, math.ceil(longest / program.simulated_step - 1e-6))
     return max(program.substeps, wanted) if wanted > program.substeps and is_step(program, data) else program.substeps
@@ -127,8 +113,7 @@ def _usual_step(data: Trajectories) -> float:
 
 def measure(program: Program, states: Tensor) -> Tensor:
     """A draw of what the program measures in these states, `(..., K)` of `(..., D)`."""
-    seen = Recording()
-    with running(*states.shape[:-1]), seen:
+    with running(*states.shape[:-1]), Recording() as seen:
         program.observe(states)
     return torch.cat([as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()], -1)
 
@@ -144,12 +129,8 @@ def _require_finite(program: Program, path: Tensor, data: Trajectories) -> None:
         )
 
 
-def _example_controls(program: Program, time: torch.Tensor) -> torch.Tensor:
-    """What the program's own method gives: `(rows, trajectories, controls)`.
-
-    Raises:
-        ProgramError: it fails, or what it gives has another shape or is not finite.
-    """
+def _example_controls(program: Program, time: Tensor) -> Tensor:
+    """What the program's own method gives, `(rows, trajectories, controls)`, checked."""
     name, expected = type(program).__name__, (*time.shape, len(program.controls))
     try:
         controls = program.example_controls(time)
@@ -159,8 +140,8 @@ def _example_controls(program: Program, time: torch.Tensor) -> torch.Tensor:
         raise ProgramError(
             f"program {name}: example_controls failed: {one_line(error)}", site="example_controls"
         ) from error
-    if not isinstance(controls, torch.Tensor) or tuple(controls.shape) != expected:
-        came = f"shape {tuple(controls.shape)}" if isinstance(controls, torch.Tensor) else type(controls).__name__
+    if not isinstance(controls, Tensor) or tuple(controls.shape) != expected:
+        came = f"shape {tuple(controls.shape)}" if isinstance(controls, Tensor) else type(controls).__name__
         raise ProgramError(
             f"program {name}: example_controls gave {came}, expected a tensor of shape {expected}",
             site="example_controls",

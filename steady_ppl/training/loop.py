@@ -27,6 +27,7 @@ from steady_ppl.training.checkpoint import Checkpoint, read_checkpoint, write_ch
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import tell
 
+SEVERAL = 10  # validations are in a training
 SETTLED = 1.0  # nats a drive by which held-out log p(y) may rise at the end of a training that has converged
 
 
@@ -192,9 +193,9 @@ def train(
                         _require_finite(loss, state.step)
                         optimizer.zero_grad()
                         loss.backward()
-                        _require_finite_gradients(state.parameters, state.step)
-                        if optimization.gradient_norm is not None:
-                            for value in state.parameters.values():
+                        for name, value in state.parameters.items():
+                            _require_finite_gradient(name, value, state.step)
+                            if optimization.gradient_norm is not None:
                                 nn.utils.clip_grad_norm_(value, optimization.gradient_norm)
                         optimizer.step()
                 state.step += 1
@@ -216,29 +217,23 @@ def train(
                 bar.set_postfix_str(_in_words({"loss": loss.item(), **figures, **held}), refresh=False)
         except KeyboardInterrupt:
             interrupted = True
-    with torch.no_grad():
-        for name, value in (state.kept or state.averaged).items():
-            parameters[name].copy_(value)
+    _copy(state.kept or state.averaged, parameters)
     return Trained(history=state.history, kept=state.kept_step, interrupted=interrupted)
 
 
 def _in_words(figures: Mapping[str, float], steps: int = 0) -> str:
     """Figures of the log in one line."""
-    shown = {
-        name.replace("log_likelihood", "held-out log p(y)").replace("_", " "): value for name, value in figures.items()
-    }
-    step = shown.pop("step", None)
-    begin = f"step {step:.0f} of {steps}: " if step is not None else ""
-    return begin + ", ".join(f"{name} {value:.4g}" for name, value in shown.items())
+    begin = f"step {figures['step']:.0f} of {steps}: " if "step" in figures else ""
+    shown = ", ".join(f"{name} {value:.4g}" for name, value in figures.items() if name != "step")
+    return begin + shown.replace("log_likelihood", "held-out log p(y)").replace("_", " ")
 
 
-def _require_finite_gradients(parameters: Mapping[str, Tensor], step: int) -> None:
-    for name, value in parameters.items():
-        if value.grad is not None and not bool(torch.isfinite(value.grad).all()):
-            raise TrainingError(
-                f"the gradient of {name.removesuffix('_unconstrained')} is not finite at step {step + 1}: look for a "
-                "square root, a division or a norm at zero in the program, or for roll-outs that blow up"
-            )
+def _require_finite_gradient(name: str, value: Tensor, step: int) -> None:
+    if value.grad is not None and not bool(torch.isfinite(value.grad).all()):
+        raise TrainingError(
+            f"the gradient of {name.removesuffix('_unconstrained')} is not finite at step {step + 1}: look for a "
+            "square root, a division or a norm at zero in the program, or for roll-outs that blow up"
+        )
 
 
 def _judge(state: Checkpoint, held_out: list[float], figures: dict[str, float]) -> None:
@@ -255,18 +250,20 @@ def _judge(state: Checkpoint, held_out: list[float], figures: dict[str, float]) 
 
 
 @contextmanager
-def using(parameters: Mapping[str, Tensor], values: dict[str, Tensor]) -> Iterator[None]:
+def using(parameters: Mapping[str, Tensor], values: Mapping[str, Tensor]) -> Iterator[None]:
     """Run a block with other parameter values, and put the present ones back."""
-    present = {name: value.detach().clone() for name, value in parameters.items()}
-    with torch.no_grad():
-        for name, value in values.items():
-            parameters[name].copy_(value)
+    present = {name: parameters[name].detach().clone() for name in values}
+    _copy(values, parameters)
     try:
         yield
     finally:
-        with torch.no_grad():
-            for name, value in present.items():
-                parameters[name].copy_(value)
+        _copy(present, parameters)
+
+
+@torch.no_grad()
+def _copy(values: Mapping[str, Tensor], parameters: Mapping[str, Tensor]) -> None:
+    for name, value in values.items():
+        parameters[name].copy_(value)
 
 
 def _guide_parameters(guide: Guide) -> dict[str, nn.Parameter]:
@@ -287,10 +284,9 @@ def _groups(program: Program, guide: Guide, optimization: Optimization) -> list[
         decay = optimization.weight_decay * relative(program.decays, name) if id(value) in linear else 0.0
         rate = optimization.learning_rate * relative(program.rates, name)
         groups.append({"params": [value], "lr": rate, "weight_decay": decay})
-    for value in _guide_parameters(guide).values():
-        rate = optimization.learning_rate * getattr(guide, "rate", 1.0)
-        groups.append({"params": [value], "lr": rate, "weight_decay": 0.0})
-    return groups
+    rate = optimization.learning_rate * getattr(guide, "rate", 1.0)
+    own = _guide_parameters(guide).values()
+    return [*groups, *({"params": [value], "lr": rate, "weight_decay": 0.0} for value in own)]
 
 
 def _set_rates(optimizer: torch.optim.Optimizer, full: list[float], progress: float, final: float) -> None:
@@ -305,9 +301,6 @@ def _require_finite(loss: Tensor, step: int) -> None:
             f"the loss is {loss.item()} at step {step + 1}: lower the learning rate, or look at the program's "
             "densities (a standard deviation of zero?)"
         )
-
-
-SEVERAL = 10  # validations are in a training
 
 
 @dataclass(frozen=True)
@@ -333,9 +326,8 @@ class Validation:
     @property
     def notes(self) -> list[str]:
         """What a fit should say of it."""
-        if self.reason is None:
-            return []
-        return [f"held-out drives were judged by the bootstrap filter at every tenth row: {self.reason}"]
+        said = f"held-out drives were judged by the bootstrap filter at every tenth row: {self.reason}"
+        return [] if self.reason is None else [said]
 
     @classmethod
     def suited(
@@ -361,17 +353,10 @@ class Validation:
     def __call__(self, program: Program, seed: int) -> list[float]:
         """Log p(y) of each held-out trajectory."""
         assert self.data is not None
+        given: Any = {name: getattr(self, name) for name in ("particles", "known_start", "every", "look_ahead")}
+        kernels = SEVERAL * self.particles * self.data.time.numel() >= STEPS_WORTH_COMPILING
         with seeded(seed, "validate"):
-            values = log_likelihood(
-                program,
-                self.data,
-                particles=self.particles,
-                known_start=self.known_start,
-                every=self.every,
-                look_ahead=self.look_ahead,
-                kernels=SEVERAL * self.particles * self.data.time.numel() >= STEPS_WORTH_COMPILING,
-            )
-        return values.tolist()
+            return log_likelihood(program, self.data, kernels=kernels, **given).tolist()
 
 
 def as_good(candidate: Sequence[float], best: Sequence[float]) -> bool:

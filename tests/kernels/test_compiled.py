@@ -53,7 +53,7 @@ def stepping(program, data, particles: int = 40, weight: float | torch.Tensor = 
     """Its kernels and its own lines, and some states."""
     size = len(program.states)
     states = 2 * torch.randn(particles, len(data), size)
-    compiled, reason = stepping_for(program, data, states, weight)
+    compiled, reason = stepping_for(Stepping(program, data, weight), states)
     assert isinstance(compiled, CompiledStepping), reason
     return compiled, Stepping(program, data, weight), states
 

@@ -159,7 +159,7 @@ def test_kernels_compute_the_substeps() -> None:
     program = with_substeps(Braked(), K)
     data = for_program(program, drives(Braked(), 3, 12)).to(torch.float32)
     state = torch.randn(64, 3, 6)
-    stepping, reason = stepping_for(program, data, state, 1.0)
+    stepping, reason = stepping_for(Stepping(program, data, 1.0), state)
     assert isinstance(stepping, CompiledStepping), reason
     noise = torch.randn(64, 3, 3)
     moved, values = stepping.transition(4, state, None, noise)
