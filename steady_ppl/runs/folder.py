@@ -24,6 +24,8 @@ from steady_ppl.utils.schema import (
     Absent,
     Among,
     Maybe,
+    Paired,
+    count,
     misfit,
     refuse_newer,
 )
@@ -221,10 +223,20 @@ def read_discovery(source: Path) -> dict[str, Any] | None:
     if not file.is_file():
         return None
     found = read_json(file, RunError)
-    problem = misfit(found, FOUND)
+    problem = misfit(found, FOUND) or _unlike(found)
     if problem is not None:
         raise RunError(f"{file} is not what `steady discover` writes: {problem}")
     return found
+
+
+def _unlike(found: Mapping[str, Any]) -> str | None:
+    """A candidate that was chosen and has another number of coefficients alone than together with the others."""
+    chosen = {one["effect"]: len(one["coefficient"]) for one in found["effects"]}
+    for i, one in enumerate(found["candidates"]):
+        known = chosen.get(one["effect"])
+        if known is not None and one["sd"] is not None and count(one["coefficient"]) != known:
+            return f"candidates[{i}].coefficient has length {count(one['coefficient'])}, expected {known} as in effects"
+    return None
 
 
 FINISHED = ("finished", "interrupted")  # what the record of a run that can be used says
@@ -255,40 +267,38 @@ FINISHED_RECORD = {
 
 
 NUMBERS = Maybe(Among((NUMBER, [Maybe(NUMBER)])))
-
-
+PAIR = [NUMBER, NUMBER]
+CANDIDATE = {
+    "effect": TEXT,
+    "kind": TEXT,
+    "p_value": Maybe(NUMBER),
+    "coefficient": NUMBERS,
+    "sd": NUMBERS,
+    "absent": Maybe(NUMBER),
+    "unit": TEXT,
+    "detection_limit": NUMBERS,
+    "heldout_gain": Maybe(NUMBER),
+    "heldout_gain_ci": Maybe(PAIR),
+    "note": Maybe(TEXT),
+}
+EFFECT = {
+    "effect": TEXT,
+    "text": TEXT,
+    "unit": TEXT,
+    "class": LINES,
+    "confidence": Maybe(NUMBER),
+    "coefficient": [NUMBER],
+    "interval_90": [PAIR],
+    "heldout_gain": Maybe(NUMBER),
+}
+SHAPE = {"channel": TEXT, "variable": TEXT, "points": [NUMBER], "curve": [NUMBER], "band": [NUMBER]}
 FOUND = {
     "source": Absent(TEXT),
     "sentence": TEXT,
     "complete": Absent(TRUTH),
-    "candidates": [
-        {
-            "effect": TEXT,
-            "kind": TEXT,
-            "p_value": Maybe(NUMBER),
-            "coefficient": NUMBERS,
-            "sd": NUMBERS,
-            "absent": Maybe(NUMBER),
-            "unit": TEXT,
-            "detection_limit": NUMBERS,
-            "heldout_gain": Maybe(NUMBER),
-            "heldout_gain_ci": Maybe([NUMBER]),
-            "note": Maybe(TEXT),
-        }
-    ],
-    "effects": [
-        {
-            "effect": TEXT,
-            "text": TEXT,
-            "unit": TEXT,
-            "class": LINES,
-            "confidence": Maybe(NUMBER),
-            "coefficient": [NUMBER],
-            "interval_90": [[NUMBER]],
-            "heldout_gain": Maybe(NUMBER),
-        }
-    ],
-    "shape": Maybe({"channel": TEXT, "variable": TEXT, "points": [NUMBER], "curve": [NUMBER], "band": [NUMBER]}),
+    "candidates": [Paired(CANDIDATE, ("coefficient", "sd"))],
+    "effects": [Paired(EFFECT, ("coefficient", "interval_90"))],
+    "shape": Maybe(Paired(SHAPE, ("points", "curve", "band"))),
     "doubts": LINES,
     "notes": LINES,
     "next_run": Maybe({"between": LINES, "way": TEXT, "separation": NUMBER, "usual": NUMBER}),

@@ -37,6 +37,13 @@ class Among(NamedTuple):
     forms: tuple[Any, ...]
 
 
+class Paired(NamedTuple):
+    """A form of names and values, of which some hold equally many numbers: those that are there and not null."""
+
+    form: Any
+    keys: tuple[str, ...]
+
+
 NUMBER, WHOLE, TEXT, TRUTH = "a finite number", "a whole number from 0 to 2^63", "text", "true or false"
 LINES = [TEXT]
 
@@ -46,8 +53,9 @@ def misfit(content: Any, form: Any, place: str = "") -> str | None:
 
     Args:
         content: as it was read.
-        form: `NUMBER`, `WHOLE`, `TEXT` or `TRUTH`; `[form]` for a list; `{key: form}` for what has these keys, and
-            perhaps others; `{str: form}` for any keys; `Maybe(form)` for null as well; `Among(forms)` for one of them.
+        form: `NUMBER`, `WHOLE`, `TEXT` or `TRUTH`; `[form]` for a list, `[form, form]` for one of two; `{key: form}`
+            for what has these keys, and perhaps others; `{str: form}` for any keys; `Maybe(form)` for null as well;
+            `Among(forms)` for one of them; `Paired(form, keys)` for lists of one length under these keys.
         place: what error messages call the content.
 
     Example:
@@ -59,10 +67,13 @@ def misfit(content: Any, form: Any, place: str = "") -> str | None:
     if isinstance(form, Among):
         found = [misfit(content, one, place) for one in form.forms]
         return None if None in found else found[0]
+    if isinstance(form, Paired):
+        return misfit(content, form.form, place) or _unpaired(content, form.keys, place)
     if isinstance(form, list):
-        if not isinstance(content, list):
-            return _wrong(content, place, "a list")
-        return _first(misfit(one, form[0], f"{place}[{i}]") for i, one in enumerate(content))
+        if not isinstance(content, list) or len(form) not in (1, len(content)):
+            return _wrong(content, place, "a list" if len(form) == 1 else f"a list of {len(form)}")
+        inner = form * len(content) if len(form) == 1 else form
+        return _first(misfit(one, of, f"{place}[{i}]") for i, (one, of) in enumerate(zip(content, inner, strict=True)))
     if isinstance(form, Mapping):
         if not isinstance(content, dict):
             return _wrong(content, place, "names and values")
@@ -96,6 +107,20 @@ def _is(content: Any, form: str) -> bool:
     if form == WHOLE:
         return isinstance(content, int) and 0 <= content < 2**63
     return abs(content) <= 1e300 if isinstance(content, int) else math.isfinite(content)
+
+
+def _unpaired(content: Mapping[str, Any], keys: tuple[str, ...], place: str) -> str | None:
+    counts = {key: count(content[key]) for key in keys if content.get(key) is not None}
+    first = next(iter(counts), "")
+    for key, found in counts.items():
+        if found != counts[first]:
+            return f"{_inside(place, key)} has length {found}, expected {counts[first]} as {first} has"
+    return None
+
+
+def count(numbers: Any) -> int:
+    """How many there are in a list, or in one number that stands for a list of it."""
+    return len(numbers) if isinstance(numbers, list) else 1
 
 
 def _first(problems: Any) -> str | None:

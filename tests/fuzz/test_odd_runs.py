@@ -5,11 +5,16 @@ from __future__ import annotations
 import json
 import os
 import struct
+from collections.abc import Iterator
+from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from examples import MODELS
+from report_pages import FOUND, two_run_report
 from small import FEW, contents, simulated, steady, written
 
 import steady_ppl as st
@@ -126,3 +131,44 @@ def test_a_discovery_of_another_form_is_refused(tmp_path: Path) -> None:
         with pytest.raises(RunError) as caught:
             read_discovery(file)
         assert says in str(caught.value)
+
+
+WIND = {"effect": "wind", "coefficient": [1.0, -0.5]}
+ALONE = {"sd": [0.1, 0.2], "detection_limit": [0.3, 0.6], "heldout_gain_ci": [1.0, 3.0]}
+FULL = FOUND | {
+    "doubts": ["a doubt"],
+    "effects": [*FOUND["effects"], FOUND["effects"][0] | WIND | {"interval_90": [[0.8, 1.2], [-0.9, -0.1]]}],
+    "candidates": [*FOUND["candidates"], FOUND["candidates"][0] | WIND | ALONE],
+    "shape": {"channel": "yaw", "variable": "speed", "points": [0, 1], "curve": [0, 2], "band": [0.1, 0.1]},
+    "next_run": {"between": ["wind", "drag"], "way": "round", "separation": 3.0, "usual": 1.0},
+}
+ANY_LENGTH = ("candidates", "effects", "class", "doubts", "notes", "between", "detection_limit")
+
+
+def lists(content: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Where the lists within are, by keys and indices."""
+    inner = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    if isinstance(content, list):
+        yield place
+    for key, value in inner:
+        yield from lists(value, (*place, key))
+
+
+@pytest.mark.parametrize("place", [pytest.param(place, id=".".join(map(str, place))) for place in lists(FULL)])
+@pytest.mark.parametrize("longer", [False, True])
+def test_a_list_of_another_length_is_refused_or_shown(tmp_path: Path, place: tuple[Any, ...], longer: bool) -> None:
+    found, file = deepcopy(FULL), tmp_path / "found.json"
+    part: Any = found
+    for key in place:
+        part = part[key]
+    part.append(part[-1]) if longer else part.pop()
+    file.write_text(json.dumps(found))
+    if place[-1] in ANY_LENGTH:
+        assert read_discovery(file) == found
+        assert replace(two_run_report(), discovery=found).html
+    else:
+        with pytest.raises(
+            RunError, match=r"is not what `steady discover` writes: (candidates|effects|shape)"
+        ) as caught:
+            read_discovery(file)
+        assert "\n" not in str(caught.value)

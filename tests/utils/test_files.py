@@ -10,7 +10,7 @@ import pytest
 
 from steady_ppl.errors import DataError
 from steady_ppl.utils.files import read_json, require_file
-from steady_ppl.utils.schema import NUMBER, TEXT, WHOLE, Absent, Among, Maybe, misfit
+from steady_ppl.utils.schema import NUMBER, TEXT, WHOLE, Absent, Among, Maybe, Paired, misfit
 from steady_ppl.utils.text import shown
 
 
@@ -24,6 +24,15 @@ def test_a_form_is_told_from_another(tmp_path: Path) -> None:
     assert misfit([], form) == "it is [], expected names and values"
     assert misfit({"x": 10**400}, {str: NUMBER}).startswith("x is 1000")
     assert misfit({"a": 1, "b": [], "c": 3, "d": 2}, form) == "c is 3, expected text"
+
+
+def test_a_list_of_another_length_is_told() -> None:
+    form = [Paired({"a": [NUMBER], "b": Maybe(Among((NUMBER, [NUMBER]))), "c": [NUMBER, TEXT]}, ("a", "b"))]
+    for good in ({"a": [1], "b": 2}, {"a": [1, 2], "b": [3, 4]}, {"a": [], "b": None}):
+        assert misfit([good | {"c": [1, "x"]}], form, "it") is None
+    assert misfit([{"a": [1, 2], "b": 3, "c": [1, "x"]}], form) == "[0].b has length 1, expected 2 as a has"
+    assert misfit([{"a": [], "b": None, "c": [1]}], form) == "[0].c is [1], expected a list of 2"
+    assert misfit([{"a": [], "b": None, "c": [1, 2]}], form) == "[0].c[1] is 2, expected text"
 
 
 def test_what_may_never_end_is_no_file(tmp_path: Path) -> None:
