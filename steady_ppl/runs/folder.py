@@ -14,33 +14,61 @@ from filelock import FileLock, Timeout
 
 from steady_ppl.errors import RunError
 from steady_ppl.utils.files import read_json, require_file, whole_file
-from steady_ppl.utils.schema import (
-    ANYTHING,
-    LINES,
-    NUMBER,
-    TEXT,
-    TRUTH,
-    WHOLE,
-    Absent,
-    Among,
-    Maybe,
-    Paired,
-    count,
-    misfit,
-    refuse_newer,
-)
+from steady_ppl.utils.schema import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Paired, count, misfit, refuse_newer
 from steady_ppl.utils.tensor_files import read_tensors
 from steady_ppl.utils.text import command_line
 
-PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY = (
-    "parameters.safetensors",
-    "run.json",
-    "posterior.nc",
-    "checkpoint.safetensors",
-    "discovery.json",
-)
+PARAMETERS, RECORD, POSTERIOR = "parameters.safetensors", "run.json", "posterior.nc"
+CHECKPOINT, DISCOVERY = "checkpoint.safetensors", "discovery.json"
 FILES = (PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY)
 ASIDE, LOCK, JOURNAL = "previous", ".lock", "journal"
+
+FORMAT = 1
+FINISHED = ("finished", "interrupted")  # what the record of a run that can be used says
+BEGUN_RECORD = {
+    "format?": WHOLE,
+    "program": ({"class": TEXT, "file": TEXT, "sha256": TEXT}, None),
+    "recipe": TEXT,
+    "status": TEXT,
+    "command?": (TEXT, None),
+}
+FINISHED_RECORD = {
+    "effects?": LINES,
+    "substeps?": WHOLE,
+    "known_start": TRUTH,
+    "seed": WHOLE,
+    "settings": {str: ANYTHING},
+    "kept_step": (WHOLE, None),
+    "history": [{"step": NUMBER}],
+    "notes": LINES,
+}
+PAIR, NUMBERS = [NUMBER, NUMBER], (NUMBER, [(NUMBER, None)], None)
+CANDIDATE = {
+    **dict.fromkeys(("effect", "kind", "unit"), TEXT),
+    **dict.fromkeys(("p_value", "absent", "heldout_gain"), (NUMBER, None)),
+    **dict.fromkeys(("coefficient", "sd", "detection_limit"), NUMBERS),
+    "heldout_gain_ci": (PAIR, None),
+    "note": (TEXT, None),
+}
+EFFECT = {
+    **dict.fromkeys(("effect", "text", "unit"), TEXT),
+    **dict.fromkeys(("confidence", "heldout_gain"), (NUMBER, None)),
+    "class": LINES,
+    "coefficient": [NUMBER],
+    "interval_90": [PAIR],
+}
+SHAPE = {"channel": TEXT, "variable": TEXT, "points": [NUMBER], "curve": [NUMBER], "band": [NUMBER]}
+FOUND = {
+    "source?": TEXT,
+    "sentence": TEXT,
+    "complete?": TRUTH,
+    "candidates": [Paired(CANDIDATE, ("coefficient", "sd"))],
+    "effects": [Paired(EFFECT, ("coefficient", "interval_90"))],
+    "shape": (Paired(SHAPE, ("points", "curve", "band")), None),
+    "doubts": LINES,
+    "notes": LINES,
+    "next_run": ({"between": LINES, "way": TEXT, "separation": NUMBER, "usual": NUMBER}, None),
+}
 
 
 @contextmanager
@@ -237,69 +265,3 @@ def _unlike(found: Mapping[str, Any]) -> str | None:
         if known is not None and one["sd"] is not None and count(one["coefficient"]) != known:
             return f"candidates[{i}].coefficient has length {count(one['coefficient'])}, expected {known} as in effects"
     return None
-
-
-FINISHED = ("finished", "interrupted")  # what the record of a run that can be used says
-
-
-FORMAT = 1
-
-
-BEGUN_RECORD = {
-    "format": Absent(WHOLE),
-    "program": Maybe({"class": TEXT, "file": TEXT, "sha256": TEXT}),
-    "recipe": TEXT,
-    "status": TEXT,
-    "command": Absent(Maybe(TEXT)),
-}
-
-
-FINISHED_RECORD = {
-    "effects": Absent(LINES),
-    "substeps": Absent(WHOLE),
-    "known_start": TRUTH,
-    "seed": WHOLE,
-    "settings": {str: ANYTHING},
-    "kept_step": Maybe(WHOLE),
-    "history": [{str: ANYTHING}],
-    "notes": LINES,
-}
-
-
-NUMBERS = Maybe(Among((NUMBER, [Maybe(NUMBER)])))
-PAIR = [NUMBER, NUMBER]
-CANDIDATE = {
-    "effect": TEXT,
-    "kind": TEXT,
-    "p_value": Maybe(NUMBER),
-    "coefficient": NUMBERS,
-    "sd": NUMBERS,
-    "absent": Maybe(NUMBER),
-    "unit": TEXT,
-    "detection_limit": NUMBERS,
-    "heldout_gain": Maybe(NUMBER),
-    "heldout_gain_ci": Maybe(PAIR),
-    "note": Maybe(TEXT),
-}
-EFFECT = {
-    "effect": TEXT,
-    "text": TEXT,
-    "unit": TEXT,
-    "class": LINES,
-    "confidence": Maybe(NUMBER),
-    "coefficient": [NUMBER],
-    "interval_90": [PAIR],
-    "heldout_gain": Maybe(NUMBER),
-}
-SHAPE = {"channel": TEXT, "variable": TEXT, "points": [NUMBER], "curve": [NUMBER], "band": [NUMBER]}
-FOUND = {
-    "source": Absent(TEXT),
-    "sentence": TEXT,
-    "complete": Absent(TRUTH),
-    "candidates": [Paired(CANDIDATE, ("coefficient", "sd"))],
-    "effects": [Paired(EFFECT, ("coefficient", "interval_90"))],
-    "shape": Maybe(Paired(SHAPE, ("points", "curve", "band"))),
-    "doubts": LINES,
-    "notes": LINES,
-    "next_run": Maybe({"between": LINES, "way": TEXT, "separation": NUMBER, "usual": NUMBER}),
-}

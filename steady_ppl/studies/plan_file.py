@@ -44,7 +44,7 @@ from steady_ppl.studies.plan import (
     FIGURES,
     HELD_OUT,
     MAX_NUMBER,
-    POINTS,
+    PICTURE,
     TASKS,
     Job,
     Picture,
@@ -53,28 +53,20 @@ from steady_ppl.studies.plan import (
     without_folder,
 )
 from steady_ppl.utils.files import require_file
-from steady_ppl.utils.schema import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Absent, Maybe, misfit
+from steady_ppl.utils.schema import ANYTHING, NUMBER, TEXT, TRUTH, WHOLE, misfit
 from steady_ppl.utils.text import shown
 
 MOST_JOBS = 100_000
 
+METHOD: dict[str, Any] = {"name": TEXT, "program": TEXT, "recipe?": TEXT, "settings?": {str: ANYTHING}}
 FORM: dict[str, Any] = {
     "title": TEXT,
-    "task": Absent(TEXT),
+    "task?": TEXT,
     "seeds": [WHOLE],
-    "known_start": Absent(TRUTH),
+    "known_start?": TRUTH,
     "data": {str: ANYTHING},
-    "picture": Absent(
-        {
-            "x": TEXT,
-            "y": LINES,
-            "labels": Absent({str: TEXT}),
-            "chosen_by": Absent(TEXT),
-            "leave_out": Absent(LINES),
-            "published": Absent(POINTS),
-        }
-    ),
-    "method": [{"name": TEXT, "program": TEXT, "recipe": Absent(TEXT), "settings": Absent({str: ANYTHING})}],
+    "picture?": PICTURE,
+    "method": [METHOD],
 }
 
 
@@ -132,9 +124,10 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
 
 def _surplus(content: Mapping[str, Any]) -> str | None:
     """A name that means nothing, so that one that is misspelt does not pass for a default."""
-    places = [("", content, FORM), *(("method.", one, FORM["method"][0]) for one in content["method"])]
-    places += [("picture.", content["picture"], FORM["picture"].form)] if "picture" in content else []
-    for place, given, known in places:
+    places = [("", content, FORM), *(("method.", one, METHOD) for one in content["method"])]
+    places += [("picture.", content["picture"], PICTURE)] if "picture" in content else []
+    for place, given, form in places:
+        known = [key.rstrip("?") for key in form]
         for name in given:
             if name not in known:
                 return f"{place}{name} means nothing here; there are {', '.join(known)}"
@@ -251,7 +244,7 @@ def source_axes(folder: Path, given: Mapping[str, Any], instead: Path | None, ta
     for name, usual in sayable.items():
         values = _axis(f"data.{name}", given.get(name, usual))
         form = TEXT if name == "effect" else NUMBER if name == "sigma_deg" else WHOLE
-        problem = misfit(values, [Maybe(form)], f"data.{name}")
+        problem = misfit(values, [(form, None)], f"data.{name}")
         if problem is not None:
             raise UsageError(problem)
         for value in values if form != TEXT else ():

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from steady_ppl.errors import RunError
-from steady_ppl.utils.schema import ANYTHING, NUMBER, WHOLE, misfit
+from steady_ppl.utils.schema import NUMBER, WHOLE, misfit
 from steady_ppl.utils.tensor_files import damaged, read_tensors, write_tensors
 from steady_ppl.utils.text import shown
 
-NUMBERS = {"step": WHOLE, "history": [{str: ANYTHING}], "kept_step": WHOLE, "best_held_out": [NUMBER]}
+NUMBERS = {"step": WHOLE, "history": [{"step": NUMBER}], "kept_step": WHOLE, "best_held_out": [NUMBER]}
 """The form of what a checkpoint says in JSON beside its tensors."""
 
 

@@ -22,12 +22,12 @@ import torch
 from torch import Tensor
 
 from steady_ppl.errors import FilterError, RunError
-from steady_ppl.utils.schema import ANYTHING, TEXT, Among, misfit
+from steady_ppl.utils.schema import ANYTHING, TEXT, misfit
 from steady_ppl.utils.tensor_files import read_tensors, write_tensors
 
 Piece = tuple[Mapping[str, Tensor], Mapping[str, Any]]
 RANDOM = "random state"  # of torch, after the piece
-SAID = Among(({"values": {str: ANYTHING}}, {"failed": TEXT}))
+SAID = ({"values": {str: ANYTHING}}, {"failed": TEXT})
 
 
 @dataclass

@@ -10,12 +10,12 @@ import pytest
 
 from steady_ppl.errors import DataError
 from steady_ppl.utils.files import read_json, require_file
-from steady_ppl.utils.schema import NUMBER, TEXT, WHOLE, Absent, Among, Maybe, Paired, misfit
+from steady_ppl.utils.schema import NUMBER, TEXT, WHOLE, Paired, misfit
 from steady_ppl.utils.text import shown
 
 
 def test_a_form_is_told_from_another(tmp_path: Path) -> None:
-    form = {"a": NUMBER, "b": Maybe([WHOLE]), "c": Absent(TEXT), "d": Among((NUMBER, TEXT))}
+    form = {"a": NUMBER, "b": ([WHOLE], None), "c?": TEXT, "d": (NUMBER, TEXT)}
     assert misfit({"a": 1, "b": None, "d": "x"}, form) is None
     assert misfit({"a": 1, "b": [1, -1], "d": 2}, form) == "b[1] is -1, expected a whole number from 0 to 2^63"
     assert misfit({"a": math.inf, "b": [], "d": 2}, form) == "a is inf, expected a finite number"
@@ -27,7 +27,7 @@ def test_a_form_is_told_from_another(tmp_path: Path) -> None:
 
 
 def test_a_list_of_another_length_is_told() -> None:
-    form = [Paired({"a": [NUMBER], "b": Maybe(Among((NUMBER, [NUMBER]))), "c": [NUMBER, TEXT]}, ("a", "b"))]
+    form = [Paired({"a": [NUMBER], "b": (NUMBER, [NUMBER], None), "c": [NUMBER, TEXT]}, ("a", "b"))]
     for good in ({"a": [1], "b": 2}, {"a": [1, 2], "b": [3, 4]}, {"a": [], "b": None}):
         assert misfit([good | {"c": [1, "x"]}], form, "it") is None
     assert misfit([{"a": [1, 2], "b": 3, "c": [1, "x"]}], form) == "[0].b has length 1, expected 2 as a has"
