@@ -208,7 +208,7 @@ def test_a_search_has_no_test_drives(tmp_path: Path):
 @pytest.mark.parametrize("name", ["known_start", "train", "program", "seed", "particles"])
 def test_a_search_takes_the_settings_that_are_its_own(tmp_path: Path, name: str):
     require_runnable(read_plan(written(tmp_path, discover(simulations=20, withheld="[['stiffness']]"))))
-    with pytest.raises(UsageError, match=f"method it: discover has no setting {name}; there are mix, "):
+    with pytest.raises(UsageError, match=f"method it: discover has no setting {name}; it has mix, "):
         require_runnable(read_plan(written(tmp_path, discover(**{name: 1}))))
 
 
