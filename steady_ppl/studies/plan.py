@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from steady_ppl.errors import RunError
-from steady_ppl.utils.files import read_json, whole_file
-from steady_ppl.utils.schema import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, misfit, refuse_newer
+from steady_ppl.utils.files import whole_file
+from steady_ppl.utils.schema import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, read_record
 from steady_ppl.utils.text import shown
 
 HELD_OUT = "valid_log_likelihood"  # of validation drives
@@ -172,15 +172,8 @@ def recorded_plan(folder: Path) -> Plan:
     Raises:
         RunError: there is none, it is damaged, or a newer steady-ppl wrote it.
     """
-    try:
-        content = read_json(folder / RECORD, RunError)
-    except (FileNotFoundError, NotADirectoryError):
-        raise RunError(f"{folder} is not a study: it has no {RECORD}") from None
-    refuse_newer(content, FORMAT, folder, RunError)
-    problem = misfit(content, RECORDED)
-    if problem is None and content["picture"] is not None:
-        problem = undrawable(content["title"], content["picture"])
-    if problem is not None:
+    content = read_record(folder / RECORD, RECORDED, FORMAT, "a study")
+    if content["picture"] is not None and (problem := undrawable(content["title"], content["picture"])):
         raise RunError(f"{folder / RECORD} is damaged: {problem}")
     picture = content["picture"]
     if picture is not None:

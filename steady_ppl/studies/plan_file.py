@@ -56,8 +56,13 @@ from steady_ppl.utils.files import require_file
 from steady_ppl.utils.schema import ANYTHING, NUMBER, TEXT, TRUTH, WHOLE, misfit
 from steady_ppl.utils.text import shown
 
-MOST_JOBS = 100_000
-
+Axes = dict[str, list[Any]]
+MOST_JOBS, MOST_DRIVES = 100_000, 1_000_000
+SOURCES: dict[str, dict[str, Any]] = {
+    "simulate": {"train": 16, "valid": 16, "test": 32, "effect": "", "sigma_deg": None},
+    "alpha_truck": {"sigma_deg": 5.0},
+    "tables": {},
+}
 METHOD: dict[str, Any] = {"name": TEXT, "program": TEXT, "recipe?": TEXT, "settings?": {str: ANYTHING}}
 FORM: dict[str, Any] = {
     "title": TEXT,
@@ -112,9 +117,17 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
     cells = len(content["seeds"]) * count(source) * sum(count(one["settings"]) for one in methods)
     if cells > MOST_JOBS:
         raise UsageError(f"{cells:,} jobs; expected at most {MOST_JOBS:,} of one study")
-    files = JobFiles()
-    cut = _jobs(content, task, source, methods)
-    jobs = _labelled(_without_doubles(tuple(replace(job, key=_key(files, job)) for job in cut)))
+    files, different = JobFiles(), dict[str, Job]()
+    for job in _jobs(content, task, source, methods):
+        with labelled(f"method {job.method}"):
+            key = files.key(job)
+        if key in different:
+            raise UsageError(
+                f"{job.method} with seed {job.seed} is there twice: methods need names of their own, and seeds and "
+                "other lists values that differ"
+            )
+        different[key] = replace(job, key=key)
+    jobs = _labelled(tuple(different.values()))
     picture = None
     if "picture" in content:
         picture = Picture(**content["picture"])
@@ -141,23 +154,6 @@ def _jobs(content: Mapping[str, Any], task: str, source: Axes, methods: list[dic
             for method in methods:
                 for settings in grid(method["settings"]):
                     yield Job(**method | {"settings": settings}, task=task, data=data, seed=seed, known_start=start)
-
-
-def _key(files: JobFiles, job: Job) -> str:
-    with labelled(f"method {job.method}"):
-        return files.key(job)
-
-
-def _without_doubles(jobs: tuple[Job, ...]) -> tuple[Job, ...]:
-    seen: set[str] = set()
-    for job in jobs:
-        if job.key in seen:
-            raise UsageError(
-                f"{job.method} with seed {job.seed} is there twice: methods need names of their own, and seeds and "
-                "other lists values that differ"
-            )
-        seen.add(job.key)
-    return jobs
 
 
 def _labelled(jobs: tuple[Job, ...]) -> tuple[Job, ...]:
@@ -206,19 +202,6 @@ def _require_columns(picture: Picture, task: str, jobs: tuple[Job, ...]) -> None
     for column in picture.published:
         if column not in picture.y:
             raise UsageError(f"picture.published: {column} is no panel; y has {', '.join(picture.y)}")
-
-
-SOURCES: dict[str, dict[str, Any]] = {
-    "simulate": {"train": 16, "valid": 16, "test": 32, "effect": "", "sigma_deg": None},
-    "alpha_truck": {"sigma_deg": 5.0},
-    "tables": {},
-}
-
-
-MOST_DRIVES = 1_000_000
-
-
-Axes = dict[str, list[Any]]
 
 
 def source_axes(folder: Path, given: Mapping[str, Any], instead: Path | None, task: str) -> Axes:

@@ -16,6 +16,7 @@ from steady_ppl.utils.schema import NUMBER, WHOLE, misfit
 from steady_ppl.utils.tensor_files import damaged, read_tensors, write_tensors
 from steady_ppl.utils.text import shown
 
+GROUPS = ("parameters", "averaged", "kept", "memory")
 NUMBERS = {"step": WHOLE, "history": [{"step": NUMBER}], "kept_step": WHOLE, "best_held_out": [NUMBER]}
 """The form of what a checkpoint says in JSON beside its tensors."""
 
@@ -47,10 +48,7 @@ class Checkpoint:
 
 def write_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimizer) -> None:
     """Write everything that `read_checkpoint` needs to go on as if nothing had happened."""
-    tensors = {f"parameters/{name}": value for name, value in state.parameters.items()}
-    tensors |= {f"averaged/{name}": value for name, value in state.averaged.items()}
-    tensors |= {f"kept/{name}": value for name, value in state.kept.items()}
-    tensors |= {f"memory/{name}": value for name, value in state.memory.items()}
+    tensors = {f"{group}/{name}": value for group in GROUPS for name, value in getattr(state, group).items()}
     for index, slots in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer/{index}/{slot}": value for slot, value in slots.items()}
     numbers = {name: getattr(state, name) for name in NUMBERS}
@@ -64,7 +62,7 @@ def read_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimi
         RunError: the file is missing, damaged, or of another program.
     """
     tensors, text = read_tensors(path)
-    groups: dict[str, dict[str, Tensor]] = {"parameters": {}, "averaged": {}, "kept": {}, "memory": {}, "optimizer": {}}
+    groups: dict[str, dict[str, Tensor]] = {group: {} for group in (*GROUPS, "optimizer")}
     for key, value in tensors.items():
         group, _, name = key.partition("/")
         if group not in groups:
@@ -98,11 +96,7 @@ def _shapes(tensors: Mapping[str, Tensor]) -> dict[str, torch.Size]:
 
 
 def _numbers(path: Path, text: Mapping[str, str]) -> dict[str, Any]:
-    """The text beside the tensors, by name of the state.
-
-    Raises:
-        RunError: it is not what `write_checkpoint` writes.
-    """
+    """The text beside the tensors, by name of the state."""
     try:
         found = {name: json.loads(text[name]) for name in NUMBERS if name in text}
     except (ValueError, RecursionError):
@@ -114,11 +108,7 @@ def _numbers(path: Path, text: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _slots(path: Path, tensors: Mapping[str, Tensor], optimizer: torch.optim.Optimizer) -> dict[int, dict[str, Tensor]]:
-    """What the optimiser remembers of each parameter, by its number.
-
-    Raises:
-        RunError: of a parameter that is not there, or of another shape.
-    """
+    """What the optimiser remembers of each parameter, by its number."""
     trained = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     slots: dict[int, dict[str, Tensor]] = {}
     for key, value in tensors.items():

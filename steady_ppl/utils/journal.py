@@ -79,11 +79,7 @@ def piece(compute: Callable[[], Piece]) -> Piece:
 
 
 def _read(file: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """A piece, the random state among its tensors.
-
-    Raises:
-        RunError: the file is damaged.
-    """
+    """A piece, the random state among its tensors."""
     tensors, text = read_tensors(file)
     try:
         said = json.loads(text.get("said", "null"))

@@ -12,7 +12,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from steady_ppl.errors import SteadyError
+from steady_ppl.errors import RunError
+from steady_ppl.utils.files import read_json
 from steady_ppl.utils.text import shown
 
 NUMBER, WHOLE, TEXT, TRUTH = "a finite number", "a whole number from 0 to 2^63", "text", "true or false"
@@ -59,18 +60,25 @@ def misfit(content: Any, form: Any, place: str = "") -> str | None:
     return None if _is(content, form) else _wrong(content, place, form)
 
 
-def refuse_newer(record: Any, known: int, folder: Path, refused: type[SteadyError]) -> None:
-    """Refuse a record whose `format` is a number that is not known yet.
+def read_record(file: Path, form: Any, known: int, what: str) -> Any:
+    """Read JSON of a form, whose `format` is a number up to the one that is known.
 
     Raises:
-        SteadyError, of the kind that is `refused`.
+        RunError: there is none, so that its folder is not `what`; it is damaged, or a newer steady-ppl wrote it.
     """
-    form = record.get("format", known) if isinstance(record, dict) else known
-    if isinstance(form, int) and form > known:
-        raise refused(
-            f"{folder} was written by a newer steady-ppl: its form is number {form}, this one reads up to {known}; "
-            "install that version or a later one to read it"
+    try:
+        record = read_json(file, RunError)
+    except (FileNotFoundError, NotADirectoryError):
+        raise RunError(f"{file.parent} is not {what}: it has no {file.name}") from None
+    number = record.get("format") if isinstance(record, dict) else None
+    if isinstance(number, int) and number > known:
+        raise RunError(
+            f"{file.parent} was written by a newer steady-ppl: its form is number {number}, this one reads up to "
+            f"{known}; install that version or a later one to read it"
         )
+    if problem := misfit(record, form):
+        raise RunError(f"{file} is damaged: {problem}")
+    return record
 
 
 def count(numbers: Any) -> int:
