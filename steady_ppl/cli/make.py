@@ -13,6 +13,7 @@ import steady_ppl as st
 from steady_ppl.cli import options
 from steady_ppl.cli.common import program_from
 from steady_ppl.errors import UsageError
+from steady_ppl.utils.progress import stages
 from steady_ppl.utils.text import say, tell
 
 NEXT = (
@@ -163,7 +164,6 @@ def simulate(
     from steady_ppl.effects.attach import with_effects
     from steady_ppl.model.validate import probe
     from steady_ppl.smc.simulate import simulated_in
-    from steady_ppl.utils.progress import stages
 
     if controls and trajectories:
         raise UsageError("--controls has as many drives as its table: leave --trajectories out")

@@ -15,7 +15,7 @@ from filelock import FileLock, Timeout
 from steady_ppl.errors import RunError
 from steady_ppl.utils import schema
 from steady_ppl.utils.files import read_json, require_file, whole_file
-from steady_ppl.utils.schema import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Paired, count, misfit
+from steady_ppl.utils.schema import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Paired, count, mismatch
 from steady_ppl.utils.tensor_files import read_tensors
 from steady_ppl.utils.text import command_line
 
@@ -218,7 +218,7 @@ def read_record(folder: Path) -> dict[str, Any]:
         RunError: there is none, it is damaged, or a newer steady-ppl wrote it.
     """
     record = schema.read_record(folder / RECORD, BEGUN_RECORD, FORMAT, "a run")
-    if record["status"] in FINISHED and (problem := misfit(record, FINISHED_RECORD)):
+    if record["status"] in FINISHED and (problem := mismatch(record, FINISHED_RECORD)):
         raise RunError(f"{folder / RECORD} is damaged: {problem}")
     return record
 
@@ -233,7 +233,7 @@ def read_discovery(source: Path) -> dict[str, Any] | None:
     if not file.is_file():
         return None
     found = read_json(file, RunError)
-    problem = misfit(found, FOUND) or _unlike(found)
+    problem = mismatch(found, FOUND) or _unlike(found)
     if problem is not None:
         raise RunError(f"{file} is not what `steady discover` writes: {problem}")
     return found

@@ -53,7 +53,7 @@ from steady_ppl.studies.plan import (
     without_folder,
 )
 from steady_ppl.utils.files import require_file
-from steady_ppl.utils.schema import ANYTHING, NUMBER, TEXT, TRUTH, WHOLE, misfit
+from steady_ppl.utils.schema import ANYTHING, NUMBER, TEXT, TRUTH, WHOLE, mismatch
 from steady_ppl.utils.text import shown
 
 Axes = dict[str, list[Any]]
@@ -97,7 +97,7 @@ def read_plan(path: Path, data: Path | None = None) -> Plan:
 
 
 def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
-    problem = misfit(content, FORM) or _surplus(content)
+    problem = mismatch(content, FORM) or _surplus(content)
     if problem is None and "picture" in content:
         problem = undrawable(content["title"], content["picture"])
     if problem is not None:
@@ -227,7 +227,7 @@ def source_axes(folder: Path, given: Mapping[str, Any], instead: Path | None, ta
     for name, usual in sayable.items():
         values = _axis(f"data.{name}", given.get(name, usual))
         form = TEXT if name == "effect" else NUMBER if name == "sigma_deg" else WHOLE
-        problem = misfit(values, [(form, None)], f"data.{name}")
+        problem = mismatch(values, [(form, None)], f"data.{name}")
         if problem is not None:
             raise UsageError(problem)
         for value in values if form != TEXT else ():

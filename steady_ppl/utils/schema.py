@@ -28,7 +28,7 @@ class Paired(NamedTuple):
     keys: tuple[str, ...]
 
 
-def misfit(content: Any, form: Any, place: str = "") -> str | None:
+def mismatch(content: Any, form: Any, place: str = "") -> str | None:
     """Return where JSON has another form than expected, in words; None where it has not.
 
     Args:
@@ -37,26 +37,28 @@ def misfit(content: Any, form: Any, place: str = "") -> str | None:
         place: what error messages call the content.
 
     Example:
-        >>> misfit({"seed": "one"}, {"seed": WHOLE})
+        >>> mismatch({"seed": "one"}, {"seed": WHOLE})
         "seed is 'one', expected a whole number from 0 to 2^63"
     """
     if isinstance(form, Paired):
-        return misfit(content, form.form, place) or _unpaired(content, form.keys, place)
+        return mismatch(content, form.form, place) or _unpaired(content, form.keys, place)
     if isinstance(form, tuple):
-        problems = [misfit(content, one, place) for one in form]
+        problems = [mismatch(content, one, place) for one in form]
         return None if None in problems else problems[0]
     if isinstance(form, list):
         if not isinstance(content, list) or len(form) not in (1, len(content)):
             return _wrong(content, place, "a list" if len(form) == 1 else f"a list of {len(form)}")
         inner = form * len(content) if len(form) == 1 else form
-        return _first(misfit(one, of, f"{place}[{i}]") for i, (one, of) in enumerate(zip(content, inner, strict=True)))
+        return _first(
+            mismatch(one, of, f"{place}[{i}]") for i, (one, of) in enumerate(zip(content, inner, strict=True))
+        )
     if isinstance(form, dict):
         if not isinstance(content, dict):
             return _wrong(content, place, "names and values")
         known = dict.fromkeys(content, form[str]) if str in form else {key.rstrip("?"): form[key] for key in form}
         if lacking := [key for key in known if key not in content and key in form]:
             return f"{place or 'it'} has no {', '.join(lacking)}"
-        return _first(misfit(content[key], known[key], _inside(place, key)) for key in known if key in content)
+        return _first(mismatch(content[key], known[key], _inside(place, key)) for key in known if key in content)
     return None if _is(content, form) else _wrong(content, place, form)
 
 
@@ -76,7 +78,7 @@ def read_record(file: Path, form: Any, known: int, what: str) -> Any:
             f"{file.parent} was written by a newer steady-ppl: its form is number {number}, this one reads up to "
             f"{known}; install that version or a later one to read it"
         )
-    if problem := misfit(record, form):
+    if problem := mismatch(record, form):
         raise RunError(f"{file} is damaged: {problem}")
     return record
 
