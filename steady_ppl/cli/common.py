@@ -8,25 +8,43 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import typer
-
+import steady_ppl as st
 from steady_ppl.errors import ComputationError, SteadyError, UsageError
 from steady_ppl.utils.files import whole_file
 from steady_ppl.utils.text import shown, tell
+
+FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "Storage size calculation overflowed")
+
+
+def fit_or_program(source: str, program: str | None, seed: int = 0, substeps: int | None = None) -> Any:
+    """The fit in a run folder, or else the program of a file.
+
+    Raises:
+        UsageError: a program is named for what is no run.
+    """
+    from steady_ppl.model.validate import probe
+
+    if not Path(source).is_dir():
+        if program:
+            raise UsageError("--program names the program of a RUN: leave it out")
+        return program_from(source, seed, substeps)
+    fit = st.Fit.load(source, program)
+    if substeps is not None:
+        fit.program = st.with_substeps(fit.program, substeps)
+        probe(fit.program)
+    return fit
 
 
 def program_from(model: str, seed: int, substeps: int | None = None) -> Any:
     """Load a program, its random initial weights keyed by the seed, and try it once on a probe; with as many substeps a
     row as its class says when None."""
-    from steady_ppl.model.loading import load_program
-    from steady_ppl.model.substeps import with_substeps
     from steady_ppl.model.validate import probe
-    from steady_ppl.utils.random import seeded
 
-    with seeded(seed, "program"):
-        program = load_program(model)
+    with st.seeded(seed, "program"):
+        program = st.load_program(model)
     if substeps is not None:
-        program = with_substeps(program, substeps)
+        program = st.with_substeps(program, substeps)
     probe(program)
     return program
 
@@ -75,14 +93,13 @@ def load_runs(labels: Mapping[str, Path], programs: Sequence[str] | None) -> dic
     Raises:
         UsageError: another number of programs than of runs.
     """
-    from steady_ppl.runs.fit import Fit
 
     if programs and len(programs) != len(labels):
         raise UsageError(
             f"--program is given {len(programs)} times for {len(labels)} runs: name one for each, in order"
         )
     sources: Sequence[str | None] = programs or [None] * len(labels)
-    return {label: Fit.load(run, source) for (label, run), source in zip(labels.items(), sources, strict=True)}
+    return {label: st.Fit.load(run, source) for (label, run), source in zip(labels.items(), sources, strict=True)}
 
 
 def used_before(runs: Mapping[str, Path], table: str) -> list[str]:
@@ -98,25 +115,6 @@ def used_before(runs: Mapping[str, Path], table: str) -> list[str]:
             if record.get(key) == table:
                 notes.append(f"{label} was {how} this very table: take drives that were not used, this proves nothing")
     return notes
-
-
-MAX_COUNT = 10**9
-
-
-def count(help: str, least: int = 1) -> Any:
-    """An option that says how many, `least` or more."""
-    return typer.Option(help=help, min=least, max=MAX_COUNT)
-
-
-def random_seed() -> Any:
-    """The option of a random seed, which a run's record holds in 63 bits."""
-    return typer.Option(help="Random seed.", min=0, max=2**63 - 1)
-
-
-FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
-
-
-MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "Storage size calculation overflowed")
 
 
 def as_refusal(error: Exception) -> SteadyError | None:

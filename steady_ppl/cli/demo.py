@@ -20,6 +20,7 @@ from typing import Annotated, Any
 
 import typer
 
+import steady_ppl as st
 from steady_ppl.errors import ComputationError, RunError
 from steady_ppl.runs.workbench import TRUTH, empty_again, workbench
 from steady_ppl.utils.text import aligned, tell
@@ -42,7 +43,6 @@ class Tour:
     say: Callable[[str], None]
     force: bool = False
     steps: list[dict[str, Any]] = field(default_factory=list)
-    began: float = field(default_factory=time.perf_counter)
 
     def step(self, title: str) -> None:
         """Begin a step."""
@@ -66,11 +66,6 @@ class Tour:
         step["seconds"], step["result"] = round(time.perf_counter() - step.pop("began"), 1), text
         said = f"{text} ({step['seconds']:.0f} s)"
         self.say(textwrap.fill(said, WIDTH, initial_indent="   → ", subsequent_indent="     "))
-
-    @property
-    def seconds(self) -> float:
-        """Since it began."""
-        return time.perf_counter() - self.began
 
 
 def run(command: Any, arguments: Sequence[str]) -> str:
@@ -138,43 +133,46 @@ def demonstrate(
         RunError: the folder exists and is no demonstration's.
         ComputationError: the search ended with nothing that can be added.
     """
-    from steady_ppl.model.loading import load_program
 
-    size = size or Size()
+    size, began = size or Size(), time.perf_counter()
     tour = Tour(command, say, force=out.exists())
     _open(out, force)
     say(textwrap.fill(BEGINNING, WIDTH))
     say(f"\n   $ cd {shlex.quote(str(out))}")
     with chdir(out):
         record_drives(tour, size)
-        fit_the_owners_program(tour, size)
-        compare(tour, size)
-        effects = discover(tour, size)
-        grown = add(tour, effects)
-        fit_again(tour, size, grown)
+        tour.step("Fit the owner's program, which has none")
+        tour.result(_fit(tour, OWNERS, "before", size))
+        tour.step("Compare: does it explain even the drives that it was fitted to?")
+        sets = size.calibration
+        tour.steady(f"check runs/before train.csv{sets} --json check.json --picture check.png", keep="check.txt")
+        tour.result(_read("check.json")["verdict"])
+        grown = add(tour, discover(tour, size))
+        tour.step("Fit again, in the same way, on the same drives; and the true structure, as the yardstick")
+        said = _fit(tour, grown, "after", size)
+        _fit(tour, TRUTH, "oracle", size)
+        tour.result(said)
         prove(tour)
-        report(tour, size)
-        say(
-            textwrap.fill(
-                f"What had been hidden: {load_program(TRUTH)}.", WIDTH, initial_indent="\n   ", subsequent_indent="   "
-            )
-        )
-        _write_record({"status": "finished", "seconds": round(tour.seconds, 1), "steps": tour.steps})
+        tour.step("See it: everything on one page")
+        tour.steady(f"report runs/before runs/after test.csv --discovery runs/found{sets} --out report.html")
+        tour.result("report.html: open it in a browser, it needs no network.")
+        hidden = f"What had been hidden: {st.load_program(TRUTH)}."
+        say(textwrap.fill(hidden, WIDTH, initial_indent="\n   ", subsequent_indent="   "))
+        _write_record({"status": "finished", "seconds": round(time.perf_counter() - began, 1), "steps": tour.steps})
     say(f"\n{out}: report.html; check, discovery and proof as .png, .txt and .json; drives; runs; {grown}")
-    say(f"{tour.seconds:.0f} s in all")
+    say(f"{time.perf_counter() - began:.0f} s in all")
     return tour.steps
 
 
 def record_drives(tour: Tour, size: Size) -> None:
     """Simulate drives of a hovercraft with drag, and forget its poses."""
-    from steady_ppl.data.table import read_table, write_table
 
     tour.step("Record drives, of a hovercraft that does have drag")
     drives = {"train": size.train, "valid": size.valid, "test": size.test}
     for seed, (name, count) in enumerate(drives.items(), 1):
         tour.steady(f"simulate {TRUTH} --trajectories {count} --seed {seed} --out {name}.csv")
     for name in ("train", "valid"):
-        write_table(read_table(f"{name}.csv").without_truth(keep_start=True), Path(f"{name}.csv"))
+        st.write_table(st.read_table(f"{name}.csv").without_truth(keep_start=True), Path(f"{name}.csv"))
     tour.result(
         f"{size.train} drives to fit and {size.valid} to choose by: of both only controls, bearings and the first "
         f"state are kept. {size.test} more are locked away for the proof, with their poses, to judge by. The "
@@ -182,24 +180,10 @@ def record_drives(tour: Tour, size: Size) -> None:
     )
 
 
-def fit_the_owners_program(tour: Tour, size: Size) -> None:
-    """Mass, inertia and noise of the program without drag, by the recipe `steady`."""
-    tour.step("Fit the owner's program, which has none")
-    tour.result(_fit(tour, OWNERS, "before", size))
-
-
-def compare(tour: Tour, size: Size) -> None:
-    """Whether the program explains even the drives that it was fitted to."""
-    tour.step("Compare: does it explain even the drives that it was fitted to?")
-    tour.steady(
-        f"check runs/before train.csv{size.calibration} --json check.json --picture check.png",
-        keep="check.txt",
-    )
-    tour.result(_read("check.json")["verdict"])
-
-
 def discover(tour: Tour, size: Size) -> list[str]:
     """Which effects are missing, as the run's record names them."""
+    from steady_ppl.runs.folder import read_record
+
     tour.step("Discover: which physical effect is missing?")
     tour.steady(
         f"discover runs/before train.csv --valid valid.csv{size.calibration} --out runs/found "
@@ -208,8 +192,6 @@ def discover(tour: Tour, size: Size) -> list[str]:
     )
     sentence = _read("discovery.json")["sentence"]
     tour.result(sentence)
-    from steady_ppl.runs.folder import read_record
-
     effects = read_record(Path("runs/found"))["effects"]
     if not effects:
         raise ComputationError(f"there is nothing to add, and the demonstration ends here: {sentence}")
@@ -227,14 +209,6 @@ def add(tour: Tour, effects: Sequence[str]) -> str:
     return grown
 
 
-def fit_again(tour: Tour, size: Size, grown: str) -> None:
-    """Fit the new program in the same way, and what made the drives, as the yardstick."""
-    tour.step("Fit again, in the same way, on the same drives; and the true structure, as the yardstick")
-    said = _fit(tour, grown, "after", size)
-    _fit(tour, TRUTH, "oracle", size)
-    tour.result(said)
-
-
 def prove(tour: Tour) -> None:
     """Before and after on the locked drives."""
     tour.step("Prove: on the locked drives, which nothing has seen so far")
@@ -248,13 +222,6 @@ def prove(tour: Tour) -> None:
     tour.say("")
     for line in summary(figures):
         tour.say(f"     {line}")
-
-
-def report(tour: Tour, size: Size) -> None:
-    """Everything on one page."""
-    tour.step("See it: everything on one page")
-    tour.steady(f"report runs/before runs/after test.csv --discovery runs/found{size.calibration} --out report.html")
-    tour.result("report.html: open it in a browser, it needs no network.")
 
 
 def summary(figures: Mapping[str, Any]) -> list[str]:

@@ -9,34 +9,33 @@ from typing import Annotated, Any
 
 import typer
 
-from steady_ppl.cli.common import count, random_seed
+import steady_ppl as st
+from steady_ppl.cli import options
+from steady_ppl.cli.common import load_runs, present, program_from, run_labels, used_before
 from steady_ppl.errors import UsageError
-from steady_ppl.utils.text import tell
+from steady_ppl.utils.files import require_picture, require_place, write_picture
+from steady_ppl.utils.text import say, tell
+
+OFTEN = 0.1  # share of the measured rows after which hardly a particle is left
+SIMULATIONS = 100  # sets for the bands of a report
 
 
 def check(
-    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    run: options.Run,
     table: Annotated[Path, typer.Argument(help="Drives to compare with, best others than those of the fit.")],
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file; - prints them instead of the text.")
-    ] = None,
+    json_file: options.Json = None,
     picture: Annotated[Path | None, typer.Option(help="Draw the picture into this file, for example .png.")] = None,
     mask: Annotated[
         Path | None,
         typer.Option(help="Write the table without the stretches that nobody measured, for fits and checks, here."),
     ] = None,
-    simulations: Annotated[int, count("Simulated sets for the bands.", least=20)] = 100,
-    program: Annotated[str | None, typer.Option(help="The program, if its file moved or changed.")] = None,
-    seed: Annotated[int, random_seed()] = 0,
+    simulations: Annotated[int, options.count("Simulated sets for the bands.", least=20)] = 100,
+    program: options.Moved = None,
+    seed: options.Seed = 0,
 ) -> None:
     """Compare a run with measurements: where, when and in which regime it fails, and who is at fault."""
-    from steady_ppl.cli.common import present
-    from steady_ppl.criticism.check import check as compare
     from steady_ppl.data.frozen_sensors import masked
-    from steady_ppl.data.table import read_table, require_table_file, write_table
-    from steady_ppl.runs.fit import Fit
-    from steady_ppl.utils.files import require_picture, require_place, write_picture
-    from steady_ppl.utils.text import say
+    from steady_ppl.data.table import require_table_file
 
     require_picture(picture)
     require_place(json_file)
@@ -45,48 +44,33 @@ def check(
         require_place(mask)
         if os.path.realpath(mask) in (os.path.realpath(table), json_file and os.path.realpath(json_file)):
             raise UsageError(f"--mask {mask} is the table itself, or the file of --json: name another file")
-    drives = read_table(table)
-    found = compare(Fit.load(run, program), drives, simulations=simulations, seed=seed)
+    drives = st.read_table(table)
+    found = st.check(st.Fit.load(run, program), drives, simulations=simulations, seed=seed)
     if picture is not None:
         from steady_ppl.plotting.check import check_picture
 
         write_picture(check_picture(found), picture)
     present(str(found), {"run": str(run), **found.figures}, json_file)
     if mask is not None:
-        write_table(masked(drives, found.stuck), mask)
+        st.write_table(masked(drives, found.stuck), mask)
         count = len(found.stuck)
         say(f"{mask}: {table.name} without {count} stretch{'' if count == 1 else 'es'} that nobody measured")
 
 
 def prove(
-    arguments: Annotated[
-        list[Path],
-        typer.Argument(metavar="RUN... TABLE", help="Run folders, the one before first, then drives not used for any."),
-    ],
+    arguments: options.RunsAndTable,
     truth: Annotated[str | None, typer.Option(help="The program that made the drives, if it is known.")] = None,
     oracle: Annotated[Path | None, typer.Option(help="A run of the true structure, fitted like the others.")] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file; - prints them instead of the text.")
-    ] = None,
+    json_file: options.Json = None,
     picture: Annotated[Path | None, typer.Option(help="Draw the errors into this file, for example .png.")] = None,
     program: Annotated[
         list[str] | None,
         typer.Option(help="The program, if its file moved or changed; once for each RUN and the oracle, in order."),
     ] = None,
-    seed: Annotated[int, random_seed()] = 0,
+    seed: options.Seed = 0,
 ) -> None:
     """Prove that runs are better than the first one: log p(y), open-loop errors and noise, with paired intervals."""
-    from steady_ppl.cli.common import (
-        load_runs,
-        present,
-        program_from,
-        run_labels,
-        used_before,
-    )
-    from steady_ppl.comparison.prove import prove as judge
-    from steady_ppl.data.table import read_table
     from steady_ppl.runs.recipes import fingerprint
-    from steady_ppl.utils.files import require_picture, require_place, write_picture
 
     *runs, table = arguments
     if not runs:
@@ -97,8 +81,8 @@ def prove(
     rows: dict[str, Any] = load_runs(labels, program)
     if truth is not None:
         rows["truth"] = program_from(truth, seed)
-    drives = read_table(table)
-    found = judge(rows, drives, truth="truth" if truth is not None else None, seed=seed)
+    drives = st.read_table(table)
+    found = st.prove(rows, drives, truth="truth" if truth is not None else None, seed=seed)
     found.notes[:0] = used_before(labels, fingerprint(drives))
     if picture is not None:
         from steady_ppl.plotting.comparison import proof_picture
@@ -108,17 +92,12 @@ def prove(
     present(str(found), {"runs": runs_by_label, **found.figures}, json_file)
 
 
-OFTEN = 0.1  # share of the measured rows after which hardly a particle is left
-
-
 def evaluate(
     arguments: Annotated[list[Path], typer.Argument(metavar="RUN... TABLE", help="Run folders, then the table.")],
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file; - prints them instead of the text.")
-    ] = None,
-    particles: Annotated[int | None, count("Particles of the filters.", least=2)] = None,
-    rollouts: Annotated[int, count("Noisy roll-outs from each true state.")] = 1000,
-    seed: Annotated[int, random_seed()] = 0,
+    json_file: options.Json = None,
+    particles: Annotated[int | None, options.count("Particles of the filters.", least=2)] = None,
+    rollouts: Annotated[int, options.count("Noisy roll-outs from each true state.")] = 1000,
+    seed: options.Seed = 0,
     surveyed: Annotated[
         str | None,
         typer.Option("--map", help="The same vehicle with the true landmarks, for runs that learned theirs."),
@@ -131,16 +110,10 @@ def evaluate(
     ] = None,
 ) -> None:
     """The paper's errors where true states exist; errors in measurement space always."""
-    from steady_ppl.cli.common import load_runs, present, run_labels, used_before
     from steady_ppl.comparison.evaluate import evaluate_all, incomparable, table_of
-    from steady_ppl.data.table import read_table
-    from steady_ppl.model.loading import load_program
-    from steady_ppl.model.program import for_program
     from steady_ppl.runs.diagnostics import diagnose_units
     from steady_ppl.runs.recipes import fingerprint
     from steady_ppl.smc.genealogy import FEW
-    from steady_ppl.utils.files import require_place
-    from steady_ppl.utils.text import say
 
     if len(arguments) < 2:
         raise UsageError("evaluate needs at least one RUN and then a TABLE")
@@ -148,8 +121,8 @@ def evaluate(
     *runs, table = arguments
     labels = run_labels(runs)
     fits = list(load_runs(labels, program).values())
-    drives = read_table(table)
-    true_map = load_program(surveyed) if surveyed else None
+    drives = st.read_table(table)
+    true_map = st.load_program(surveyed) if surveyed else None
     settings: dict[str, Any] = {"particles": particles, "rollouts": rollouts, "seed": seed, "surveyed": true_map}
     folders = [str(run) for run in runs]
     results = evaluate_all(fits, folders, drives, **settings)
@@ -160,7 +133,7 @@ def evaluate(
             lines.append(f"{label}: landmarks off by {error['rms']:.3g} m rms, {error['most']:.3g} m at most{how}")
     rows = [{"run": folder, **result} for folder, result in zip(folders, results, strict=True)]
     present("\n".join(lines), {"runs": rows}, json_file)
-    doubts = {doubt: None for fit in fits for doubt in diagnose_units(fit.program, for_program(fit.program, drives))}
+    doubts = {doubt: None for fit in fits for doubt in diagnose_units(fit.program, st.for_program(fit.program, drives))}
     for reason in [
         *incomparable(results, folders),
         *used_before(labels, fingerprint(drives)),
@@ -180,7 +153,7 @@ def evaluate(
 
 
 def states(
-    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    run: options.Run,
     table: Annotated[Path, typer.Argument(help="Drives.")],
     out: Annotated[
         Path,
@@ -188,66 +161,50 @@ def states(
             "--out", help="A table (.csv, .parquet) of medians and 90 % intervals, or all draws for ArviZ (.nc)."
         ),
     ],
-    draws: Annotated[int, count("Paths of each drive.")] = 100,
-    particles: Annotated[int | None, count("Particles of the filter.")] = None,
-    program: Annotated[str | None, typer.Option(help="The program, if its file moved or changed.")] = None,
-    seed: Annotated[int, random_seed()] = 0,
+    draws: Annotated[int, options.count("Paths of each drive.")] = 100,
+    particles: Annotated[int | None, options.count("Particles of the filter.")] = None,
+    program: options.Moved = None,
+    seed: options.Seed = 0,
 ) -> None:
     """Write where the vehicle probably was, given all measurements of a drive: posterior draws of its states.
 
     The table has for each state its median and the ends of its 90 % interval, `…_low` and `…_high`.
     """
-    from steady_ppl.data.table import read_table
-    from steady_ppl.model.program import for_program
     from steady_ppl.runs.diagnostics import diagnose_units
-    from steady_ppl.runs.fit import Fit
     from steady_ppl.runs.posterior import require_states_file, write_states
     from steady_ppl.smc.genealogy import few_starts
-    from steady_ppl.utils.files import require_place
-    from steady_ppl.utils.text import say
 
     require_states_file(out)
     require_place(out)
-    fit, drives = Fit.load(run, program), read_table(table)
+    fit, drives = st.Fit.load(run, program), st.read_table(table)
     posterior = fit.posterior(drives, draws=draws, particles=particles, seed=seed)
     write_states(posterior, out)
     tell(f"{out}: {len(drives)} drives, {draws} draws of each")
     scarce = few_starts(float(posterior["sample_stats"]["roots"].min()))
-    for doubt in [*diagnose_units(fit.program, for_program(fit.program, drives)), *([scarce] if scarce else [])]:
+    for doubt in [*diagnose_units(fit.program, st.for_program(fit.program, drives)), *([scarce] if scarce else [])]:
         say(doubt)
 
 
-SIMULATIONS = 100
-
-
 def report(
-    arguments: Annotated[
-        list[Path],
-        typer.Argument(metavar="RUN... TABLE", help="Run folders, the one before first, then drives not used for any."),
-    ],
+    arguments: options.RunsAndTable,
     out: Annotated[Path, typer.Option("--out", help="The page to write.")] = Path("report.html"),
     discovery: Annotated[
         Path | None,
         typer.Option(help="What `steady discover` found: its RUN or its --json file, if none of the RUNs has it."),
     ] = None,
     title: Annotated[str | None, typer.Option(help="Of the page; the runs' names when not given.")] = None,
-    simulations: Annotated[int, count("Simulated sets for the bands.", least=20)] = SIMULATIONS,
+    simulations: Annotated[int, options.count("Simulated sets for the bands.", least=20)] = SIMULATIONS,
     program: Annotated[
-        list[str] | None,
-        typer.Option(help="The program, if its file moved or changed; once for each RUN, in order."),
+        list[str] | None, typer.Option(help="The program, if its file moved or changed; once for each RUN, in order.")
     ] = None,
-    seed: Annotated[int, random_seed()] = 0,
+    seed: options.Seed = 0,
 ) -> None:
     """Write one page of HTML: verdict, measured against predicted, where it fails, what is missing, before and after.
 
     What `steady discover … --out RUN` found is shown if one of the runs is such a RUN. The page needs no network.
     """
-    from steady_ppl.cli.common import load_runs, run_labels, used_before
-    from steady_ppl.data.table import read_table
-    from steady_ppl.reporting.report import report as gather
     from steady_ppl.runs.folder import read_discovery
     from steady_ppl.runs.recipes import fingerprint
-    from steady_ppl.utils.files import require_place
 
     *runs, table = arguments
     if not runs:
@@ -257,55 +214,43 @@ def report(
     require_place(out)
     labels = run_labels(runs)
     fits = load_runs(labels, program)
-    drives = read_table(table)
+    drives = st.read_table(table)
     found = [one for run in labels.values() if (one := read_discovery(run)) is not None]
-    if discovery is not None and (given := read_discovery(discovery)) is None:
+    if discovery is not None and (known := read_discovery(discovery)) is None:
         raise UsageError(f"{discovery} is neither a RUN that `steady discover` made nor its --json file")
-    gather(
+    given: list[tuple[str, Any]] = [("--discovery", discovery), ("--title", title)]
+    given += [("--program", one) for one in program or []]
+    given += [("--simulations", simulations if simulations != SIMULATIONS else None), ("--seed", seed or None)]
+    words = ["steady", "report", *map(str, arguments)]
+    words += [word for name, value in [*given, ("--out", out)] if value is not None for word in (name, str(value))]
+    digest = fingerprint(drives)
+    how = [*_made(runs, discovery), f"# {table}: sha256 of its drives {digest[:16]}…", shlex.join(words)]
+    st.report(
         fits,
         drives,
-        discovery=given if discovery is not None else found[-1] if found else None,
+        discovery=known if discovery is not None else found[-1] if found else None,
         title=title or f"{', '.join(labels)} on {table.name}",
-        how=_how(arguments, fingerprint(drives), out, discovery, title, program, simulations, seed),
-        notes=used_before(labels, fingerprint(drives)),
+        how=["\n".join(how)],
+        notes=used_before(labels, digest),
         simulations=simulations,
         seed=seed,
     ).write(out)
     tell(f"{out}: {', '.join(labels)} on {len(drives)} drives")
 
 
-def _how(
-    arguments: list[Path],
-    digest: str,
-    out: Path,
-    discovery: Path | None,
-    title: str | None,
-    programs: list[str] | None,
-    simulations: int,
-    seed: int,
-) -> list[str]:
-    """How each of the runs, and what was discovered, were made, by which command if one did; the table; the command as
-    it was given."""
+def _made(runs: list[Path], discovery: Path | None) -> list[str]:
+    """How each of the runs, and what was discovered, were made, by which command if one did."""
     from steady_ppl.runs.folder import RECORD, read_record
 
-    given: list[tuple[str, Any]] = [
-        ("--discovery", discovery),
-        ("--title", title),
-        *(("--program", one) for one in programs or []),
-    ]
-    given += [("--simulations", simulations if simulations != SIMULATIONS else None), ("--seed", seed or None)]
-    options = [word for name, value in given if value is not None for word in (name, str(value))]
-    *runs, table = arguments
     if discovery is not None and (discovery / RECORD).is_file() and discovery not in runs:
-        runs.insert(1, discovery)
-    fitted = []
+        runs = [*runs[:1], discovery, *runs[1:]]
+    made = []
     for run in runs:
         record = read_record(run)
         source = record["program"]
         start = "with" if record["known_start"] else "without"
         name = f"{os.path.relpath(run / source['file'])}:{source['class']}" if source else "a program of no file"
-        fitted.append(f"# {run}: {name}, recipe {record['recipe']}, seed {record['seed']}, {start} a known start")
+        made.append(f"# {run}: {name}, recipe {record['recipe']}, seed {record['seed']}, {start} a known start")
         if command := record.get("command"):
-            fitted.append(command)
-    fitted.append(f"# {table}: sha256 of its drives {digest[:16]}…")
-    return ["\n".join([*fitted, shlex.join(["steady", "report", *map(str, arguments), *options, "--out", str(out)])])]
+            made.append(command)
+    return made

@@ -3,41 +3,27 @@
 from __future__ import annotations
 
 import ast
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
-from steady_ppl.cli.common import MAX_COUNT, count, random_seed
+import steady_ppl as st
+from steady_ppl.cli import options
+from steady_ppl.cli.common import fit_or_program, present, program_from, write_json
 from steady_ppl.errors import RunError, UsageError
-from steady_ppl.utils.text import shown, tell
+from steady_ppl.utils.files import require_picture, require_place, write_picture
+from steady_ppl.utils.text import is_quiet, say, shown, tell
 
 WORDS = {"true": True, "false": False, "none": None}
 RECIPES = ("steady", "likelihood", "steady-minus", "svi", "hand", "fit-hand", "fit-tv", "fit-truth")
-
-
-class Device(StrEnum):
-    """Where tensors live."""
-
-    cpu = "cpu"
-    cuda = "cuda"
-
-
-class GuideName(StrEnum):
-    """The E step of STEADY, and the guides of SVI."""
-
-    lookahead = "lookahead"
-    gaussian = "gaussian"
-    bootstrap = "bootstrap"
-    network = "network"
-    mean_field = "mean-field"
-    smoother = "smoother"
+Device = Literal["cpu", "cuda"]
+GuideName = Literal["lookahead", "gaussian", "bootstrap", "network", "mean-field", "smoother"]
 
 
 def fit(
     context: typer.Context,
-    model: Annotated[str, typer.Argument(help="Program: models/hovercraft.py, or mine.py:Boat.")],
+    model: options.Model,
     table: Annotated[Path, typer.Argument(help="Training drives, .csv or .parquet.")],
     out: Annotated[Path, typer.Option("--out", help="Run folder to write.")],
     valid: Annotated[Path | None, typer.Option(help="Held-out drives that decide when to stop.")] = None,
@@ -53,39 +39,33 @@ def fit(
     ] = None,
     hand: Annotated[str | None, typer.Option(help="The program written by hand, for fit-hand.")] = None,
     known_start: Annotated[bool, typer.Option(help="Give the first row's x. columns as the exact start.")] = False,
-    substeps: Annotated[
-        int | None, typer.Option(help="Steps of the program in each row; as its class says when not given.")
-    ] = None,
-    particles: Annotated[int | None, count("Particles for each drive.")] = None,
-    draws: Annotated[int | None, count("Paths for each drive in the M step.")] = None,
-    steps: Annotated[int | None, count("E steps.")] = None,
+    substeps: options.Substeps = None,
+    particles: Annotated[int | None, options.count("Particles for each drive.")] = None,
+    draws: Annotated[int | None, options.count("Paths for each drive in the M step.")] = None,
+    steps: Annotated[int | None, options.count("E steps.")] = None,
     setting: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Any other setting of the recipe, for example ramp=0.7."),
     ] = None,
-    seed: Annotated[int, random_seed()] = 0,
-    device: Annotated[Device, typer.Option(help="Where to compute.")] = Device.cpu,
+    seed: options.Seed = 0,
+    device: Annotated[Device, typer.Option(help="Where to compute.")] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite an existing run.")] = False,
+    force: options.Overwrite = False,
 ) -> None:
     """Learn a program's parameters from measurements."""
-    from steady_ppl.cli.common import program_from
-    from steady_ppl.data.table import read_table
     from steady_ppl.runs.recipes import run_recipe
-    from steady_ppl.utils.text import is_quiet, say
 
-    given: dict[str, Any] = {"particles": particles, "draws": draws, "steps": steps, "hand": hand}
-    given["guide"] = guide and guide.value
+    given = {"particles": particles, "draws": draws, "steps": steps, "hand": hand, "guide": guide}
     result = run_recipe(
         recipe,
         program_from(model, seed, substeps),
-        read_table(table),
-        read_table(valid) if valid else None,
+        st.read_table(table),
+        st.read_table(valid) if valid else None,
         out,
         options=_settings(setting or [], {name: value for name, value in given.items() if value is not None}),
         known_start=known_start,
         seed=seed,
-        device=device.value,
+        device=device,
         resume=resume,
         force=force,
         progress=not is_quiet(),
@@ -97,32 +77,30 @@ def fit(
         judged = {e["step"]: e["log_likelihood"] for e in result.trained.history if "log_likelihood" in e}
         if judged:
             first, kept = next(iter(judged.values())), judged[result.trained.kept]
-            tell(
-                f"held-out log p(y) of a drive {first:.2f} → {kept:.2f} at step {result.trained.kept}, "
-                "whose parameters were kept"
-            )
+            rise = f"{first:.2f} → {kept:.2f} at step {result.trained.kept}"
+            tell(f"held-out log p(y) of a drive {rise}, whose parameters were kept")
         if result.trained.interrupted:
             say(f"interrupted; the run so far is usable, `--resume` goes on with {out}")
             raise typer.Exit(1)
 
 
-def _settings(pairs: list[str], options: dict[str, Any]) -> dict[str, Any]:
+def _settings(pairs: list[str], found: dict[str, Any]) -> dict[str, Any]:
     """Add `NAME=VALUE` settings to the named options: Python literals, true, false, none, or else words."""
     for pair in pairs:
         name, equals, text = pair.partition("=")
         name = name.strip().replace("-", "_")
         if not (equals and name):
             raise UsageError(f"--set {pair}: expected NAME=VALUE")
-        if name in options:
+        if name in found:
             raise UsageError(f"--set {pair}: {name} is given twice")
         word = text.strip()
         try:
-            options[name] = ast.literal_eval(word)
+            found[name] = ast.literal_eval(word)
         except (ValueError, SyntaxError):
-            options[name] = WORDS.get(word, word)
-        if isinstance(options[name], int) and abs(options[name]) > MAX_COUNT:
-            raise UsageError(f"--set {shown(pair, 60)}: expected a whole number up to {MAX_COUNT}")
-    return options
+            found[name] = WORDS.get(word, word)
+        if isinstance(found[name], int) and abs(found[name]) > options.MAX_COUNT:
+            raise UsageError(f"--set {shown(pair, 60)}: expected a whole number up to {options.MAX_COUNT}")
+    return found
 
 
 def discover(
@@ -135,52 +113,35 @@ def discover(
         bool | None,
         typer.Option(help="Give the first row's x. columns as the exact start; a RUN's own setting when not given."),
     ] = None,
-    substeps: Annotated[
-        int | None, typer.Option(help="Steps of the program in each row; as its class says when not given.")
-    ] = None,
+    substeps: options.Substeps = None,
     mix: Annotated[
         bool, typer.Option("--mix", help="Put both tables together and keep every second drive to choose by.")
     ] = False,
     out: Annotated[Path | None, typer.Option("--out", help="Run folder for the improved fit.")] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the figures to this file; - prints them instead of the text.")
-    ] = None,
+    json_file: options.Json = None,
     picture: Annotated[Path | None, typer.Option(help="Draw what was found into this file, for example .png.")] = None,
-    simulations: Annotated[int, count("Simulated sets for the calibration.", least=50)] = 200,
-    program: Annotated[str | None, typer.Option(help="The run's program, if its file moved or changed.")] = None,
-    seed: Annotated[int, random_seed()] = 0,
+    simulations: Annotated[int, options.count("Simulated sets for the calibration.", least=50)] = 200,
+    program: options.MovedOfRun = None,
+    seed: options.Seed = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a search that was stopped.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite an existing run.")] = False,
+    force: options.Overwrite = False,
 ) -> None:
     """Learn which physical effect a program lacks: none, one by name, several, or a curve that has no name."""
-    from steady_ppl.cli.common import present, program_from, write_json
-    from steady_ppl.data.table import read_table
-    from steady_ppl.discovery.discover import discover as search, kept_search
-    from steady_ppl.model.substeps import with_substeps
-    from steady_ppl.model.validate import probe
-    from steady_ppl.runs.fit import Fit
+    from steady_ppl.discovery.discover import kept_search
     from steady_ppl.runs.folder import DISCOVERY
     from steady_ppl.runs.recipes import fingerprint
-    from steady_ppl.utils.files import require_picture, require_place, write_picture
-    from steady_ppl.utils.text import say
 
-    is_run = Path(source).is_dir()
-    if program and not is_run:
-        raise UsageError("--program names the program of a RUN: leave it out")
     if out is None and resume:
         raise UsageError("--resume goes on with a search in its run folder: name it (--out)")
     if out is not None and out.exists() and not (force or resume):
         raise RunError(f"{out} exists: choose another folder, or --force to overwrite, or --resume to go on")
     require_picture(picture)
     require_place(json_file)
-    given: Any = Fit.load(source, program) if is_run else program_from(source, seed, substeps)
-    if is_run and substeps is not None:
-        given.program = with_substeps(given.program, substeps)
-        probe(given.program)
-    drives, judges = read_table(table), read_table(valid) if valid else None
-    options: dict[str, Any] = {"known_start": known_start, "mix": mix, "simulations": simulations, "seed": seed}
-    with kept_search(out, given, drives, judges, options, force=force, resume=resume):
-        found = search(given, drives, judges, **options)
+    given = fit_or_program(source, program, seed, substeps)
+    drives, judges = st.read_table(table), st.read_table(valid) if valid else None
+    settings: dict[str, Any] = {"known_start": known_start, "mix": mix, "simulations": simulations, "seed": seed}
+    with kept_search(out, given, drives, judges, settings, force=force, resume=resume):
+        found = st.discover(given, drives, judges, **settings)
         figures = {"source": source, **found.figures}
         present(str(found), figures, json_file)
         if out is not None:
@@ -207,7 +168,7 @@ def add(
     source: Annotated[str, typer.Argument(metavar="RUN|MODEL", help="A run folder, or a program's file.")],
     out: Annotated[Path, typer.Option("--out", metavar="MODEL.py", help="Program to write, beside the old one.")],
     effects: Effects = None,
-    program: Annotated[str | None, typer.Option(help="The run's program, if its file moved or changed.")] = None,
+    program: options.MovedOfRun = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing file.")] = False,
 ) -> None:
     """Write a program with physical effects; `fit` it like any other.
@@ -215,17 +176,11 @@ def add(
     Its parameters start at the run's values, a coefficient at the value that is given, else at the run's, else at the
     effect's typical one.
     """
-    from steady_ppl.cli.common import program_from
     from steady_ppl.effects import added, write_program
     from steady_ppl.effects.attach import with_effects
-    from steady_ppl.runs.fit import Fit
-    from steady_ppl.utils.text import say
 
-    is_run = Path(source).is_dir()
-    if program and not is_run:
-        raise UsageError("--program names the program of a RUN: leave it out")
-    grown = Fit.load(source, program).program if is_run else program_from(source, 0)
-    grown = with_effects(grown, effects or [], say)
+    given, is_run = fit_or_program(source, program), Path(source).is_dir()
+    grown = with_effects(given.program if is_run else given, effects or [], say)
     if not added(grown):
         raise UsageError(f"{source} has no effect that its file does not have: name one, `steady effects` lists them")
     notes = write_program(grown, out, force=force)
@@ -241,7 +196,6 @@ def effects(
     model: Annotated[str | None, typer.Argument(help="Only those that this program could have, and why.")] = None,
 ) -> None:
     """List the physical effects that a program may lack."""
-    from steady_ppl.cli.common import program_from
     from steady_ppl.effects.registry import page
 
     tell(page(program_from(model, 0) if model else None), end="")
@@ -249,8 +203,8 @@ def effects(
 
 def study(
     plan: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="What is compared with what.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder of the results; one that is there is gone on with.")],
-    workers: Annotated[int | None, count("Processes of this machine; its cores when not given.")] = None,
+    out: Annotated[Path, typer.Option("--out", help="Folder of the results; an existing one is resumed.")],
+    workers: Annotated[int | None, options.count("Processes of this machine; its cores when not given.")] = None,
     cluster: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, tcp://HOST:PORT, in place of processes.")
     ] = None,
@@ -267,7 +221,6 @@ def study(
     from steady_ppl.studies.executors import Cluster, Local
     from steady_ppl.studies.plan_file import read_plan
     from steady_ppl.studies.runner import require_runnable, run_study
-    from steady_ppl.utils.text import say
 
     if workers is not None and cluster is not None:
         raise UsageError("--workers are processes of this machine: take it or --cluster")
@@ -290,7 +243,6 @@ def plot_study(
     from steady_ppl.studies.pictures import study_picture
     from steady_ppl.studies.plan import recorded_plan
     from steady_ppl.studies.table import read_results
-    from steady_ppl.utils.files import require_picture, write_picture
 
     plan, place = recorded_plan(folder), out or folder / "study.png"
     require_picture(place)

@@ -9,7 +9,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from importlib.metadata import version as installed_version
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import typer
 
@@ -18,7 +18,7 @@ from steady_ppl.cli.common import as_refusal
 from steady_ppl.cli.progress import progress_line
 from steady_ppl.errors import SteadyError
 from steady_ppl.utils.progress import listening
-from steady_ppl.utils.text import commanded, quietly, say, tell
+from steady_ppl.utils.text import commanded, one_line, quietly, say, tell
 
 INTERRUPTED = 130  # what typer returns for Ctrl-C
 # left out of the help, which then fits one screen; as --debug, which the line of an unexpected error names
@@ -26,14 +26,12 @@ COMPLETION = ("install_completion", "show_completion")
 EVERYWHERE = {"--debug": "debug", "--quiet": "quiet", "-q": "quiet"}  # before or after the command
 
 
-class Command(NamedTuple):
+class Command:
     """A command, what `steady --help` says of it, examples for its own help, and whether another one's help names it:
     one screen is full."""
 
-    function: Callable[..., None]
-    about: str
-    examples: tuple[str, ...]
-    hidden: bool = False
+    def __init__(self, function: Callable[..., None], about: str, *examples: str, hidden: bool = False) -> None:
+        self.function, self.about, self.examples, self.hidden = function, about, examples, hidden
 
     @property
     def name(self) -> str:
@@ -42,101 +40,83 @@ class Command(NamedTuple):
 
 
 COMMANDS = (
-    Command(demo.demo, "Show the whole loop on drives with a hidden effect.", ("steady demo --out demo",)),
-    Command(make.init, "Make a folder to work in, with first drives.", ("steady init lab",)),
+    Command(demo.demo, "Show the whole loop on drives with a hidden effect.", "steady demo --out demo"),
+    Command(make.init, "Make a folder to work in, with first drives.", "steady init lab"),
     Command(
         make.import_bag,
         "Turn ROS 1 or 2 bags and MCAP files into a table.",
-        (
-            "steady import-bag drive.bag > mapping.toml",
-            "steady import-bag monday/*.mcap mapping.toml --out drives.csv",
-            "steady import-bag drive.bag --map u.speed=/cmd_vel:linear.x \\",
-            "                            --map y.range=/range:range --step 0.1 --out drive.csv",
-        ),
+        "steady import-bag drive.bag > mapping.toml",
+        "steady import-bag monday/*.mcap mapping.toml --out drives.csv",
+        "steady import-bag drive.bag --map u.speed=/cmd_vel:linear.x \\",
+        "                            --map y.range=/range:range --step 0.1 --out drive.csv",
     ),
     Command(
         make.simulate,
         "Simulate drives of a program.",
-        (
-            "steady simulate models/hovercraft.py --trajectories 16 --out train.csv",
-            "steady simulate models/hovercraft.py --effect wind=1,0.5 --out windy.csv",
-            "steady simulate mine.py:Boat --controls drives.csv --out again.csv",
-        ),
+        "steady simulate models/hovercraft.py --trajectories 16 --out train.csv",
+        "steady simulate models/hovercraft.py --effect wind=1,0.5 --out windy.csv",
+        "steady simulate mine.py:Boat --controls drives.csv --out again.csv",
     ),
     Command(
         learn.fit,
         "Learn a program's parameters from measurements.",
-        (
-            "steady fit mine.py train.csv --valid valid.csv --recipe likelihood --out runs/first",
-            "steady fit models/neural_vehicle.py:NeuralHovercraft train.csv --known-start --out runs/net",
-            "steady fit mine.py train.csv --recipe svi --set learning_rate=1e-3 --out runs/svi",
-        ),
+        "steady fit mine.py train.csv --valid valid.csv --recipe likelihood --out runs/first",
+        "steady fit models/neural_vehicle.py:NeuralHovercraft train.csv --known-start --out runs/net",
+        "steady fit mine.py train.csv --recipe svi --set learning_rate=1e-3 --out runs/svi",
     ),
     Command(
         judge.check,
         "Say where and when a run fails, and who is at fault.",
-        (
-            "steady check runs/first test.csv --picture check.png",
-            "steady check runs/first test.csv --quiet --json - | jq .who",
-        ),
+        "steady check runs/first test.csv --picture check.png",
+        "steady check runs/first test.csv --quiet --json - | jq .who",
     ),
     Command(
         learn.discover,
         "Learn which physical effect a program lacks, or none.",
-        (
-            "steady discover runs/first train.csv --valid valid.csv --out runs/found",
-            "steady discover mine.py drives.csv --json found.json",
-        ),
+        "steady discover runs/first train.csv --valid valid.csv --out runs/found",
+        "steady discover mine.py drives.csv --json found.json",
     ),
     Command(
         learn.add,
         "Write a program with physical effects.",
-        (
-            "steady add runs/found --out models/with_drag.py",
-            "steady add models/hovercraft.py yaw_linear_drag=0.05 wind --out models/windy.py",
-        ),
+        "steady add runs/found --out models/with_drag.py",
+        "steady add models/hovercraft.py yaw_linear_drag=0.05 wind --out models/windy.py",
     ),
     Command(
         judge.prove,
         "Prove on other drives that runs are better than the first.",
-        ("steady prove runs/before runs/after test.csv --picture proof.png",),
+        "steady prove runs/before runs/after test.csv --picture proof.png",
     ),
     Command(
         judge.evaluate,
         "Errors of runs, against true states where they exist.",
-        ("steady evaluate runs/first runs/svi test.csv --json errors.json",),
+        "steady evaluate runs/first runs/svi test.csv --json errors.json",
     ),
     Command(
         judge.report,
         "Write all of it on one page of HTML.",
-        ("steady report runs/before runs/after test.csv --discovery runs/found --out report.html",),
+        "steady report runs/before runs/after test.csv --discovery runs/found --out report.html",
     ),
     Command(
         judge.states,
         "Write where the vehicle probably was.",
-        (
-            "steady states runs/after test.csv --out states.csv",
-            "steady states runs/after test.csv --draws 200 --out states.nc",
-        ),
+        "steady states runs/after test.csv --out states.csv",
+        "steady states runs/after test.csv --draws 200 --out states.nc",
     ),
     Command(
         learn.study,
         "Compute a grid of fits or searches, here or on a cluster.",
-        (
-            "steady study studies/observation-noise.toml --data logs --out noise",
-            "steady study mine.toml --cluster tcp://scheduler:8786 --out mine",
-        ),
+        "steady study studies/observation-noise.toml --data logs --out noise",
+        "steady study mine.toml --cluster tcp://scheduler:8786 --out mine",
     ),
     Command(
-        learn.plot_study,
-        "Draw what a study has found so far.",
-        ("steady plot-study noise --out noise.png",),
-        hidden=True,
+        learn.plot_study, "Draw what a study has found so far.", "steady plot-study noise --out noise.png", hidden=True
     ),
     Command(
         learn.effects,
         "List the physical effects that a program may lack.",
-        ("steady effects", "steady effects models/hovercraft.py"),
+        "steady effects",
+        "steady effects models/hovercraft.py",
     ),
 )
 
@@ -192,11 +172,6 @@ def main(arguments: list[str] | None = None) -> int:
                 say("interrupted", always=True)
                 return 1
             return code
-        except SteadyError as error:
-            if "debug" in asked:
-                tell(traceback.format_exc(), aside=True)
-            say(str(error), always=True)
-            return error.exit_code
         except KeyboardInterrupt:
             say("interrupted", always=True)
             return 1
@@ -210,11 +185,11 @@ def main(arguments: list[str] | None = None) -> int:
                 return 2
             if "debug" in asked:
                 tell(traceback.format_exc(), aside=True)
-            if (refusal := as_refusal(error)) is not None:
+            refusal = error if isinstance(error, SteadyError) else as_refusal(error)
+            if refusal is not None:
                 say(str(refusal), always=True)
                 return refusal.exit_code
-            lines = str(error).strip().splitlines() or [""]
-            say(f"{type(error).__name__}: {lines[0]} (--debug shows where)", always=True)
+            say(f"{one_line(error)} (--debug shows where)", always=True)
             return 1
 
 

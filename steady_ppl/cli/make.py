@@ -9,9 +9,12 @@ from typing import Annotated, Any
 
 import typer
 
-from steady_ppl.cli.common import count, random_seed
+import steady_ppl as st
+from steady_ppl.cli import options
+from steady_ppl.cli.common import program_from
 from steady_ppl.errors import UsageError
-from steady_ppl.utils.text import tell
+from steady_ppl.utils.progress import stages
+from steady_ppl.utils.text import say, tell
 
 NEXT = (
     "steady fit models/hovercraft.py train.csv --valid valid.csv --known-start --recipe likelihood --out runs/first",
@@ -43,9 +46,9 @@ def import_bag(
     step: Annotated[float | None, typer.Option(help="Seconds between rows; before that of MAPPING.toml.")] = None,
 ) -> None:
     """Turn ROS bags into a table; without a mapping, list what is in them and print one to start from."""
-    from steady_ppl.data.rosbag.read import open_bag, read_bags
+    from steady_ppl.data.rosbag.read import open_bag
     from steady_ppl.data.rosbag.reader import listing
-    from steady_ppl.data.table import require_table_file, write_table
+    from steady_ppl.data.table import require_table_file
 
     bags = [path for path in arguments if path.suffix != ".toml"]
     files = [path for path in arguments if path.suffix == ".toml"]
@@ -61,8 +64,8 @@ def import_bag(
         raise UsageError("name the table to write: --out TABLE")
     mapping = _mapping(files[0] if files else None, column or [], step)
     require_table_file(out)
-    data = read_bags(bags, mapping)
-    write_table(data, out)
+    data = st.read_bags(bags, mapping)
+    st.write_table(data, out)
     rows, many = int(data.lengths.sum()), len(data)
     tell(f"{out}: {many} trajector{'y' if many == 1 else 'ies'}, {rows} rows, {_share(data)}")
 
@@ -98,41 +101,39 @@ app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 @app.command("alpha-truck", epilog="Example:  steady data alpha-truck alpha_truck/train --out train.csv")
 def alpha_truck(
     folder: Annotated[Path, typer.Argument(help="One split: holds vrpn-pose.csv and vesc_drive.csv.")],
-    out: Annotated[Path, typer.Option("--out", help="Table to write, .csv or .parquet.")],
+    out: options.Table,
     sigma_deg: Annotated[float, typer.Option(help="Standard deviation of the simulated bearings, degrees.")] = 5.0,
     centred: Annotated[
         bool, typer.Option("--centred", help="Velocities of each row itself, not the authors' of half a row later.")
     ] = False,
-    seed: Annotated[int, random_seed()] = 0,
+    seed: options.Seed = 0,
 ) -> None:
     """One split of the AlphaTruck logs to a table, resampled as the authors do.
 
     The logs are published in datasets/alpha_truck of the repository MrVPlusOne/STEADY on GitHub. They are real motion
     capture and commands; the bearings are simulated from the true poses. True states are kept in the x. columns.
     """
-    from steady_ppl.data.table import write_table
     from steady_ppl.datasets.alpha_truck import read_alpha_truck
 
-    write_table(read_alpha_truck(folder, sigma_degrees=sigma_deg, seed=seed, centred=centred), out)
+    st.write_table(read_alpha_truck(folder, sigma_degrees=sigma_deg, seed=seed, centred=centred), out)
 
 
 @app.command("cut", epilog="Example:  steady data cut log.csv --seconds 60 --out drives.csv")
 def cut(
     table: Annotated[Path, typer.Argument(help="Drives.")],
     seconds: Annotated[float, typer.Option(help="Length of a piece, s.")],
-    out: Annotated[Path, typer.Option("--out", help="Table to write, .csv or .parquet.")],
+    out: options.Table,
 ) -> None:
     """Long drives in pieces, `…-1`, `…-2`, … of the drive's name.
 
     Each begins at its first row that has a measurement; pieces of one row or without a measurement are left out.
     """
-    from steady_ppl.data.table import cut, read_table, require_table_file, write_table
-    from steady_ppl.utils.text import say
+    from steady_ppl.data.table import require_table_file
 
     require_table_file(out)
-    drives = read_table(table)
-    pieces = cut(drives, seconds)
-    write_table(pieces, out)
+    drives = st.read_table(table)
+    pieces = st.cut(drives, seconds)
+    st.write_table(pieces, out)
     tell(f"{out}: {len(pieces)} drives")
     left_out = int(drives.lengths.sum() - pieces.lengths.sum())
     if left_out:
@@ -145,10 +146,10 @@ def data() -> None:
 
 
 def simulate(
-    model: Annotated[str, typer.Argument(help="Program: models/hovercraft.py, or mine.py:Boat.")],
-    out: Annotated[Path, typer.Option("--out", help="Table to write, .csv or .parquet.")],
-    trajectories: Annotated[int | None, count("How many drives, 16 when not given.")] = None,
-    seed: Annotated[int, random_seed()] = 0,
+    model: options.Model,
+    out: options.Table,
+    trajectories: Annotated[int | None, options.count("How many drives, 16 when not given.")] = None,
+    seed: options.Seed = 0,
     controls: Annotated[Path | None, typer.Option(help="Take time, controls and gaps from this table.")] = None,
     substeps: Annotated[
         int | None,
@@ -160,23 +161,18 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate drives of a program, with measurements and true states."""
-    from steady_ppl.cli.common import program_from
-    from steady_ppl.data.table import read_table, write_table
     from steady_ppl.effects.attach import with_effects
-    from steady_ppl.model.substeps import with_substeps
     from steady_ppl.model.validate import probe
-    from steady_ppl.smc.simulate import simulate as run, simulated_in
-    from steady_ppl.utils.progress import stages
-    from steady_ppl.utils.text import say
+    from steady_ppl.smc.simulate import simulated_in
 
     if controls and trajectories:
         raise UsageError("--controls has as many drives as its table: leave --trajectories out")
     program = with_effects(program_from(model, seed), effect or [], say)
     if substeps is not None:
-        probe(with_substeps(program, substeps))
-    like = read_table(controls) if controls else None
+        probe(st.with_substeps(program, substeps))
+    like = st.read_table(controls) if controls else None
     with stages(("simulating", 1)) as begin:
         begin()
-        drives = run(program, trajectories or 16, seed=seed, like=like, substeps=substeps)
-    write_table(drives, out)
+        drives = st.simulate(program, trajectories or 16, seed=seed, like=like, substeps=substeps)
+    st.write_table(drives, out)
     say(simulated_in(program, drives, substeps))

@@ -31,7 +31,7 @@ class _Line:
                 self.begun = self.since
             self.doing, self.share = doing, share
             if share == 1.0:
-                self._clear()
+                self.clear()
 
     def keep_drawing(self) -> None:
         """Until it is ended."""
@@ -43,17 +43,11 @@ class _Line:
                     print(f"{CLEAR}{printable(said)}", end="", file=sys.stderr, flush=True)
                     self.drawn = True
 
-    def _clear(self) -> None:
+    def clear(self) -> None:
+        """Leave an empty line."""
         if self.drawn:
             print(CLEAR, end="", file=sys.stderr, flush=True)
             self.drawn = False
-
-    def end(self) -> None:
-        """Leave an empty line."""
-        self.ended.set()
-        with self.lock:
-            self.doing = ""
-            self._clear()
 
 
 @contextmanager
@@ -68,8 +62,9 @@ def progress_line() -> Iterator[Callable[[str, float], None]]:
     try:
         yield line.heard
     finally:
-        line.end()
+        line.ended.set()
         thread.join()
+        line.clear()
 
 
 def in_words(doing: str, share: float, until_now: float, elapsed: float) -> str:

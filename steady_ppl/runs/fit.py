@@ -65,13 +65,7 @@ class Fit(Displayed):
         from steady_ppl.runs.posterior import posterior
 
         return posterior(
-            self.program,
-            data,
-            draws=draws,
-            particles=particles,
-            every=every,
-            known_start=self.known_start,
-            seed=seed,
+            self.program, data, draws=draws, particles=particles, every=every, known_start=self.known_start, seed=seed
         )
 
     def forecast(
@@ -88,17 +82,8 @@ class Fit(Displayed):
         """What planned `controls` lead to, or what comes `after` so many seconds; see `steady_ppl.runs.posterior`."""
         from steady_ppl.runs.posterior import forecast
 
-        return forecast(
-            self.program,
-            data,
-            controls=controls,
-            after=after,
-            step=step,
-            draws=draws,
-            particles=particles,
-            known_start=self.known_start,
-            seed=seed,
-        )
+        settings: dict[str, Any] = {"after": after, "step": step, "draws": draws, "particles": particles, "seed": seed}
+        return forecast(self.program, data, controls=controls, known_start=self.known_start, **settings)
 
     def dynamics(self, step: float | None = None) -> Dynamics:
         """A copy of the learned dynamics as a plain torch module; `step` is the program's when not given."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,34 +13,63 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from steady_ppl.errors import RunError
+from steady_ppl.utils import schema
 from steady_ppl.utils.files import read_json, require_file, whole_file
-from steady_ppl.utils.schema import (
-    ANYTHING,
-    LINES,
-    NUMBER,
-    TEXT,
-    TRUTH,
-    WHOLE,
-    Absent,
-    Among,
-    Maybe,
-    Paired,
-    count,
-    misfit,
-    refuse_newer,
-)
+from steady_ppl.utils.schema import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Paired, count, mismatch
 from steady_ppl.utils.tensor_files import read_tensors
 from steady_ppl.utils.text import command_line
 
-PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY = (
-    "parameters.safetensors",
-    "run.json",
-    "posterior.nc",
-    "checkpoint.safetensors",
-    "discovery.json",
-)
+PARAMETERS, RECORD, POSTERIOR = "parameters.safetensors", "run.json", "posterior.nc"
+CHECKPOINT, DISCOVERY = "checkpoint.safetensors", "discovery.json"
 FILES = (PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY)
 ASIDE, LOCK, JOURNAL = "previous", ".lock", "journal"
+
+FORMAT = 1
+FINISHED = ("finished", "interrupted")  # what the record of a run that can be used says
+BEGUN_RECORD = {
+    "format?": WHOLE,
+    "program": ({"class": TEXT, "file": TEXT, "sha256": TEXT}, None),
+    "recipe": TEXT,
+    "status": TEXT,
+    "command?": (TEXT, None),
+}
+FINISHED_RECORD = {
+    "effects?": LINES,
+    "substeps?": WHOLE,
+    "known_start": TRUTH,
+    "seed": WHOLE,
+    "settings": {str: ANYTHING},
+    "kept_step": (WHOLE, None),
+    "history": [{"step": NUMBER}],
+    "notes": LINES,
+}
+PAIR, NUMBERS = [NUMBER, NUMBER], (NUMBER, [(NUMBER, None)], None)
+CANDIDATE = {
+    **dict.fromkeys(("effect", "kind", "unit"), TEXT),
+    **dict.fromkeys(("p_value", "absent", "heldout_gain"), (NUMBER, None)),
+    **dict.fromkeys(("coefficient", "sd", "detection_limit"), NUMBERS),
+    "heldout_gain_ci": (PAIR, None),
+    "note": (TEXT, None),
+}
+EFFECT = {
+    **dict.fromkeys(("effect", "text", "unit"), TEXT),
+    **dict.fromkeys(("confidence", "heldout_gain"), (NUMBER, None)),
+    "class": LINES,
+    "coefficient": [NUMBER],
+    "interval_90": [PAIR],
+}
+SHAPE = {"channel": TEXT, "variable": TEXT, "points": [NUMBER], "curve": [NUMBER], "band": [NUMBER]}
+FOUND = {
+    "source?": TEXT,
+    "sentence": TEXT,
+    "complete?": TRUTH,
+    "candidates": [Paired(CANDIDATE, ("coefficient", "sd"))],
+    "effects": [Paired(EFFECT, ("coefficient", "interval_90"))],
+    "shape": (Paired(SHAPE, ("points", "curve", "band")), None),
+    "doubts": LINES,
+    "notes": LINES,
+    "next_run": ({"between": LINES, "way": TEXT, "separation": NUMBER, "usual": NUMBER}, None),
+}
 
 
 @contextmanager
@@ -72,7 +101,9 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
                 if not resume:
                     _clean_up(folder)
                 raise
-            _remove_aside(folder)
+            if (folder / ASIDE).is_dir():
+                _remove(folder / ASIDE)
+                (folder / ASIDE).rmdir()
     finally:
         _remove_empty(made)
 
@@ -112,7 +143,7 @@ def _put_aside(folder: Path) -> None:
     for name in present:
         require_file(folder / name, RunError)
     try:
-        _remove_journal(folder)
+        _remove(folder, ())
         if present:
             aside.mkdir()
         for name in present:
@@ -123,20 +154,17 @@ def _put_aside(folder: Path) -> None:
 
 def _clean_up(folder: Path) -> None:
     """Undo what a failed block wrote."""
-    aside = folder / ASIDE
-    if aside.is_dir():
-        _remove(folder)
-        for name in FILES:
-            if (aside / name).exists():
-                os.replace(aside / name, folder / name)
-        aside.rmdir()
-        return
-    checkpoint = folder / CHECKPOINT
-    if checkpoint.is_file() and json.loads(read_tensors(checkpoint)[1]["step"]) > 0:
-        return
-    if any((folder / JOURNAL).glob("*")):
+    aside, checkpoint = folder / ASIDE, folder / CHECKPOINT
+    if not aside.is_dir():
+        begun = checkpoint.is_file() and json.loads(read_tensors(checkpoint)[1]["step"]) > 0
+        if not begun and not any((folder / JOURNAL).glob("*")):
+            _remove(folder)
         return
     _remove(folder)
+    for name in FILES:
+        if (aside / name).exists():
+            os.replace(aside / name, folder / name)
+    aside.rmdir()
 
 
 def _remove_empty(folders: list[Path]) -> None:
@@ -148,20 +176,10 @@ def _remove_empty(folders: list[Path]) -> None:
             folder.rmdir()
 
 
-def _remove_aside(folder: Path) -> None:
-    aside = folder / ASIDE
-    if aside.is_dir():
-        _remove(aside)
-        aside.rmdir()
-
-
-def _remove(folder: Path) -> None:
-    for name in FILES:
+def _remove(folder: Path, files: Sequence[str] = FILES) -> None:
+    """Remove files of a run, and the journal of a search."""
+    for name in files:
         (folder / name).unlink(missing_ok=True)
-    _remove_journal(folder)
-
-
-def _remove_journal(folder: Path) -> None:
     if (folder / JOURNAL).is_dir():
         shutil.rmtree(folder / JOURNAL)
 
@@ -179,14 +197,13 @@ def require_same(folder: Path, begun: Mapping[str, Any]) -> None:
         RunError: naming the first that was.
     """
     before = read_record(folder)
-    for key in ("program", "table_sha256", "valid_sha256"):
+    inputs = {"program": "program", "table_sha256": "training table", "valid_sha256": "--valid table"}
+    for key, what in inputs.items():
         if before.get(key) != begun[key]:
-            what = {"program": "program", "table_sha256": "training table", "valid_sha256": "--valid table"}[key]
             raise RunError(f"{folder}: --resume goes on with the same {what}, but it is another or has changed since")
     if before.get("option_files", {}) != begun["option_files"]:
-        raise RunError(
-            f"{folder}: --resume goes on with the same {' and '.join(begun['option_files'])}; a file has changed"
-        )
+        same = " and ".join(begun["option_files"])
+        raise RunError(f"{folder}: --resume goes on with the same {same}; a file has changed")
     for key in ("recipe", "known_start", "seed", "options", "begun_substeps"):
         then = before.get(key, 1 if key == "begun_substeps" else None)
         if then != begun[key]:
@@ -200,15 +217,8 @@ def read_record(folder: Path) -> dict[str, Any]:
     Raises:
         RunError: there is none, it is damaged, or a newer steady-ppl wrote it.
     """
-    try:
-        record = read_json(folder / RECORD, RunError)
-    except (FileNotFoundError, NotADirectoryError):
-        raise RunError(f"{folder} is not a run: it has no {RECORD}") from None
-    refuse_newer(record, FORMAT, folder, RunError)
-    problem = misfit(record, BEGUN_RECORD)
-    if problem is None and record["status"] in FINISHED:
-        problem = misfit(record, FINISHED_RECORD)
-    if problem is not None:
+    record = schema.read_record(folder / RECORD, BEGUN_RECORD, FORMAT, "a run")
+    if record["status"] in FINISHED and (problem := mismatch(record, FINISHED_RECORD)):
         raise RunError(f"{folder / RECORD} is damaged: {problem}")
     return record
 
@@ -223,7 +233,7 @@ def read_discovery(source: Path) -> dict[str, Any] | None:
     if not file.is_file():
         return None
     found = read_json(file, RunError)
-    problem = misfit(found, FOUND) or _unlike(found)
+    problem = mismatch(found, FOUND) or _unlike(found)
     if problem is not None:
         raise RunError(f"{file} is not what `steady discover` writes: {problem}")
     return found
@@ -237,69 +247,3 @@ def _unlike(found: Mapping[str, Any]) -> str | None:
         if known is not None and one["sd"] is not None and count(one["coefficient"]) != known:
             return f"candidates[{i}].coefficient has length {count(one['coefficient'])}, expected {known} as in effects"
     return None
-
-
-FINISHED = ("finished", "interrupted")  # what the record of a run that can be used says
-
-
-FORMAT = 1
-
-
-BEGUN_RECORD = {
-    "format": Absent(WHOLE),
-    "program": Maybe({"class": TEXT, "file": TEXT, "sha256": TEXT}),
-    "recipe": TEXT,
-    "status": TEXT,
-    "command": Absent(Maybe(TEXT)),
-}
-
-
-FINISHED_RECORD = {
-    "effects": Absent(LINES),
-    "substeps": Absent(WHOLE),
-    "known_start": TRUTH,
-    "seed": WHOLE,
-    "settings": {str: ANYTHING},
-    "kept_step": Maybe(WHOLE),
-    "history": [{str: ANYTHING}],
-    "notes": LINES,
-}
-
-
-NUMBERS = Maybe(Among((NUMBER, [Maybe(NUMBER)])))
-PAIR = [NUMBER, NUMBER]
-CANDIDATE = {
-    "effect": TEXT,
-    "kind": TEXT,
-    "p_value": Maybe(NUMBER),
-    "coefficient": NUMBERS,
-    "sd": NUMBERS,
-    "absent": Maybe(NUMBER),
-    "unit": TEXT,
-    "detection_limit": NUMBERS,
-    "heldout_gain": Maybe(NUMBER),
-    "heldout_gain_ci": Maybe(PAIR),
-    "note": Maybe(TEXT),
-}
-EFFECT = {
-    "effect": TEXT,
-    "text": TEXT,
-    "unit": TEXT,
-    "class": LINES,
-    "confidence": Maybe(NUMBER),
-    "coefficient": [NUMBER],
-    "interval_90": [PAIR],
-    "heldout_gain": Maybe(NUMBER),
-}
-SHAPE = {"channel": TEXT, "variable": TEXT, "points": [NUMBER], "curve": [NUMBER], "band": [NUMBER]}
-FOUND = {
-    "source": Absent(TEXT),
-    "sentence": TEXT,
-    "complete": Absent(TRUTH),
-    "candidates": [Paired(CANDIDATE, ("coefficient", "sd"))],
-    "effects": [Paired(EFFECT, ("coefficient", "interval_90"))],
-    "shape": Maybe(Paired(SHAPE, ("points", "curve", "band"))),
-    "doubts": LINES,
-    "notes": LINES,
-    "next_run": Maybe({"between": LINES, "way": TEXT, "separation": NUMBER, "usual": NUMBER}),
-}

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -26,15 +26,14 @@ from steady_ppl.utils.files import whole_file
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
-if TYPE_CHECKING:
-    import arviz
-
-
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", FutureWarning)  # an advertisement of arviz 1, once a day
     import arviz
 
-DIMENSIONS = ("chain", "draw", "trajectory", "row")
+OF_ROW = ("trajectory", "row")
+DIMENSIONS = ("chain", "draw", *OF_ROW)
+INTERVAL = (0.05, 0.95)
+SUFFIXES = (".csv", ".parquet", ".nc")
 
 
 def posterior(
@@ -68,11 +67,8 @@ def posterior(
     """
     run = for_program(program, data).observed_every(every)
     refuse_long(run)
-    states: list[Tensor] = []
+    states, evidence, sizes, roots = (list[Tensor]() for _ in range(4))
     noise: dict[str, list[Tensor]] = {}
-    evidence: list[Tensor] = []
-    sizes: list[Tensor] = []
-    roots: list[Tensor] = []
     with seeded(seed, "posterior"):
         choice = choose_filter(program, run, known_start=known_start, particles=particles)
         groups = list(in_parts(run, choice.particles, look_ahead=choice.look_ahead))
@@ -80,11 +76,7 @@ def posterior(
             for part in groups:
                 begin()
                 filtered = run_filter(
-                    program,
-                    part,
-                    particles=choice.particles,
-                    known_start=known_start,
-                    look_ahead=choice.look_ahead,
+                    program, part, particles=choice.particles, known_start=known_start, look_ahead=choice.look_ahead
                 )
                 paths = filtered.paths(draws)
                 states.append(paths.states)
@@ -93,12 +85,8 @@ def posterior(
                 roots.append(filtered.roots)
                 for site, value in paths.noise.items():
                     noise.setdefault(site, []).append(as_vector(value, paths.event_dims[site]))
-    coordinates: dict[str, list | np.ndarray] = {
-        "chain": [0],
-        "draw": np.arange(draws),
-        "trajectory": list(run.labels),
-        "row": np.arange(run.time.shape[0]),
-    }
+    coordinates: dict[str, list | np.ndarray] = {"chain": [0], "draw": np.arange(draws)}
+    coordinates |= {"trajectory": list(run.labels), "row": np.arange(run.time.shape[0])}
     inside = run.rows.t().numpy(force=True)
     variables: dict[str, tuple] = {}
     path = _draws(torch.cat(states, 2))
@@ -118,11 +106,15 @@ def posterior(
         coordinates[dimension] = list(labels) if known else [f"{site}_{i}" for i in range(values.shape[-1])]
         attributes = {"units": list(program.channel_units)} if known else {}
         variables[site if site not in variables else f"{site}_noise"] = ((*DIMENSIONS, dimension), values, attributes)
+    measured = program.measurement_names, program.measurement_units
     about = {"program": type(program).__name__, "particles": choice.particles, "filter": choice.name}
     return arviz.InferenceData(
         posterior=xarray.Dataset(variables, coordinates, about),
         sample_stats=_health(run, coordinates, torch.cat(sizes, 1), torch.cat(roots)),
-        observed_data=_observed(program, run, coordinates),
+        observed_data=xarray.Dataset(
+            _columns("measured_", *measured, torch.where(run.observed, run.measurements, torch.nan)),
+            {name: coordinates[name] for name in OF_ROW},
+        ),
         constant_data=_constants(program, run, coordinates, torch.cat(evidence)),
     )
 
@@ -132,53 +124,32 @@ def _draws(values: Tensor) -> np.ndarray:
     return values.transpose(1, 2).unsqueeze(0).numpy(force=True).copy()
 
 
-def _by_trajectory(values: Tensor) -> np.ndarray:
-    return values.t().double().numpy(force=True).copy()
+def _columns(prefix: str, names: Sequence[str], units: Sequence[str], values: Tensor) -> dict[str, tuple]:
+    """Variables over trajectories and rows of the components of `(rows, B, ·)`."""
+    columns = values.transpose(0, 1).double().numpy(force=True).copy()
+    return {
+        f"{prefix}{name}": (OF_ROW, columns[..., index], {"units": unit})
+        for index, (name, unit) in enumerate(zip(names, units, strict=True))
+    }
 
 
 def _health(data: Trajectories, coordinates: dict, sizes: Tensor, roots: Tensor) -> xarray.Dataset:
     """Of the filter, over the one chain."""
-    inside = torch.where(data.rows, sizes.to(torch.float64), torch.nan)
-    return xarray.Dataset(
-        {
-            "effective_size": (("chain", "trajectory", "row"), _by_trajectory(inside)[None], {"units": "particles"}),
-            "roots": (("chain", "trajectory"), roots.double().numpy(force=True)[None], {"units": "particles"}),
-        },
-        {name: coordinates[name] for name in ("chain", "trajectory", "row")},
-    )
-
-
-def _observed(program: Program, data: Trajectories, coordinates: dict) -> xarray.Dataset:
-    shown = {name: coordinates[name] for name in ("trajectory", "row")}
-    measured = torch.where(data.observed, data.measurements, torch.nan)
-    return xarray.Dataset(
-        {
-            f"measured_{name}": (("trajectory", "row"), _by_trajectory(measured[..., index]), {"units": unit})
-            for index, (name, unit) in enumerate(zip(program.measurement_names, program.measurement_units, strict=True))
-        },
-        shown,
-    )
+    inside = torch.where(data.rows, sizes.to(torch.float64), torch.nan).t().numpy(force=True)
+    variables = {
+        "effective_size": (("chain", *OF_ROW), inside[None], {"units": "particles"}),
+        "roots": (("chain", "trajectory"), roots.double().numpy(force=True)[None], {"units": "particles"}),
+    }
+    return xarray.Dataset(variables, {name: coordinates[name] for name in ("chain", *OF_ROW)})
 
 
 def _constants(program: Program, data: Trajectories, coordinates: dict, evidence: Tensor) -> xarray.Dataset:
-    shown = {name: coordinates[name] for name in ("trajectory", "row")}
-    both = ("trajectory", "row")
-    variables = {
-        "time": (both, _by_trajectory(data.elapsed), {"units": "s"}),
-        "log_likelihood": (("trajectory",), evidence.numpy(force=True), {"units": "nat"}),
-    }
-    for index, (name, unit) in enumerate(zip(program.control_names, program.control_units, strict=True)):
-        variables[f"control_{name}"] = (both, _by_trajectory(data.controls[..., index]), {"units": unit})
+    variables = _columns("", ("time",), ("s",), data.elapsed.unsqueeze(-1))
+    variables["log_likelihood"] = ("trajectory",), evidence.numpy(force=True), {"units": "nat"}
+    variables |= _columns("control_", program.control_names, program.control_units, data.controls)
     if data.states is not None:
-        for index, (name, unit) in enumerate(zip(program.state_names, program.state_units, strict=True)):
-            variables[f"true_{name}"] = (both, _by_trajectory(data.states[..., index]), {"units": unit})
-    return xarray.Dataset(variables, shown)
-
-
-INTERVAL = (0.05, 0.95)
-
-
-SUFFIXES = (".csv", ".parquet", ".nc")
+        variables |= _columns("true_", program.state_names, program.state_units, data.states)
+    return xarray.Dataset(variables, {name: coordinates[name] for name in OF_ROW})
 
 
 def states_frame(posterior: arviz.InferenceData) -> pd.DataFrame:
@@ -219,11 +190,10 @@ def write_states(posterior: arviz.InferenceData, path: Path) -> None:
         UsageError: another suffix, or the file cannot be written.
     """
     require_states_file(path)
-    suffix = path.suffix.lower()
     with whole_file(path) as beside:
-        if suffix == ".nc":
+        if path.suffix.lower() == ".nc":
             beside.write_bytes(netcdf(posterior))
-        elif suffix == ".csv":
+        elif path.suffix.lower() == ".csv":
             states_frame(posterior).to_csv(beside, index=False)
         else:
             states_frame(posterior).to_parquet(beside, index=False)
@@ -271,7 +241,8 @@ def forecast(
     """
     table = data if controls is None else data.continued(controls, step)
     run = for_program(program, table)
-    last = _last_measured(run) if after is None else run.elapsed.new_full((len(run),), after)
+    measured_until = torch.where(run.observed.any(-1), run.elapsed, 0.0).amax(0)
+    last = measured_until if after is None else torch.full_like(measured_until, after)
     future = (run.elapsed > last + 0.01 * run.median_step) & run.rows  # decimal seconds are not binary ones
     for drive, label in enumerate(run.labels):
         if not bool(future[:, drive].any()):
@@ -289,10 +260,9 @@ def forecast(
     with seeded(seed, "forecast"):
         measured = measure(program, path).transpose(1, 2).numpy(force=True)
     there = future.t().numpy(force=True)
-    later = torch.where(run.observed & future[..., None], run.measurements, torch.nan).transpose(0, 1)
-    of_row = ("trajectory", "row")
-    time = np.where(there, run.elapsed.double().t().numpy(force=True), np.nan)
-    constants: dict[str, tuple] = {"time": (of_row, time, {"units": "s"})}
+    later = torch.where(run.observed & future[..., None], run.measurements, torch.nan)
+    constants = _columns("", ("time",), ("s",), torch.where(future, run.elapsed, torch.nan).unsqueeze(-1))
+    constants |= _columns("measured_", program.measurement_names, program.measurement_units, later)
     variables: dict[str, tuple] = {}
     for index, (name, unit) in enumerate(zip(program.state_names, program.state_units, strict=True)):
         variables[name] = (DIMENSIONS, np.where(there, states[None, ..., index], np.nan), {"units": unit})
@@ -301,16 +271,9 @@ def forecast(
         values = draws_on_one_turn(measured[..., index]) if circular[index] else measured[..., index]
         about = {"units": unit, "circular": int(circular[index])}
         variables[f"measured_{name}"] = (DIMENSIONS, np.where(there, values[None], np.nan), about)
-        constants[f"measured_{name}"] = (of_row, later[..., index].double().numpy(force=True), {"units": unit})
     coordinates = found["posterior"].coords
-    shown = {name: coordinates[name] for name in of_row}
     found.add_groups(
         predictions=xarray.Dataset(variables, {name: coordinates[name] for name in DIMENSIONS}),
-        predictions_constant_data=xarray.Dataset(constants, shown),
+        predictions_constant_data=xarray.Dataset(constants, {name: coordinates[name] for name in OF_ROW}),
     )
     return found
-
-
-def _last_measured(data: Trajectories) -> Tensor:
-    """When each drive was last measured, s; zero where it never was."""
-    return torch.where(data.observed.any(-1), data.elapsed, 0.0).amax(0)

@@ -22,27 +22,12 @@ from steady_ppl.runs.workbench import workbench
 from steady_ppl.utils.tensor_files import read_tensors
 
 Recipe = Callable[..., Fit]
+KINDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a word", "None": "none"}
 
 
 def recipe_folder() -> Path:
     """`inference/` of the checkout, else the copy that the wheel carries."""
     return workbench() / "inference"
-
-
-def require_kind(function: Callable[..., Any], option: str, value: Any) -> None:
-    """A number where the function's annotation says so, and so on; what it does not annotate can be anything.
-
-    Raises:
-        UsageError: it is of another kind.
-    """
-    annotation = inspect.formatannotation(inspect.signature(function).parameters[option].annotation)
-    kinds = annotation.strip("'").split(" | ")  # by name: a recipe's annotations may not be there to be evaluated
-    words = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a word", "None": "none"}
-    if not all(kind in words for kind in kinds):
-        return
-    given = "None" if value is None else type(value).__name__
-    fits = given in kinds or (given == "int" and "float" in kinds)
-    require(fits, option, repr(value), " or ".join(words[kind] for kind in kinds))
 
 
 def recipe_file(name: str) -> Path:
@@ -75,21 +60,26 @@ def find_recipe(name: str) -> Recipe:
     return found
 
 
-def require_settings(name: str, recipe: Recipe, options: Mapping[str, Any]) -> None:
-    """Refuse what is no setting of a recipe, or of another kind.
+def require_settings(name: str, recipe: Callable[..., Any], options: Mapping[str, Any]) -> None:
+    """Refuse what is no setting of a recipe, or of `discover`, or of another kind than its annotation says.
 
     Raises:
         UsageError: naming it, and the settings that there are.
     """
-    settings = [
-        setting
+    settings = {
+        setting: parameter
         for setting, parameter in list(inspect.signature(recipe).parameters.items())[3:]
         if parameter.kind is not parameter.VAR_KEYWORD and setting not in ("known_start", "seed")
-    ]
+    }
     for option, value in options.items():
         if option not in settings:
-            raise UsageError(f"recipe {name} has no setting {option}; it has {', '.join(settings) or 'none'}")
-        require_kind(recipe, option, value)
+            raise UsageError(f"{name} has no setting {option}; it has {', '.join(settings) or 'none'}")
+        annotation = inspect.formatannotation(settings[option].annotation)
+        kinds = annotation.strip("'").split(" | ")  # by name: a recipe's annotations may not be there to be evaluated
+        given = "None" if value is None else type(value).__name__
+        if all(kind in KINDS for kind in kinds):
+            fits = given in kinds or (given == "int" and "float" in kinds)
+            require(fits, option, repr(value), " or ".join(KINDS[kind] for kind in kinds))
 
 
 def trains(recipe: Recipe) -> bool:
@@ -127,7 +117,7 @@ def run_recipe(
         RunError: the folder exists, or does not match on `resume`.
     """
     recipe = find_recipe(name)
-    require_settings(name, recipe, options)
+    require_settings(f"recipe {name}", recipe, options)
     if device == "cuda" and not torch.cuda.is_available():
         raise UsageError("--device cuda: this machine has no CUDA device")
     program.to(device)

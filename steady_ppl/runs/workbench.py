@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from steady_ppl.errors import UsageError
+from steady_ppl.utils.progress import stages
 
 FOLDERS = ("models", "inference", "notebooks", "studies")
 LEFT_OUT = {"__pycache__", ".ipynb_checkpoints"}
@@ -93,7 +94,6 @@ def _simulate_tables(folder: Path) -> list[Path]:
     from steady_ppl.data.table import write_table
     from steady_ppl.model.loading import load_program
     from steady_ppl.smc.simulate import simulate
-    from steady_ppl.utils.progress import stages
 
     program = load_program(str(folder / TRUTH))
     tables = []

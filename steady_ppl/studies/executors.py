@@ -4,68 +4,63 @@ joblib's own way to Dask is not taken: when a job had killed four workers, it wa
 job, and otherwise had everything that was left computed twice. A result is let go of when it is here, so that a worker
 that dies later does not have it computed again.
 
-Of this machine's processes joblib leaves open what `Local` adds: that a worker dies is told apart from what a job
-raises, and which jobs had been begun, and which had ended, is known afterwards.
+On this machine each process has an executor of its own, as joblib's pools do not say which job a process died of.
 """
 
 from __future__ import annotations
 
-import json
 import logging
-import tempfile
 import time
 import uuid
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import CancelledError
-from contextlib import closing, suppress
-from pathlib import Path
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
+from contextlib import suppress
 from typing import Any, NamedTuple
 
-import joblib
-from joblib.externals.loky.process_executor import TerminatedWorkerError
+from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
 
-from steady_ppl.errors import ComputationError, RunError, UsageError
+from steady_ppl.errors import ComputationError, UsageError
 from steady_ppl.runs.fit import packages
 from steady_ppl.studies import job as work
 from steady_ppl.studies.fingerprints import JobFiles
 from steady_ppl.studies.plan import Job
-from steady_ppl.utils.files import whole_file
 from steady_ppl.utils.text import one_line, shown
 
 Row = dict[str, Any]
-
-
 Say = Callable[[str], None]
 
-
-ENDED = ".json"  # of the name of a job's mark, with its row
+THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")
+ONE_THREAD = dict.fromkeys([*(f"{name}_NUM_THREADS" for name in THREADS), "VECLIB_MAXIMUM_THREADS"], "1")
+WORKER_WAIT = 30  # s for the first worker, and between looks at whether there still is one
+TRIES = 3  # of a job whose workers die; the scheduler itself tries it so often as it is set, four times at first
+HOLD, LONGEST_HOLD = 10, 60  # s for which a worker that is not used holds what it is given, or it would get it all
+MIN_REFUSED_JOBS = 4  # jobs whose files are others, at which a worker has been refused if its files alone are
+MAX_LOST_JOBS = 10  # jobs that Dask gives up while nothing is begun
 
 
 class Place:
     """Where jobs are computed.
 
     Attributes:
-        died: what `results` raises when a worker has died and taken others with it.
-        lost: what it raises when there is nothing left to compute on.
+        lost: what `results` raises when there is nothing left to compute on.
     """
 
-    died: tuple[type[BaseException], ...] = ()
     lost: tuple[type[BaseException], ...] = ()
 
     def __enter__(self) -> Place:
         return self
 
     def __exit__(self, *raised: Any) -> None:
-        raise NotImplementedError
+        pass
 
     def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
-        """What comes back, in any order; `say` hears of what holds it up."""
-        raise NotImplementedError
+        """What comes back, in any order; `say` hears of what holds it up.
 
-    def begun(self) -> set[str]:
-        """The keys of the jobs that have been begun since this was last asked."""
-        return set()
+        Raises:
+            ComputationError: workers die before they begin.
+        """
+        raise NotImplementedError
 
 
 def given_up(job: Job) -> Row:
@@ -74,65 +69,77 @@ def given_up(job: Job) -> Row:
 
 
 class Local(Place):
-    """Processes of this machine, each with one thread; when one dies, all jobs that are begun have to be tried again.
+    """Processes of this machine, each with one thread and one job at a time, so that a process that dies takes no other
+    job with it. Its job is tried again when all others have ended, the last time alone: it may need all the memory.
 
     Args:
         workers: how many.
     """
 
-    died = (TerminatedWorkerError,)
-
     def __init__(self, workers: int) -> None:
         self.workers = workers
 
-    def __enter__(self) -> Local:
-        self.folder = tempfile.TemporaryDirectory(prefix="steady-study-")
-        self.marks = Path(self.folder.name)  # a job that is begun leaves its mark there, and its row when it has ended
-        return self
-
-    def __exit__(self, *raised: Any) -> None:
-        self.folder.cleanup()
-
     def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
-        waiting = {job.key for job in jobs}
-        try:
-            with closing(self._computed(jobs)) as computed:
-                for row in computed:
-                    waiting.remove(row["key"])
-                    (self.marks / f"{row['key']}{ENDED}").unlink(missing_ok=True)
-                    yield row
-        except self.died:  # joblib drops what had ended beside it and was not fetched yet
-            for ended in self.marks.glob(f"*{ENDED}"):
-                if ended.stem in waiting:
-                    yield json.loads(ended.read_text())
-            raise
-
-    def _computed(self, jobs: Sequence[Job]) -> Generator[Row]:
-        # of a single one joblib would make this process, which must not die of a job: it starts two, sent work in turn
-        with joblib.parallel_config("loky", n_jobs=max(2, self.workers), inner_max_num_threads=1):
-            parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch=self.workers)
-            yield from parallel(joblib.delayed(_marked)(job, self.marks) for job in jobs)
-
-    def begun(self) -> set[str]:
-        marks = [mark for mark in self.marks.iterdir() if not mark.suffix]
-        for mark in marks:
-            mark.unlink()
-        return {mark.name for mark in marks}
+        left = list(jobs)
+        for workers in (*[self.workers] * (TRIES - 1), 1):
+            died: list[Job] = []
+            yield from _rows(left, min(workers, len(left)), died, say)
+            left = died
+        yield from map(given_up, left)
 
 
-def _marked(job: Job, marks: Path) -> Row:
-    (marks / job.key).touch()
-    row = work.run(job)
-    with suppress(RunError), whole_file(marks / f"{job.key}{ENDED}", RunError) as beside:  # no room: fetched, or again
-        beside.write_text(json.dumps(row))
-    return row
+class _Process:
+    """A process of this machine; where it has died, the one in its place."""
+
+    def __init__(self) -> None:
+        self.start()
+
+    def start(self) -> None:
+        """Start it, and let it load what it needs."""
+        self.executor = ProcessPoolExecutor(1, env=ONE_THREAD)
+        self.loaded = self.executor.submit(packages)
+
+    def replace(self) -> None:
+        """Start another one in its place.
+
+        Raises:
+            ComputationError: it died before it could begin a job.
+        """
+        if reason := self.loaded.exception():
+            raise ComputationError("workers die before they begin") from reason
+        self.executor.shutdown(kill_workers=True)
+        self.start()
+
+    def submit(self, job: Job) -> Future:
+        """Have a job computed."""
+        with suppress(BrokenProcessPool):
+            return self.executor.submit(work.run, job)
+        self.replace()  # it died while it had nothing to do
+        return self.executor.submit(work.run, job)
 
 
-WORKER_WAIT = 30  # s for the first worker, and between looks at whether there still is one
-TRIES = 3  # of a job whose workers die; the scheduler itself tries it so often as it is set, four times at first
-HOLD, LONGEST_HOLD = 10, 60  # s for which a worker that is not used holds what it is given, or it would get it all
-MIN_REFUSED_JOBS = 4  # jobs whose files are others, at which a worker has been refused if its files alone are
-MAX_LOST_JOBS = 10  # jobs that Dask gives up while nothing is begun
+def _rows(jobs: Sequence[Job], workers: int, died: list[Job], say: Say) -> Generator[Row]:
+    """The rows of jobs, but of those whose processes have `died`."""
+    waiting, processes = list(reversed(jobs)), [_Process() for _ in range(workers)]
+    running: dict[Future, tuple[Job, _Process]] = {}
+    idle = list(processes)
+    try:
+        while waiting or running:
+            while waiting and idle:
+                job, process = waiting.pop(), idle.pop()
+                running[process.submit(job)] = job, process
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                job, process = running.pop(future)
+                idle.append(process)
+                if isinstance(future.exception(), BrokenProcessPool):
+                    process.replace()
+                    say(f"a worker died of {job.label}")
+                    died.append(job)
+                else:
+                    yield future.result()
+    finally:
+        for process in processes:
+            process.executor.shutdown(kill_workers=True)
 
 
 class Cluster(Place):
@@ -163,16 +170,15 @@ class Cluster(Place):
         except (OSError, TimeoutError, ValueError, TypeError) as error:  # the last of an address that needs TLS
             reason = str(error).partition("\n")[0]
             raise UsageError(f"no Dask scheduler answers at {address}: {reason}") from error
-        _hush("distributed", "tornado", "asyncio")
+        _silence("distributed", "tornado", "asyncio")
         try:
             self.client.wait_for_workers(1, timeout=WORKER_WAIT)
             self._require_alike(address)
-        except TimeoutError as error:
+        except (TimeoutError, UsageError) as error:
             self.client.close()
+            if isinstance(error, UsageError):
+                raise
             raise UsageError(f"the scheduler at {address} has no worker: start some") from error
-        except UsageError:
-            self.client.close()
-            raise
 
     def __exit__(self, *raised: Any) -> None:
         self.client.close(timeout=2)
@@ -190,11 +196,6 @@ class Cluster(Place):
             if other:
                 raise UsageError(f"the worker {worker} has {other}: results would not be comparable")
 
-    def _require_files(self, jobs: Sequence[Job]) -> None:
-        for worker, other in self._ask(other_files, JobFiles().digests_of(jobs)).items():
-            if other:
-                raise UsageError(f"the worker {worker} does not see {other[0]} as it is here: it needs the same paths")
-
     def _workers(self) -> dict[str, Any]:
         return self.client.scheduler_info(n_workers=-1)["workers"]
 
@@ -210,7 +211,9 @@ class Cluster(Place):
         return answers
 
     def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
-        self._require_files(jobs)
+        for worker, other in self._ask(other_files, JobFiles().digests_of(jobs)).items():
+            if other:
+                raise UsageError(f"the worker {worker} does not see {other[0]} as it is here: it needs the same paths")
         sent = _Sent(self.client)
         try:
             for job in jobs:
@@ -224,7 +227,7 @@ class Cluster(Place):
                         if row := self._usable(answer, job, sent, say):
                             yield row
                     elif isinstance(answer, tuple) and isinstance(answer[1], self.killed):
-                        if sent.deaths.killed(job.key):
+                        if sent.attempts.killed(job.key):
                             yield given_up(job)
                         else:
                             sent.send(job)
@@ -251,7 +254,7 @@ class Cluster(Place):
         reason = answer.unlike
         if answer.row.get("reason") == work.CHANGED and JobFiles().is_of(job):
             reason = "other files than there are here"
-            sent.deaths.begun[job.key] -= 1  # only its files were looked at
+            sent.attempts.begun[job.key] -= 1  # only its files were looked at
         if not reason:
             return answer.row
         if answer.worker not in sent.refused:
@@ -264,13 +267,7 @@ class Cluster(Place):
 
 
 class Answer(NamedTuple):
-    """Of a worker.
-
-    Attributes:
-        worker: its address.
-        unlike: what it has that this machine has not; empty where nothing.
-        row: of the job; empty where it is unlike.
-    """
+    """The row of a job, by a worker of an address; empty where the worker has what this machine has not."""
 
     worker: str
     unlike: str
@@ -278,32 +275,24 @@ class Answer(NamedTuple):
 
 
 class _Sent:
-    """What is on the cluster.
-
-    Attributes:
-        jobs: by their futures.
-        running: hands out futures as they end, with their answers.
-        deaths: which of them kill workers.
-        refused: addresses of workers that are not used.
-    """
+    """What is on the cluster: jobs by their futures, which are handed out as they end, and workers not to be used."""
 
     def __init__(self, client: Any) -> None:
         from distributed import as_completed
 
         self.client, self.topic, self.here = client, f"steady-study-{uuid.uuid4().hex}", packages()
-        self.jobs, self.deaths, self.refused = dict[Any, Job](), Deaths(), set[str]()
+        self.jobs, self.attempts, self.refused = dict[Any, Job](), Attempts(), set[str]()
         self.running = as_completed(loop=client.loop, with_results=True, raise_errors=False)
-        client.subscribe_topic(self.topic, lambda event: self.deaths.hear(event[1]))
+        client.subscribe_topic(self.topic, lambda event: self.attempts.hear(event[1]))
 
     def send(self, job: Job, **where: Any) -> None:
-        """Have it computed."""
-        self.deaths.sent(job.key)  # before it can be begun
+        self.attempts.sent(job.key)  # before it can be begun
         future = self.client.submit(computed, job, self.here, self.topic, pure=False, **where)
         self.jobs[future] = job
         self.running.add(future)
 
 
-class Deaths:
+class Attempts:
     """Tells jobs that kill their workers from those that only waited at one that died, which Dask blames as well.
 
     Attributes:
@@ -376,7 +365,7 @@ def other_files(digests: Mapping[str, str]) -> list[str]:
     return [file for file, digest in digests.items() if files.digest_or_none(file) != digest]
 
 
-def _hush(*owners: str) -> None:
+def _silence(*owners: str) -> None:
     """What they log of a connection that is lost is said in one line here."""
     for name in list(logging.root.manager.loggerDict):
         if name.partition(".")[0] in owners:

@@ -51,15 +51,14 @@ def run(job: Job) -> dict[str, Any]:
         _forget_peak()
         try:
             # files change while a study goes on, and may be others on another machine
-            found = _done(job) if JobFiles().is_of(job) else {"outcome": "failed", "reason": CHANGED}
+            if JobFiles().is_of(job):
+                found = {"outcome": "done", **TASKS[job.task](job)}
+            else:
+                found = {"outcome": "failed", "reason": CHANGED}
         except (Exception, SystemExit) as error:  # a study goes on without this job
             found = {"outcome": "failed", "reason": one_line(error)}
         spent = {"seconds": time.perf_counter() - began, "peak_mib": _peak_mib(), "packages": in_words(packages())}
         return job.columns | spent | found
-
-
-def _done(job: Job) -> dict[str, Any]:
-    return {"outcome": "done"} | TASKS[job.task](job)
 
 
 def _forget_peak() -> None:
@@ -100,7 +99,7 @@ def _fit(job: Job) -> dict[str, Any]:
     with seeded(job.seed, "program"):
         program = told(load_program(job.program), job)
     recipe = find_recipe(job.recipe)
-    require_settings(job.recipe, recipe, job.settings)
+    require_settings(f"recipe {job.recipe}", recipe, job.settings)
     silent = {"progress": False} if trains(recipe) else {}
     began = time.perf_counter()
     fitted = recipe(

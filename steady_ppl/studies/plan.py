@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from steady_ppl.errors import RunError
-from steady_ppl.utils.files import read_json, whole_file
-from steady_ppl.utils.schema import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Absent, Maybe, misfit, refuse_newer
+from steady_ppl.utils.files import whole_file
+from steady_ppl.utils.schema import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, read_record
 from steady_ppl.utils.text import shown
 
 HELD_OUT = "valid_log_likelihood"  # of validation drives
@@ -28,31 +28,24 @@ FIGURES = {
 MOST_PANELS, MOST_PUBLISHED, LONGEST = 12, 100, 1000  # of a picture; characters of its title and labels
 MAX_NUMBER = 1e100  # a number beyond cannot be drawn
 
-POINTS = {str: {str: [[NUMBER]]}}
 FORMAT = 1
 RECORD = "study.json"
-RECORDED: dict[str, Any] = {
-    "title": TEXT,
-    "task": TEXT,
-    "jobs": [
-        {
-            **dict.fromkeys(("task", "method", "program", "recipe", "key", "label"), TEXT),
-            **{name: {str: ANYTHING} for name in ("data", "settings")},
-            "seed": WHOLE,
-            "known_start": TRUTH,
-        }
-    ],
-    "picture": Maybe(
-        {
-            "x": TEXT,
-            "y": LINES,
-            "labels": {str: TEXT},
-            "published": POINTS,
-            "chosen_by": TEXT,
-            "leave_out": Absent(LINES),
-        }
-    ),
+PICTURE: dict[str, Any] = {
+    "x": TEXT,
+    "y": LINES,
+    "labels?": {str: TEXT},
+    "published?": {str: {str: [[NUMBER, NUMBER]]}},
+    "chosen_by?": TEXT,
+    "leave_out?": LINES,
 }
+JOB: dict[str, Any] = {
+    **dict.fromkeys(("task", "method", "program", "recipe", "key", "label"), TEXT),
+    "data": {str: ANYTHING},
+    "settings": {str: ANYTHING},
+    "seed": WHOLE,
+    "known_start": TRUTH,
+}
+RECORDED = {"title": TEXT, "task": TEXT, "jobs": [JOB], "picture": (PICTURE, None)}
 
 
 @dataclass(frozen=True)
@@ -158,7 +151,7 @@ def undrawable(title: str, picture: Mapping[str, Any]) -> str | None:
             return f"picture.published: {column} has {len(lines)} lines, expected at most {MOST_PUBLISHED}"
         for name, points in lines.items():
             for point in points:
-                if len(point) != 2 or max(map(abs, point)) > MAX_NUMBER:
+                if max(map(abs, point)) > MAX_NUMBER:
                     return f"picture.published: {column}, {name}: {shown(str(point), 40)} is no point, expected [x, y]"
     return None
 
@@ -179,20 +172,13 @@ def recorded_plan(folder: Path) -> Plan:
     Raises:
         RunError: there is none, it is damaged, or a newer steady-ppl wrote it.
     """
-    try:
-        content = read_json(folder / RECORD, RunError)
-    except (FileNotFoundError, NotADirectoryError):
-        raise RunError(f"{folder} is not a study: it has no {RECORD}") from None
-    refuse_newer(content, FORMAT, folder, RunError)
-    problem = misfit(content, RECORDED)
-    if problem is None and content["picture"] is not None:
-        problem = undrawable(content["title"], content["picture"])
-    if problem is not None:
+    content = read_record(folder / RECORD, RECORDED, FORMAT, "a study")
+    if content["picture"] is not None and (problem := undrawable(content["title"], content["picture"])):
         raise RunError(f"{folder / RECORD} is damaged: {problem}")
     picture = content["picture"]
     if picture is not None:
-        picture = Picture(**{name: picture[name] for name in RECORDED["picture"].form if name in picture})
-    jobs = tuple(Job(**{name: job[name] for name in RECORDED["jobs"][0]}) for job in content["jobs"])
+        picture = Picture(**{one.name: picture[one.name] for one in fields(Picture) if one.name in picture})
+    jobs = tuple(Job(**{name: job[name] for name in JOB}) for job in content["jobs"])
     return Plan(content["title"], content["task"], jobs, picture)
 
 

@@ -44,7 +44,7 @@ from steady_ppl.studies.plan import (
     FIGURES,
     HELD_OUT,
     MAX_NUMBER,
-    POINTS,
+    PICTURE,
     TASKS,
     Job,
     Picture,
@@ -53,28 +53,25 @@ from steady_ppl.studies.plan import (
     without_folder,
 )
 from steady_ppl.utils.files import require_file
-from steady_ppl.utils.schema import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Absent, Maybe, misfit
+from steady_ppl.utils.schema import ANYTHING, NUMBER, TEXT, TRUTH, WHOLE, mismatch
 from steady_ppl.utils.text import shown
 
-MOST_JOBS = 100_000
-
+Axes = dict[str, list[Any]]
+MOST_JOBS, MOST_DRIVES = 100_000, 1_000_000
+SOURCES: dict[str, dict[str, Any]] = {
+    "simulate": {"train": 16, "valid": 16, "test": 32, "effect": "", "sigma_deg": None},
+    "alpha_truck": {"sigma_deg": 5.0},
+    "tables": {},
+}
+METHOD: dict[str, Any] = {"name": TEXT, "program": TEXT, "recipe?": TEXT, "settings?": {str: ANYTHING}}
 FORM: dict[str, Any] = {
     "title": TEXT,
-    "task": Absent(TEXT),
+    "task?": TEXT,
     "seeds": [WHOLE],
-    "known_start": Absent(TRUTH),
+    "known_start?": TRUTH,
     "data": {str: ANYTHING},
-    "picture": Absent(
-        {
-            "x": TEXT,
-            "y": LINES,
-            "labels": Absent({str: TEXT}),
-            "chosen_by": Absent(TEXT),
-            "leave_out": Absent(LINES),
-            "published": Absent(POINTS),
-        }
-    ),
-    "method": [{"name": TEXT, "program": TEXT, "recipe": Absent(TEXT), "settings": Absent({str: ANYTHING})}],
+    "picture?": PICTURE,
+    "method": [METHOD],
 }
 
 
@@ -100,7 +97,7 @@ def read_plan(path: Path, data: Path | None = None) -> Plan:
 
 
 def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
-    problem = misfit(content, FORM) or _surplus(content)
+    problem = mismatch(content, FORM) or _surplus(content)
     if problem is None and "picture" in content:
         problem = undrawable(content["title"], content["picture"])
     if problem is not None:
@@ -120,9 +117,17 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
     cells = len(content["seeds"]) * count(source) * sum(count(one["settings"]) for one in methods)
     if cells > MOST_JOBS:
         raise UsageError(f"{cells:,} jobs; expected at most {MOST_JOBS:,} of one study")
-    files = JobFiles()
-    cut = _jobs(content, task, source, methods)
-    jobs = _labelled(_without_doubles(tuple(replace(job, key=_key(files, job)) for job in cut)))
+    files, different = JobFiles(), dict[str, Job]()
+    for job in _jobs(content, task, source, methods):
+        with labelled(f"method {job.method}"):
+            key = files.key(job)
+        if key in different:
+            raise UsageError(
+                f"{job.method} with seed {job.seed} is there twice: methods need names of their own, and seeds and "
+                "other lists values that differ"
+            )
+        different[key] = replace(job, key=key)
+    jobs = _labelled(tuple(different.values()))
     picture = None
     if "picture" in content:
         picture = Picture(**content["picture"])
@@ -132,9 +137,10 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
 
 def _surplus(content: Mapping[str, Any]) -> str | None:
     """A name that means nothing, so that one that is misspelt does not pass for a default."""
-    places = [("", content, FORM), *(("method.", one, FORM["method"][0]) for one in content["method"])]
-    places += [("picture.", content["picture"], FORM["picture"].form)] if "picture" in content else []
-    for place, given, known in places:
+    places = [("", content, FORM), *(("method.", one, METHOD) for one in content["method"])]
+    places += [("picture.", content["picture"], PICTURE)] if "picture" in content else []
+    for place, given, form in places:
+        known = [key.rstrip("?") for key in form]
         for name in given:
             if name not in known:
                 return f"{place}{name} means nothing here; there are {', '.join(known)}"
@@ -148,23 +154,6 @@ def _jobs(content: Mapping[str, Any], task: str, source: Axes, methods: list[dic
             for method in methods:
                 for settings in grid(method["settings"]):
                     yield Job(**method | {"settings": settings}, task=task, data=data, seed=seed, known_start=start)
-
-
-def _key(files: JobFiles, job: Job) -> str:
-    with labelled(f"method {job.method}"):
-        return files.key(job)
-
-
-def _without_doubles(jobs: tuple[Job, ...]) -> tuple[Job, ...]:
-    seen: set[str] = set()
-    for job in jobs:
-        if job.key in seen:
-            raise UsageError(
-                f"{job.method} with seed {job.seed} is there twice: methods need names of their own, and seeds and "
-                "other lists values that differ"
-            )
-        seen.add(job.key)
-    return jobs
 
 
 def _labelled(jobs: tuple[Job, ...]) -> tuple[Job, ...]:
@@ -215,19 +204,6 @@ def _require_columns(picture: Picture, task: str, jobs: tuple[Job, ...]) -> None
             raise UsageError(f"picture.published: {column} is no panel; y has {', '.join(picture.y)}")
 
 
-SOURCES: dict[str, dict[str, Any]] = {
-    "simulate": {"train": 16, "valid": 16, "test": 32, "effect": "", "sigma_deg": None},
-    "alpha_truck": {"sigma_deg": 5.0},
-    "tables": {},
-}
-
-
-MOST_DRIVES = 1_000_000
-
-
-Axes = dict[str, list[Any]]
-
-
 def source_axes(folder: Path, given: Mapping[str, Any], instead: Path | None, task: str) -> Axes:
     """The source of the data with its path, and all that is said of it, each a list of values; a search uses no test
     drives."""
@@ -251,7 +227,7 @@ def source_axes(folder: Path, given: Mapping[str, Any], instead: Path | None, ta
     for name, usual in sayable.items():
         values = _axis(f"data.{name}", given.get(name, usual))
         form = TEXT if name == "effect" else NUMBER if name == "sigma_deg" else WHOLE
-        problem = misfit(values, [Maybe(form)], f"data.{name}")
+        problem = mismatch(values, [(form, None)], f"data.{name}")
         if problem is not None:
             raise UsageError(problem)
         for value in values if form != TEXT else ():

@@ -1,15 +1,12 @@
 """Send the jobs of a study out and keep what comes back.
 
-A result is kept when it comes; what is lost with a worker that dies is tried again, and a job that kills one worker
-after the other is given up.
+A result is kept when it comes. A job whose worker dies is tried again; one that kills each of its workers is given up.
 """
 
 from __future__ import annotations
 
-import inspect
 import time
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -20,15 +17,12 @@ from steady_ppl.errors import ComputationError, RunError, UsageError, labelled
 from steady_ppl.model.loading import load_program
 from steady_ppl.model.program import Program, error_groups, for_program
 from steady_ppl.runs.fit import packages
-from steady_ppl.runs.recipes import find_recipe, require_kind, require_settings
+from steady_ppl.runs.recipes import find_recipe, require_settings
 from steady_ppl.smc.simulate import simulate
-from steady_ppl.studies.executors import Place, Row, Say, given_up
+from steady_ppl.studies.executors import Place, Row, Say
 from steady_ppl.studies.job import CHANGED, ERRORS, drives, in_words, told, told_settings, truth, without_effect
-from steady_ppl.studies.plan import RECORD, Job, Plan, record_plan, recorded_plan
+from steady_ppl.studies.plan import RECORD, Plan, record_plan, recorded_plan
 from steady_ppl.studies.table import read_results, study_table
-
-Keep = Callable[[Row], None]
-MAX_IDLE_ROUNDS = 3  # rounds in which workers died and nothing had been begun
 
 
 def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, say: Say = lambda line: None) -> int:
@@ -61,17 +55,20 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
         others = sorted({_packages(row) for row in rows if row["key"] in kept} - {in_words(packages())})
         if others:
             say(f"some of them were computed with {'; '.join(others)}: here is {in_words(packages())}")
-        clock = _Clock(len(left))
+        jobs, began = len(left), time.monotonic()
 
         def keep(row: Row) -> None:
             table.add(row)
             kept[row["key"]] = row["outcome"]
-            say(f"{len(kept)}/{len(wanted)} {left.pop(row['key']).label}: {_result(row)}, {clock.tick()}")
+            result = f"failed, {row['reason']}" if row["outcome"] == "failed" else f"{row['seconds']:.0f} s"
+            label, time_left = left.pop(row["key"]).label, _time_left(began, jobs - len(left), len(left))
+            say(f"{len(kept)}/{len(wanted)} {label}: {result}, {time_left}")
 
         ended: tuple[type[BaseException], ...] = (ComputationError, KeyboardInterrupt, *place.lost)
         try:
-            with place:
-                _compute(place, left, keep, say)
+            with place, closing(place.results(list(left.values()), say)) as results:
+                for row in results:
+                    keep(row)
         except ended as error:
             so_far = f"{len(kept)} of {len(wanted)} jobs are kept in {folder}; the same command goes on"
             if isinstance(error, KeyboardInterrupt):
@@ -81,44 +78,6 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
             reason = str(error) if isinstance(error, ComputationError) else gone
             raise ComputationError(f"{reason}: {so_far}") from error
     return sum(outcome == "failed" for outcome in kept.values())
-
-
-def _compute(place: Place, left: dict[str, Job], keep: Keep, say: Say) -> None:
-    """Until nothing is left: what had been begun when a worker died twice is tried apart."""
-    deaths, in_vain = Counter[str](), 0
-    while left:
-        before = len(left)
-        try:
-            _keep_all(place, list(left.values()), keep, say)
-        except place.died as error:
-            begun = place.begun() & left.keys()
-            deaths.update(begun)
-            suspects = [job for key, job in left.items() if deaths[key] > 1]
-            say(f"a worker died: {len(begun)} jobs are begun again, {len(suspects)} of them apart")
-            _sift(place, suspects, left, keep, say)
-            in_vain = 0 if begun or len(left) < before else in_vain + 1
-            if in_vain == MAX_IDLE_ROUNDS:
-                raise ComputationError("workers die before they begin") from error
-
-
-def _sift(place: Place, suspects: Sequence[Job], left: Mapping[str, Job], keep: Keep, say: Say) -> None:
-    """Jobs of which some kill, in halves, and halves of those in which a worker dies, down to a job that does so."""
-    middle = (len(suspects) + 1) // 2
-    for half in filter(None, (suspects[:middle], suspects[middle:])):
-        try:
-            _keep_all(place, half, keep, say)
-        except place.died:
-            rest = [job for job in half if job.key in left]
-            if len(rest) == 1 == len(half):
-                keep(given_up(rest[0]))
-            else:
-                _sift(place, rest, left, keep, say)
-
-
-def _keep_all(place: Place, jobs: Sequence[Job], keep: Keep, say: Say) -> None:
-    with closing(place.results(jobs, say)) as results:
-        for row in results:
-            keep(row)
 
 
 def _require_same_study(plan: Plan, folder: Path) -> None:
@@ -139,23 +98,13 @@ def _is_tried_again(row: Mapping[str, Any], again: bool) -> bool:
     return row["outcome"] == "failed" and (again or row.get("reason") == CHANGED)
 
 
-def _result(row: Row) -> str:
-    return f"failed, {row['reason']}" if row["outcome"] == "failed" else f"{row['seconds']:.0f} s"
-
-
-class _Clock:
-    """Says how long it will take."""
-
-    def __init__(self, jobs: int) -> None:
-        self.left, self.done, self.began = jobs, 0, time.monotonic()
-
-    def tick(self) -> str:
-        self.left, self.done = self.left - 1, self.done + 1
-        seconds = (time.monotonic() - self.began) / self.done * self.left
-        for size, unit in ((86_400, "days"), (3600, "h"), (60, "min")):
-            if seconds > 2 * size:
-                return f"{seconds / size:.0f} {unit} left"
-        return f"{seconds:.0f} s left"
+def _time_left(began: float, done: int, left: int) -> str:
+    """How long it will take."""
+    seconds = (time.monotonic() - began) / done * left
+    for size, unit in ((86_400, "days"), (3600, "h"), (60, "min")):
+        if seconds > 2 * size:
+            return f"{seconds / size:.0f} {unit} left"
+    return f"{seconds:.0f} s left"
 
 
 def require_runnable(plan: Plan) -> None:
@@ -171,9 +120,9 @@ def require_runnable(plan: Plan) -> None:
             programs.append((job.method, told(load_program(job.program), job)))
             told_settings(job)
             if job.task == "fit":
-                require_settings(job.recipe, find_recipe(job.recipe), job.settings)
+                require_settings(f"recipe {job.recipe}", find_recipe(job.recipe), job.settings)
             else:
-                _require_search_settings(job.settings)
+                require_settings("discover", discover, job.settings)
     for job in {repr(job.data): job for job in plan.jobs if "simulate" in job.data}.values():
         with labelled("data"):
             truth(job)
@@ -200,13 +149,3 @@ def _require_figures(columns: Sequence[str], programs: Sequence[Program]) -> Non
         group, _, name = column.partition(".")
         if group in known and name not in known[group]:
             raise UsageError(f"picture: there will be no column {column}; {group} has {', '.join(known[group])}")
-
-
-def _require_search_settings(settings: Mapping[str, Any]) -> None:
-    given = set(list(inspect.signature(discover).parameters)[:3]) | {"known_start", "seed"}  # by the study itself
-    known = [name for name in inspect.signature(discover).parameters if name not in given]
-    unknown = [name for name in settings if name not in known]
-    if unknown:
-        raise UsageError(f"discover has no setting {unknown[0]}; there are {', '.join(known)}")
-    for name, value in settings.items():
-        require_kind(discover, name, value)

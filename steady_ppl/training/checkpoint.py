@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from steady_ppl.errors import RunError
-from steady_ppl.utils.schema import ANYTHING, NUMBER, WHOLE, misfit
+from steady_ppl.utils.schema import NUMBER, WHOLE, mismatch
 from steady_ppl.utils.tensor_files import damaged, read_tensors, write_tensors
 from steady_ppl.utils.text import shown
 
 GROUPS = ("parameters", "averaged", "kept", "memory")  # of tensors of a `Checkpoint`
-NUMBERS = {"step": WHOLE, "history": [{str: ANYTHING}], "kept_step": WHOLE, "best_held_out": [NUMBER]}
+NUMBERS = {"step": WHOLE, "history": [{"step": NUMBER}], "kept_step": WHOLE, "best_held_out": [NUMBER]}
 """The form of what a checkpoint says in JSON beside its tensors."""
 
 
@@ -101,7 +101,7 @@ def _numbers(path: Path, text: Mapping[str, str]) -> dict[str, Any]:
         found = {name: json.loads(text[name]) for name in NUMBERS if name in text}
     except (ValueError, RecursionError):
         raise damaged(path, "the text beside the tensors is no JSON") from None
-    problem = misfit(found, NUMBERS)
+    problem = mismatch(found, NUMBERS)
     if problem is not None:
         raise damaged(path, problem)
     return found

@@ -22,12 +22,12 @@ import torch
 from torch import Tensor
 
 from steady_ppl.errors import FilterError, RunError
-from steady_ppl.utils.schema import ANYTHING, TEXT, Among, misfit
+from steady_ppl.utils.schema import ANYTHING, TEXT, mismatch
 from steady_ppl.utils.tensor_files import read_tensors, write_tensors
 
 Piece = tuple[Mapping[str, Tensor], Mapping[str, Any]]
 RANDOM = "random state"  # of torch, after the piece
-SAID = Among(({"values": {str: ANYTHING}}, {"failed": TEXT}))
+SAID = ({"values": {str: ANYTHING}}, {"failed": TEXT})
 
 
 _files: ContextVar[Iterator[Path] | None] = ContextVar("the files of a journal's pieces, in order", default=None)
@@ -78,7 +78,7 @@ def _read(file: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     except (ValueError, RecursionError):
         said = None
     state, now = tensors.get(RANDOM), torch.get_rng_state()
-    if misfit(said, SAID) is not None or state is None or (state.shape, state.dtype) != (now.shape, now.dtype):
+    if mismatch(said, SAID) is not None or state is None or (state.shape, state.dtype) != (now.shape, now.dtype):
         raise RunError(f"{file} is damaged: it is no piece of a search; --force begins the search anew")
     return tensors, said
 

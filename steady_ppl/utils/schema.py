@@ -1,112 +1,91 @@
-"""The form of JSON that somebody gives, and where it departs from it."""
+"""The form of JSON that somebody gives, and where it departs from it.
+
+A form is `NUMBER`, `WHOLE`, `TEXT`, `TRUTH`, `ANYTHING` or None, which is null; `[form]` for a list, `[form, form]` for
+one of two; `(form, form)` for one of several; `{"key": form, "other?": form}` for what has these keys, of which those
+with a `?` need not be there, and perhaps others; `{str: form}` for any keys; `Paired(form, keys)`.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from steady_ppl.errors import SteadyError
+from steady_ppl.errors import RunError
+from steady_ppl.utils.files import read_json
 from steady_ppl.utils.text import shown
 
-
-def refuse_newer(record: Any, known: int, folder: Path, refused: type[SteadyError]) -> None:
-    """Refuse a record whose `format` is a number that is not known yet.
-
-    Raises:
-        SteadyError, of the kind that is `refused`.
-    """
-    form = record.get("format", known) if isinstance(record, dict) else known
-    if isinstance(form, int) and form > known:
-        raise refused(
-            f"{folder} was written by a newer steady-ppl: its form is number {form}, this one reads up to {known}; "
-            "install that version or a later one to read it"
-        )
-
-
-class Maybe(NamedTuple):
-    """A form that may be null."""
-
-    form: Any
-
-
-class Among(NamedTuple):
-    """One of several forms."""
-
-    forms: tuple[Any, ...]
+NUMBER, WHOLE, TEXT, TRUTH = "a finite number", "a whole number from 0 to 2^63", "text", "true or false"
+ANYTHING = "anything"
+LINES = [TEXT]
 
 
 class Paired(NamedTuple):
     """A form of names and values, of which some hold equally many numbers: those that are there and not null."""
 
-    form: Any
+    form: dict[str, Any]
     keys: tuple[str, ...]
 
 
-NUMBER, WHOLE, TEXT, TRUTH = "a finite number", "a whole number from 0 to 2^63", "text", "true or false"
-LINES = [TEXT]
-
-
-def misfit(content: Any, form: Any, place: str = "") -> str | None:
-    """Where JSON has another form than expected, in words; None where it has not.
+def mismatch(content: Any, form: Any, place: str = "") -> str | None:
+    """Return where JSON has another form than expected, in words; None where it has not.
 
     Args:
         content: as it was read.
-        form: `NUMBER`, `WHOLE`, `TEXT` or `TRUTH`; `[form]` for a list, `[form, form]` for one of two; `{key: form}`
-            for what has these keys, and perhaps others; `{str: form}` for any keys; `Maybe(form)` for null as well;
-            `Among(forms)` for one of them; `Paired(form, keys)` for lists of one length under these keys.
+        form: as the module says.
         place: what error messages call the content.
 
     Example:
-        >>> misfit({"seed": "one"}, {"seed": WHOLE})
+        >>> mismatch({"seed": "one"}, {"seed": WHOLE})
         "seed is 'one', expected a whole number from 0 to 2^63"
     """
-    if isinstance(form, Maybe):
-        return None if content is None else misfit(content, form.form, place)
-    if isinstance(form, Among):
-        found = [misfit(content, one, place) for one in form.forms]
-        return None if None in found else found[0]
     if isinstance(form, Paired):
-        return misfit(content, form.form, place) or _unpaired(content, form.keys, place)
+        return mismatch(content, form.form, place) or _unpaired(content, form.keys, place)
+    if isinstance(form, tuple):
+        problems = [mismatch(content, one, place) for one in form]
+        return None if None in problems else problems[0]
     if isinstance(form, list):
         if not isinstance(content, list) or len(form) not in (1, len(content)):
             return _wrong(content, place, "a list" if len(form) == 1 else f"a list of {len(form)}")
         inner = form * len(content) if len(form) == 1 else form
-        return _first(misfit(one, of, f"{place}[{i}]") for i, (one, of) in enumerate(zip(content, inner, strict=True)))
-    if isinstance(form, Mapping):
+        return _first(
+            mismatch(one, of, f"{place}[{i}]") for i, (one, of) in enumerate(zip(content, inner, strict=True))
+        )
+    if isinstance(form, dict):
         if not isinstance(content, dict):
             return _wrong(content, place, "names and values")
-        if str in form:
-            return _first(misfit(one, form[str], _inside(place, key)) for key, one in content.items())
-        lacking = [key for key in form if key not in content and not isinstance(form[key], Absent)]
-        if lacking:
+        known = dict.fromkeys(content, form[str]) if str in form else {key.rstrip("?"): form[key] for key in form}
+        if lacking := [key for key in known if key not in content and key in form]:
             return f"{place or 'it'} has no {', '.join(lacking)}"
-        return _first(misfit(content[key], inner, _inside(place, key)) for key, inner in form.items() if key in content)
-    if isinstance(form, Absent):
-        return misfit(content, form.form, place)
+        return _first(mismatch(content[key], known[key], _inside(place, key)) for key in known if key in content)
     return None if _is(content, form) else _wrong(content, place, form)
 
 
-class Absent(NamedTuple):
-    """A form of what need not be there."""
+def read_record(file: Path, form: Any, known: int, what: str) -> Any:
+    """Read JSON of a form, whose `format` is a number up to the one that is known.
 
-    form: Any
+    Raises:
+        RunError: there is none, so that its folder is not `what`; it is damaged, or a newer steady-ppl wrote it.
+    """
+    try:
+        record = read_json(file, RunError)
+    except (FileNotFoundError, NotADirectoryError):
+        raise RunError(f"{file.parent} is not {what}: it has no {file.name}") from None
+    number = record.get("format") if isinstance(record, dict) else None
+    if isinstance(number, int) and number > known:
+        raise RunError(
+            f"{file.parent} was written by a newer steady-ppl: its form is number {number}, this one reads up to "
+            f"{known}; install that version or a later one to read it"
+        )
+    if problem := mismatch(record, form):
+        raise RunError(f"{file} is damaged: {problem}")
+    return record
 
 
-ANYTHING = "anything"
-
-
-def _is(content: Any, form: str) -> bool:
-    if form == ANYTHING:
-        return True
-    if form in (TEXT, TRUTH):
-        return isinstance(content, str if form == TEXT else bool)
-    if isinstance(content, bool) or not isinstance(content, int | float):
-        return False
-    if form == WHOLE:
-        return isinstance(content, int) and 0 <= content < 2**63
-    return abs(content) <= 1e300 if isinstance(content, int) else math.isfinite(content)
+def count(numbers: Any) -> int:
+    """How many there are in a list, or in one number that stands for a list of it."""
+    return len(numbers) if isinstance(numbers, list) else 1
 
 
 def _unpaired(content: Mapping[str, Any], keys: tuple[str, ...], place: str) -> str | None:
@@ -118,12 +97,19 @@ def _unpaired(content: Mapping[str, Any], keys: tuple[str, ...], place: str) -> 
     return None
 
 
-def count(numbers: Any) -> int:
-    """How many there are in a list, or in one number that stands for a list of it."""
-    return len(numbers) if isinstance(numbers, list) else 1
+def _is(content: Any, form: str | None) -> bool:
+    if form is None or form == ANYTHING:
+        return form == ANYTHING or content is None
+    if form in (TEXT, TRUTH):
+        return isinstance(content, str if form == TEXT else bool)
+    if isinstance(content, bool) or not isinstance(content, int | float):
+        return False
+    if form == WHOLE:
+        return isinstance(content, int) and 0 <= content < 2**63
+    return abs(content) <= 1e300 if isinstance(content, int) else math.isfinite(content)
 
 
-def _first(problems: Any) -> str | None:
+def _first(problems: Iterable[str | None]) -> str | None:
     return next((problem for problem in problems if problem is not None), None)
 
 

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Generator, Sequence
+import os
 from pathlib import Path
 
 import pytest
-from dask_cluster import wait_for
 from small import steady
 from small_studies import STUDY, written
 
 from steady_ppl.errors import ComputationError
-from steady_ppl.studies.executors import Deaths, Local, Place, Row, Say
-from steady_ppl.studies.plan import Job
+from steady_ppl.studies import executors
+from steady_ppl.studies.executors import TRIES, Attempts, Local
 from steady_ppl.studies.plan_file import read_plan
 from steady_ppl.studies.runner import run_study
 from steady_ppl.studies.table import TABLE, read_results
@@ -73,108 +71,59 @@ def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(t
         and found.loc[13, "reason"] == "its worker died each time that it was tried"
     )
     begun = {seed: (tmp_path / "marks" / str(seed)).stat().st_size for seed in (1, 7, 13)}
-    # of two workers the other one may have died of 13 while 1 was begun again, or of 1 before 13 had left its mark
-    assert 2 <= begun[1] <= 1 + workers and 4 - workers <= begun[13] <= 3
-    assert 2 <= begun[7] <= 1 + workers
+    assert begun == {1: 2, 7: 2, 13: TRIES}
     assert sorted(file.name for file in out.iterdir()) == [TABLE, "study.json"]
     assert run_study(plan, out, Local(workers)) == 3  # what has failed is left
     assert (tmp_path / "marks" / "7").stat().st_size == begun[7]
     assert run_study(plan, out, Local(workers), again=True) == 3
-    assert begun[7] < (tmp_path / "marks" / "7").stat().st_size <= begun[7] + workers
+    assert (tmp_path / "marks" / "7").stat().st_size == begun[7] + 1
 
 
-def test_what_had_ended_beside_a_job_that_dies_is_not_lost(tmp_path: Path):
+def test_a_deadly_job_takes_nothing_with_it_and_is_tried_after_the_others(tmp_path: Path):
     (tmp_path / "mine.py").write_text(RECIPE.format())
     (tmp_path / "marks").mkdir()
-    text = STUDY[: STUDY.index("[[method]]")].replace("[1, 2]", "[1, 2, 3, 5, 13]") + (
+    text = STUDY[: STUDY.index("[[method]]")].replace("[1, 2]", "[13, 1, 2, 3, 5]") + (
         '[[method]]\nname = "mine"\nprogram = "{model}"\nrecipe = "mine.py"\n'
         f'settings = {{{{mark = "{tmp_path / "marks"}", deadly = [false]}}}}\n'
         '[[method]]\nname = "deadly"\nprogram = "{model}"\nrecipe = "mine.py"\n'
         f'settings = {{{{mark = "{tmp_path / "marks"}", deadly = true}}}}\n'
     )
     jobs = [job for job in read_plan(written(tmp_path, text)).jobs if (job.method == "deadly") == (job.seed == 13)]
-    found = []
-
-    def fetch(place: Place) -> None:
-        for row in place.results(jobs, print):
-            found.append(row["key"])
-            if len(found) == 1:  # until 13 has died
-                wait_for((tmp_path / "marks" / "13").exists)
-                time.sleep(2)
-
-    with Local(2) as place, pytest.raises(place.died):
-        fetch(place)
-    assert len(found) == len(set(found)) >= 3  # the other worker may have died at the fourth
+    said: list[str] = []
+    with Local(2) as place:
+        found = list(place.results(jobs, said.append))
+    assert [(row["seed"], row["outcome"]) for row in found[4:]] == [(13, "failed")]
+    assert {(row["seed"], row["outcome"]) for row in found[:4]} == {(seed, "done") for seed in (1, 2, 3, 5)}
+    begun = {int(mark.name): mark.stat().st_size for mark in (tmp_path / "marks").iterdir()}
+    assert begun == {1: 1, 2: 1, 3: 1, 5: 1, 13: TRIES}
+    assert said == [f"a worker died of {jobs[0].label}"] * TRIES
 
 
-class Died(Exception):
-    pass
-
-
-class Fragile(Place):
-    """Sixteen workers, all of which die of one job."""
-
-    died = (Died,)
-
-    def __init__(self, deadly: set[str]) -> None:
-        self.deadly, self.rounds, self.marks = deadly, list[int](), set[str]()
-
-    def __exit__(self, *raised: object) -> None:
-        pass
-
-    def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
-        self.rounds.append(len(jobs))
-        for place in range(0, len(jobs), 16):
-            under_way = jobs[place : place + 16]
-            self.marks |= {job.key for job in under_way}
-            if any(job.key in self.deadly for job in under_way):
-                raise Died
-            yield from (job.columns | {"outcome": "done", "seconds": 1.0} for job in under_way)
-
-    def begun(self) -> set[str]:
-        found, self.marks = self.marks, set()
-        return found
-
-
-def test_jobs_that_were_under_way_beside_a_deadly_one_are_tried_beside_each_other(tmp_path: Path):
-    plan = read_plan(written(tmp_path, STUDY.replace("[1, 2]", f"{list(range(1, 14))}")))
-    assert len(plan.jobs) == 39
-    deadly = {plan.jobs[3].key, plan.jobs[20].key}
-    place = Fragile(deadly)
-    assert run_study(plan, tmp_path / "out", place) == 2
-    found = read_results(tmp_path / "out").set_index("key")["outcome"]
-    assert len(found) == 39 and set(found[found == "failed"].index) == deadly
-    assert len(place.rounds) <= 2 * (2 + 2 * 5)  # of each two deaths, and sixteen halved until one is left
-
-
-def test_workers_that_die_before_they_begin_end_a_study(tmp_path: Path):
-    plan = read_plan(written(tmp_path))
-    place = Fragile({plan.jobs[0].key})
-    place.begun = set  # type: ignore[method-assign]
+def test_workers_that_die_before_they_begin_end_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(executors, "packages", os.abort)  # what a worker does first
     with pytest.raises(ComputationError, match="workers die before they begin: 0 of 6 jobs are kept"):
-        run_study(plan, tmp_path / "out", place)
-    assert len(place.rounds) == 3
+        run_study(read_plan(written(tmp_path)), tmp_path / "out", Local(2))
 
 
 def test_a_cluster_gives_up_every_job_that_kills_and_none_that_only_waited():
-    deaths, deadly = Deaths(), [f"deadly {place}" for place in range(16)]
+    attempts, deadly = Attempts(), [f"deadly {place}" for place in range(16)]
     for key in [*deadly, "waits"]:
-        deaths.sent(key)
+        attempts.sent(key)
     for key in 4 * deadly:
-        deaths.hear(key)
-    assert all(deaths.killed(key) for key in deadly)  # all at once
-    assert not deaths.killed("waits")
-    assert not any(deaths.killed("waits") for _ in range(9))
+        attempts.hear(key)
+    assert all(attempts.killed(key) for key in deadly)  # all at once
+    assert not attempts.killed("waits")
+    assert not any(attempts.killed("waits") for _ in range(9))
     with pytest.raises(ComputationError, match="workers die before they begin"):
-        deaths.killed("waits")
+        attempts.killed("waits")
 
 
 def test_jobs_that_a_machine_takes_along_once_are_tried_again():
-    deaths = Deaths()
+    attempts = Attempts()
     for key in map(str, range(40)):  # of a scheduler that tries once
-        deaths.sent(key)
-        deaths.hear(key)
-    assert not any(deaths.killed(str(place)) for place in range(40))
+        attempts.sent(key)
+        attempts.hear(key)
+    assert not any(attempts.killed(str(place)) for place in range(40))
 
 
 def test_a_folder_that_is_no_study_is_said(tmp_path: Path, capsys):

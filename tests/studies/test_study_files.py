@@ -91,7 +91,7 @@ def test_a_job_is_known_by_what_it_depends_on_and_not_by_where_it_is(tmp_path: P
             'labels = {{learnt = "a"}}\nx = ',
             "labels: learnt is not in the picture; there are settings.*, learned",
         ),
-        ("[60, -4.0]", "[60]", r"learned: \[60\] is no point"),
+        ("[60, -4.0]", "[60]", r"learned\[1\] is \[60\], expected a list of 2"),
         ("[60, -4.0]", "[60, 1e200]", "is no point"),
         ('title = "Small"', f'title = "{"x" * 1001}"', "more than 1000 characters"),
         ("train = 2", "train = 9223372036854775807", "at most 1,000,000"),
@@ -208,7 +208,7 @@ def test_a_search_has_no_test_drives(tmp_path: Path):
 @pytest.mark.parametrize("name", ["known_start", "train", "program", "seed", "particles"])
 def test_a_search_takes_the_settings_that_are_its_own(tmp_path: Path, name: str):
     require_runnable(read_plan(written(tmp_path, discover(simulations=20, withheld="[['stiffness']]"))))
-    with pytest.raises(UsageError, match=f"method it: discover has no setting {name}; there are mix, "):
+    with pytest.raises(UsageError, match=f"method it: discover has no setting {name}; it has mix, "):
         require_runnable(read_plan(written(tmp_path, discover(**{name: 1}))))
 
 
