@@ -14,6 +14,17 @@ from steady_ppl.effects import attached
 from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.text import aligned
 
+WIDTH, NAME = 100, 20
+FLOOR = "noise floor"
+POSSIBLE = (FLOOR, "constant velocity", "oracle", "truth")
+JUDGED = {  # the signs of what log p(y) and the error gained
+    (0, 0): ("is not shown to help", "is not shown to be better than"),
+    (1, 1): ("helps", "is better than"),
+    (-1, -1): ("makes it worse", "is worse than"),
+    (1, -1): ("helps log p(y) and harms the predictions", "fits better and predicts worse than"),
+    (-1, 1): ("harms log p(y) and helps the predictions", "fits worse and predicts better than"),
+}
+
 
 @dataclass(frozen=True, repr=False)
 class Proof(Displayed):
@@ -49,18 +60,6 @@ class Proof(Displayed):
 
     def __repr__(self) -> str:
         return f"Proof({verdict(self)!r})"
-
-
-WIDTH, NAME = 100, 20
-FLOOR = "noise floor"
-POSSIBLE = (FLOOR, "constant velocity", "oracle", "truth")
-JUDGED = {  # the signs of what log p(y) and the error gained
-    (0, 0): ("is not shown to help", "is not shown to be better than"),
-    (1, 1): ("helps", "is better than"),
-    (-1, -1): ("makes it worse", "is worse than"),
-    (1, -1): ("helps log p(y) and harms the predictions", "fits better and predicts worse than"),
-    (-1, 1): ("harms log p(y) and helps the predictions", "fits worse and predicts better than"),
-}
 
 
 def figures(found: Proof) -> dict[str, Any]:
@@ -114,15 +113,7 @@ def _against(found: Proof, name: str) -> dict[str, Any] | None:
 
 
 def _plain(change: Change | None) -> dict[str, Any] | None:
-    if change is None:
-        return None
-    interval = change.relative_interval
-    return {
-        "difference": change.value,
-        "interval": list(change.interval),
-        "relative": change.relative,
-        "relative_interval": None if interval is None else list(interval),
-    }
+    return None if change is None else dict(vars(change))
 
 
 def changes(found: Proof, name: str) -> dict[Key, Change | None]:
@@ -151,7 +142,7 @@ def verdict(found: Proof) -> str:
     errors = {key.of: change for key, change in changed.items() if key[::2] == ("measurement", found.horizons[horizon])}
     parts = []
     if likely is not None:
-        parts.append(f"log p(y) {with_interval(likely.value, likely.interval, 1, ' nats a drive')}")
+        parts.append(f"log p(y) {with_interval(likely.difference, likely.interval, 1, ' nats a drive')}")
     for of, change in errors.items():
         differs = _differs(_plain(change))
         where = f" in {of}" if len(errors) > 1 and of else ""

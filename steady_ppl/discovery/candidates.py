@@ -17,8 +17,6 @@ from steady_ppl.discovery.refits import ALWAYS, BY_LIKELIHOOD, Refit, Worth, ref
 from steady_ppl.discovery.screening import ALPHA, Screened, Tested, screen
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.errors import FilterError
-from steady_ppl.gaussian.information_filter import Lookahead
-from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood.parameters import Element, elements
 from steady_ppl.likelihood.scores import measured, smoothed, typical_spreads
 from steady_ppl.model.program import Program
@@ -34,50 +32,23 @@ LINEAR = ("push", "command", "history", "measured", "viewpoint")
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What a search was told.
-
-    Attributes:
-        known_start: the first states are certain.
-        withheld: names of effects that are left out of the catalogue.
-    """
-
-    known_start: bool
-    withheld: Sequence[str] = ()
-
-
-@dataclass(frozen=True)
 class Screening:
-    """Tests of a program, and what the refits need of them.
+    """Tests of a program, and what the refits need of them."""
 
-    Attributes:
-        tests: of all candidates.
-        parameters: the program's learnable numbers, in the order of `information`.
-        information: of parameters and one candidate, by the candidate; the parameters' alone by "".
-    """
-
-    tests: Screened
-    parameters: list[Element]
-    information: Mapping[str, Tensor]
+    tests: Screened  # of all candidates
+    parameters: list[Element]  # the program's learnable numbers, in the order of `information`
+    information: Mapping[str, Tensor]  # of parameters and one candidate, by the candidate; the parameters' alone by ""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A candidate that was fitted.
+    """A candidate that was fitted."""
 
-    Attributes:
-        tested: its score test.
-        refit: the program with it, or why there is none.
-        gain: held-out log p(y) above that of the program without, nats, `(B,)`.
-        alone: the same of the programs that were fitted to one fold alone, which is all there is of those given up.
-        behind: the best in its round, where one fold was enough to see that this one is behind.
-    """
-
-    tested: Tested
-    refit: Refit | str
-    gain: Tensor
-    alone: Tensor
-    behind: Candidate | None = None
+    tested: Tested  # its score test
+    refit: Refit | str  # the program with it, or why there is none
+    gain: Tensor  # held-out log p(y) above that of the program without, nats, (B,)
+    alone: Tensor  # the same of the programs fitted to one fold alone, which is all there is of those given up
+    behind: Candidate | None = None  # the best in its round, where one fold showed that this one is behind
 
     @property
     def variant(self) -> Variant:
@@ -127,44 +98,45 @@ class Candidate:
 
 
 @torch.no_grad()
-def screen_program(now: Refit, declared: Program, settings: Settings, *, sets: int, seed: int) -> Screening:
+def screen_program(now: Refit, declared: Program, *, sets: int, seed: int, withheld: Sequence[str] = ()) -> Screening:
     """Test every candidate that a fitted program does not have.
 
     Args:
         now: the fitted program; the drives of its first fold are tested.
         declared: as it was before it was fitted.
-        settings: of the search.
         sets: simulated sets.
         seed: of them.
+        withheld: names of effects that are left out of the catalogue.
     """
     program, fold = now.program, now.folds[0]
-    parts = elements(program)
+    problem, parts = fold.fitting(program), elements(program)
     there = {variant.name for variant in attached(program)}
     seen = replace(fold.drives, states=fold.path.states)
-    ahead = smooth(program, fold.drives, fold.path, known_start=settings.known_start, passes=3, tolerance=0.01)
+    ahead = problem.smooth(fold.path, passes=3, tolerance=0.01)
     away = departures(declared, now, parts)
-    away = [one for one in away if one.variant.name not in there and one.variant.effect.name not in settings.withheld]
+    away = [one for one in away if one.variant.name not in there and one.variant.effect.name not in withheld]
     skip = there | {departure.variant.name for departure in away}
     tailed = bool(torch.isfinite(measured(program, fold.path.states[:1, :1]).freedom).any())  # Student t as it stands
     variants = [
         variant
         for effect in catalogue(program)
-        if effect.name not in settings.withheld and not (tailed and effect.form == "tails")
+        if effect.name not in withheld and not (tailed and effect.form == "tails")
         for variant in effect.variants(program, seen)
         if variant.name not in skip
     ]
     spread, sharpness = typical_spreads(program, fold.drives, smoothed(ahead, fold.drives))
     columns = columns_of([*variants, *curves(program, seen, spread, sharpness)])
-    observed = scores_along(program, fold.drives, ahead, parts, columns)
+    observed = scores_along(problem, ahead, parts, columns)
     broken = (~torch.isfinite(observed).all(-1)).nonzero().flatten().tolist()
     if broken:
         raise FilterError(f"trajectory {fold.drives.labels[broken[0]]}: the fitted program blows up on it")
-    starts = _starts(ahead, fold.path.states[0], settings.known_start, sets, seed)
+    starts = fold.path.states[0].expand(sets, -1, -1)  # known, or draws of their posterior
+    if not fold.known_start:
+        with seeded(seed, "starts"):
+            starts = ahead.draws(sets)[1][:, 0].to(starts)
 
     def simulate() -> Piece:
-        made = simulate_scores(
-            program, fold.drives, starts, parts, columns, known_start=settings.known_start, seed=seed
-        )
+        made = simulate_scores(problem, starts, parts, columns, seed=seed)
         return {"scores": made.scores, "log_likelihood": made.log_likelihood}, {}
 
     simulated = Simulated(**piece(simulate)[0])
@@ -174,15 +146,6 @@ def screen_program(now: Refit, declared: Program, settings: Settings, *, sets: i
         information[_key(column)] = simulated.information[index][:, index]
         first += column.size
     return Screening(screen(observed, simulated, len(parts), columns, away), parts, information)
-
-
-def _starts(ahead: Lookahead, path: Tensor, known_start: bool, sets: int, seed: int) -> Tensor:
-    """First states of simulated sets, `(S, B, D)`: the known ones, or draws of their posterior."""
-    if known_start:
-        return path.expand(sets, *path.shape)
-    with seeded(seed, "starts"):
-        _, states, _ = ahead.draws(sets)
-    return states[:, 0].to(path)
 
 
 def leaders(screened: Screened, first: bool) -> list[Tested]:
@@ -196,31 +159,19 @@ def leaders(screened: Screened, first: bool) -> list[Tested]:
     if not alive:
         return []
     top = alive[0][0]
-    few = alive[:LEADERS] if first else [one for k, one in enumerate(alive[:LEADERS]) if k == 0 or _nearly(one[1])]
-    few += [one for one in alive[LEADERS:] if first and _nearly(one[1])]
-    return [tested for i, tested in alive if (i, tested) in few or float(screened.alike[top, i]) > ALIKE]
+    best = [i for i, _ in alive[:LEADERS]]
+    near = [i for i, tested in alive if tested.p_value < NEAR_ALPHA]
+    few = {*best, *near} if first else {top, *(i for i in best if i in near)}
+    return [tested for i, tested in alive if i in few or float(screened.alike[top, i]) > ALIKE]
 
 
-def _nearly(tested: Tested) -> bool:
-    return tested.p_value < NEAR_ALPHA
-
-
-def fitted(now: Refit, tested: Tested, screening: Screening, settings: Settings, worth: Worth = ALWAYS) -> Candidate:
-    """The program with a candidate.
-
-    Args:
-        now: the program without.
-        tested: the candidate.
-        screening: that tested it.
-        settings: of the search.
-        worth: what the first fold must reach for the second to be fitted as well.
-    """
+def fitted(now: Refit, tested: Tested, screening: Screening, worth: Worth = ALWAYS) -> Candidate:
+    """A program with a candidate, by the screening that tested it; see `refit_with` for `worth`."""
     effect = tested.variant.effect
     known = screening.information[_key(tested.column)] if effect.null == 0 and effect.form in LINEAR else None
 
     def fit(start: Any) -> Candidate:
-        refit = refit_with(now, tested.variant, start, known_start=settings.known_start, information=known, worth=worth)
-        return judged(now, tested, refit)
+        return judged(now, tested, refit_with(now, tested.variant, start, information=known, worth=worth))
 
     absent = [0.0] * len(tested.coefficient)
     if known is not None and tested.column.probe is None and now.fitting == BY_LIKELIHOOD:

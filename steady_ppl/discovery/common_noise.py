@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -19,6 +19,7 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.likelihood.maximize import Maximum, Term, climb
 from steady_ppl.likelihood.parameters import elements, moved, set_values, values_of
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import channel_moments, substep_spreads
 from steady_ppl.model.program import Program
 
@@ -29,59 +30,49 @@ STEPS, PRECISION = 25, 0.01  # scoring steps of the sum at most, and nats that a
 
 @dataclass(frozen=True)
 class Judges:
-    """Programs, one a fold, that judge the drives they were not fitted to.
-
-    Attributes:
-        programs: with some learnable numbers in common.
-        maxima: where each ended.
-        common: names of the numbers that are the same in all.
-    """
+    """Programs, one a fold, that judge the drives they were not fitted to."""
 
     programs: list[Program]
-    maxima: list[Maximum]
-    common: tuple[str, ...] = ()
+    maxima: list[Maximum]  # where each ended
+    common: tuple[str, ...] = ()  # names of the learnable numbers that are the same in all
 
 
-def with_common_noise(
-    programs: Sequence[Program], maxima: Sequence[Maximum], drives: Sequence[Trajectories], *, known_start: bool
-) -> Judges:
+def with_common_noise(problems: Sequence[Problem], maxima: Sequence[Maximum]) -> Judges:
     """Return copies of programs with their process noise in common.
 
     The sum of the folds' log p(y) is maximised in the noise of all and in every program's other numbers. Programs
     without such noise are returned as they are.
 
     Args:
-        programs: one a fold, with the same learnable numbers, fitted.
+        problems: one a fold; their programs have the same learnable numbers and are fitted.
         maxima: where their fits ended.
-        drives: to which each was fitted.
-        known_start: the first states are certain.
 
     Raises:
         FilterError: the programs cannot follow their drives with one noise.
     """
-    names = [part.name for part in elements(programs[0])]
-    found = [noise_numbers(*one) for one in zip(programs, drives, (m.path for m in maxima), strict=True)]
+    found = [noise_numbers(one.program, one.data, m.path) for one, m in zip(problems, maxima, strict=True)]
     common = sorted(set().union(*found))
     if not common:
-        return Judges(list(programs), list(maxima))
-    copies = [copy.deepcopy(program) for program in programs]
+        return Judges([problem.program for problem in problems], list(maxima))
+    names = [part.name for part in elements(problems[0].program)]
+    copies = [replace(problem, program=copy.deepcopy(problem.program)) for problem in problems]
     places = _places(len(names), common, len(copies))
     terms = [
-        Term(program, data, maximum.path, elements(program), own)
-        for program, data, maximum, own in zip(copies, drives, maxima, places, strict=True)
+        Term(problem, maximum.path, elements(problem.program), own)
+        for problem, maximum, own in zip(copies, maxima, places, strict=True)
     ]
     starts = _starts(terms, maxima)
     for last, start in enumerate(starts, 1):
         for term in terms:
-            set_values(term.parts, start[list(term.columns)])
+            set_values(term.parts, start[term.columns])
         try:
-            ended = climb(terms, known_start=known_start, steps=STEPS, precision=PRECISION)
+            ended = climb(terms, steps=STEPS, precision=PRECISION)
         except FilterError:
             if last == len(starts):
                 raise
         else:
             break
-    return Judges(copies, ended, tuple(names[index] for index in common))
+    return Judges([problem.program for problem in copies], ended, tuple(names[index] for index in common))
 
 
 @torch.no_grad()

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 
 import torch
 from torch import Tensor
@@ -16,8 +16,8 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import simulate_again
-from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood.parameters import Element
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import (
     Smoothed,
     channel_moments,
@@ -32,19 +32,15 @@ from steady_ppl.model.substeps import acting_controls, row_controls
 from steady_ppl.utils.random import seeded
 
 PART = 400  # trajectories at a time
+LEAST_LEFT = 0.8  # share of the simulated sets that must not blow up
 
 
 @dataclass(frozen=True)
 class Column:
-    """A candidate's scores.
+    """A candidate's scores."""
 
-    Attributes:
-        variant: the effect.
-        probe: the finite coefficient that was tried, None for the derivative where the effect is absent.
-    """
-
-    variant: Variant
-    probe: float | None = None
+    variant: Variant  # the effect
+    probe: float | None = None  # the finite coefficient that was tried, None for the derivative where it is absent
 
     @property
     def size(self) -> int:
@@ -58,13 +54,7 @@ def columns_of(variants: Sequence[Variant]) -> list[Column]:
 
 
 class Scoring:
-    """Scores of columns along a smoothed program.
-
-    Args:
-        program: without the candidates.
-        data: as returned by `for_program`.
-        at: of the program on these drives.
-    """
+    """Scores of columns along a program without them, smoothed on these drives."""
 
     def __init__(self, program: Program, data: Trajectories, at: Smoothed) -> None:
         self.program, self.data, self.at = program, data, at
@@ -73,18 +63,17 @@ class Scoring:
         self.means, spread = channel_moments(program, data, at.channels.points, self.acting)
         self.row_spread = spread[0]
         self.substep_spread = substep_spreads(program, data, at.channels.points[:1], self.acting)[0]
-        self.here = measured(program, at.measurements.points)
-        self._points: dict[int, Tensor] = {}
+        self._around = cache(at.channels.around)
         self._values: dict[int, dict[str, Tensor]] = {}
 
     def __call__(self, column: Column) -> Tensor:
         """Scores of a column, `(B, size)`, in double precision."""
-        form = column.variant.effect.form
         if column.variant.effect.function is over_state:
             return self._curve_of_channel(column.variant)
         if column.variant.effect.function is over_reading:
             return self._curve_of_readings(column.variant)
-        parts = [_FORMS[form](self, column.variant, c, width) for c, width in self._differences(column)]
+        score = getattr(self, f"_{column.variant.effect.form}")
+        parts = [score(column.variant, c, width) for c, width in self._differences(column)]
         return torch.stack(parts, -1).double()
 
     def _differences(self, column: Column) -> Iterator[tuple[tuple[Tensor, Tensor], float]]:
@@ -143,9 +132,8 @@ class Scoring:
         if index not in self._values:
             given = (self._around(index), self.controls[:-1], self.data.elapsed[:-1])
             found = variables(self.program, *given, self._means_around(index))
-            self._values[index] = {
-                name: value.expand(3, *self.substep_spread.shape[:2]) for name, value in found.items()
-            }
+            shape = (3, *self.substep_spread.shape[:2])
+            self._values[index] = {name: value.expand(shape) for name, value in found.items()}
         return self._values[index]
 
     def _means_around(self, index: int) -> dict[str, Tensor]:
@@ -169,11 +157,6 @@ class Scoring:
         """Whether the push only changes its sign with the coefficient, as far as one drive shows."""
         first, second = (self._pushed(variant, value, 0, few=True) for value in values)
         return all(bool((first[name] == -second[name]).all()) for name in first)
-
-    def _around(self, index: int) -> Tensor:
-        if index not in self._points:
-            self._points[index] = self.at.channels.around(index)
-        return self._points[index]
 
     def _command(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         control, time = self.controls[:-1], self.data.elapsed[:-1]
@@ -211,7 +194,7 @@ class Scoring:
     @cached_property
     def reading(self) -> Tensor:
         """What is measured on average at the measurements' points, `(P, T + 1, B, K)`."""
-        return self.here.reading
+        return measured(self.program, self.at.measurements.points).reading
 
     def _measured(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         points, reading = self.at.measurements.points, self.reading
@@ -253,33 +236,12 @@ class Scoring:
         return torch.where(at.present[1:], product * ratio * chosen, 0.0).sum((0, -1))
 
 
-_FORMS: dict[str, Callable[[Scoring, Variant, tuple[Tensor, Tensor], float], Tensor]] = {
-    "push": Scoring._push,
-    "command": Scoring._command,
-    "history": Scoring._history,
-    "measured": Scoring._measured,
-    "viewpoint": Scoring._viewpoint,
-    "spread": Scoring._spread,
-    "blur": Scoring._blur,
-    "tails": Scoring._tails,
-    "colour": Scoring._colour,
-}
-
-
-LEAST_LEFT = 0.8  # share of the simulated sets that must not blow up
-
-
 @dataclass(frozen=True)
 class Simulated:
-    """Scores of simulated sets of drives.
+    """Scores of simulated sets of drives."""
 
-    Attributes:
-        scores: `(S, B, N)`, of the parameters first and then of the columns.
-        log_likelihood: `(S, B)`.
-    """
-
-    scores: Tensor
-    log_likelihood: Tensor
+    scores: Tensor  # (S, B, N), of the parameters first and then of the columns
+    log_likelihood: Tensor  # (S, B)
 
     @cached_property
     def information(self) -> Tensor:
@@ -288,10 +250,9 @@ class Simulated:
         return torch.einsum("sbi,sbj->ij", apart, apart) / (len(apart) - 1)
 
 
-def scores_along(
-    program: Program, data: Trajectories, ahead: Lookahead, parts: Sequence[Element], columns: Sequence[Column]
-) -> Tensor:
+def scores_along(problem: Problem, ahead: Lookahead, parts: Sequence[Element], columns: Sequence[Column]) -> Tensor:
     """Scores of parameters and columns, `(B, N)`."""
+    program, data = problem.program, problem.data
     at = smoothed(ahead, data)
     scoring = Scoring(program, data, at)
     return torch.cat([parameter_scores(program, data, at, list(parts)), *(scoring(column) for column in columns)], -1)
@@ -299,42 +260,19 @@ def scores_along(
 
 @torch.no_grad()
 def simulate_scores(
-    program: Program,
-    data: Trajectories,
-    starts: Tensor,
-    parts: Sequence[Element],
-    columns: Sequence[Column],
-    *,
-    known_start: bool,
-    seed: int,
-    passes: int = 2,
+    problem: Problem, starts: Tensor, parts: Sequence[Element], columns: Sequence[Column], *, seed: int
 ) -> Simulated:
-    """Simulate drives with the same controls and gaps, and score them at the same parameters.
-
-    Args:
-        program: fitted.
-        data: as returned by `for_program`.
-        starts: where each drive begins, `(S, B, D)`.
-        parts, columns: what is scored.
-        known_start: the first state is certain.
-        seed: the same seed gives the same scores.
-        passes: linearisations; they begin at the true path.
-    """
-    channels, sets = len(program.channels), len(starts)
+    """Simulate drives of a fitted program that begin at `starts`, `(S, B, D)`, with the same controls and gaps, and
+    score parts and columns at the same parameters."""
+    program, data, sets = problem.program, problem.data, len(starts)
     with seeded(seed, "bootstrap"):
-        drives, path = simulate_again(program, data, starts, channels)
+        drives, path = simulate_again(program, data, starts, len(program.channels))
     scores, likely = [], []
     for first in range(0, len(drives), PART):
         index = torch.arange(first, min(first + PART, len(drives)))
-        part = drives.subset(index)
-        ahead = smooth(
-            program,
-            part,
-            ReferencePath(path.states[:, index], path.noise[:, index]),
-            known_start=known_start,
-            passes=passes,
-        )
-        scores.append(scores_along(program, part, ahead, parts, columns))
+        part = replace(problem, data=drives.subset(index))
+        ahead = part.smooth(ReferencePath(path.states[:, index], path.noise[:, index]), passes=2)
+        scores.append(scores_along(part, ahead, parts, columns))
         likely.append(ahead.log_likelihood)
     found = Simulated(torch.cat(scores).unflatten(0, (sets, len(data))), torch.cat(likely).view(sets, len(data)))
     whole = torch.isfinite(found.scores).all(-1).all(-1) & torch.isfinite(found.log_likelihood).all(-1)

@@ -25,50 +25,30 @@ RESAMPLES = 2000
 
 @dataclass(frozen=True)
 class Finding:
-    """An effect that a program lacks.
+    """An effect that a program lacks; of noise that is not the declared, which is a test's result, some are None."""
 
-    Attributes:
-        variant: the effect, the best of its class.
-        kind: dynamics, actuator, sensor or noise.
-        alike: names of the effects that these drives cannot tell apart, best first.
-        confidence: the probability that the right one is among them; None for noise that is not the declared, which is
-            a test's result.
-        coefficient, sd: each number of the coefficient and its standard deviation.
-        interval: 90 %, one a number.
-        gain: nats of held-out log p(y) that it brings; None for noise that is not the declared.
-    """
-
-    variant: Variant
-    kind: str
-    alike: list[str]
-    confidence: float | None
+    variant: Variant  # the effect, the best of its class
+    kind: str  # dynamics, actuator, sensor or noise
+    alike: list[str]  # names of the effects that these drives cannot tell apart, best first
+    confidence: float | None  # the probability that the right one is among them
     coefficient: list[float]
-    sd: list[float]
-    interval: list[tuple[float, float]]
-    gain: float | None
+    sd: list[float]  # standard deviation of each number
+    interval: list[tuple[float, float]]  # 90 %
+    gain: float | None  # nats of held-out log p(y) that it brings
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A curve where no effect of the catalogue explains the drives.
+    """A curve where no effect of the catalogue explains the drives."""
 
-    Attributes:
-        channel: channel, or measurement, that lacks it.
-        variable: that it depends on.
-        times: what the curve is multiplied with, empty where it adds by itself.
-        unit, variable_unit: of the curve and of the variable.
-        points, curve: where and how high.
-        band: half the width of a band that holds the whole curve with 90 % probability.
-    """
-
-    channel: str
-    variable: str
-    times: str
+    channel: str  # channel, or measurement, that lacks it
+    variable: str  # that it depends on
+    times: str  # what the curve is multiplied with, empty where it adds by itself
     unit: str
     variable_unit: str
     points: list[float]
-    curve: list[float]
-    band: list[float]
+    curve: list[float]  # how high it is there
+    band: list[float]  # half the width of a band that holds the whole curve with 90 % probability
 
 
 def findings(search: Search) -> list[Finding]:
@@ -84,7 +64,7 @@ def _finding(search: Search, found: Found) -> Finding:
     values = refit.coefficient(variant).flatten().double().numpy()
     spread = _spread(search, variant, len(values))
     if variant.profiled:
-        places = variance_of_places(found.without, found.candidate, search.known_start)
+        places = variance_of_places(found.without, found.candidate)
         scale = values if effect.null != 0 else 1.0  # of its logarithm
         spread = np.sqrt(spread**2 + places.numpy() / scale**2)
     by = stats.norm.isf((1 - INTERVAL) / 2)
@@ -99,8 +79,8 @@ def _finding(search: Search, found: Found) -> Finding:
         kind=effect.verdict,
         alike=[candidate.variant.name for candidate in alike],
         confidence=_confidence(search, found, alike),
-        coefficient=[float(v) for v in values],
-        sd=[float(s) for s in spread],
+        coefficient=values.tolist(),
+        sd=spread.tolist(),
         interval=[(float(low), float(high)) for low, high in interval],
         gain=found.candidate.total,
     )
@@ -112,13 +92,11 @@ def _spread(search: Search, variant: Variant, count: int) -> np.ndarray:
     information = screening.information[""]
     ridge = 1e-10 * float(information.diagonal().max()) * torch.eye(len(information)).double()
     covariance = torch.linalg.inv(information + ridge)  # what the drives do not tell has a huge variance
-    folds = search.final.folds
-    share = len(folds[0].drives) / sum(len(fold.drives) for fold in folds)
     learned = [part.name.split("[")[0] for part in screening.parameters]
     (there,) = [known for known in attached(search.final.program) if known.name == variant.name]
     index = [i for i, name in enumerate(learned) if name == there.parameter]
     assert len(index) == count
-    return (share * covariance.diagonal()[index]).clamp(min=0).sqrt().numpy()
+    return (search.final.first_share * covariance.diagonal()[index]).clamp(min=0).sqrt().numpy()
 
 
 def _confidence(search: Search, found: Found, alike: Sequence[Candidate]) -> float:
@@ -153,9 +131,7 @@ def shape_of(search: Search, program: Program) -> Shape | None:
         return None
     variant = curve.variant
     heights = curve.refit.coefficient(variant)
-    folds = curve.refit.folds
-    share = len(folds[0].drives) / sum(len(fold.drives) for fold in folds)
-    wide = float(stats.norm.isf((1 - INTERVAL) / 2 / len(heights))) * math.sqrt(share)
+    wide = float(stats.norm.isf((1 - INTERVAL) / 2 / len(heights))) * math.sqrt(curve.refit.first_share)
     channel = variant.at.partition("~")[0]
     variable = variant.options.get("variable", "reading")
     about = program.measurement_names[0] if channel == "all" else channel

@@ -11,21 +11,20 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
+from steady_ppl.gaussian.smoother import resting_path
 from steady_ppl.guides.base import Constant
 from steady_ppl.guides.linearized import LookaheadGuide
 from steady_ppl.likelihood.evidence import neglected
-from steady_ppl.likelihood.maximize import Maximum, kept_maximum, maximise
-from steady_ppl.model.program import Program
+from steady_ppl.likelihood.maximize import Maximum, kept_maximum, maximum_of
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.training.loop import Optimization, Validation, train
 from steady_ppl.utils.random import seeded
 
@@ -41,55 +40,27 @@ class Judged:
     path: ReferencePath
 
 
-class Fitting(Protocol):
-    """A way of fitting and judging."""
-
-    def fit(
-        self,
-        program: Program,
-        drives: Trajectories,
-        path: ReferencePath | None = None,
-        *,
-        known_start: bool,
-        information: Tensor | None = None,
-        hopeless: float = -math.inf,
-    ) -> Maximum:
-        """Move a program's parameters, in place.
-
-        Args:
-            path: to linearise along at first, found when not given.
-            known_start: the drives' first states are exact.
-            information, hopeless: those of `maximise`, by which scoring steps begin and give up; nothing for draws.
-
-        Raises:
-            FilterError: the program cannot follow the drives.
-        """
-        ...
-
-    def judge(self, program: Program, drives: Trajectories, path: ReferencePath, *, known_start: bool) -> Judged:
-        """Log p(y) of drives, linearised along a path that is improved from here."""
-        ...
-
-
 @dataclass(frozen=True)
 class ByLikelihood:
     """Scoring steps of the linearised program's log p(y), which judges as well."""
 
-    def fit(
-        self,
-        program: Program,
-        drives: Trajectories,
-        path: ReferencePath | None = None,
-        *,
-        known_start: bool,
-        information: Tensor | None = None,
-        hopeless: float = -math.inf,
-    ) -> Maximum:
-        return maximise(program, drives, path, known_start=known_start, information=information, hopeless=hopeless)
+    def fit(self, problem: Problem, path: ReferencePath | None = None, **settings: Any) -> Maximum:
+        """Move a program's parameters, in place.
 
-    def judge(self, program: Program, drives: Trajectories, path: ReferencePath, *, known_start: bool) -> Judged:
-        ahead = _at_rest(program, drives, path, known_start)
-        return Judged(ahead.log_likelihood, resting_path(ahead, drives))
+        Args:
+            problem: the program and the drives that it is fitted to.
+            path: to linearise along at first, found when not given.
+            settings: of `maximise`, by which scoring steps begin and give up; nothing for draws.
+
+        Raises:
+            FilterError: the program cannot follow the drives.
+        """
+        return maximum_of(problem, path, **settings)
+
+    def judge(self, problem: Problem, path: ReferencePath) -> Judged:
+        """Log p(y) of drives, linearised along a path that is improved from here."""
+        ahead = _at_rest(problem, path)
+        return Judged(ahead.log_likelihood, resting_path(ahead, problem.data))
 
 
 @dataclass(frozen=True)
@@ -107,30 +78,22 @@ class ByDraws:
     steps: int = 60
     learning_rate: float = 0.1
 
-    def fit(
-        self,
-        program: Program,
-        drives: Trajectories,
-        path: ReferencePath | None = None,
-        *,
-        known_start: bool,
-        information: Tensor | None = None,
-        hopeless: float = -math.inf,
-    ) -> Maximum:
-        return kept_maximum(program, lambda: self._climb(program, drives, path, known_start))
+    def fit(self, problem: Problem, path: ReferencePath | None = None, **_: Any) -> Maximum:
+        """See `ByLikelihood`."""
+        return kept_maximum(problem.program, lambda: self._climb(problem, path or problem.find_path()))
 
-    def _climb(self, program: Program, drives: Trajectories, path: ReferencePath | None, known_start: bool) -> Maximum:
-        path = path or find_path(program, drives, known_start=known_start)
-        before = self.judge(program, drives, path, known_start=known_start)
+    def _climb(self, problem: Problem, path: ReferencePath) -> Maximum:
+        program, data, known_start = problem.program, problem.data, problem.known_start
+        before = self.judge(problem, path)
         guide = LookaheadGuide(
             program, particles=PARTICLES, tempering=Constant(), known_start=known_start, search_again=math.inf
         )
-        guide.remember(before.path, drives)
+        guide.remember(before.path, data)
         optimization = Optimization(self.steps, learning_rate=self.learning_rate, averaging=0.95)
         began = copy.deepcopy(program.state_dict())
         with torch.enable_grad():
-            train(program, guide, drives, Validation(), optimization, known_start=known_start, progress=False)
-        after = self.judge(program, drives, before.path, known_start=known_start)
+            train(program, guide, data, Validation(), optimization, known_start=known_start, progress=False)
+        after = self.judge(problem, before.path)
         if not float(after.log_likelihood.sum()) > float(before.log_likelihood.sum()):
             program.load_state_dict(began)
             after = before
@@ -145,28 +108,32 @@ class ByDraws:
             gained=float((after.log_likelihood - before.log_likelihood).sum()),
         )
 
-    def judge(self, program: Program, drives: Trajectories, path: ReferencePath, *, known_start: bool) -> Judged:
-        ahead = _at_rest(program, drives, path, known_start)
-        with seeded(0, "judge"):
-            more = neglected(program, drives, known_start=known_start, particles=JUDGING, ahead=ahead)
-        return Judged(ahead.log_likelihood + more, resting_path(ahead, drives))
+    def judge(self, problem: Problem, path: ReferencePath) -> Judged:
+        """See `ByLikelihood`."""
+        ahead = _at_rest(problem, path)
+        more = _neglected(problem, ahead, particles=JUDGING)
+        return Judged(ahead.log_likelihood + more, resting_path(ahead, problem.data))
 
 
-def is_doubtful(program: Program, drives: Trajectories, path: ReferencePath, known_start: bool) -> bool:
+Fitting = ByLikelihood | ByDraws
+
+
+def is_doubtful(problem: Problem, path: ReferencePath) -> bool:
     """Whether the linearised program's log p(y) is off by more than half a nat a drive, or no particle filter that it
     leads can follow these drives to say so."""
-    ahead = _at_rest(program, drives, path, known_start)
+    ahead = _at_rest(problem, path)
     try:
-        with seeded(0, "judge"):
-            return (
-                float(neglected(program, drives, known_start=known_start, ahead=ahead).abs().mean())
-                > MAX_LINEARISATION_ERROR
-            )
+        return float(_neglected(problem, ahead).abs().mean()) > MAX_LINEARISATION_ERROR
     except FilterError:
         return True
 
 
-def _at_rest(program: Program, drives: Trajectories, path: ReferencePath, known_start: bool) -> Lookahead:
-    ahead = smooth(program, drives, path, known_start=known_start, passes=15, tolerance=0.02, kernels=False)
-    require_found(ahead, program, drives)
-    return ahead
+def _at_rest(problem: Problem, path: ReferencePath) -> Lookahead:
+    return problem.smooth_or_raise(path, passes=15, tolerance=0.02, kernels=False)
+
+
+def _neglected(problem: Problem, ahead: Lookahead, particles: int = 200) -> Tensor:
+    with seeded(0, "judge"):
+        return neglected(
+            problem.program, problem.data, known_start=problem.known_start, particles=particles, ahead=ahead
+        )

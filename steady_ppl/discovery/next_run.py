@@ -10,13 +10,11 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.refits import Refit, wide, wide_drives
 from steady_ppl.discovery.search import Found
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import simulate_again
-from steady_ppl.gaussian.smoother import smooth
-from steady_ppl.model.program import Program
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.utils.random import seeded
 
 DRIVES = 24  # simulated for each proposal
@@ -45,7 +43,7 @@ class NextRun:
 
 
 @torch.no_grad()
-def next_run(found: Found, known_start: bool, seed: int) -> NextRun | None:
+def next_run(found: Found, seed: int) -> NextRun | None:
     """The best of some ways of driving within the limits of the controls that were driven, None where none separates
     the class better than the drives that there are.
 
@@ -53,23 +51,23 @@ def next_run(found: Found, known_start: bool, seed: int) -> NextRun | None:
 
     Args:
         found: an effect whose class has several members.
-        known_start: the first states are certain.
         seed: of the ways that are random, and of the simulations.
     """
-    members = [c for c in found.alike if isinstance(c.refit, Refit)]
-    data = members[0].refit.folds[0].drives  # type: ignore[union-attr]
-    usual = _separation(members, data.controls, data, known_start, seed)
+    members = [(c.variant.name, c.refit) for c in found.alike if isinstance(c.refit, Refit)]
+    refits = [refit for _, refit in members]
+    data = refits[0].folds[0].drives
+    usual = _separation(refits, data.controls, seed)
     better = []
     for way, controls in _ways(data, seed):
-        apart = _separation(members, controls.unsqueeze(1).expand_as(data.controls), data, known_start, seed)
+        apart = _separation(refits, controls.unsqueeze(1).expand_as(data.controls), seed)
         if math.isfinite(apart) and apart > max(0.0, usual):
             better.append((apart, way, controls))
     if not better:
         return None
     separation, way, controls = max(better, key=lambda one: one[0])
-    order = members[0].refit.program.control_names  # type: ignore[union-attr]
+    order = refits[0].program.control_names
     return NextRun(
-        between=[member.variant.name for member in members],
+        between=[name for name, _ in members],
         way=way,
         controls={name: [round(v, 4) for v in controls[:, i].tolist()] for i, name in enumerate(order)},
         step=data.median_step,
@@ -78,29 +76,26 @@ def next_run(found: Found, known_start: bool, seed: int) -> NextRun | None:
     )
 
 
-def _separation(members: list[Candidate], controls: Tensor, data: Trajectories, known_start: bool, seed: int) -> float:
+def _separation(refits: list[Refit], controls: Tensor, seed: int) -> float:
     """Nats a drive by which the first member is told from the nearest other."""
-    count = min(DRIVES, len(data))
-    drives = replace(data.subset(range(count)), controls=controls[:, :count].contiguous())
-    first = members[0].refit
-    assert isinstance(first, Refit)
-    program, path = first.judges.programs[0], first.folds[0].path
-    starts = path.states[0, :count].unsqueeze(0)
+    fold, (program, *others) = refits[0].folds[0], [refit.judges.programs[0] for refit in refits]
+    count = min(DRIVES, len(fold.drives))
+    drives = replace(fold.drives.subset(range(count)), controls=controls[:, :count].contiguous())
+    starts = fold.path.states[0, :count].unsqueeze(0)
     with seeded(seed, "next run"):
         again, truth = simulate_again(program, drives, starts, len(program.channels))
-    own = _log_likelihood(program, again, truth, known_start)
-    apart = []
-    for member in members[1:]:
-        assert isinstance(member.refit, Refit)
-        apart.append(float((own - _log_likelihood(member.refit.judges.programs[0], again, truth, known_start)).mean()))
+    own = _log_likelihood(Problem(program, again, fold.known_start), truth)
+    apart = [float((own - _log_likelihood(Problem(other, again, fold.known_start), truth)).mean()) for other in others]
     return min(apart) if all(map(math.isfinite, apart)) else math.nan
 
 
-def _log_likelihood(program: Program, drives: Trajectories, path: ReferencePath, known_start: bool) -> Tensor:
-    states = path.states[..., : len(program.states)]
-    fitting = replace(drives, states=None if drives.states is None else drives.states[..., : len(program.states)])
-    near = wide(ReferencePath(states, path.noise), program)
-    return smooth(program, wide_drives(fitting, program), near, known_start=known_start, passes=4).log_likelihood
+def _log_likelihood(problem: Problem, path: ReferencePath) -> Tensor:
+    """Of drives and a path of another program, whose further states are left out."""
+    program, drives = problem.program, problem.data
+    count = len(program.states)
+    fitting = replace(drives, states=None if drives.states is None else drives.states[..., :count])
+    near = wide(ReferencePath(path.states[..., :count], path.noise), program)
+    return replace(problem, data=wide_drives(fitting, program)).smooth(near, passes=4).log_likelihood
 
 
 def _ways(data: Trajectories, seed: int) -> Iterator[tuple[str, Tensor]]:

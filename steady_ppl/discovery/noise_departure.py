@@ -12,28 +12,20 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.refits import Fold, Refit, as_declared
 from steady_ppl.effects import Variant, attached, catalogue
-from steady_ppl.likelihood.parameters import Element, moved
+from steady_ppl.likelihood.parameters import Element, on_both_sides
 from steady_ppl.likelihood.scores import measured, substep_spreads
 from steady_ppl.model.program import Program
 
 
 @dataclass(frozen=True)
 class Departure:
-    """Of the fitted standard deviations of some channels, or of the measurements, from the declared.
+    """Of the fitted standard deviations of some channels, or of the measurements, from the declared."""
 
-    Attributes:
-        variant: `process_noise` of these channels, or `measurement_noise`.
-        away: log ratio of fitted to declared, their mean, on the drives that are tested.
-        on_all: the same of the judges, on the drives of all folds.
-        share: of the drives that are tested among all.
-        slope: derivative of `away` in the fitted parameters, `(P,)`.
-    """
-
-    variant: Variant
-    away: float
-    on_all: float
-    share: float
-    slope: Tensor
+    variant: Variant  # `process_noise` of these channels, or `measurement_noise`
+    away: float  # log ratio of fitted to declared, their mean, on the drives that are tested
+    on_all: float  # the same of the judges, on the drives of all folds
+    share: float  # of the drives that are tested among all
+    slope: Tensor  # derivative of `away` in the fitted parameters, (P,)
 
     @property
     def factor(self) -> float:
@@ -52,23 +44,25 @@ def departures(declared: Program, now: Refit, parts: Sequence[Element]) -> list[
         now: the fitted program; the first fold's drives are tested.
         parts: the learnable numbers of the first fold's program.
     """
-    own = [part.name.split("[")[0] not in {known.parameter for known in attached(now.program)} for part in parts]
-    counts = [len(fold.drives) for fold in now.folds]
+    if not parts:
+        return []
+    program, fold = now.program, now.folds[0]
+    effects = {known.parameter for known in attached(program)}
+    own = torch.tensor([part.name.split("[")[0] not in effects for part in parts])
     found = []
     for name, spread in SPREADS.items():
-        slope = _slope(spread, now.program, now.folds[0], parts) * torch.tensor(own).unsqueeze(-1)
-        away = _away(spread, declared, now.program, now.folds[0])
-        of_folds = torch.stack(
-            [_away(spread, declared, *one) for one in zip(now.judges.programs, now.folds, strict=True)]
-        )
-        mean = (torch.tensor(counts).unsqueeze(-1) * of_folds).sum(0) / sum(counts)
-        variants = [v for effect in catalogue(now.program) if effect.name == name for v in effect.variants(now.program)]
-        for variant in variants if parts else []:
-            index = _columns(now.program, variant)
-            index = [i for i in index if bool(slope[:, i].any()) and not _guessed(now.program, parts, slope[:, i])]
+        slope = _slope(spread, program, fold, parts) * own.unsqueeze(-1)
+        away = _away(spread, declared, program, fold)
+        mean = now.mean([_away(spread, declared, *one) for one in zip(now.judges.programs, now.folds, strict=True)])
+        variants = [v for effect in catalogue(program) if effect.name == name for v in effect.variants(program)]
+        for variant in variants:
+            index = _columns(program, variant)
+            index = [i for i in index if bool(slope[:, i].any()) and not _guessed(program, parts, slope[:, i])]
             if index:
-                away_of, mean_of = float(away[index].mean()), float(mean[index].mean())
-                found.append(Departure(variant, away_of, mean_of, counts[0] / sum(counts), slope[:, index].mean(1)))
+                of_all = float(mean[index].mean())
+                found.append(
+                    Departure(variant, float(away[index].mean()), of_all, now.first_share, slope[:, index].mean(1))
+                )
     return found
 
 
@@ -76,20 +70,15 @@ def _slope(spread: Spread, program: Program, fold: Fold, parts: Sequence[Element
     """The derivative of log standard deviations in the parameters, `(P, C)` or `(P, K)`."""
     slopes = []
     for part in parts:
-        with moved(part, part.step):
-            up = _spread(spread, program, fold)
-        with moved(part, -part.step):
-            slopes.append((up - _spread(spread, program, fold)) / (2 * part.step))
-    return torch.stack(slopes) if slopes else torch.zeros(0)
+        up, down = on_both_sides(part, lambda: spread(program, fold.drives, fold.path.states))
+        slopes.append((up - down) / (2 * part.step))
+    return torch.stack(slopes)
 
 
 def _away(spread: Spread, declared: Program, program: Program, fold: Fold) -> Tensor:
     """Log ratios of standard deviations to the declared, `(C,)` or `(K,)`."""
-    return _spread(spread, program, fold) - _spread(spread, as_declared(declared, program), fold)
-
-
-def _spread(spread: Spread, program: Program, fold: Fold) -> Tensor:
-    return spread(program, fold.drives, fold.path.states)
+    here, there = (spread(one, fold.drives, fold.path.states) for one in (program, as_declared(declared, program)))
+    return here - there
 
 
 def _of_channels(program: Program, data: Trajectories, states: Tensor) -> Tensor:

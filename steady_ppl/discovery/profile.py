@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from steady_ppl.discovery.candidates import Candidate, Settings, gain_of_fits, judged
+from steady_ppl.discovery.candidates import Candidate, gain_of_fits, judged
 from steady_ppl.discovery.refits import Refit, refit_near, refit_with
 from steady_ppl.effects import Variant
 
@@ -18,14 +18,14 @@ PASSES = 4  # along all knees and places in turns, with steps of one size
 NEIGHBOUR_SHARE = 0.25  # of the grid's spacing, at which a place's likelihood is compared with its neighbours'
 
 
-def at_its_best_place(now: Refit, candidate: Candidate, settings: Settings) -> Candidate:
+def at_its_best_place(now: Refit, candidate: Candidate) -> Candidate:
     """A candidate with the knee, width or place at which it gains most: on its grid, and then between its points."""
     if isinstance(candidate.refit, str) or not candidate.variant.profiled:
         return candidate
     grid, at, tested = _grid(now, candidate), candidate.variant, candidate.tested
     fit: Refit | str = candidate.refit
     if not candidate.is_judged:
-        fit = refit_with(now, at, candidate.refit.coefficient(at), known_start=settings.known_start)
+        fit = refit_with(now, at, candidate.refit.coefficient(at))
         if isinstance(fit, str):
             return candidate
 
@@ -33,7 +33,7 @@ def at_its_best_place(now: Refit, candidate: Candidate, settings: Settings) -> C
         nonlocal at, fit
         for variant in variants:
             assert isinstance(fit, Refit)
-            other = refit_near(now, fit, [variant], known_start=settings.known_start)
+            other = refit_near(now, fit, [variant])
             if isinstance(other, Refit) and gain_of_fits(now, other) > gain_of_fits(now, fit) + MIN_GAIN_OF_PLACE:
                 at, fit = variant, other
 
@@ -49,7 +49,7 @@ def at_its_best_place(now: Refit, candidate: Candidate, settings: Settings) -> C
     return there if there.total > candidate.total else candidate
 
 
-def variance_of_places(now: Refit, candidate: Candidate, known_start: bool) -> Tensor:
+def variance_of_places(now: Refit, candidate: Candidate) -> Tensor:
     """What the uncertainty of knees, widths and places adds to the variance of a coefficient, `(k,)`.
 
     By the delta method along their profile likelihood, with a prior as wide as their grid. Where the program cannot be
@@ -58,7 +58,6 @@ def variance_of_places(now: Refit, candidate: Candidate, known_start: bool) -> T
     Args:
         now: the program without the candidate.
         candidate: fitted at its best place.
-        known_start: the first states are certain.
     """
     assert isinstance(candidate.refit, Refit)
     at, grid, near = candidate.variant, _grid(now, candidate), candidate.refit
@@ -66,7 +65,7 @@ def variance_of_places(now: Refit, candidate: Candidate, known_start: bool) -> T
 
     def fitted(variant: Variant) -> tuple[Tensor, float] | None:
         """How the coefficient changes, and by how much the likelihood falls."""
-        refit = refit_near(now, near, [variant], known_start=known_start)
+        refit = refit_near(now, near, [variant])
         if isinstance(refit, str):
             return None
         return refit.coefficient(variant).flatten().double() - here, best - gain_of_fits(now, refit)
@@ -100,24 +99,15 @@ def variance_of_places(now: Refit, candidate: Candidate, known_start: bool) -> T
 
 @dataclass(frozen=True)
 class _Way:
-    """A step beside a place, in one of its numbers.
+    """A step beside a place, in one of its numbers."""
 
-    Attributes:
-        name: of the number.
-        sign, beside: which way it goes and where that leads.
-        fall: of the likelihood there, nats.
-        slope: change of the coefficient by a step up, `(k,)`.
-        bend: curvature of the likelihood in steps.
-        prior: precision of a normal as wide as the grid, in steps.
-    """
-
-    name: str
-    sign: int
-    beside: Variant
-    fall: float
-    slope: Tensor
-    bend: float
-    prior: float
+    name: str  # of the number
+    sign: int  # which way it goes
+    beside: Variant  # where that leads
+    fall: float  # of the likelihood there, nats
+    slope: Tensor  # change of the coefficient by a step up, (k,)
+    bend: float  # curvature of the likelihood in steps
+    prior: float  # precision of a normal as wide as the grid, in steps
 
 
 def _grid(now: Refit, candidate: Candidate) -> list[Variant]:

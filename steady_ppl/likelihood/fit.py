@@ -1,4 +1,4 @@
-"""Maximum likelihood from declared values: noise that is too small is widened first, strays are led back.
+"""Maximum likelihood from declared values: noise that is too small is widened first, outlying drives are refitted.
 
 For programs of some dozens of learnable numbers with normal noise. System identification calls it the prediction-error
 method; its predictor is the linearised program (Ljung 1999, System Identification, section 7.4).
@@ -14,19 +14,16 @@ import torch
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.gaussian.smoother import find_path, resting_path, smooth
-from steady_ppl.likelihood.maximize import Maximum, maximise
-from steady_ppl.likelihood.parameters import elements
+from steady_ppl.gaussian.smoother import resting_path
+from steady_ppl.likelihood.maximize import Maximum, maximum_of
+from steady_ppl.likelihood.parameters import elements, set_values, values_of
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import smoothed, widens
 from steady_ppl.model.program import Program
 from steady_ppl.utils.progress import stages
 
-MAX_ROUGHNESS = 1.5
-"""Mean square deviation, in the program's own, from which its noise is widened before anything is fitted."""
-MAX_STRAY_SD, SEARCHES = (
-    6.0,
-    3,
-)  # standard deviations by which a drive strays from the others, and searches for its path
+MAX_ROUGHNESS = 1.5  # mean square deviation, in the program's own, from which noise is widened before a fit
+OUTLIER_SD, SEARCHES = 6.0, 3  # standard deviations by which an outlier is less likely, and searches for its path
 
 
 def fit_by_likelihood(program: Program, data: Trajectories, *, known_start: bool = False) -> Maximum:
@@ -43,64 +40,60 @@ def fit_by_likelihood(program: Program, data: Trajectories, *, known_start: bool
         UsageError: more learnable numbers than can be looked at one by one.
         FilterError: the drives cannot be smoothed.
     """
+    problem = Problem(program, data, known_start)
     with stages(("finding paths", 1), ("scoring steps", 3), ("drives that strayed", 1)) as begin:
         begin()
-        first = roomy_path(program, data, known_start)
+        path = widen_noise(problem)
         begin()
-        found = maximise(program, data, first, known_start=known_start)
+        found = maximum_of(problem, path)
         begin()
-        return led_back(program, data, found, known_start)
+        return refit_outliers(problem, found)
 
 
-def led_back(program: Program, data: Trajectories, maximum: Maximum, known_start: bool) -> Maximum:
-    """A fit whose strays have found another path: drives far less likely than the others, whose paths were found before
-    the program was fitted."""
+def refit_outliers(problem: Problem, maximum: Maximum) -> Maximum:
+    """Search again for the paths of drives far less likely than the others, which were found before the program was
+    fitted, and refit where they are better."""
     for _ in range(SEARCHES):
-        cells = data.observed.sum((0, 2)).clamp(min=1)
-        each = maximum.log_likelihood / cells
+        each = maximum.log_likelihood / problem.data.observed.sum((0, 2)).clamp(min=1)
         middle = each.median()
         usual = 1.5 * (each - middle).abs().median()
-        strays = (~(each >= middle - MAX_STRAY_SD * usual)).nonzero().flatten()
-        if not len(strays):
+        outliers = (~(each >= middle - OUTLIER_SD * usual)).nonzero().flatten()
+        if not len(outliers):
             break
-        part = data.subset(strays)
-        found = find_path(program, part, known_start=known_start)
-        there = smooth(program, part, found, known_start=known_start, kernels=False)
-        better = there.log_likelihood > maximum.log_likelihood[strays] + 1
+        part = problem.subset(outliers)
+        there = part.smooth(part.find_path(), kernels=False)
+        better = there.log_likelihood > maximum.log_likelihood[outliers] + 1
         if not bool(better.any()):
             break
         states, noise = maximum.path.states.clone(), maximum.path.noise.clone()
-        found = resting_path(there, part)
-        states[:, strays[better]], noise[:, strays[better]] = found.states[:, better], found.noise[:, better]
+        found = resting_path(there, part.data)
+        states[:, outliers[better]], noise[:, outliers[better]] = found.states[:, better], found.noise[:, better]
         before = maximum.gained - maximum.objective
-        maximum = maximise(program, data, ReferencePath(states, noise), known_start=known_start)
+        maximum = maximum_of(problem, ReferencePath(states, noise))
         maximum = replace(maximum, gained=maximum.objective + before)
     return maximum
 
 
-def roomy_path(
-    program: Program, data: Trajectories, known_start: bool, path: ReferencePath | None = None
-) -> ReferencePath:
-    """Find paths; where the drives are much rougher than the program says, widen its noise first, in place.
+def widen_noise(problem: Problem, path: ReferencePath | None = None) -> ReferencePath:
+    """Widen the program's noise, in place, where the drives are much rougher than it says; return paths, found anew.
 
     A program that lacks a strong effect explains nothing at its declared noise: scores there lead nowhere. A path that
     is given is returned where the noise is wide enough.
     """
-    path = path or find_path(program, data, known_start=known_start)
-    ahead = smooth(program, data, path, known_start=known_start, kernels=False)
-    every = elements(program)
-    parts = [part for part, wider in zip(every, widens(program, every, data), strict=True) if wider]
-    while parts and _roughness(ahead, data) > MAX_ROUGHNESS:
-        before = [part.parameter.data.clone() for part in parts]
+    path = path or problem.find_path()
+    ahead = problem.smooth(path, kernels=False)
+    every = elements(problem.program)
+    parts = [part for part, wider in zip(every, widens(problem.program, every, problem.data), strict=True) if wider]
+    while parts and _roughness(ahead, problem.data) > MAX_ROUGHNESS:
+        before = values_of(parts)
         for part in parts:
             part.move(math.log(3.0))
-        wider = find_path(program, data, known_start=known_start)
-        there = smooth(program, data, wider, known_start=known_start, kernels=False)
+        wider_path = problem.find_path()
+        there = problem.smooth(wider_path, kernels=False)
         if not float(there.log_likelihood.sum()) > float(ahead.log_likelihood.sum().nan_to_num(-math.inf)):
-            for part, value in zip(parts, before, strict=True):
-                part.parameter.data.copy_(value)
+            set_values(parts, before)
             break
-        path, ahead = wider, there
+        path, ahead = wider_path, there
     return path
 
 
