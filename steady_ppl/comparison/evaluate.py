@@ -15,6 +15,7 @@ from steady_ppl.comparison.metrics import (
     measurement_errors,
     state_estimation,
 )
+from steady_ppl.comparison.result import number
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, labelled
@@ -116,9 +117,10 @@ def _checked(fit: Fit, table: Trajectories, surveyed: Program | None) -> Problem
     """The fit's program and the columns that it reads, if table and map suit it."""
     data = for_program(fit.program, table)
     refuse_long(data)
+    problem = Problem(fit.program, data, fit.known_start)
     if surveyed is not None:
         _judged_map(fit.program, surveyed)
-    return Problem(fit.program, data, fit.known_start)
+    return problem
 
 
 def _judged_map(program: Program, surveyed: Program) -> dict[str, Any]:
@@ -181,11 +183,7 @@ def table_of(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> str
         start = "known" if result["known_start"] else "prior"
         line = [label, *([start] if started else []), f"{result['log_likelihood']:.2f}"]
         for name in ("forward", "forward_mean", "state_estimation"):
-            line += [_figure(result[name].get(group)) for group in groups]
-        line += [_figure(result["measurement"].get(name)) for name in measured]
+            line += [number(result[name].get(group), ".4f") for group in groups]
+        line += [number(result["measurement"].get(name), ".4f") for name in measured]
         lines.append(line)
     return "\n".join(aligned(lines))
-
-
-def _figure(value: float | None) -> str:
-    return "–" if value is None else f"{value:.4f}"

@@ -57,16 +57,8 @@ def state_estimation(
 ) -> Errors:
     """Errors of smoothed lineages, measured at every n-th row and judged at all rows.
 
-    The squared error is averaged over lineages and rows; its root is averaged over trajectories.
-
-    Args:
-        program: the state-space model.
-        data: as returned by `for_program`, with the true states.
-        particles: N, for each trajectory.
-        known_start: start at the true first state.
-        every: use the measurements of every n-th row only.
-        lineages: paths for each trajectory.
-        look_ahead: with a filter that looks ahead.
+    The squared error is averaged over lineages and rows; its root is averaged over trajectories. See `run_filter` for
+    the filter's settings; `every` is n, `lineages` are the paths of each trajectory.
 
     Returns:
         Error group → error, groups without truth left out.
@@ -156,12 +148,6 @@ def measurement_errors(program: Program, data: Trajectories, *, particles: int, 
     `one_step` and `coverage_90` judge the prediction of each row from the rows before it. `open_loop_1s` (and `_3s`)
     starts 64 filtered particles at each row and runs them without noise over the rows that make up that time.
     Measurement noise is part of every one of these errors.
-
-    Args:
-        program: the state-space model.
-        data: as returned by `for_program`; all its rows are used.
-        particles: N, for each trajectory.
-        known_start: start at the true first state.
 
     Returns:
         `one_step`, `open_loop_1s`, `open_loop_3s` in the measurements' unit, and `coverage_90` between 0 and 1; an

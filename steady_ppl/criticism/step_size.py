@@ -17,8 +17,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, UsageError
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
-from steady_ppl.likelihood.fit import widen_noise
-from steady_ppl.likelihood.maximize import Maximum, maximise
+from steady_ppl.likelihood.maximize import Maximum, maximise, widen_noise
 from steady_ppl.likelihood.parameters import elements, values_of
 from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import widens

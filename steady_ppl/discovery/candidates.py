@@ -1,9 +1,10 @@
-"""Candidates that are worth fitting, and where their fits begin."""
+"""Candidates that are worth fitting, where their fits begin, and their best knees, widths and places."""
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,9 +13,8 @@ from torch import Tensor
 
 from steady_ppl.discovery.curves import curves
 from steady_ppl.discovery.effect_scores import Column, Simulated, columns_of, scores_along, simulate_scores
-from steady_ppl.discovery.noise_departure import departures
-from steady_ppl.discovery.refits import ALWAYS, BY_LIKELIHOOD, Refit, Worth, refit_with
-from steady_ppl.discovery.screening import ALPHA, Screened, Tested, screen
+from steady_ppl.discovery.refits import ALWAYS, BY_LIKELIHOOD, Refit, Threshold, refit_near, refit_with
+from steady_ppl.discovery.screening import ALPHA, Screened, Tested, departures, screen
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.errors import FilterError
 from steady_ppl.likelihood.parameters import Element, elements
@@ -29,6 +29,9 @@ CLEAR_GAIN = 10.0  # nats of held-out log p(y) for which a test need only be nea
 NEAR_ALPHA = ALPHA / 5  # p-value of a single test that is near it
 MIN_STATISTIC_TO_RETRY = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
 LINEAR = ("push", "command", "history", "measured", "viewpoint")
+MIN_GAIN_OF_PLACE = 0.3  # nats by which another knee or place has to be likelier
+PASSES = 4  # along all knees and places in turns, with steps of one size
+NEIGHBOUR_SHARE = 0.25  # of the grid's spacing, at which a place's likelihood is compared with its neighbours'
 
 
 @dataclass(frozen=True)
@@ -99,13 +102,12 @@ class Candidate:
 
 @torch.no_grad()
 def screen_program(now: Refit, declared: Program, *, sets: int, seed: int, withheld: Sequence[str] = ()) -> Screening:
-    """Test every candidate that a fitted program does not have.
+    """Test every candidate that a fitted program does not have, on the drives of its first fold.
 
     Args:
-        now: the fitted program; the drives of its first fold are tested.
+        now: the fitted program.
         declared: as it was before it was fitted.
-        sets: simulated sets.
-        seed: of them.
+        sets, seed: simulated sets.
         withheld: names of effects that are left out of the catalogue.
     """
     program, fold = now.program, now.folds[0]
@@ -165,13 +167,13 @@ def leaders(screened: Screened, first: bool) -> list[Tested]:
     return [tested for i, tested in alive if i in few or float(screened.alike[top, i]) > ALIKE]
 
 
-def fitted(now: Refit, tested: Tested, screening: Screening, worth: Worth = ALWAYS) -> Candidate:
-    """A program with a candidate, by the screening that tested it; see `refit_with` for `worth`."""
+def fitted(now: Refit, tested: Tested, screening: Screening, threshold: Threshold = ALWAYS) -> Candidate:
+    """A program with a candidate, by the screening that tested it; see `refit_with` for `threshold`."""
     effect = tested.variant.effect
     known = screening.information[_key(tested.column)] if effect.null == 0 and effect.form in LINEAR else None
 
     def fit(start: Any) -> Candidate:
-        return judged(now, tested, refit_with(now, tested.variant, start, information=known, worth=worth))
+        return judged(now, tested, refit_with(now, tested.variant, start, information=known, threshold=threshold))
 
     absent = [0.0] * len(tested.coefficient)
     if known is not None and tested.column.probe is None and now.fitting == BY_LIKELIHOOD:
@@ -217,3 +219,107 @@ def _start(tested: Tested) -> Any:
 
 def _key(column: Column) -> str:
     return f"{column.variant.label} {column.probe}"
+
+
+def at_its_best_place(now: Refit, candidate: Candidate) -> Candidate:
+    """A candidate with the knee, width or place at which it gains most: on its grid, and then between its points."""
+    if isinstance(candidate.refit, str) or not candidate.variant.profiled:
+        return candidate
+    grid, at, tested = _grid(now, candidate), candidate.variant, candidate.tested
+    fit: Refit | str = candidate.refit
+    if not candidate.is_judged:
+        fit = refit_with(now, at, candidate.refit.coefficient(at))
+        if isinstance(fit, str):
+            return candidate
+
+    def try_all(variants: Iterable[Variant]) -> None:
+        nonlocal at, fit
+        for variant in variants:
+            assert isinstance(fit, Refit)
+            other = refit_near(now, fit, [variant])
+            if isinstance(other, Refit) and gain_of_fits(now, other) > gain_of_fits(now, fit) + MIN_GAIN_OF_PLACE:
+                at, fit = variant, other
+
+    try_all(variant for variant in grid if variant.label != candidate.variant.label)
+    for share in (0.5, 0.25):
+        for _ in range(PASSES):
+            before = at
+            for name in at.profiled:
+                try_all(_beside(at, grid, name, share))
+            if at is before:
+                break
+    there = judged(now, replace(tested, column=replace(tested.column, variant=at)), fit)
+    return there if there.total > candidate.total else candidate
+
+
+def variance_of_places(now: Refit, candidate: Candidate) -> Tensor:
+    """What the uncertainty of knees, widths and places adds to the variance of a coefficient, `(k,)`.
+
+    By the delta method along their profile likelihood, with a prior as wide as their grid. Where the program cannot be
+    fitted on either side of one, its coefficient is taken as uncertain by its own size. `now` is the program without
+    the candidate, which is fitted at its best place.
+    """
+    assert isinstance(candidate.refit, Refit)
+    at, grid, near = candidate.variant, _grid(now, candidate), candidate.refit
+    here, best = near.coefficient(at).flatten().double(), gain_of_fits(now, near)
+
+    def fitted(variant: Variant) -> tuple[Tensor, float] | None:
+        """How the coefficient changes, and by how much the likelihood falls."""
+        refit = refit_near(now, near, [variant])
+        if isinstance(refit, str):
+            return None
+        return refit.coefficient(variant).flatten().double() - here, best - gain_of_fits(now, refit)
+
+    variance, ways = torch.zeros_like(here), list[_Way]()
+    for name in at.profiled:
+        sides = [
+            (sign, v, fit)
+            for sign, v in zip((1, -1), _beside(at, grid, name, NEIGHBOUR_SHARE), strict=True)
+            if (fit := fitted(v))
+        ]
+        if not sides:
+            variance = variance + here.square()
+            continue
+        slope = torch.stack([sign * change for sign, _, (change, _) in sides]).mean(0)
+        bend = sum(2 * fall for *_, (_, fall) in sides) / len(sides)
+        count = len({variant.profiled[name] for variant in grid})
+        sign, variant, (_, fall) = sides[0]
+        ways.append(_Way(name, sign, variant, fall, slope, bend, (2 * NEIGHBOUR_SHARE / max(1, count - 1)) ** 2))
+    if not ways:
+        return variance
+    curvature = torch.diag(torch.tensor([way.bend for way in ways], dtype=torch.float64))
+    for (i, one), (j, other) in itertools.combinations(enumerate(ways), 2):
+        both = fitted(replace(one.beside, options={**one.beside.options, other.name: other.beside.options[other.name]}))
+        if both is not None:
+            curvature[i, j] = curvature[j, i] = one.sign * other.sign * (both[1] - one.fall - other.fall)
+    values, turn = torch.linalg.eigh(curvature)
+    along = torch.stack([way.slope for way in ways], -1) @ turn
+    return variance + (along.square() / (values.clamp(min=0) + min(way.prior for way in ways))).sum(-1)
+
+
+@dataclass(frozen=True)
+class _Way:
+    """A step beside a place, in one of its numbers."""
+
+    name: str  # of the number
+    sign: int  # which way it goes
+    beside: Variant  # where that leads
+    fall: float  # of the likelihood there, nats
+    slope: Tensor  # change of the coefficient by a step up, (k,)
+    bend: float  # curvature of the likelihood in steps
+    prior: float  # precision of a normal as wide as the grid, in steps
+
+
+def _grid(now: Refit, candidate: Candidate) -> list[Variant]:
+    """The effect at all places that were screened."""
+    fold = now.folds[0]
+    every = candidate.variant.effect.variants(now.program, replace(fold.drives, states=fold.path.states))
+    return [variant for variant in every if variant.name == candidate.variant.name]
+
+
+def _beside(at: Variant, grid: Sequence[Variant], name: str, share: float) -> list[Variant]:
+    """The effect on either side of a place: by a share of the grid's spacing, or of the value where there is none."""
+    value = at.profiled[name]
+    values = sorted({float(variant.profiled[name]) for variant in grid})
+    apart = min((b - a for a, b in itertools.pairwise(values)), default=0.8 * value)
+    return [replace(at, options={**at.options, name: value + sign * share * apart}) for sign in (1, -1)]

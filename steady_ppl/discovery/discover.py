@@ -16,9 +16,8 @@ from steady_ppl.comparison.result import Proof
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories, joined
 from steady_ppl.discovery.candidates import NATS
-from steady_ppl.discovery.finding import Finding, findings, shape_of
+from steady_ppl.discovery.finding import Finding, findings, next_run, shape_of
 from steady_ppl.discovery.fitting import ByDraws
-from steady_ppl.discovery.next_run import next_run
 from steady_ppl.discovery.result import Discovery
 from steady_ppl.discovery.search import MAX_EFFECTS, Found, Search, Settings, search
 from steady_ppl.effects import of_name, record, restore, written_class
@@ -197,8 +196,8 @@ def _notes(found: Search) -> list[str]:
         )
     if not found.final.converged and found.found:
         notes.append("the fit with what was found has not converged")
-    if found.broke:
-        effects = " and ".join(found.broke)
+    if found.diverged:
+        effects = " and ".join(found.diverged)
         notes.append(f"{effects}: taken back, with it the program blows up on drives of its own")
     if len(found.found) == MAX_EFFECTS:
         notes.append(f"the search stops at {MAX_EFFECTS} effects: add them, fit, and discover again from there")
@@ -288,12 +287,8 @@ def kept_search(
 ) -> Iterator[None]:
     """The folder of a search for the block that makes it; nothing at all where there is none.
 
-    Args:
-        folder: the run.
-        given: the program or run that is searched.
-        train, valid, options: of `discover`.
-        force: overwrite a run.
-        resume: go on with the journal that is there; everything must be as it was.
+    `given`, `train`, `valid` and `options` are those of `discover`. `resume` goes on with the journal that is there, if
+    everything is as it was; `force` overwrites a run.
 
     Raises:
         RunError: as `run_folder`, or what is given is not what the search was begun with.

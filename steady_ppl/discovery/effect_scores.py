@@ -95,12 +95,13 @@ class Scoring:
 
     def _push(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         values = [value for value in c if bool(torch.isfinite(value).all())]
-        odd = len(values) == 2 and self._is_odd(variant, values)
-        if odd:
-            values, width = values[:1], width / 2
+        of_one_drive = [self._pushed(variant, value, 0, few=True) for value in values]
+        first, second = of_one_drive[0], of_one_drive[-1]
+        if len(values) == 2 and all(bool((first[name] == -second[name]).all()) for name in first):
+            values, width = values[:1], width / 2  # the push only changes its sign with the coefficient
         total = self.at.states.new_zeros(len(self.data))
         for index, channel in enumerate(self.program.channel_names):
-            if channel not in self._channels(variant, values[0]):
+            if channel not in first:
                 continue
             pushes = [self._pushed(variant, value, index)[channel] for value in values]
             change = pushes[0] if len(pushes) == 1 else pushes[0] - pushes[1]
@@ -150,27 +151,15 @@ class Scoring:
             means = {name: mean[:1, :, :1] for name, mean in means.items()}
         return variant.push(self.program, points, *given, value, means)
 
-    def _channels(self, variant: Variant, value: Tensor) -> set[str]:
-        return set(self._pushed(variant, value, 0, few=True))
-
-    def _is_odd(self, variant: Variant, values: list[Tensor]) -> bool:
-        """Whether the push only changes its sign with the coefficient, as far as one drive shows."""
-        first, second = (self._pushed(variant, value, 0, few=True) for value in values)
-        return all(bool((first[name] == -second[name]).all()) for name in first)
-
     def _command(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         control, time = self.controls[:-1], self.data.elapsed[:-1]
-        points = self.at.channels.points
-        changed = [variant(self.program, points, control, time, c=value) for value in c]
-        return self._of_control(changed[0] - changed[1], width)
+        up, down = (variant(self.program, self.at.channels.points, control, time, c=value) for value in c)
+        slope = (self.by_control * (up - down).movedim(-1, 0).unsqueeze(-1)).sum(0)
+        return self.at.channels.of_mean(slope / (width * self.row_spread))
 
     def _history(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
-        changed = [variant(self.program, self.controls, self.data.elapsed, c=value)[:-1] for value in c]
-        return ((changed[0] - changed[1]) * self.of_control).sum((0, -1)) / width
-
-    def _of_control(self, change: Tensor, width: float) -> Tensor:
-        slope = (self.by_control * change.movedim(-1, 0).unsqueeze(-1)).sum(0)
-        return self.at.channels.of_mean(slope / (width * self.row_spread))
+        up, down = (variant(self.program, self.controls, self.data.elapsed, c=value)[:-1] for value in c)
+        return ((up - down) * self.of_control).sum((0, -1)) / width
 
     @cached_property
     def of_control(self) -> Tensor:
@@ -180,8 +169,7 @@ class Scoring:
     @cached_property
     def by_control(self) -> Tensor:
         """Derivatives of the channels' means in the acting controls, `(U, P, T, B, C)`."""
-        found = []
-        count = self.controls.shape[-1]
+        found, count = [], self.controls.shape[-1]
         for index in range(count):
             step = 0.02 * float(self.controls[..., index].abs().max()) or 0.02
             up, down = self.acting.clone(), self.acting.clone()
@@ -197,25 +185,23 @@ class Scoring:
         return measured(self.program, self.at.measurements.points).reading
 
     def _measured(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
-        points, reading = self.at.measurements.points, self.reading
-        changed = [variant(self.program, points, reading, c=value) for value in c]
-        return self.at.measurements.of_mean((changed[0] - changed[1]) * self.at.sharpness / width)
+        up, down = (variant(self.program, self.at.measurements.points, self.reading, c=value) for value in c)
+        return self.at.measurements.of_mean((up - down) * self.at.sharpness / width)
 
     def _viewpoint(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         points = self.at.measurements.points
-        seen = [measured(self.program, variant(self.program, points, c=value)) for value in c]
-        return self.at.measurements.of_mean(seen[1].shift(seen[0]) * self.at.sharpness / width)
+        up, down = (measured(self.program, variant(self.program, points, c=value)) for value in c)
+        return self.at.measurements.of_mean(down.shift(up) * self.at.sharpness / width)
 
     def _spread(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         given = (self.at.states[:-1], self.controls[:-1], self.data.elapsed[:-1], self.data.steps)
-        factors = [
-            by_channel(self.program, variant(self.program, *given, c=value), 1.0, self.substep_spread) for value in c
-        ]
-        return self.at.channels.of_spread((factors[0] / factors[1]).log() / width)
+        factors = (variant(self.program, *given, c=value) for value in c)
+        up, down = (by_channel(self.program, factor, 1.0, self.substep_spread) for factor in factors)
+        return self.at.channels.of_spread((up / down).log() / width)
 
     def _blur(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
-        factors = [variant(self.program, self.at.states, c=value) for value in c]
-        return self.at.measurements.of_spread((factors[0] / factors[1]).log() / width)
+        up, down = (variant(self.program, self.at.states, c=value) for value in c)
+        return self.at.measurements.of_spread((up / down).log() / width)
 
     def _tails(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         """Of 1/ν at zero: (z⁴ − 2 z² − 1) / 4, its posterior mean."""
@@ -230,10 +216,8 @@ class Scoring:
         at = self.at.channels
         product = at.mean[1:] * at.mean[:-1] + self.at.lag[1:]
         ratio = self.substep_spread[:-1] / self.substep_spread[1:]
-        chosen = self.substep_spread.new_tensor(
-            [float(n in variant.options["channels"]) for n in self.program.channel_names]
-        )
-        return torch.where(at.present[1:], product * ratio * chosen, 0.0).sum((0, -1))
+        chosen = [float(name in variant.options["channels"]) for name in self.program.channel_names]
+        return torch.where(at.present[1:], product * ratio * ratio.new_tensor(chosen), 0.0).sum((0, -1))
 
 
 @dataclass(frozen=True)

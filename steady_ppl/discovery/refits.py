@@ -11,13 +11,11 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.discovery.common_noise import Judges, with_common_noise
-from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, Fitting, is_doubtful
+from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, Fitting, Judges, is_doubtful, with_common_noise
 from steady_ppl.effects import Variant, attach, attached, coefficient
 from steady_ppl.errors import FilterError, SteadyError
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.likelihood.fit import fit_by_likelihood, refit_outliers
-from steady_ppl.likelihood.maximize import Maximum, maximum_of
+from steady_ppl.likelihood.maximize import Maximum, fit_by_likelihood, maximum_of, refit_outliers
 from steady_ppl.likelihood.parameters import elements, values_of
 from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import widens
@@ -48,42 +46,33 @@ class Fold:
 
 
 @dataclass(frozen=True)
-class Worth:
+class Threshold:
     """What log p(y) the drives of the first fold, or those kept from it, must reach for the second to be fitted."""
 
     drives: float = -math.inf
     held_out: float = -math.inf
 
 
-ALWAYS = Worth()
+ALWAYS = Threshold()
 BY_LIKELIHOOD, BY_DRAWS, FIRST_BY_DRAWS = ByLikelihood(), ByDraws(), ByDraws(steps=180)
 
 
 @dataclass(frozen=True)
 class Refit:
-    """A program fitted on each fold.
+    """A program fitted on each fold; folds come one after another."""
 
-    Attributes:
-        programs: one a fold, fitted to its drives alone.
-        judges: the same with their process noise in common, if fits by likelihood ended on every fold.
-        maxima: one a fold.
-        folds: with the paths of these programs.
-        held_out: log p(y) of each drive under the judge fitted without it, but for the noise in common, `(B,)`.
-            The folds come one after another; those of the first only where the rest was not worth fitting.
-        held_out_alone: the same under the programs that were fitted to one fold alone.
-        rough: the program before its fit made its noise many times wider, from whose parameters fits with an effect
-            begin as well; None where it did not.
-        fitting: how it was fitted, and how fits with an effect are.
-    """
-
-    programs: list[Program]
-    judges: Judges
-    maxima: list[Maximum]
-    folds: list[Fold]
+    programs: list[Program]  # one a fold, fitted to its drives alone
+    judges: Judges  # the same with their process noise in common, if fits by likelihood ended on every fold
+    maxima: list[Maximum]  # one a fold
+    folds: list[Fold]  # with the paths of these programs
     held_out: Tensor
-    held_out_alone: Tensor
-    rough: Program | None = None
-    fitting: Fitting = BY_LIKELIHOOD
+    """log p(y) of each drive under the judge fitted without it, but for the noise in common, `(B,)`; of the first fold
+    only where the rest was not worth fitting."""
+    held_out_alone: Tensor  # the same under the programs that were fitted to one fold alone
+    unwidened: Program | None = None
+    """The program before its fit made its noise many times wider, from whose parameters fits with an effect begin as
+    well; None where it did not."""
+    fitting: Fitting = BY_LIKELIHOOD  # how it was fitted, and how fits with an effect are
 
     @property
     def program(self) -> Program:
@@ -144,10 +133,10 @@ def first_refit(problem: Problem, valid: Trajectories, *, seed: int, nearer: Pro
         Fold(train, one.path, valid, second.path, known_start),
         Fold(valid, second.path, train, one.path, known_start),
     ]
-    rough = copy.deepcopy(program) if _far_wider(own, program, train) else None
-    if rough is None and is_doubtful(folds[0].fitting(own), one.path):
+    unwidened = copy.deepcopy(program) if _far_wider(own, program, train) else None
+    if unwidened is None and is_doubtful(folds[0].fitting(own), one.path):
         return first_by_draws(program, [own, other.program], folds, seed)
-    return replace(_refit([own, other.program], folds, [one, second]), rough=rough)
+    return replace(_refit([own, other.program], folds, [one, second]), unwidened=unwidened)
 
 
 @dataclass(frozen=True)
@@ -216,22 +205,20 @@ def refit_with(
     value: float | Sequence[float] | Tensor,
     *,
     information: Tensor | None = None,
-    worth: Worth = ALWAYS,
+    threshold: Threshold = ALWAYS,
 ) -> Refit | str:
-    """The program with an effect, or why it cannot be fitted.
+    """The program with an effect whose coefficient begins at `value`, or why it cannot be fitted.
 
     Args:
         base: the program without.
-        variant: the effect.
-        value: where its coefficient begins.
         information: of the first fold's drives, the coefficient last.
-        worth: what the first fold must reach for the second to be fitted as well.
+        threshold: what the first fold must reach for the second to be fitted as well.
     """
     try:
         programs = [attach(copy.deepcopy(program), variant, value) for program in base.programs]
         least = [float(maximum.log_likelihood.sum()) - MAX_LOSS for maximum in base.maxima]
         nothing = [None] * len(programs)
-        return _refit(programs, base.folds, nothing, information, least, worth, base.rough, base.fitting)
+        return _refit(programs, base.folds, nothing, information, least, threshold, base.unwidened, base.fitting)
     except SteadyError as error:
         return str(error)
 
@@ -239,10 +226,7 @@ def refit_with(
 def refit_near(base: Refit, near: Refit, variants: Sequence[Variant]) -> Refit | str:
     """The program with effects, fitted from where another that shares parameters with it ended, or why it cannot be.
 
-    Args:
-        base: the program without these effects.
-        near: where the fit begins; its paths are taken as well.
-        variants: the effects; one at another knee, width or place than `near` has it, or fewer of them.
+    `near` has one of the `variants` at another knee, width or place, or more of them; `base` has none.
     """
     try:
         programs = [copy.deepcopy(program) for program in base.programs]
@@ -274,8 +258,8 @@ def _refit(
     maxima: Sequence[Maximum | None],
     information: Tensor | None = None,
     least: Sequence[float] = (-math.inf, -math.inf),
-    worth: Worth = ALWAYS,
-    rough: Program | None = None,
+    threshold: Threshold = ALWAYS,
+    unwidened: Program | None = None,
     fitting: Fitting = BY_LIKELIHOOD,
 ) -> Refit:
     fitted, found, held_out, judged_folds = list[Program](), list[Maximum](), list[Tensor](), list[Fold]()
@@ -283,20 +267,21 @@ def _refit(
         fold = _wide_fold(begun, program)
         share = len(fold.drives) / len(folds[0].drives)
         guess = None if information is None else share * information
-        afresh = None if rough is None else _afresh(fold.fitting(as_declared(rough, program)), floor)
-        if afresh is not None:
-            floor = max(floor, float(afresh[1].log_likelihood.sum()))
+        anew = None if unwidened is None else _fitted_anew(fold.fitting(as_declared(unwidened, program)), floor)
+        if anew is not None:
+            floor = max(floor, float(anew[1].log_likelihood.sum()))
         maximum = known or fitting.fit(fold.fitting(program), fold.path, information=guess, hopeless=floor)
         held_out_path = fold.held_out_path
-        if afresh is not None and afresh[1].objective > maximum.objective:
-            program, maximum = afresh
+        if anew is not None and anew[1].objective > maximum.objective:
+            program, maximum = anew
             held_out_path = fold.judging(program).find_path()
         judged = fitting.judge(fold.judging(program), held_out_path)
         fitted.append(program)
         found.append(maximum)
         held_out.append(judged.log_likelihood)
         judged_folds.append(replace(fold, path=maximum.path, held_out_path=judged.path))
-        if float(maximum.log_likelihood.sum()) < worth.drives and float(judged.log_likelihood.sum()) < worth.held_out:
+        own, others = float(maximum.log_likelihood.sum()), float(judged.log_likelihood.sum())
+        if own < threshold.drives and others < threshold.held_out:
             break
     judges, alone = Judges(fitted, found), torch.cat(held_out)
     if len(fitted) == len(folds) and fitting == BY_LIKELIHOOD:
@@ -307,10 +292,10 @@ def _refit(
             fitting.judge(fold.judging(program), fold.held_out_path).log_likelihood
             for program, fold in zip(judges.programs, judged_folds, strict=True)
         ]
-    return Refit(fitted, judges, found, judged_folds, torch.cat(held_out), alone, rough, fitting)
+    return Refit(fitted, judges, found, judged_folds, torch.cat(held_out), alone, unwidened, fitting)
 
 
-def _afresh(problem: Problem, floor: float) -> tuple[Program, Maximum] | None:
+def _fitted_anew(problem: Problem, floor: float) -> tuple[Program, Maximum] | None:
     """A fit whose paths are found anew; None where the program cannot follow the drives."""
     try:
         return problem.program, maximum_of(problem, hopeless=floor)
@@ -335,15 +320,16 @@ def _wide_fold(fold: Fold, program: Program) -> Fold:
 
 
 def wide(path: ReferencePath, program: Program) -> ReferencePath:
-    """A path for a program that has further, resting states."""
-    return ReferencePath(_with_resting(path.states, program), path.noise)
+    """A path for a program that has further, resting states, or fewer."""
+    return ReferencePath(_for_states_of(path.states, program), path.noise)
 
 
 def wide_drives(drives: Trajectories, program: Program) -> Trajectories:
-    """Drives for a program that has further, resting states."""
-    return drives if drives.states is None else replace(drives, states=_with_resting(drives.states, program))
+    """Drives for a program that has further, resting states, or fewer."""
+    return drives if drives.states is None else replace(drives, states=_for_states_of(drives.states, program))
 
 
-def _with_resting(states: Tensor, program: Program) -> Tensor:
-    more = max(0, len(program.states) - states.shape[-1])
-    return torch.cat([states, states.new_zeros((*states.shape[:-1], more))], -1)
+def _for_states_of(states: Tensor, program: Program) -> Tensor:
+    count = len(program.states)
+    more = max(0, count - states.shape[-1])
+    return torch.cat([states[..., :count], states.new_zeros((*states.shape[:-1], more))], -1)

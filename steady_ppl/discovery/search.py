@@ -19,13 +19,13 @@ from steady_ppl.discovery.candidates import (
     NEAR_ALPHA,
     Candidate,
     Screening,
+    at_its_best_place,
     fitted,
     judged,
     leaders,
     screen_program,
 )
-from steady_ppl.discovery.profile import at_its_best_place
-from steady_ppl.discovery.refits import Refit, Worth, first_refit, refit_near, refit_with
+from steady_ppl.discovery.refits import Refit, Threshold, first_refit, refit_near, refit_with
 from steady_ppl.discovery.screening import ALPHA, Tested
 from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
@@ -55,10 +55,10 @@ class Settings:
     seed: int = 0  # of the simulated sets
     withheld: Sequence[str] = ()  # names of effects that are left out of the catalogue
 
-    def screen(self, program: Refit, index: int) -> Screening:
-        """Test every candidate in a round, counted from 0."""
+    def screen(self, now: Refit, index: int) -> Screening:
+        """Test every candidate that a fitted program does not have, in a round counted from 0."""
         sets = self.later_sets if index else self.sets
-        return screen_program(program, self.declared, sets=sets, seed=self.seed + index, withheld=self.withheld)
+        return screen_program(now, self.declared, sets=sets, seed=self.seed + index, withheld=self.withheld)
 
 
 @dataclass(frozen=True)
@@ -93,30 +93,20 @@ class Found:
 
 @dataclass
 class Search:
-    """What a search came to.
+    """What a search came to."""
 
-    Attributes:
-        base: the program as it stands, fitted.
-        final: the program with all effects that were found, fitted.
-        step: the program as it stands beside itself at finer steps; all else is at the step that suits.
-        gained: nats that fitting the program as it stands gained on the training drives.
-        with_found: the program with what was found beside itself at finer steps, where these asked for a second search
-            at the step that suits; None where they did not.
-        rounds: in their order; the last tests the final program unless the search ended early.
-        found: the effects that were added.
-        curves: fits of curves in place of the first effect, best first, where effects alone did not explain the drives.
-        broke: effects that were taken back because the program with them blew up on drives of its own.
-    """
-
-    base: Refit
-    final: Refit
-    step: StepCheck
-    gained: float
+    base: Refit  # the program as it stands, fitted
+    final: Refit  # the program with all effects that were found, fitted
+    step: StepCheck  # the program as it stands beside itself at finer steps; all else is at the step that suits
+    gained: float  # nats that fitting the program as it stands gained on the training drives
     with_found: StepCheck | None = None
-    rounds: list[Round] = field(default_factory=list)
-    found: list[Found] = field(default_factory=list)
+    """The program with what was found beside itself at finer steps, where these asked for a second search at the step
+    that suits; None where they did not."""
+    rounds: list[Round] = field(default_factory=list)  # the last tests the final program unless the search ended early
+    found: list[Found] = field(default_factory=list)  # the effects that were added
     curves: list[Candidate] = field(default_factory=list)
-    broke: list[str] = field(default_factory=list)
+    """Fits of curves in place of the first effect, best first, where effects alone did not explain the drives."""
+    diverged: list[str] = field(default_factory=list)  # effects taken back: the program blew up with them
 
     @property
     def is_complete(self) -> bool:
@@ -142,23 +132,15 @@ class Search:
         return best if not self.departed or best.total > CLEAR_GAIN or of_all <= tests.critical else None
 
     @property
-    def needs_a_name(self) -> bool:
-        """Whether neither a curve nor departed noise can be what the tests found."""
-        return self.curve is None and not self.departed
-
-    @property
     def gain(self) -> float:
         """Held-out log p(y) of the final program above the first, nats."""
         return float((self.final.held_out - self.base.held_out[: len(self.final.held_out)]).sum())
 
 
 def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
-    """Look for the effects that a program lacks.
+    """Look for the effects that a program lacks, which is not changed.
 
-    Args:
-        problem: the state-space model, which is not changed, and the drives by which it is tested and fitted.
-        valid: as returned by `for_program`; they choose as well.
-        settings: of the search.
+    It is tested by the drives of the problem; both they and `valid`, as returned by `for_program`, choose.
     """
 
     def first(program: Program, nearer: Program | None = None) -> Refit:
@@ -198,14 +180,8 @@ def _step_of(refit: Refit, found: Sequence[Found] = ()) -> StepCheck:
         parameters = [variant.parameter for variant in attached(refit.program)]
         watched = {"watched": parameters, "max_shift": MAX_SHIFT_OF_SIZES}
     fold = refit.folds[0]
-    return check_step(
-        refit.program,
-        fold.drives,
-        refit.maxima[0],
-        known_start=fold.known_start,
-        finest=MAX_SUBSTEPS_OF_FIT,
-        **watched,
-    )
+    settings = {"known_start": fold.known_start, "finest": MAX_SUBSTEPS_OF_FIT} | watched
+    return check_step(refit.program, fold.drives, refit.maxima[0], **settings)
 
 
 def _rounds(found: Search, settings: Settings) -> Search:
@@ -223,7 +199,7 @@ def _rounds(found: Search, settings: Settings) -> Search:
                     if index == 0:
                         raise
                     taken_back = found.found.pop()
-                    found.final, found.broke = taken_back.without, [taken_back.candidate.variant.label]
+                    found.final, found.diverged = taken_back.without, [taken_back.candidate.variant.label]
                     break
                 begin_part()
                 if not _add_best(found, screening, index):
@@ -236,7 +212,7 @@ def _rounds(found: Search, settings: Settings) -> Search:
                 try:
                     found.rounds.append(Round(settings.screen(found.final, MAX_EFFECTS + 1), [], None))
                 except FilterError:
-                    found.broke = [label for label in labels(found.final) if label not in labels(final)]
+                    found.diverged = [label for label in labels(found.final) if label not in labels(final)]
                     found.found, found.final = before, final
     return found
 
@@ -253,11 +229,10 @@ def _add_best(found: Search, screening: Screening, index: int) -> bool:
     candidates = _refits(found.final, screening, index == 0)
     able = [c for c in candidates if c.is_judged and not c.against_its_sign]
     best = next((c for c in able if c.significant(screening.tests.critical)), None)
-    gains = best is not None
-    if index == 0 and not gains:
+    if index == 0 and best is None:
         found.curves = _curves(found.base, screening)
-    if index == 0 and not gains and found.needs_a_name:
-        best = next((c for c in able if c.total > NATS and c.tested.p_value <= NEAR_ALPHA), None)
+        if found.curve is None and not found.departed:  # neither can be what the tests found
+            best = next((c for c in able if c.total > NATS and c.tested.p_value <= NEAR_ALPHA), None)
     found.rounds[-1] = Round(screening, candidates, best)
     if best is None:
         return False
@@ -273,7 +248,7 @@ def _refits(now: Refit, screening: Screening, first: bool) -> list[Candidate]:
     with stages(*((f"fitting with {tested.variant.label}", 1) for tested in chosen)) as begin:
         for tested in chosen:
             begin()
-            candidates.append(fitted(now, tested, screening, _worth(candidates)))
+            candidates.append(fitted(now, tested, screening, _threshold(candidates)))
     best = max((c for c in candidates if c.is_judged), key=lambda c: c.total, default=None)
     candidates = [c if c.is_judged else replace(c, behind=best) for c in candidates]
     close = max((candidate.total for candidate in candidates), default=0.0) - MAX_NATS_OF_RIVAL
@@ -281,12 +256,12 @@ def _refits(now: Refit, screening: Screening, first: bool) -> list[Candidate]:
     return sorted(found, key=lambda candidate: -candidate.total)
 
 
-def _worth(candidates: Sequence[Candidate]) -> Worth:
+def _threshold(candidates: Sequence[Candidate]) -> Threshold:
     """What the next candidate must reach on the first fold, given those that were fitted."""
     fits = [c.refit for c in candidates if isinstance(c.refit, Refit)]
     drives = [float(fit.maxima[0].log_likelihood.sum()) for fit in fits]
     held_out = [float(fit.held_out_alone[: len(fit.folds[0].held_out)].sum()) for fit in fits]
-    return Worth(max(drives, default=-math.inf) - MAX_NATS_BEHIND, max(held_out, default=-math.inf) - NATS)
+    return Threshold(max(drives, default=-math.inf) - MAX_NATS_BEHIND, max(held_out, default=-math.inf) - NATS)
 
 
 def _curves(base: Refit, screening: Screening) -> list[Candidate]:
@@ -344,7 +319,7 @@ def _without(search: Search, found: Found) -> Refit | str:
     near = refit_near(search.base, search.final, [other.variant for other in others])
     if isinstance(afresh, str) or isinstance(near, str):
         return afresh if isinstance(near, str) else near
-    most = max(_objective(search.final), _objective(afresh)) + MIN_NATS_OF_RUNAWAY  # both contain it
+    most = max(_objective(search.final), _objective(afresh)) + MIN_NATS_OF_RUNAWAY  # more: it has run away
     return near if _objective(afresh) < _objective(near) < most else afresh
 
 

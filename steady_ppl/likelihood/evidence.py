@@ -49,17 +49,11 @@ def run_filter(
 
 @dataclass(frozen=True)
 class FilterChoice:
-    """Which filter suits a program: the one that looks ahead wherever its noise is normal.
+    """Which filter suits a program: the one that looks ahead wherever its noise is normal."""
 
-    Attributes:
-        particles: N, for each trajectory.
-        look_ahead: whether it looks ahead.
-        name: "lookahead", or "bootstrap" and why.
-    """
-
-    particles: int
+    particles: int  # N, for each trajectory
     look_ahead: bool
-    name: str
+    name: str  # "lookahead", or "bootstrap" and why
 
 
 def choose_filter(

@@ -11,7 +11,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath, why_not_linear
-from steady_ppl.gaussian.smoother import find_and_smooth, find_path, require_found, smooth
+from steady_ppl.gaussian.smoother import find_and_smooth, find_path, smooth
 from steady_ppl.model.program import Program, for_program
 
 
@@ -66,13 +66,3 @@ class Problem:
     def smooth(self, path: ReferencePath, **settings: Any) -> Lookahead:
         """The lookahead along the posterior's mode near a path; see `gaussian.smoother`."""
         return smooth(self.program, self.data, path, known_start=self.known_start, **settings)
-
-    def smooth_or_raise(self, path: ReferencePath, **settings: Any) -> Lookahead:
-        """`smooth` whose log p(y) is finite.
-
-        Raises:
-            FilterError: it is not.
-        """
-        ahead = self.smooth(path, **settings)
-        require_found(ahead, self.program, self.data)
-        return ahead

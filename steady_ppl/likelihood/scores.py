@@ -207,13 +207,12 @@ def channel_moments(program: Program, data: Trajectories, states: Tensor, contro
     seen = Recording()
     with running(*states.shape[:-1]), seen, AtMean():
         sample_channels(program, states, controls[..., :-1, :, :], data.elapsed[:-1], data.steps)
-    means, spreads = [], []
-    for site, fn in seen.distributions.items():
-        mean, spread = normal_moments(fn, site)
-        means.append(as_vector(mean, fn.event_dim))
-        spreads.append(as_vector(spread, fn.event_dim))
-    left = states.shape[:-1]
-    return tuple(torch.cat([part.expand(*left, -1) for part in parts], -1) for parts in (means, spreads))  # type: ignore[return-value]
+    sites = (
+        [as_vector(part, fn.event_dim).expand(*states.shape[:-1], -1) for part in normal_moments(fn, site)]
+        for site, fn in seen.distributions.items()
+    )
+    mean, spread = (torch.cat(parts, -1) for parts in zip(*sites, strict=True))
+    return mean, spread
 
 
 @torch.no_grad()

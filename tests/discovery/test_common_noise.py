@@ -15,10 +15,10 @@ from pyro.nn import PyroParam
 from models.linear_gaussian import LinearGaussian
 from steady_ppl import stack
 from steady_ppl.data.trajectories import joined
-from steady_ppl.discovery import common_noise
+from steady_ppl.discovery import fitting
 from steady_ppl.discovery.candidates import judged
-from steady_ppl.discovery.common_noise import noise_numbers, with_common_noise
-from steady_ppl.discovery.refits import Worth, first_refit, refit_with
+from steady_ppl.discovery.fitting import noise_numbers, with_common_noise
+from steady_ppl.discovery.refits import Threshold, first_refit, refit_with
 from steady_ppl.effects import chosen_variant
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path, smooth
@@ -170,14 +170,14 @@ def test_a_program_without_learnable_noise_is_its_own_judge():
 def test_a_candidate_that_is_given_up_is_compared_with_fits_to_the_same_half(carts):
     variant = chosen_variant(carts.program, "acceleration_bias")
     whole = refit_with(carts, variant, [0.0])
-    half = refit_with(carts, variant, [0.0], worth=Worth(drives=1e9, held_out=1e9))
+    half = refit_with(carts, variant, [0.0], threshold=Threshold(drives=1e9, held_out=1e9))
     assert not isinstance(whole, str) and not isinstance(half, str) and len(half.programs) == 1
     given_up, through = judged(carts, None, half), judged(carts, None, whole)
     torch.testing.assert_close(given_up.gain, through.alone[: len(given_up.gain)])
 
 
 def test_it_begins_elsewhere_where_the_parabola_leads_nowhere(carts, monkeypatch):
-    starts, tried = common_noise._starts, []
+    starts, tried = fitting._starts, []
 
     def far(terms, maxima):
         parabola, means = starts(terms, maxima)
@@ -189,8 +189,8 @@ def test_it_begins_elsewhere_where_the_parabola_leads_nowhere(carts, monkeypatch
             raise FilterError("beyond all measure")
         return climb(terms, **options)
 
-    monkeypatch.setattr(common_noise, "_starts", far)
-    monkeypatch.setattr(common_noise, "climb", seen)
+    monkeypatch.setattr(fitting, "_starts", far)
+    monkeypatch.setattr(fitting, "climb", seen)
     problems = [fold.fitting(program) for program, fold in zip(carts.programs, carts.folds, strict=True)]
     found = with_common_noise(problems, carts.maxima)
     assert len(tried) == 2

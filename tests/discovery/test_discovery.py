@@ -15,15 +15,13 @@ from small import finite
 from torch.distributions import constraints
 
 import steady_ppl as st
+from steady_ppl.discovery.candidates import variance_of_places
 from steady_ppl.discovery.curves import knots_of
 from steady_ppl.discovery.discover import NOT_CONVERGED, _of_one_drive
-from steady_ppl.discovery.finding import _spread
-from steady_ppl.discovery.next_run import next_run
-from steady_ppl.discovery.profile import variance_of_places
+from steady_ppl.discovery.finding import _spread, next_run
 from steady_ppl.effects import Effect, chosen_variant, parsed
 from steady_ppl.effects.registry import _EFFECTS, register
-from steady_ppl.likelihood.fit import refit_outliers
-from steady_ppl.likelihood.maximize import maximise, maximum_of
+from steady_ppl.likelihood.maximize import maximise, maximum_of, refit_outliers
 from steady_ppl.likelihood.problem import Problem
 from steady_ppl.plotting.discovery import unknown_effect
 

@@ -13,8 +13,7 @@ from steady_ppl.discovery.candidates import gain_of_fits
 from steady_ppl.discovery.refits import first_refit, refit_near, refit_with
 from steady_ppl.effects import chosen_variant
 from steady_ppl.gaussian.smoother import smooth
-from steady_ppl.likelihood.fit import widen_noise
-from steady_ppl.likelihood.maximize import maximise
+from steady_ppl.likelihood.maximize import maximise, widen_noise
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.likelihood.problem import Problem
 
@@ -113,7 +112,7 @@ def test_fits_begin_at_the_declared_noise_as_well_where_the_program_alone_explai
     truth = truth.with_effect("range_dependent_noise", 0.1)
     train, valid = drives(truth, 6, 41, seed=1), drives(truth, 6, 41, seed=2)
     base = first_refit(Problem(program, train, True), valid, seed=0)
-    assert base.rough is not None and float(base.program.noise.detach().max()) > 20 * 0.05
+    assert base.unwidened is not None and float(base.program.noise.detach().max()) > 20 * 0.05
     variant = chosen_variant(program, "range_dependent_noise", "")
     found = refit_with(base, variant, 0.05)
     assert not isinstance(found, str)
@@ -125,7 +124,7 @@ def test_a_fit_at_another_knee_is_the_one_from_nothing():
     truth, program = example("hovercraft").with_effect("thrust_saturation", 0.8, knee=0.6), example("hovercraft")
     train, valid = drives(truth, 5, 41, seed=1), drives(truth, 5, 41, seed=2)
     base = first_refit(Problem(program, train, True), valid, seed=0)
-    assert base.rough is None
+    assert base.unwidened is None
     knees = [chosen_variant(program, "thrust_saturation", knee=knee) for knee in (0.5, 0.65)]
     direct = [refit_with(base, knee, 0.5) for knee in knees]
     near = refit_near(base, direct[0], [knees[1]])
