@@ -18,7 +18,7 @@ from references import runs
 from torch import Tensor
 
 from steady_ppl import Program, Trajectories, run_filter, seeded
-from steady_ppl.likelihood.evidence import find_and_smooth
+from steady_ppl.gaussian.smoother import find_and_smooth
 
 FILTERS = {
     "bootstrap 200": (200, False),

@@ -26,6 +26,7 @@ from steady_ppl.likelihood.parameter_posterior import (
     resampled,
     weighed,
 )
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import for_program
 
 DRAWS, DRIVES = 99, 4
@@ -76,8 +77,9 @@ def ranked(seed: int) -> dict:
     program, truth, data = drawn(seed)
     with seeded(seed, "parameters"):
         maximum = maximise(program, data)
-        shape = about_maximum(program, data, maximum.path)
-        judge = linearised(data, maximum.path)
+        problem = Problem(program, data)
+        shape = about_maximum(problem, maximum.path)
+        judge = linearised(problem, maximum.path)
         values, log_weights = adapt(program, shape, judge, VALUES)
         some = torch.randperm(VALUES)[:BLIND_VALUES]
         density = weighed(program, values[some], judge) - log_weights[some]

@@ -76,7 +76,7 @@ def _improvement(chosen: BenchmarkSet, found: Discovery, test: Any) -> dict[str,
         name, at, options, value = parsed(text)
         if isinstance(oracle, Refit):
             variant = chosen_variant(found.search.base.program, name, at, **options)
-            oracle = refit_with(oracle, variant, value, known_start=True)
+            oracle = refit_with(oracle, variant, value)
     rows: dict[str, Any] = {"before": found.before.program, "after": found.after.program}
     if found.shape is not None and found.search.curve and isinstance(found.search.curve.refit, Refit):
         rows["after"] = found.search.curve.refit.mean_program()

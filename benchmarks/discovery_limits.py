@@ -21,11 +21,12 @@ import torch
 from torch import Tensor
 
 from steady_ppl import Program, for_program, load_program, simulate
-from steady_ppl.discovery.candidates import Screening, Settings, screen_program
+from steady_ppl.discovery.candidates import Screening, screen_program
 from steady_ppl.discovery.effect_scores import columns_of
 from steady_ppl.discovery.refits import Refit, first_refit
 from steady_ppl.discovery.screening import MIN_SHARE_OF_INFORMATION, Screened
 from steady_ppl.effects import Variant, attached, catalogue, chosen_variant, parsed
+from steady_ppl.likelihood.problem import Problem
 
 Array = np.ndarray
 MODEL = Path(__file__).resolve().parents[1] / "models" / "hovercraft.py"
@@ -123,8 +124,8 @@ def _screened(program: Program) -> tuple[Refit, Screening]:
     train, valid = (
         for_program(program, simulate(program, size, seed=seed)) for size, seed in ((REFERENCE, SEED), (4, SEED + 1))
     )
-    base = first_refit(program, train, valid, known_start=True, seed=SEED)
-    return base, screen_program(base, program, Settings(known_start=True), sets=SETS, seed=SEED)
+    base = first_refit(Problem(program, train, True), valid, seed=SEED)
+    return base, screen_program(base, program, sets=SETS, seed=SEED)
 
 
 def _plantings(screened: tuple[Refit, Screening]) -> list[Planting]:

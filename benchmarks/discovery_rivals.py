@@ -22,6 +22,7 @@ from torch import Tensor
 from steady_ppl import Program, Trajectories, for_program
 from steady_ppl.discovery.refits import Refit, first_refit, refit_with
 from steady_ppl.effects import Variant
+from steady_ppl.likelihood.problem import Problem
 
 Tables = Sequence[Trajectories]
 WINDOWS = (15, 23, 31, 41, 71)  # rows
@@ -84,8 +85,8 @@ def _by_window(
 
 def fitted(tables: Tables, program: Program, known_start: bool) -> Refit:
     """The owner's program fitted to the training drives, what several rivals begin with."""
-    drives = (for_program(program, table.without_truth(keep_start=known_start)) for table in tables[:2])
-    return first_refit(program, *drives, known_start=known_start, seed=0)
+    train, valid = (Problem.of_table(program, table, known_start) for table in tables[:2])
+    return first_refit(train, valid.data, seed=0)
 
 
 def smoothed_residuals(
@@ -177,7 +178,7 @@ def brute_force(
     gains: dict[str, Tensor] = {}
     for variant in candidates(base.program, data, withheld):
         for value in _beginnings(variant):
-            refit = refit_with(base, variant, value, known_start=known_start)
+            refit = refit_with(base, variant, value)
             gain = torch.full_like(base.held_out, -1e9) if isinstance(refit, str) else refit.held_out - base.held_out
             if variant.name not in gains or float(gain.sum()) > float(gains[variant.name].sum()):
                 gains[variant.name] = gain

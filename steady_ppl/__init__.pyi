@@ -48,7 +48,7 @@ from .likelihood.evidence import (
     run_filter as run_filter,
     smoothed_states as smoothed_states,
 )
-from .likelihood.fit import fit_by_likelihood as fit_by_likelihood
+from .likelihood.maximize import fit_by_likelihood as fit_by_likelihood
 from .likelihood.parameter_posterior import (
     ParameterPosterior as ParameterPosterior,
     parameter_posterior as parameter_posterior,

@@ -7,11 +7,20 @@ from typing import Any
 
 import torch
 
-from steady_ppl.comparison.metrics import forward, forward_mean, map_errors, measurement_errors, state_estimation
+from steady_ppl.comparison.metrics import (
+    forward,
+    forward_mean,
+    has_truth,
+    map_errors,
+    measurement_errors,
+    state_estimation,
+)
+from steady_ppl.comparison.result import number
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, labelled
 from steady_ppl.likelihood.evidence import choose_filter, evidence
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.planar_vehicle import UnknownMap
 from steady_ppl.model.program import Program, for_program, names
 from steady_ppl.runs.fit import Fit
@@ -53,14 +62,11 @@ def evaluate(
         UsageError: the map is none, or another vehicle's.
         FilterError: the filter broke down.
     """
-    program, known_start = fit.program, fit.known_start
-    data = _checked(fit, table, surveyed)
+    problem = _checked(fit, table, surveyed)
+    program, data, known_start = problem.program, problem.data, problem.known_start
     choice = choose_filter(program, data, known_start=known_start, particles=particles, look_ahead=look_ahead)
-    settings: dict[str, Any] = {
-        "particles": choice.particles,
-        "look_ahead": choice.look_ahead,
-        "known_start": known_start,
-    }
+    settings: dict[str, Any] = {"look_ahead": choice.look_ahead, "known_start": known_start}
+    settings["particles"] = choice.particles
     result: dict[str, Any] = {"recipe": fit.recipe, "known_start": known_start}
     result |= {"measured": list(data.measurement_names), "filter": choice.name}
     with stages(("log p(y)", 1), ("states", 2), ("measurements", 2)) as begin:
@@ -69,11 +75,8 @@ def evaluate(
             found = evidence(program, data, **settings)
             result["log_likelihood"] = float(found.log_likelihood.mean())
             worst = int(found.scarce.argmax())
-            result["scarce"] = {
-                "trajectory": data.labels[worst],
-                "share": float(found.scarce[worst]),
-                "particles": choice.particles,
-            }
+            scarce = {"trajectory": data.labels[worst], "share": float(found.scarce[worst])}
+            result["scarce"] = scarce | {"particles": choice.particles}
         result |= {"forward": {}, "forward_mean": {}, "state_estimation": {}}
         begin()
         if has_truth(data):
@@ -91,12 +94,7 @@ def evaluate(
 
 
 def evaluate_all(
-    fits: Sequence[Fit],
-    labels: Sequence[str],
-    table: Trajectories,
-    *,
-    surveyed: Program | None = None,
-    **settings: Any,
+    fits: Sequence[Fit], labels: Sequence[str], table: Trajectories, *, surveyed: Program | None = None, **settings: Any
 ) -> list[dict[str, Any]]:
     """`evaluate` of several fits, all checked before anything is computed.
 
@@ -115,15 +113,14 @@ def evaluate_all(
     return results
 
 
-def _checked(fit: Fit, table: Trajectories, surveyed: Program | None) -> Trajectories:
-    """The columns that the program reads, if table and map suit it."""
+def _checked(fit: Fit, table: Trajectories, surveyed: Program | None) -> Problem:
+    """The fit's program and the columns that it reads, if table and map suit it."""
     data = for_program(fit.program, table)
     refuse_long(data)
-    if fit.known_start:
-        _ = data.known_start
+    problem = Problem(fit.program, data, fit.known_start)
     if surveyed is not None:
         _judged_map(fit.program, surveyed)
-    return data
+    return problem
 
 
 def _judged_map(program: Program, surveyed: Program) -> dict[str, Any]:
@@ -169,11 +166,6 @@ def incomparable(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) ->
     return reasons
 
 
-def has_truth(data: Trajectories) -> bool:
-    """Whether the states are known beyond a first row."""
-    return data.states is not None and bool(torch.isfinite(data.states[1:]).any())
-
-
 def table_of(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> str:
     """The results as one table of text, a line a program.
 
@@ -183,21 +175,15 @@ def table_of(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> str
     """
     groups = list(next((r["forward"] for r in results if r["forward"]), {}))[:2]
     started = len({result["known_start"] for result in results}) > 1
-    header = ["", *(["start"] if started else []), "log p(y)"]
-    for name in ("forward", "mean", "state"):
-        header += [f"{name} {group}" for group in groups]
     measured = ["one_step", "open_loop_1s", "open_loop_3s", "coverage_90"]
-    header += measured
+    errors = [f"{name} {group}" for name in ("forward", "mean", "state") for group in groups]
+    header = ["", *(["start"] if started else []), "log p(y)", *errors, *measured]
     lines = [header]
     for label, result in zip(labels, results, strict=True):
         start = "known" if result["known_start"] else "prior"
         line = [label, *([start] if started else []), f"{result['log_likelihood']:.2f}"]
         for name in ("forward", "forward_mean", "state_estimation"):
-            line += [_figure(result[name].get(group)) for group in groups]
-        line += [_figure(result["measurement"].get(name)) for name in measured]
+            line += [number(result[name].get(group), ".4f") for group in groups]
+        line += [number(result["measurement"].get(name), ".4f") for name in measured]
         lines.append(line)
     return "\n".join(aligned(lines))
-
-
-def _figure(value: float | None) -> str:
-    return "–" if value is None else f"{value:.4f}"

@@ -6,13 +6,16 @@ Definitions: STEADY (IROS 2022), section V, as its authors' code computes them.
 from __future__ import annotations
 
 import math
+from collections import Counter, deque
 
 import torch
+from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError
 from steady_ppl.likelihood.evidence import in_parts, run_filter
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.handlers import AtMean, Recording, as_vector, residual, running
 from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.model.program import Program, error_groups
@@ -22,6 +25,13 @@ from steady_ppl.smc.resampling import systematic, take
 from steady_ppl.utils.angles import wrap
 
 Errors = dict[str, float]
+OPEN_LOOP = {"open_loop_1s": 1.0, "open_loop_3s": 3.0}  # s ahead
+OPEN_LOOP_DRAWS = 64
+
+
+def has_truth(data: Trajectories) -> bool:
+    """Whether the states are known beyond a first row."""
+    return data.states is not None and bool(torch.isfinite(data.states[1:]).any())
 
 
 def squared_errors(program: Program, states: Tensor, truth: Tensor) -> dict[str, Tensor]:
@@ -47,16 +57,8 @@ def state_estimation(
 ) -> Errors:
     """Errors of smoothed lineages, measured at every n-th row and judged at all rows.
 
-    The squared error is averaged over lineages and rows; its root is averaged over trajectories.
-
-    Args:
-        program: the state-space model.
-        data: as returned by `for_program`, with the true states.
-        particles: N, for each trajectory.
-        known_start: start at the true first state.
-        every: use the measurements of every n-th row only.
-        lineages: paths for each trajectory.
-        look_ahead: with a filter that looks ahead.
+    The squared error is averaged over lineages and rows; its root is averaged over trajectories. See `run_filter` for
+    the filter's settings; `every` is n, `lineages` are the paths of each trajectory.
 
     Returns:
         Error group → error, groups without truth left out.
@@ -77,54 +79,49 @@ def state_estimation(
 
 
 @torch.no_grad()
-def forward(program: Program, data: Trajectories, *, horizon: int = 10, rollouts: int = 1000) -> Errors:
+def forward(
+    program: Program, data: Trajectories, *, horizon: int = 10, rollouts: int = 1000, handler: Messenger | None = None
+) -> Errors:
     """End-point errors of noisy roll-outs from every true state, with the recorded controls.
 
-    One root of the squared error averaged over roll-outs, starts and trajectories: the process noise counts in it.
+    One root of the squared error averaged over roll-outs, starts and trajectories: the process noise counts in it,
+    unless a handler changes it.
     """
-    return _forward(program, data, horizon, rollouts, mean=False)
-
-
-@torch.no_grad()
-def forward_mean(program: Program, data: Trajectories, *, horizon: int = 10) -> Errors:
-    """The same for one roll-out without channel noise."""
-    return _forward(program, data, horizon, 1, mean=True)
-
-
-def _forward(program: Program, data: Trajectories, horizon: int, rollouts: int, mean: bool) -> Errors:
     assert data.states is not None
-    starts = data.time.shape[0] - horizon
-    if starts < 1:
+    if data.time.shape[0] <= horizon:
         return {}
     counted = data.rows[horizon:] & torch.isfinite(data.states[:-horizon]).all(-1)
     origin = torch.where(counted[..., None], data.states[:-horizon], 0.0)
-    sums: dict[str, float] = {}
-    counts: dict[str, int] = {}
+    sums: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     at_once = max(1, 500_000 // counted.numel())
     for first in range(0, rollouts, at_once):
         draws = min(at_once, rollouts - first)
-        end = _end_of_roll_out(program, data, origin.expand(draws, *origin.shape), horizon, starts, mean)
+        end = _ends_of_roll_outs(program, data, origin.expand(draws, *origin.shape), horizon, handler)
         for group, squared in squared_errors(program, end, data.states[horizon:]).items():
             members = list(error_groups(program)[group])
             known = counted & torch.isfinite(data.states[horizon:, :, members]).all(-1)
-            sums[group] = sums.get(group, 0.0) + float(squared[:, known].double().sum())
-            counts[group] = counts.get(group, 0) + draws * int(known.sum())
+            sums[group] += float(squared[:, known].double().sum())  # type: ignore[assignment]
+            counts[group] += draws * int(known.sum())
     return {group: math.sqrt(total / counts[group]) for group, total in sums.items() if counts[group]}
 
 
-def _end_of_roll_out(
-    program: Program, data: Trajectories, state: Tensor, horizon: int, starts: int, mean: bool
-) -> Tensor:
-    def windows(values: Tensor) -> Tensor:
-        return torch.stack([values[k : k + starts] for k in range(horizon)])
+def forward_mean(program: Program, data: Trajectories, *, horizon: int = 10) -> Errors:
+    """The same for one roll-out without channel noise."""
+    return forward(program, data, horizon=horizon, rollouts=1, handler=AtMean())
 
-    handler = AtMean() if mean else None
-    controls = windows(acting_controls(program, data))
-    for state in roll_out(  # noqa: B007, B020
-        program, state, controls, windows(data.elapsed), windows(data.steps), handler=handler
-    ):
-        pass
-    return state
+
+def _ends_of_roll_outs(
+    program: Program, data: Trajectories, states: Tensor, horizon: int, handler: Messenger | None
+) -> Tensor:
+    """Where roll-outs end that begin at given states of all rows but the last `horizon`, with the recorded controls."""
+    starts = data.time.shape[0] - horizon
+    given = (
+        torch.stack([values[k : k + starts] for k in range(horizon)])
+        for values in (acting_controls(program, data), data.elapsed, data.steps)
+    )
+    (end,) = deque(roll_out(program, states, *given, handler=handler), maxlen=1)
+    return end
 
 
 def map_errors(program: Program, surveyed: Program) -> Errors:
@@ -144,45 +141,32 @@ def map_errors(program: Program, surveyed: Program) -> Errors:
     return {"rms": float(squares.mean().sqrt()), "most": float(squares.max().sqrt())}
 
 
-OPEN_LOOP = {"open_loop_1s": 1.0, "open_loop_3s": 3.0}
-
-
-OPEN_LOOP_DRAWS = 64
-
-
 @torch.no_grad()
-def measurement_errors(program: Program, data: Trajectories, *, particles: int, known_start: bool) -> dict[str, float]:
+def measurement_errors(program: Program, data: Trajectories, *, particles: int, known_start: bool) -> Errors:
     """Root mean square of measured minus predicted over all measured cells, and the coverage of 90 % intervals.
 
     `one_step` and `coverage_90` judge the prediction of each row from the rows before it. `open_loop_1s` (and `_3s`)
     starts 64 filtered particles at each row and runs them without noise over the rows that make up that time.
     Measurement noise is part of every one of these errors.
 
-    Args:
-        program: the state-space model.
-        data: as returned by `for_program`; all its rows are used.
-        particles: N, for each trajectory.
-        known_start: start at the true first state.
-
     Returns:
         `one_step`, `open_loop_1s`, `open_loop_3s` in the measurements' unit, and `coverage_90` between 0 and 1; an
         open loop shorter than a step or longer than every trajectory is left out.
     """
-    totals: dict[str, list[float]] = {}
+    totals: dict[str, tuple[float, float]] = {}
     rows = {name: data.rows_ahead(seconds) for name, seconds in OPEN_LOOP.items()}
     horizons = {name: count for name, count in rows.items() if 1 <= count < data.time.shape[0]}
     for part in in_parts(data, particles):
-        for name, (total, count) in _totals(program, part, particles, known_start, horizons).items():
-            have = totals.setdefault(name, [0.0, 0.0])
-            have[0] += total
-            have[1] += count
+        for name, (total, count) in _totals(Problem(program, part, known_start), particles, horizons).items():
+            so_far = totals.get(name, (0.0, 0.0))
+            totals[name] = so_far[0] + total, so_far[1] + count
     means = {name: total / count for name, (total, count) in totals.items() if count}
     return {name: mean if name == "coverage_90" else math.sqrt(mean) for name, mean in means.items()}
 
 
-def _totals(
-    program: Program, data: Trajectories, particles: int, known_start: bool, horizons: dict[str, int]
-) -> dict[str, tuple[float, float]]:
+def _totals(problem: Problem, particles: int, horizons: dict[str, int]) -> dict[str, tuple[float, float]]:
+    """Error → its sum over measured cells, and how many they are."""
+    program, data = problem.program, problem.data
     squares, covered, count = 0.0, 0.0, 0.0
     draws: list[Tensor] = []
 
@@ -200,30 +184,14 @@ def _totals(
         covered += float(((below > 0.05) & (below < 0.95))[observed].sum())
         count += float(observed.sum())
 
-    particle_filter(program, data, particles=particles, known_start=known_start, keep_history=False, on_frame=on_frame)
+    particle_filter(
+        program, data, particles=particles, known_start=problem.known_start, keep_history=False, on_frame=on_frame
+    )
     totals = {"one_step": (squares, count), "coverage_90": (covered, count)}
-    return totals | _open_loop(program, data, torch.stack(draws, 1), horizons)
-
-
-def _open_loop(
-    program: Program, data: Trajectories, draws: Tensor, horizons: dict[str, int]
-) -> dict[str, tuple[float, float]]:
-    totals: dict[str, tuple[float, float]] = {}
+    filtered = torch.stack(draws, 1)
     for name, horizon in horizons.items():
-        starts = data.time.shape[0] - horizon
-
-        def windows(values: Tensor, horizon: int = horizon, starts: int = starts) -> Tensor:
-            return torch.stack([values[k : k + starts] for k in range(horizon)])
-
-        *_, state = roll_out(
-            program,
-            draws[:, :starts],
-            windows(acting_controls(program, data)),
-            windows(data.elapsed),
-            windows(data.steps),
-            handler=AtMean(),
-        )
-        error, _ = _residuals(program, state, data.measurements[horizon:])
+        end = _ends_of_roll_outs(program, data, filtered[:, :-horizon], horizon, AtMean())
+        error, _ = _residuals(program, end, data.measurements[horizon:])
         observed = data.observed[horizon:]
         totals[name] = (float(error.mean(0)[observed].double().square().sum()), float(observed.sum()))
     return totals

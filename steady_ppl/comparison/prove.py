@@ -89,26 +89,24 @@ def prove(
             judged[name] = judged[same] if same else judge_program(name, program, data, known_start, seed)
         begin()
         before, true = judged[reference], judged.get(truth or "")
-        coasting = keeping_velocity(before, known_start) if with_constant_velocity else None
+        coasting = keeping_velocity(before) if with_constant_velocity else None
     if isinstance(coasting, Judged):
         judged[COASTING] = coasting
-    floor = noise_floor(true, known_start, seed) if true else None
+    floor = noise_floor(true, seed) if true else None
     notes += [f"no row {name!r}: {why}" for name, why in ((COASTING, coasting), (FLOOR, floor)) if isinstance(why, str)]
     counted = _counted(judged.values())
     found = {name: as_row(row, counted) for name, row in judged.items()}
     if isinstance(floor, Judged):
         found[FLOOR] = as_row(floor, _counted([floor]))
-    horizons = named_horizons(before.data, SECONDS)
-    notes += (
-        before.data.uneven_steps
-        + diagnose_units(before.program, before.data)
-        + _few_starts(before.data, horizons, known_start)
-    )
+    drives = before.problem.data
+    horizons = named_horizons(drives, SECONDS)
+    notes += drives.uneven_steps + diagnose_units(before.problem.program, drives)
+    notes += _few_starts(drives, horizons, known_start)
     return Proof(
         rows=found,
         reference=reference,
         horizons=horizons,
-        step=before.data.median_step,
+        step=drives.median_step,
         trajectories=len(data),
         known_start=known_start,
         seed=seed,

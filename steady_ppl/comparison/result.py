@@ -11,8 +11,20 @@ from torch import Tensor
 
 from steady_ppl.comparison.scores import BANDS, COVERAGE, RESAMPLES, Change, Key, Row, paired
 from steady_ppl.effects import attached
+from steady_ppl.model.program import error_groups
 from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.text import aligned
+
+WIDTH, NAME = 100, 20
+FLOOR = "noise floor"
+POSSIBLE = (FLOOR, "constant velocity", "oracle", "truth")
+JUDGED = {  # the signs of what log p(y) and the error gained
+    (0, 0): ("is not shown to help", "is not shown to be better than"),
+    (1, 1): ("helps", "is better than"),
+    (-1, -1): ("makes it worse", "is worse than"),
+    (1, -1): ("helps log p(y) and harms the predictions", "fits better and predicts worse than"),
+    (-1, 1): ("harms log p(y) and helps the predictions", "fits worse and predicts better than"),
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -41,57 +53,71 @@ class Proof(Displayed):
 
     @property
     def figures(self) -> dict[str, Any]:
-        """Everything as a plain dict, ready for JSON."""
-        return figures(self)
+        """Everything as a plain dict, ready for JSON; every figure is finite, None where there is none."""
+        return {
+            "verdict": verdict(self),
+            "reference": self.reference,
+            "trajectories": self.trajectories,
+            "known_start": self.known_start,
+            "resamples": RESAMPLES,
+            "level": COVERAGE,
+            "horizons": {name: rows * self.step for name, rows in self.horizons.items()},
+            "units": units_of_states(self),
+            "rows": [
+                {"row": name, "program": type(row.program).__name__}
+                | _by_key(self, {key: sums.value for key, sums in row.sums.items()})
+                | {"neglected": float(row.neglected.mean()) if isinstance(row.neglected, Tensor) else None}
+                | {"scales": row.scales, "against_reference": _against_reference(self, name)}
+                for name, row in self.rows.items()
+            ],
+            "notes": self.notes,
+        }
 
     def __str__(self) -> str:
-        return as_text(self.figures)
+        content = self.figures
+        rows, horizons = content["rows"], list(content["horizons"])
+        far = horizons[1:] or horizons
+        said = (
+            f"{self.trajectories} drives; differences are from {self.reference}, with {COVERAGE:.0%} intervals "
+            "bootstrapped over drives"
+        )
+        lines = [*textwrap.wrap(content["verdict"], WIDTH), "", said, ""]
+        bands = [name for name in BANDS if name in horizons]
+        shown = [name if i else f"in 90 % band, {name}" for i, name in enumerate(bands)]
+        header = ["", "log p(y) [nats]", "difference [nats]", "by particles", *shown]
+        lines += _table(header, [[row["row"], *_likely(row), *_covered(row, bands)] for row in rows])
+        lines += ["", "root mean square error of predictions ahead, and by how much it differs"]
+        units_of = {("measurement", of): of for of in rows[0]["measurement"]}
+        units_of |= {("state", of): unit for of, unit in content["units"].items()}
+        for (kind, of), unit in units_of.items():
+            title = of if kind == "state" else "measured"
+            header = [f"{title} [{unit}]" if unit else title, *far, *(f"{name}, differs" for name in far)]
+            cells = [[row["row"], *_errors(row[kind][of], row, kind, of, far)] for row in rows if of in row[kind]]
+            lines += [*_table(header, cells), ""] if cells else []
+        lines += _scales([row for row in rows if row["row"] != FLOOR])
+        for note in self.notes:
+            lines += textwrap.wrap(f"note: {note}", WIDTH)
+        return "\n".join(lines)
 
     def __repr__(self) -> str:
         return f"Proof({verdict(self)!r})"
 
 
-WIDTH, NAME = 100, 20
-FLOOR = "noise floor"
-POSSIBLE = (FLOOR, "constant velocity", "oracle", "truth")
-JUDGED = {  # the signs of what log p(y) and the error gained
-    (0, 0): ("is not shown to help", "is not shown to be better than"),
-    (1, 1): ("helps", "is better than"),
-    (-1, -1): ("makes it worse", "is worse than"),
-    (1, -1): ("helps log p(y) and harms the predictions", "fits better and predicts worse than"),
-    (-1, 1): ("harms log p(y) and helps the predictions", "fits worse and predicts better than"),
-}
-
-
-def figures(found: Proof) -> dict[str, Any]:
-    """Everything as a plain dict; every figure is finite, None where there is none."""
-    return {
-        "verdict": verdict(found),
-        "reference": found.reference,
-        "trajectories": found.trajectories,
-        "known_start": found.known_start,
-        "resamples": RESAMPLES,
-        "level": COVERAGE,
-        "horizons": {name: rows * found.step for name, rows in found.horizons.items()},
-        "units": units_of_states(found),
-        "rows": [
-            {"row": name, "program": type(row.program).__name__}
-            | _by_key(found, {key: sums.value for key, sums in row.sums.items()})
-            | {"neglected": float(row.neglected.mean()) if isinstance(row.neglected, Tensor) else None}
-            | {"scales": row.scales, "against_reference": _against(found, name)}
-            for name, row in found.rows.items()
-        ],
-        "notes": found.notes,
-    }
-
-
 def units_of_states(found: Proof) -> dict[str, str]:
     """Error group of states → unit, empty where its components have several."""
     program = found.rows[found.reference].program
-    order, unit = program.state_names, program.state_units
-    groups = program.error_groups or {name: (name,) for name in order}
-    of = {group: {unit[order.index(name)] for name in members} for group, members in groups.items()}
+    of = {group: {program.state_units[i] for i in members} for group, members in error_groups(program).items()}
     return {group: kinds.pop() if len(kinds) == 1 else "" for group, kinds in of.items()}
+
+
+def _against_reference(found: Proof, name: str) -> dict[str, Any] | None:
+    if name in (found.reference, FLOOR):
+        return None
+    return _by_key(found, {key: _plain(change) for key, change in changes(found, name).items()})
+
+
+def _plain(change: Change | None) -> dict[str, Any] | None:
+    return None if change is None else dict(vars(change))
 
 
 def _by_key(found: Proof, values: Mapping[Key, Any]) -> dict[str, Any]:
@@ -105,24 +131,6 @@ def _by_key(found: Proof, values: Mapping[Key, Any]) -> dict[str, Any]:
             place = nested[key.kind].setdefault(key.of, {}) if key.of or key.kind == "measurement" else nested[key.kind]
             place[ahead[key.horizon]] = value
     return nested
-
-
-def _against(found: Proof, name: str) -> dict[str, Any] | None:
-    if name in (found.reference, FLOOR):
-        return None
-    return _by_key(found, {key: _plain(change) for key, change in changes(found, name).items()})
-
-
-def _plain(change: Change | None) -> dict[str, Any] | None:
-    if change is None:
-        return None
-    interval = change.relative_interval
-    return {
-        "difference": change.value,
-        "interval": list(change.interval),
-        "relative": change.relative,
-        "relative_interval": None if interval is None else list(interval),
-    }
 
 
 def changes(found: Proof, name: str) -> dict[Key, Change | None]:
@@ -151,7 +159,7 @@ def verdict(found: Proof) -> str:
     errors = {key.of: change for key, change in changed.items() if key[::2] == ("measurement", found.horizons[horizon])}
     parts = []
     if likely is not None:
-        parts.append(f"log p(y) {with_interval(likely.value, likely.interval, 1, ' nats a drive')}")
+        parts.append(f"log p(y) {with_interval(likely.difference, likely.interval, 1, ' nats a drive')}")
     for of, change in errors.items():
         differs = _differs(_plain(change))
         where = f" in {of}" if len(errors) > 1 and of else ""
@@ -183,49 +191,22 @@ def with_interval(value: float, interval: Sequence[float], digits: int, unit: st
     return f"{value:+.{digits}f}{unit} [{low}, {high}]".replace("-", "−")
 
 
-def as_text(content: Mapping[str, Any]) -> str:
-    """The figures as text: the verdict, and tables no wider than 100 columns."""
-    rows, horizons = content["rows"], list(content["horizons"])
-    far = horizons[1:] or horizons
-    said = (
-        f"{content['trajectories']} drives; differences are from {content['reference']}, "
-        f"with {content['level']:.0%} intervals bootstrapped over drives"
-    )
-    lines = [*textwrap.wrap(content["verdict"], WIDTH), "", said, ""]
-    bands = [name for name in BANDS if name in horizons]
-    shown = [name if i else f"in 90 % band, {name}" for i, name in enumerate(bands)]
-    header = ["", "log p(y) [nats]", "difference [nats]", "by particles", *shown]
-    lines += _table(header, [[row["row"], *_likely(row), *_covered(row, bands)] for row in rows])
-    lines += ["", "root mean square error of predictions ahead, and by how much it differs"]
-    units_of = {("measurement", of): of for of in rows[0]["measurement"]}
-    units_of |= {("state", of): unit for of, unit in content["units"].items()}
-    for (kind, of), unit in units_of.items():
-        title = of if kind == "state" else "measured"
-        header = [f"{title} [{unit}]" if unit else title, *far, *(f"{name}, differs" for name in far)]
-        cells = [[row["row"], *_errors(row[kind][of], row, kind, of, far)] for row in rows if of in row[kind]]
-        lines += [*_table(header, cells), ""] if cells else []
-    lines += _scales([row for row in rows if row["row"] != FLOOR])
-    for note in content["notes"]:
-        lines += textwrap.wrap(f"note: {note}", WIDTH)
-    return "\n".join(lines)
-
-
 def _likely(row: Mapping[str, Any]) -> list[str]:
     change = (row["against_reference"] or {}).get("log_likelihood")
     said = with_interval(change["difference"], change["interval"], 1) if change else ""
-    left = _number(row["neglected"], "+.2f")
-    return [cell.replace("-", "−") for cell in (_number(row["log_likelihood"], ".1f"), said, left)]
+    left = number(row["neglected"], "+.2f")
+    return [cell.replace("-", "−") for cell in (number(row["log_likelihood"], ".1f"), said, left)]
 
 
 def _covered(row: Mapping[str, Any], bands: Sequence[str]) -> list[str]:
-    return [_number(row["coverage_90"].get(name), ".1%") for name in bands]
+    return [number(row["coverage_90"].get(name), ".1%") for name in bands]
 
 
 def _errors(
     errors: Mapping[str, float | None], row: Mapping[str, Any], kind: str, of: str, horizons: Sequence[str]
 ) -> list[str]:
     against = (row["against_reference"] or {}).get(kind, {}).get(of, {})
-    return [_number(errors.get(name), ".3g") for name in horizons] + [_differs(against.get(name)) for name in horizons]
+    return [number(errors.get(name), ".3g") for name in horizons] + [_differs(against.get(name)) for name in horizons]
 
 
 def _differs(change: Mapping[str, Any] | None) -> str:
@@ -240,7 +221,7 @@ def _scales(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     for kind in ("channels", "measurements"):
         before: list[str] | None = None
         for label in rows[0]["scales"][kind]:
-            column = [_number(row["scales"][kind].get(label), ".4g") for row in rows]
+            column = [number(row["scales"][kind].get(label), ".4g") for row in rows]
             if column == before:
                 last = list(columns)[-1]
                 columns[last if "…" in last else last.replace(" ", " … ", 1)] = columns.pop(last)
@@ -251,7 +232,8 @@ def _scales(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return _table(["noise σ", *columns], lines)
 
 
-def _number(value: float | None, form: str) -> str:
+def number(value: float | None, form: str) -> str:
+    """A figure as text, a dash where there is none."""
     return "–" if value is None else f"{value:{form}}"
 
 

@@ -18,9 +18,9 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, UsageError
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
-from steady_ppl.likelihood.fit import roomy_path
-from steady_ppl.likelihood.maximize import Maximum, maximise
+from steady_ppl.likelihood.maximize import Maximum, maximise, widen_noise
 from steady_ppl.likelihood.parameters import elements, values_of
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import widens
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import can_be_cut, counts_rows, is_step
@@ -210,7 +210,7 @@ def check_step(
             return StepTrial(substeps, float(ahead.log_likelihood.sum()), 0.0, changed, resting_path(ahead, data))
         if steps:
             with seeded(substeps, "wider noise"):
-                path = roomy_path(changed, data, known_start, path)
+                path = widen_noise(Problem(changed, data, known_start), path)
         maximum = maximise(changed, data, path, known_start=known_start, steps=steps, precision=PRECISION)
         return _trial(changed, maximum, names)
 

@@ -1,9 +1,10 @@
-"""Candidates that are worth fitting, and where their fits begin."""
+"""Candidates that are worth fitting, where their fits begin, and their best knees, widths and places."""
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,13 +13,10 @@ from torch import Tensor
 
 from steady_ppl.discovery.curves import curves
 from steady_ppl.discovery.effect_scores import Column, Simulated, columns_of, scores_along, simulate_scores
-from steady_ppl.discovery.noise_departure import departures
-from steady_ppl.discovery.refits import ALWAYS, BY_LIKELIHOOD, Refit, Worth, refit_with
-from steady_ppl.discovery.screening import ALPHA, Screened, Tested, screen
+from steady_ppl.discovery.refits import ALWAYS, BY_LIKELIHOOD, Refit, Threshold, refit_near, refit_with
+from steady_ppl.discovery.screening import ALPHA, Screened, Tested, departures, screen
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.errors import FilterError
-from steady_ppl.gaussian.information_filter import Lookahead
-from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood.parameters import Element, elements
 from steady_ppl.likelihood.scores import measured, smoothed, typical_spreads
 from steady_ppl.model.program import Program
@@ -31,53 +29,29 @@ CLEAR_GAIN = 10.0  # nats of held-out log p(y) for which a test need only be nea
 NEAR_ALPHA = ALPHA / 5  # p-value of a single test that is near it
 MIN_STATISTIC_TO_RETRY = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
 LINEAR = ("push", "command", "history", "measured", "viewpoint")
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What a search was told.
-
-    Attributes:
-        known_start: the first states are certain.
-        withheld: names of effects that are left out of the catalogue.
-    """
-
-    known_start: bool
-    withheld: Sequence[str] = ()
+MIN_GAIN_OF_PLACE = 0.3  # nats by which another knee or place has to be likelier
+PASSES = 4  # along all knees and places in turns, with steps of one size
+NEIGHBOUR_SHARE = 0.25  # of the grid's spacing, at which a place's likelihood is compared with its neighbours'
 
 
 @dataclass(frozen=True)
 class Screening:
-    """Tests of a program, and what the refits need of them.
+    """Tests of a program, and what the refits need of them."""
 
-    Attributes:
-        tests: of all candidates.
-        parameters: the program's learnable numbers, in the order of `information`.
-        information: of parameters and one candidate, by the candidate; the parameters' alone by "".
-    """
-
-    tests: Screened
-    parameters: list[Element]
-    information: Mapping[str, Tensor]
+    tests: Screened  # of all candidates
+    parameters: list[Element]  # the program's learnable numbers, in the order of `information`
+    information: Mapping[str, Tensor]  # of parameters and one candidate, by the candidate; the parameters' alone by ""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A candidate that was fitted.
+    """A candidate that was fitted."""
 
-    Attributes:
-        tested: its score test.
-        refit: the program with it, or why there is none.
-        gain: held-out log p(y) above that of the program without, nats, `(B,)`.
-        alone: the same of the programs that were fitted to one fold alone, which is all there is of those given up.
-        behind: the best in its round, where one fold was enough to see that this one is behind.
-    """
-
-    tested: Tested
-    refit: Refit | str
-    gain: Tensor
-    alone: Tensor
-    behind: Candidate | None = None
+    tested: Tested  # its score test
+    refit: Refit | str  # the program with it, or why there is none
+    gain: Tensor  # held-out log p(y) above that of the program without, nats, (B,)
+    alone: Tensor  # the same of the programs fitted to one fold alone, which is all there is of those given up
+    behind: Candidate | None = None  # the best in its round, where one fold showed that this one is behind
 
     @property
     def variant(self) -> Variant:
@@ -127,44 +101,44 @@ class Candidate:
 
 
 @torch.no_grad()
-def screen_program(now: Refit, declared: Program, settings: Settings, *, sets: int, seed: int) -> Screening:
-    """Test every candidate that a fitted program does not have.
+def screen_program(now: Refit, declared: Program, *, sets: int, seed: int, withheld: Sequence[str] = ()) -> Screening:
+    """Test every candidate that a fitted program does not have, on the drives of its first fold.
 
     Args:
-        now: the fitted program; the drives of its first fold are tested.
+        now: the fitted program.
         declared: as it was before it was fitted.
-        settings: of the search.
-        sets: simulated sets.
-        seed: of them.
+        sets, seed: simulated sets.
+        withheld: names of effects that are left out of the catalogue.
     """
     program, fold = now.program, now.folds[0]
-    parts = elements(program)
+    problem, parts = fold.fitting(program), elements(program)
     there = {variant.name for variant in attached(program)}
     seen = replace(fold.drives, states=fold.path.states)
-    ahead = smooth(program, fold.drives, fold.path, known_start=settings.known_start, passes=3, tolerance=0.01)
+    ahead = problem.smooth(fold.path, passes=3, tolerance=0.01)
     away = departures(declared, now, parts)
-    away = [one for one in away if one.variant.name not in there and one.variant.effect.name not in settings.withheld]
+    away = [one for one in away if one.variant.name not in there and one.variant.effect.name not in withheld]
     skip = there | {departure.variant.name for departure in away}
     tailed = bool(torch.isfinite(measured(program, fold.path.states[:1, :1]).freedom).any())  # Student t as it stands
     variants = [
         variant
         for effect in catalogue(program)
-        if effect.name not in settings.withheld and not (tailed and effect.form == "tails")
+        if effect.name not in withheld and not (tailed and effect.form == "tails")
         for variant in effect.variants(program, seen)
         if variant.name not in skip
     ]
     spread, sharpness = typical_spreads(program, fold.drives, smoothed(ahead, fold.drives))
     columns = columns_of([*variants, *curves(program, seen, spread, sharpness)])
-    observed = scores_along(program, fold.drives, ahead, parts, columns)
+    observed = scores_along(problem, ahead, parts, columns)
     broken = (~torch.isfinite(observed).all(-1)).nonzero().flatten().tolist()
     if broken:
         raise FilterError(f"trajectory {fold.drives.labels[broken[0]]}: the fitted program blows up on it")
-    starts = _starts(ahead, fold.path.states[0], settings.known_start, sets, seed)
+    starts = fold.path.states[0].expand(sets, -1, -1)  # known, or draws of their posterior
+    if not fold.known_start:
+        with seeded(seed, "starts"):
+            starts = ahead.draws(sets)[1][:, 0].to(starts)
 
     def simulate() -> Piece:
-        made = simulate_scores(
-            program, fold.drives, starts, parts, columns, known_start=settings.known_start, seed=seed
-        )
+        made = simulate_scores(problem, starts, parts, columns, seed=seed)
         return {"scores": made.scores, "log_likelihood": made.log_likelihood}, {}
 
     simulated = Simulated(**piece(simulate)[0])
@@ -174,15 +148,6 @@ def screen_program(now: Refit, declared: Program, settings: Settings, *, sets: i
         information[_key(column)] = simulated.information[index][:, index]
         first += column.size
     return Screening(screen(observed, simulated, len(parts), columns, away), parts, information)
-
-
-def _starts(ahead: Lookahead, path: Tensor, known_start: bool, sets: int, seed: int) -> Tensor:
-    """First states of simulated sets, `(S, B, D)`: the known ones, or draws of their posterior."""
-    if known_start:
-        return path.expand(sets, *path.shape)
-    with seeded(seed, "starts"):
-        _, states, _ = ahead.draws(sets)
-    return states[:, 0].to(path)
 
 
 def leaders(screened: Screened, first: bool) -> list[Tested]:
@@ -196,31 +161,19 @@ def leaders(screened: Screened, first: bool) -> list[Tested]:
     if not alive:
         return []
     top = alive[0][0]
-    few = alive[:LEADERS] if first else [one for k, one in enumerate(alive[:LEADERS]) if k == 0 or _nearly(one[1])]
-    few += [one for one in alive[LEADERS:] if first and _nearly(one[1])]
-    return [tested for i, tested in alive if (i, tested) in few or float(screened.alike[top, i]) > ALIKE]
+    best = [i for i, _ in alive[:LEADERS]]
+    near = [i for i, tested in alive if tested.p_value < NEAR_ALPHA]
+    few = {*best, *near} if first else {top, *(i for i in best if i in near)}
+    return [tested for i, tested in alive if i in few or float(screened.alike[top, i]) > ALIKE]
 
 
-def _nearly(tested: Tested) -> bool:
-    return tested.p_value < NEAR_ALPHA
-
-
-def fitted(now: Refit, tested: Tested, screening: Screening, settings: Settings, worth: Worth = ALWAYS) -> Candidate:
-    """The program with a candidate.
-
-    Args:
-        now: the program without.
-        tested: the candidate.
-        screening: that tested it.
-        settings: of the search.
-        worth: what the first fold must reach for the second to be fitted as well.
-    """
+def fitted(now: Refit, tested: Tested, screening: Screening, threshold: Threshold = ALWAYS) -> Candidate:
+    """A program with a candidate, by the screening that tested it; see `refit_with` for `threshold`."""
     effect = tested.variant.effect
     known = screening.information[_key(tested.column)] if effect.null == 0 and effect.form in LINEAR else None
 
     def fit(start: Any) -> Candidate:
-        refit = refit_with(now, tested.variant, start, known_start=settings.known_start, information=known, worth=worth)
-        return judged(now, tested, refit)
+        return judged(now, tested, refit_with(now, tested.variant, start, information=known, threshold=threshold))
 
     absent = [0.0] * len(tested.coefficient)
     if known is not None and tested.column.probe is None and now.fitting == BY_LIKELIHOOD:
@@ -266,3 +219,107 @@ def _start(tested: Tested) -> Any:
 
 def _key(column: Column) -> str:
     return f"{column.variant.label} {column.probe}"
+
+
+def at_its_best_place(now: Refit, candidate: Candidate) -> Candidate:
+    """A candidate with the knee, width or place at which it gains most: on its grid, and then between its points."""
+    if isinstance(candidate.refit, str) or not candidate.variant.profiled:
+        return candidate
+    grid, at, tested = _grid(now, candidate), candidate.variant, candidate.tested
+    fit: Refit | str = candidate.refit
+    if not candidate.is_judged:
+        fit = refit_with(now, at, candidate.refit.coefficient(at))
+        if isinstance(fit, str):
+            return candidate
+
+    def try_all(variants: Iterable[Variant]) -> None:
+        nonlocal at, fit
+        for variant in variants:
+            assert isinstance(fit, Refit)
+            other = refit_near(now, fit, [variant])
+            if isinstance(other, Refit) and gain_of_fits(now, other) > gain_of_fits(now, fit) + MIN_GAIN_OF_PLACE:
+                at, fit = variant, other
+
+    try_all(variant for variant in grid if variant.label != candidate.variant.label)
+    for share in (0.5, 0.25):
+        for _ in range(PASSES):
+            before = at
+            for name in at.profiled:
+                try_all(_beside(at, grid, name, share))
+            if at is before:
+                break
+    there = judged(now, replace(tested, column=replace(tested.column, variant=at)), fit)
+    return there if there.total > candidate.total else candidate
+
+
+def variance_of_places(now: Refit, candidate: Candidate) -> Tensor:
+    """What the uncertainty of knees, widths and places adds to the variance of a coefficient, `(k,)`.
+
+    By the delta method along their profile likelihood, with a prior as wide as their grid. Where the program cannot be
+    fitted on either side of one, its coefficient is taken as uncertain by its own size. `now` is the program without
+    the candidate, which is fitted at its best place.
+    """
+    assert isinstance(candidate.refit, Refit)
+    at, grid, near = candidate.variant, _grid(now, candidate), candidate.refit
+    here, best = near.coefficient(at).flatten().double(), gain_of_fits(now, near)
+
+    def fitted(variant: Variant) -> tuple[Tensor, float] | None:
+        """How the coefficient changes, and by how much the likelihood falls."""
+        refit = refit_near(now, near, [variant])
+        if isinstance(refit, str):
+            return None
+        return refit.coefficient(variant).flatten().double() - here, best - gain_of_fits(now, refit)
+
+    variance, ways = torch.zeros_like(here), list[_Way]()
+    for name in at.profiled:
+        sides = [
+            (sign, v, fit)
+            for sign, v in zip((1, -1), _beside(at, grid, name, NEIGHBOUR_SHARE), strict=True)
+            if (fit := fitted(v))
+        ]
+        if not sides:
+            variance = variance + here.square()
+            continue
+        slope = torch.stack([sign * change for sign, _, (change, _) in sides]).mean(0)
+        bend = sum(2 * fall for *_, (_, fall) in sides) / len(sides)
+        count = len({variant.profiled[name] for variant in grid})
+        sign, variant, (_, fall) = sides[0]
+        ways.append(_Way(name, sign, variant, fall, slope, bend, (2 * NEIGHBOUR_SHARE / max(1, count - 1)) ** 2))
+    if not ways:
+        return variance
+    curvature = torch.diag(torch.tensor([way.bend for way in ways], dtype=torch.float64))
+    for (i, one), (j, other) in itertools.combinations(enumerate(ways), 2):
+        both = fitted(replace(one.beside, options={**one.beside.options, other.name: other.beside.options[other.name]}))
+        if both is not None:
+            curvature[i, j] = curvature[j, i] = one.sign * other.sign * (both[1] - one.fall - other.fall)
+    values, turn = torch.linalg.eigh(curvature)
+    along = torch.stack([way.slope for way in ways], -1) @ turn
+    return variance + (along.square() / (values.clamp(min=0) + min(way.prior for way in ways))).sum(-1)
+
+
+@dataclass(frozen=True)
+class _Way:
+    """A step beside a place, in one of its numbers."""
+
+    name: str  # of the number
+    sign: int  # which way it goes
+    beside: Variant  # where that leads
+    fall: float  # of the likelihood there, nats
+    slope: Tensor  # change of the coefficient by a step up, (k,)
+    bend: float  # curvature of the likelihood in steps
+    prior: float  # precision of a normal as wide as the grid, in steps
+
+
+def _grid(now: Refit, candidate: Candidate) -> list[Variant]:
+    """The effect at all places that were screened."""
+    fold = now.folds[0]
+    every = candidate.variant.effect.variants(now.program, replace(fold.drives, states=fold.path.states))
+    return [variant for variant in every if variant.name == candidate.variant.name]
+
+
+def _beside(at: Variant, grid: Sequence[Variant], name: str, share: float) -> list[Variant]:
+    """The effect on either side of a place: by a share of the grid's spacing, or of the value where there is none."""
+    value = at.profiled[name]
+    values = sorted({float(variant.profiled[name]) for variant in grid})
+    apart = min((b - a for a, b in itertools.pairwise(values)), default=0.8 * value)
+    return [replace(at, options={**at.options, name: value + sign * share * apart}) for sign in (1, -1)]

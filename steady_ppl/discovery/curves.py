@@ -36,11 +36,8 @@ def curves(program: Program, data: Trajectories, spread: Tensor, sharpness: Tens
     """All curves that are looked at: every channel over every variable, what is commanded of it over time, every
     measurement over its own reading.
 
-    Args:
-        program: without them.
-        data: with the states along which they are looked at.
-        spread: standard deviations of the channels, `(C,)`.
-        sharpness: of the measurements, `(K,)`.
+    `data` has the states along which they are looked at. `spread`, `(C,)`, are standard deviations of the channels,
+    `sharpness`, `(K,)`, of the measurements.
     """
     assert data.states is not None
     controls = row_controls(program, acting_controls(program, data))
@@ -54,7 +51,9 @@ def curves(program: Program, data: Trajectories, spread: Tensor, sharpness: Tens
             continue
         for index, channel in enumerate(program.channel_names):
             for times in (ADDITIVE, COMMANDED) if variable == "time" else (ADDITIVE,):
-                size = _size(data, multiplier(mean, channel, times))
+                size = 1.0
+                if times:
+                    size = float(mean[channel].expand(data.steps.shape)[data.transitions].square().mean().sqrt())
                 if size > 0 and float(spread[index]) / size > MIN_HEIGHT:
                     unit = "1" if times else program.channel_units[index]
                     height = float(spread[index]) / size
@@ -67,13 +66,6 @@ def curves(program: Program, data: Trajectories, spread: Tensor, sharpness: Tens
 def multiplier(mean: Mapping[str, Tensor], channel: str, times: str) -> Tensor | float:
     """What a curve of a channel is multiplied with, `(...)`."""
     return mean[channel] if times == COMMANDED else 1.0
-
-
-def _size(data: Trajectories, values: Tensor | float) -> float:
-    """The root mean square of what a curve is multiplied with."""
-    if not isinstance(values, Tensor):
-        return values
-    return float(values.expand(data.transitions.shape)[data.transitions].square().mean().sqrt())
 
 
 def variables(

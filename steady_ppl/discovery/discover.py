@@ -16,16 +16,15 @@ from steady_ppl.comparison.result import Proof
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories, joined
 from steady_ppl.discovery.candidates import NATS
-from steady_ppl.discovery.finding import Finding, findings, shape_of
+from steady_ppl.discovery.finding import Finding, findings, next_run, shape_of
 from steady_ppl.discovery.fitting import ByDraws
-from steady_ppl.discovery.next_run import next_run
 from steady_ppl.discovery.result import Discovery
-from steady_ppl.discovery.search import MAX_EFFECTS, Found, Search, search
+from steady_ppl.discovery.search import MAX_EFFECTS, Found, Search, Settings, search
 from steady_ppl.effects import of_name, record, restore, written_class
 from steady_ppl.errors import DataError, UsageError
-from steady_ppl.gaussian.linearize import why_not_linear
 from steady_ppl.likelihood.parameters import elements
-from steady_ppl.model.program import Program, for_program
+from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.program import Program
 from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit, program_source, versions
 from steady_ppl.runs.folder import JOURNAL, require_same, run_folder, write_record
@@ -35,7 +34,7 @@ from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
 FITTED_FURTHER = 10.0  # nats that fitting a run further may gain before it is said
-
+FEWEST_DRIVES, FEWEST_SETS = 5, 50
 NOT_CONVERGED = "the program's own fit has not converged: no ranking below is to be trusted"
 
 
@@ -93,9 +92,9 @@ def discover(
     program = copy.deepcopy(program).cpu()
     declared = copy.deepcopy(declared or program).cpu()
     notes: list[str] = []
-    if mix and valid is None:
-        raise UsageError("mix puts two tables together: name the second one (--valid)")
-    if mix and valid is not None:
+    if mix:
+        if valid is None:
+            raise UsageError("mix puts two tables together: name the second one (--valid)")
         train, valid = joined(train=train, valid=valid), None
     if valid is None:
         if len(train) < 2 * FEWEST_DRIVES:
@@ -107,31 +106,23 @@ def discover(
         train = train.subset(range(0, len(train), 2))
         kept = f"{len(valid)} of the {len(train) + len(valid)} drives were kept to choose by"
         notes.append(f"the tables were mixed: {kept}" if mix else f"no validation drives were given: {kept}")
-    drives = [for_program(program, table).without_truth(keep_start=known_start) for table in (train, valid)]
-    require(program, drives[0], drives[1], known_start, simulations)
+    problem, choosing = (Problem.of_table(program, table, known_start) for table in (train, valid))
+    require(problem, choosing.data, simulations)
     with stages(("", 8), ("comparing before and after", 1), ("looking for a better next drive", 1)) as begin:
         begin()
         with seeded(seed, "search"):
-            found = search(
-                program,
-                drives[0],
-                drives[1],
-                known_start=known_start,
-                declared=declared,
-                sets=simulations,
-                seed=seed,
-                withheld=withheld,
-            )
+            chosen = Settings(declared, simulations, seed=seed, withheld=withheld)
+            found = search(problem, choosing.data, chosen)
         begin()
         shape = shape_of(found, program)
         effects = [] if shape else findings(found)
         final = found.base if shape or found.rounds[0].quiet else found.final
         settings = {"simulations": simulations, "seed": seed}
         fits = [Fit(refit.mean_program(), "discover", settings, seed, known_start) for refit in (found.base, final)]
-        proof = _proof(found, shape is not None, drives[1], known_start, seed)
+        proof = _proof(found, shape is not None, choosing, seed)
         begin()
         unclear = _unclear(found, effects)
-        proposed = next_run(unclear, known_start, seed) if unclear else None
+        proposed = next_run(unclear, seed) if unclear else None
     if unclear and proposed is None:
         alike = " from ".join(candidate.variant.name for candidate in unclear.alike[:2])
         notes.append(f"no way of driving that was tried tells {alike} better than these drives do")
@@ -144,7 +135,7 @@ def discover(
         before=fits[0],
         after=fits[1],
         doubts=_doubts(found, is_fitted),
-        notes=notes + diagnose_units(program, drives[0]) + _notes(found) + far_off(proof.rows, drives[1]),
+        notes=notes + diagnose_units(program, problem.data) + _notes(found) + far_off(proof.rows, choosing.data),
     )
 
 
@@ -177,10 +168,10 @@ def _as_written(program: Program) -> Program:
         return restore(written_class(program)(), record(program)).to(next(program.parameters(), torch.zeros(())).dtype)
 
 
-def _proof(found: Search, is_curve: bool, valid: Trajectories, known_start: bool, seed: int) -> Proof:
+def _proof(found: Search, is_curve: bool, valid: Problem, seed: int) -> Proof:
     after: Any = found.curve.refit if is_curve and found.curve else found.final
     rows = {"before": found.base.judges.programs[0], "after": after.judges.programs[0]}
-    return prove(rows, valid, known_start=known_start, with_constant_velocity=False, seed=seed)
+    return prove(rows, valid.data, known_start=valid.known_start, with_constant_velocity=False, seed=seed)
 
 
 def _notes(found: Search) -> list[str]:
@@ -205,8 +196,8 @@ def _notes(found: Search) -> list[str]:
         )
     if not found.final.converged and found.found:
         notes.append("the fit with what was found has not converged")
-    if found.broke:
-        effects = " and ".join(found.broke)
+    if found.diverged:
+        effects = " and ".join(found.diverged)
         notes.append(f"{effects}: taken back, with it the program blows up on drives of its own")
     if len(found.found) == MAX_EFFECTS:
         notes.append(f"the search stops at {MAX_EFFECTS} effects: add them, fit, and discover again from there")
@@ -229,17 +220,9 @@ def _of_one_drive(found: Found) -> str:
     return f"without drive {drives[int(gain.argmax())]} nothing would be left of its gain: look at that drive"
 
 
-FEWEST_DRIVES, FEWEST_SETS = 5, 50
-
-
-def require(program: Program, train: Trajectories, valid: Trajectories, known_start: bool, simulations: int) -> None:
-    """Refuse what cannot be searched.
-
-    Raises:
-        UsageError: a network, a program that cannot be linearised, or too few simulations.
-        DataError: too few drives, one that is too long, no known start, nothing measured, or controls that never
-            change.
-    """
+def require(problem: Problem, valid: Trajectories, simulations: int) -> None:
+    """Refuse what cannot be searched: the faults that `discover` raises."""
+    program, train = problem.program, problem.data
     if simulations < FEWEST_SETS:
         raise UsageError(f"got {simulations} simulations: the calibration needs at least {FEWEST_SETS}, 200 are better")
     elements(program)
@@ -254,15 +237,14 @@ def require(program: Program, train: Trajectories, valid: Trajectories, known_st
         if drives.time.shape[0] < 3 or not bool(drives.observed[1:].any()):
             raise DataError(f"the {name} drives have no measurements after their first rows")
         refuse_long(drives)
-        if known_start:
-            _ = drives.known_start
     both = shared(train, valid)
     if both:
+        some = ", ".join(both[:3]) + (" …" if len(both) > 3 else "")
         raise UsageError(
-            f"{len(both)} of the validation drives are training drives as well ({_few(both)}): nothing could be judged "
+            f"{len(both)} of the validation drives are training drives as well ({some}): nothing could be judged "
             "by them"
         )
-    why = why_not_linear(program, train, known_start=known_start)
+    why = problem.why_not_linear()
     if why is not None:
         raise UsageError(f"discover needs a program that can be linearised: {why.split(': looking')[0]}")
     constant = unexcited(program, train)
@@ -285,10 +267,6 @@ def _measured(data: Trajectories, index: int) -> bytes:
     return torch.where(seen, data.measurements[:rows, index], 0.0).numpy().tobytes() + seen.numpy().tobytes()
 
 
-def _few(labels: Sequence[str]) -> str:
-    return ", ".join(labels[:3]) + (" …" if len(labels) > 3 else "")
-
-
 def unexcited(program: Program, data: Trajectories) -> list[str]:
     """Controls that have one value everywhere."""
     controls = data.controls[:-1][data.transitions]
@@ -309,12 +287,8 @@ def kept_search(
 ) -> Iterator[None]:
     """The folder of a search for the block that makes it; nothing at all where there is none.
 
-    Args:
-        folder: the run.
-        given: the program or run that is searched.
-        train, valid, options: of `discover`.
-        force: overwrite a run.
-        resume: go on with the journal that is there; everything must be as it was.
+    `given`, `train`, `valid` and `options` are those of `discover`. `resume` goes on with the journal that is there, if
+    everything is as it was; `force` overwrites a run.
 
     Raises:
         RunError: as `run_folder`, or what is given is not what the search was begun with.

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 
 import torch
 from torch import Tensor
@@ -16,8 +16,8 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import simulate_again
-from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood.parameters import Element
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import (
     Smoothed,
     channel_moments,
@@ -32,19 +32,15 @@ from steady_ppl.model.substeps import acting_controls, row_controls
 from steady_ppl.utils.random import seeded
 
 PART = 400  # trajectories at a time
+LEAST_LEFT = 0.8  # share of the simulated sets that must not blow up
 
 
 @dataclass(frozen=True)
 class Column:
-    """A candidate's scores.
+    """A candidate's scores."""
 
-    Attributes:
-        variant: the effect.
-        probe: the finite coefficient that was tried, None for the derivative where the effect is absent.
-    """
-
-    variant: Variant
-    probe: float | None = None
+    variant: Variant  # the effect
+    probe: float | None = None  # the finite coefficient that was tried, None for the derivative where it is absent
 
     @property
     def size(self) -> int:
@@ -58,13 +54,7 @@ def columns_of(variants: Sequence[Variant]) -> list[Column]:
 
 
 class Scoring:
-    """Scores of columns along a smoothed program.
-
-    Args:
-        program: without the candidates.
-        data: as returned by `for_program`.
-        at: of the program on these drives.
-    """
+    """Scores of columns along a program without them, smoothed on these drives."""
 
     def __init__(self, program: Program, data: Trajectories, at: Smoothed) -> None:
         self.program, self.data, self.at = program, data, at
@@ -73,18 +63,17 @@ class Scoring:
         self.means, spread = channel_moments(program, data, at.channels.points, self.acting)
         self.row_spread = spread[0]
         self.substep_spread = substep_spreads(program, data, at.channels.points[:1], self.acting)[0]
-        self.here = measured(program, at.measurements.points)
-        self._points: dict[int, Tensor] = {}
+        self._around = cache(at.channels.around)
         self._values: dict[int, dict[str, Tensor]] = {}
 
     def __call__(self, column: Column) -> Tensor:
         """Scores of a column, `(B, size)`, in double precision."""
-        form = column.variant.effect.form
         if column.variant.effect.function is over_state:
             return self._curve_of_channel(column.variant)
         if column.variant.effect.function is over_reading:
             return self._curve_of_readings(column.variant)
-        parts = [_FORMS[form](self, column.variant, c, width) for c, width in self._differences(column)]
+        score = getattr(self, f"_{column.variant.effect.form}")
+        parts = [score(column.variant, c, width) for c, width in self._differences(column)]
         return torch.stack(parts, -1).double()
 
     def _differences(self, column: Column) -> Iterator[tuple[tuple[Tensor, Tensor], float]]:
@@ -106,12 +95,13 @@ class Scoring:
 
     def _push(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         values = [value for value in c if bool(torch.isfinite(value).all())]
-        odd = len(values) == 2 and self._is_odd(variant, values)
-        if odd:
-            values, width = values[:1], width / 2
+        of_one_drive = [self._pushed(variant, value, 0, few=True) for value in values]
+        first, second = of_one_drive[0], of_one_drive[-1]
+        if len(values) == 2 and all(bool((first[name] == -second[name]).all()) for name in first):
+            values, width = values[:1], width / 2  # the push only changes its sign with the coefficient
         total = self.at.states.new_zeros(len(self.data))
         for index, channel in enumerate(self.program.channel_names):
-            if channel not in self._channels(variant, values[0]):
+            if channel not in first:
                 continue
             pushes = [self._pushed(variant, value, index)[channel] for value in values]
             change = pushes[0] if len(pushes) == 1 else pushes[0] - pushes[1]
@@ -143,9 +133,8 @@ class Scoring:
         if index not in self._values:
             given = (self._around(index), self.controls[:-1], self.data.elapsed[:-1])
             found = variables(self.program, *given, self._means_around(index))
-            self._values[index] = {
-                name: value.expand(3, *self.substep_spread.shape[:2]) for name, value in found.items()
-            }
+            shape = (3, *self.substep_spread.shape[:2])
+            self._values[index] = {name: value.expand(shape) for name, value in found.items()}
         return self._values[index]
 
     def _means_around(self, index: int) -> dict[str, Tensor]:
@@ -162,32 +151,15 @@ class Scoring:
             means = {name: mean[:1, :, :1] for name, mean in means.items()}
         return variant(self.program, points, *given, c=value, mean=means)
 
-    def _channels(self, variant: Variant, value: Tensor) -> set[str]:
-        return set(self._pushed(variant, value, 0, few=True))
-
-    def _is_odd(self, variant: Variant, values: list[Tensor]) -> bool:
-        """Whether the push only changes its sign with the coefficient, as far as one drive shows."""
-        first, second = (self._pushed(variant, value, 0, few=True) for value in values)
-        return all(bool((first[name] == -second[name]).all()) for name in first)
-
-    def _around(self, index: int) -> Tensor:
-        if index not in self._points:
-            self._points[index] = self.at.channels.around(index)
-        return self._points[index]
-
     def _command(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         control, time = self.controls[:-1], self.data.elapsed[:-1]
-        points = self.at.channels.points
-        changed = [variant(self.program, points, control, time, c=value) for value in c]
-        return self._of_control(changed[0] - changed[1], width)
+        up, down = (variant(self.program, self.at.channels.points, control, time, c=value) for value in c)
+        slope = (self.by_control * (up - down).movedim(-1, 0).unsqueeze(-1)).sum(0)
+        return self.at.channels.of_mean(slope / (width * self.row_spread))
 
     def _history(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
-        changed = [variant(self.program, self.controls, self.data.elapsed, c=value)[:-1] for value in c]
-        return ((changed[0] - changed[1]) * self.of_control).sum((0, -1)) / width
-
-    def _of_control(self, change: Tensor, width: float) -> Tensor:
-        slope = (self.by_control * change.movedim(-1, 0).unsqueeze(-1)).sum(0)
-        return self.at.channels.of_mean(slope / (width * self.row_spread))
+        up, down = (variant(self.program, self.controls, self.data.elapsed, c=value)[:-1] for value in c)
+        return ((up - down) * self.of_control).sum((0, -1)) / width
 
     @cached_property
     def of_control(self) -> Tensor:
@@ -197,8 +169,7 @@ class Scoring:
     @cached_property
     def by_control(self) -> Tensor:
         """Derivatives of the channels' means in the acting controls, `(U, P, T, B, C)`."""
-        found = []
-        count = self.controls.shape[-1]
+        found, count = [], self.controls.shape[-1]
         for index in range(count):
             step = 0.02 * float(self.controls[..., index].abs().max()) or 0.02
             up, down = self.acting.clone(), self.acting.clone()
@@ -211,28 +182,26 @@ class Scoring:
     @cached_property
     def reading(self) -> Tensor:
         """What is measured on average at the measurements' points, `(P, T + 1, B, K)`."""
-        return self.here.reading
+        return measured(self.program, self.at.measurements.points).reading
 
     def _measured(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
-        points, reading = self.at.measurements.points, self.reading
-        changed = [variant(self.program, points, reading, c=value) for value in c]
-        return self.at.measurements.of_mean((changed[0] - changed[1]) * self.at.sharpness / width)
+        up, down = (variant(self.program, self.at.measurements.points, self.reading, c=value) for value in c)
+        return self.at.measurements.of_mean((up - down) * self.at.sharpness / width)
 
     def _viewpoint(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         points = self.at.measurements.points
-        seen = [measured(self.program, variant(self.program, points, c=value)) for value in c]
-        return self.at.measurements.of_mean(seen[1].shift(seen[0]) * self.at.sharpness / width)
+        up, down = (measured(self.program, variant(self.program, points, c=value)) for value in c)
+        return self.at.measurements.of_mean(down.shift(up) * self.at.sharpness / width)
 
     def _spread(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         given = (self.at.states[:-1], self.controls[:-1], self.data.elapsed[:-1], self.data.steps)
-        factors = [
-            by_channel(self.program, variant(self.program, *given, c=value), 1.0, self.substep_spread) for value in c
-        ]
-        return self.at.channels.of_spread((factors[0] / factors[1]).log() / width)
+        factors = (variant(self.program, *given, c=value) for value in c)
+        up, down = (by_channel(self.program, factor, 1.0, self.substep_spread) for factor in factors)
+        return self.at.channels.of_spread((up / down).log() / width)
 
     def _blur(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
-        factors = [variant(self.program, self.at.states, c=value) for value in c]
-        return self.at.measurements.of_spread((factors[0] / factors[1]).log() / width)
+        up, down = (variant(self.program, self.at.states, c=value) for value in c)
+        return self.at.measurements.of_spread((up / down).log() / width)
 
     def _tails(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         """Of 1/ν at zero: (z⁴ − 2 z² − 1) / 4, its posterior mean."""
@@ -247,39 +216,16 @@ class Scoring:
         at = self.at.channels
         product = at.mean[1:] * at.mean[:-1] + self.at.lag[1:]
         ratio = self.substep_spread[:-1] / self.substep_spread[1:]
-        chosen = self.substep_spread.new_tensor(
-            [float(n in variant.options["channels"]) for n in self.program.channel_names]
-        )
-        return torch.where(at.present[1:], product * ratio * chosen, 0.0).sum((0, -1))
-
-
-_FORMS: dict[str, Callable[[Scoring, Variant, tuple[Tensor, Tensor], float], Tensor]] = {
-    "push": Scoring._push,
-    "command": Scoring._command,
-    "history": Scoring._history,
-    "measured": Scoring._measured,
-    "viewpoint": Scoring._viewpoint,
-    "spread": Scoring._spread,
-    "blur": Scoring._blur,
-    "tails": Scoring._tails,
-    "colour": Scoring._colour,
-}
-
-
-LEAST_LEFT = 0.8  # share of the simulated sets that must not blow up
+        chosen = [float(name in variant.options["channels"]) for name in self.program.channel_names]
+        return torch.where(at.present[1:], product * ratio * ratio.new_tensor(chosen), 0.0).sum((0, -1))
 
 
 @dataclass(frozen=True)
 class Simulated:
-    """Scores of simulated sets of drives.
+    """Scores of simulated sets of drives."""
 
-    Attributes:
-        scores: `(S, B, N)`, of the parameters first and then of the columns.
-        log_likelihood: `(S, B)`.
-    """
-
-    scores: Tensor
-    log_likelihood: Tensor
+    scores: Tensor  # (S, B, N), of the parameters first and then of the columns
+    log_likelihood: Tensor  # (S, B)
 
     @cached_property
     def information(self) -> Tensor:
@@ -288,10 +234,9 @@ class Simulated:
         return torch.einsum("sbi,sbj->ij", apart, apart) / (len(apart) - 1)
 
 
-def scores_along(
-    program: Program, data: Trajectories, ahead: Lookahead, parts: Sequence[Element], columns: Sequence[Column]
-) -> Tensor:
+def scores_along(problem: Problem, ahead: Lookahead, parts: Sequence[Element], columns: Sequence[Column]) -> Tensor:
     """Scores of parameters and columns, `(B, N)`."""
+    program, data = problem.program, problem.data
     at = smoothed(ahead, data)
     scoring = Scoring(program, data, at)
     return torch.cat([parameter_scores(program, data, at, list(parts)), *(scoring(column) for column in columns)], -1)
@@ -299,42 +244,19 @@ def scores_along(
 
 @torch.no_grad()
 def simulate_scores(
-    program: Program,
-    data: Trajectories,
-    starts: Tensor,
-    parts: Sequence[Element],
-    columns: Sequence[Column],
-    *,
-    known_start: bool,
-    seed: int,
-    passes: int = 2,
+    problem: Problem, starts: Tensor, parts: Sequence[Element], columns: Sequence[Column], *, seed: int
 ) -> Simulated:
-    """Simulate drives with the same controls and gaps, and score them at the same parameters.
-
-    Args:
-        program: fitted.
-        data: as returned by `for_program`.
-        starts: where each drive begins, `(S, B, D)`.
-        parts, columns: what is scored.
-        known_start: the first state is certain.
-        seed: the same seed gives the same scores.
-        passes: linearisations; they begin at the true path.
-    """
-    channels, sets = len(program.channels), len(starts)
+    """Simulate drives of a fitted program that begin at `starts`, `(S, B, D)`, with the same controls and gaps, and
+    score parts and columns at the same parameters."""
+    program, data, sets = problem.program, problem.data, len(starts)
     with seeded(seed, "bootstrap"):
-        drives, path = simulate_again(program, data, starts, channels)
+        drives, path = simulate_again(program, data, starts, len(program.channels))
     scores, likely = [], []
     for first in range(0, len(drives), PART):
         index = torch.arange(first, min(first + PART, len(drives)))
-        part = drives.subset(index)
-        ahead = smooth(
-            program,
-            part,
-            ReferencePath(path.states[:, index], path.noise[:, index]),
-            known_start=known_start,
-            passes=passes,
-        )
-        scores.append(scores_along(program, part, ahead, parts, columns))
+        part = replace(problem, data=drives.subset(index))
+        ahead = part.smooth(ReferencePath(path.states[:, index], path.noise[:, index]), passes=2)
+        scores.append(scores_along(part, ahead, parts, columns))
         likely.append(ahead.log_likelihood)
     found = Simulated(torch.cat(scores).unflatten(0, (sets, len(data))), torch.cat(likely).view(sets, len(data)))
     whole = torch.isfinite(found.scores).all(-1).all(-1) & torch.isfinite(found.log_likelihood).all(-1)

@@ -1,74 +1,61 @@
-"""What a search amounts to: an effect with its class, confidence and interval, or a curve."""
+"""What a search amounts to: an effect with its class, confidence and interval, or a curve; and what to drive next."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy import stats
+from torch import Tensor
 
-from steady_ppl.discovery.candidates import Candidate
+from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.discovery.candidates import Candidate, variance_of_places
 from steady_ppl.discovery.curves import unit_of
-from steady_ppl.discovery.profile import variance_of_places
-from steady_ppl.discovery.refits import Refit
+from steady_ppl.discovery.refits import Refit, wide, wide_drives
 from steady_ppl.discovery.screening import Tested
 from steady_ppl.discovery.search import MIN_GAIN_OF_CURVE, Found, Search
 from steady_ppl.effects import Variant, attached
+from steady_ppl.gaussian.linearize import ReferencePath
+from steady_ppl.gaussian.predict import simulate_again
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import Program
+from steady_ppl.utils.random import seeded
 
 INTERVAL = 0.9
 RESAMPLES = 2000
+DRIVES = 24  # simulated for each proposal
+TYPES = 3  # of every way of driving
 
 
 @dataclass(frozen=True)
 class Finding:
-    """An effect that a program lacks.
+    """An effect that a program lacks; of noise that is not the declared, which is a test's result, some are None."""
 
-    Attributes:
-        variant: the effect, the best of its class.
-        kind: dynamics, actuator, sensor or noise.
-        alike: names of the effects that these drives cannot tell apart, best first.
-        confidence: the probability that the right one is among them; None for noise that is not the declared, which is
-            a test's result.
-        coefficient, sd: each number of the coefficient and its standard deviation.
-        interval: 90 %, one a number.
-        gain: nats of held-out log p(y) that it brings; None for noise that is not the declared.
-    """
-
-    variant: Variant
-    kind: str
-    alike: list[str]
-    confidence: float | None
+    variant: Variant  # the effect, the best of its class
+    kind: str  # dynamics, actuator, sensor or noise
+    alike: list[str]  # names of the effects that these drives cannot tell apart, best first
+    confidence: float | None  # the probability that the right one is among them
     coefficient: list[float]
-    sd: list[float]
-    interval: list[tuple[float, float]]
-    gain: float | None
+    sd: list[float]  # standard deviation of each number
+    interval: list[tuple[float, float]]  # 90 %
+    gain: float | None  # nats of held-out log p(y) that it brings
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A curve where no effect of the catalogue explains the drives.
+    """A curve where no effect of the catalogue explains the drives."""
 
-    Attributes:
-        channel: channel, or measurement, that lacks it.
-        variable: that it depends on.
-        times: what the curve is multiplied with, empty where it adds by itself.
-        unit, variable_unit: of the curve and of the variable.
-        points, curve: where and how high.
-        band: half the width of a band that holds the whole curve with 90 % probability.
-    """
-
-    channel: str
-    variable: str
-    times: str
+    channel: str  # channel, or measurement, that lacks it
+    variable: str  # that it depends on
+    times: str  # what the curve is multiplied with, empty where it adds by itself
     unit: str
     variable_unit: str
     points: list[float]
-    curve: list[float]
-    band: list[float]
+    curve: list[float]  # how high it is there
+    band: list[float]  # half the width of a band that holds the whole curve with 90 % probability
 
 
 def findings(search: Search) -> list[Finding]:
@@ -84,7 +71,7 @@ def _finding(search: Search, found: Found) -> Finding:
     values = refit.coefficient(variant).flatten().double().numpy()
     spread = _spread(search, variant, len(values))
     if variant.profiled:
-        places = variance_of_places(found.without, found.candidate, search.known_start)
+        places = variance_of_places(found.without, found.candidate)
         scale = values if effect.null != 0 else 1.0  # of its logarithm
         spread = np.sqrt(spread**2 + places.numpy() / scale**2)
     by = stats.norm.isf((1 - INTERVAL) / 2)
@@ -99,8 +86,8 @@ def _finding(search: Search, found: Found) -> Finding:
         kind=effect.verdict,
         alike=[candidate.variant.name for candidate in alike],
         confidence=_confidence(search, found, alike),
-        coefficient=[float(v) for v in values],
-        sd=[float(s) for s in spread],
+        coefficient=values.tolist(),
+        sd=spread.tolist(),
         interval=[(float(low), float(high)) for low, high in interval],
         gain=found.candidate.total,
     )
@@ -112,13 +99,11 @@ def _spread(search: Search, variant: Variant, count: int) -> np.ndarray:
     information = screening.information[""]
     ridge = 1e-10 * float(information.diagonal().max()) * torch.eye(len(information)).double()
     covariance = torch.linalg.inv(information + ridge)  # what the drives do not tell has a huge variance
-    folds = search.final.folds
-    share = len(folds[0].drives) / sum(len(fold.drives) for fold in folds)
     learned = [part.name.split("[")[0] for part in screening.parameters]
     (there,) = [known for known in attached(search.final.program) if known.name == variant.name]
     index = [i for i, name in enumerate(learned) if name == there.parameter]
     assert len(index) == count
-    return (share * covariance.diagonal()[index]).clamp(min=0).sqrt().numpy()
+    return (search.final.first_share * covariance.diagonal()[index]).clamp(min=0).sqrt().numpy()
 
 
 def _confidence(search: Search, found: Found, alike: Sequence[Candidate]) -> float:
@@ -153,9 +138,7 @@ def shape_of(search: Search, program: Program) -> Shape | None:
         return None
     variant = curve.variant
     heights = curve.refit.coefficient(variant)
-    folds = curve.refit.folds
-    share = len(folds[0].drives) / sum(len(fold.drives) for fold in folds)
-    wide = float(stats.norm.isf((1 - INTERVAL) / 2 / len(heights))) * math.sqrt(share)
+    width = float(stats.norm.isf((1 - INTERVAL) / 2 / len(heights))) * math.sqrt(curve.refit.first_share)
     channel = variant.at.partition("~")[0]
     variable = variant.options.get("variable", "reading")
     about = program.measurement_names[0] if channel == "all" else channel
@@ -167,7 +150,7 @@ def shape_of(search: Search, program: Program) -> Shape | None:
         variable_unit=unit_of(program, about if variable == "reading" else variable),
         points=[float(knot) for knot in variant.options["knots"]],
         curve=[float(value) for value in heights],
-        band=[wide * float(sd) for sd in curve.tested.sd],
+        band=[width * float(sd) for sd in curve.tested.sd],
     )
 
 
@@ -180,3 +163,87 @@ def gain_interval(candidate: Candidate, seed: int) -> tuple[float, float] | None
     totals = random.choice(gain, (RESAMPLES, len(gain))).sum(1)
     low, high = np.quantile(totals, [0.025, 0.975])
     return float(low), float(high)
+
+
+@dataclass(frozen=True)
+class NextRun:
+    """Controls to drive next."""
+
+    between: list[str]  # the class
+    way: str  # how they are made, in words
+    controls: dict[str, list[float]]  # control → its values, one a row
+    step: float  # s, of a row
+    separation: float
+    """Nats of log p(y) by which one such drive tells the first member of the class from the nearest other."""
+    usual: float  # the same of the drives that there are
+
+
+@torch.no_grad()
+def next_run(found: Found, seed: int) -> NextRun | None:
+    """The best of some ways of driving within the limits of the controls that were driven, None where none separates
+    the class better than the drives that there are.
+
+    Each is simulated with the best member of the class; the others are judged by how much less likely they find it.
+    """
+    members = [(c.variant.name, c.refit) for c in found.alike if isinstance(c.refit, Refit)]
+    refits = [refit for _, refit in members]
+    data = refits[0].folds[0].drives
+    usual = _separation(refits, data.controls, seed)
+    better = []
+    for way, controls in _ways(data, seed):
+        apart = _separation(refits, controls.unsqueeze(1).expand_as(data.controls), seed)
+        if math.isfinite(apart) and apart > max(0.0, usual):
+            better.append((apart, way, controls))
+    if not better:
+        return None
+    separation, way, controls = max(better, key=lambda one: one[0])
+    order = refits[0].program.control_names
+    return NextRun(
+        between=[name for name, _ in members],
+        way=way,
+        controls={name: [round(v, 4) for v in controls[:, i].tolist()] for i, name in enumerate(order)},
+        step=data.median_step,
+        separation=separation,
+        usual=usual if math.isfinite(usual) else 0.0,
+    )
+
+
+def _separation(refits: list[Refit], controls: Tensor, seed: int) -> float:
+    """Nats a drive by which the first member is told from the nearest other."""
+    fold, (program, *others) = refits[0].folds[0], [refit.judges.programs[0] for refit in refits]
+    count = min(DRIVES, len(fold.drives))
+    drives = replace(fold.drives.subset(range(count)), controls=controls[:, :count].contiguous())
+    starts = fold.path.states[0, :count].unsqueeze(0)
+    with seeded(seed, "next run"):
+        again, truth = simulate_again(program, drives, starts, len(program.channels))
+    own = _log_likelihood(Problem(program, again, fold.known_start), truth)
+    apart = [float((own - _log_likelihood(Problem(other, again, fold.known_start), truth)).mean()) for other in others]
+    return min(apart) if all(map(math.isfinite, apart)) else math.nan
+
+
+def _log_likelihood(problem: Problem, path: ReferencePath) -> Tensor:
+    """Of drives and a path of another program."""
+    fitting = replace(problem, data=wide_drives(problem.data, problem.program))
+    return fitting.smooth(wide(path, problem.program), passes=4).log_likelihood
+
+
+def _ways(data: Trajectories, seed: int) -> Iterator[tuple[str, Tensor]]:
+    """Ways of driving: held, stepped and swept between the limits that were driven."""
+    driven = data.controls[:-1][data.transitions]
+    low, high = driven.amin(0), driven.amax(0)
+    rows, count = len(data.controls), driven.shape[-1]
+    time = torch.arange(rows).to(driven) / max(1, rows - 1)
+    middle = (low + high) / 2
+    with seeded(seed, "ways of driving"):
+        for index in range(TYPES):
+            held = torch.where(torch.rand(count) < 0.5, low, high)
+            yield f"hold {index + 1}: one level throughout", held.expand(rows, count).clone()
+            least = torch.zeros_like(low).clamp(low, high)
+            push = torch.where((time < (0.2, 0.4, 0.6)[index]).unsqueeze(-1), high, least)
+            yield f"push and coast: full for {(20, 40, 60)[index]} % of the time, then as little as was driven", push
+            levels = low + (high - low) * torch.rand(5, count)
+            held = levels[(time * 4.999).long()]
+            yield f"steps {index + 1}: five random levels", held
+            periods = torch.tensor([2.0, 3.0, 5.0]).to(driven)[(torch.arange(count) + index) % 3]
+            swept = middle + (high - low) / 2 * (2 * torch.pi * periods * time.unsqueeze(-1)).sin()
+            yield f"swing {index + 1}: sines between the limits", swept

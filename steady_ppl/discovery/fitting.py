@@ -4,92 +4,71 @@ By likelihood: scoring steps of the linearised program, fast and exact where it 
 steps on paths drawn from its posterior by the filter that looks ahead (generalised EM, as the recipe `steady` without
 tempering), which judges as well, for programs whose linearised log p(y) has kinks or is off: acceleration limits that
 bind, noise that goes with the state.
+
+Programs fitted to different drives judge with the size of their process noise in common. A few drives tell little of a
+noise that the sensors nearly hide. Fitted to them alone it may vanish, and then other drives punish the program by tens
+of nats, whatever its physics.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
+from steady_ppl.gaussian.smoother import require_found, resting_path
 from steady_ppl.guides.base import Constant
 from steady_ppl.guides.linearized import LookaheadGuide
 from steady_ppl.likelihood.evidence import neglected
-from steady_ppl.likelihood.maximize import Maximum, kept_maximum, maximise
+from steady_ppl.likelihood.maximize import Maximum, Term, climb, kept_maximum, maximum_of
+from steady_ppl.likelihood.parameters import elements, moved, set_values, values_of
+from steady_ppl.likelihood.problem import Problem
+from steady_ppl.likelihood.scores import channel_moments, substep_spreads
 from steady_ppl.model.program import Program
 from steady_ppl.training.loop import Optimization, Validation, train
 from steady_ppl.utils.random import seeded
 
 MAX_LINEARISATION_ERROR = 0.5  # nats a drive by which the linearised log p(y) may be off
 PARTICLES, JUDGING = 100, 400  # of the guide and of the judge: see docs/discovery.md, step 4
+FORMS = ("spread", "colour")  # of effects that are process noise
+MOVED, LIKE = 0.1, 1e-3  # by how much a number is moved, and what its effect on log spreads may vary by from row to row
+STEPS, PRECISION = 25, 0.01  # scoring steps of the sum at most, and nats that another would gain
 
 
 @dataclass(frozen=True)
-class Judged:
+class Judgement:
     """Drives under a program: log p(y), `(B,)`, and the posterior means along which it was linearised."""
 
     log_likelihood: Tensor
     path: ReferencePath
 
 
-class Fitting(Protocol):
-    """A way of fitting and judging."""
-
-    def fit(
-        self,
-        program: Program,
-        drives: Trajectories,
-        path: ReferencePath | None = None,
-        *,
-        known_start: bool,
-        information: Tensor | None = None,
-        hopeless: float = -math.inf,
-    ) -> Maximum:
-        """Move a program's parameters, in place.
-
-        Args:
-            path: to linearise along at first, found when not given.
-            known_start: the drives' first states are exact.
-            information, hopeless: those of `maximise`, by which scoring steps begin and give up; nothing for draws.
-
-        Raises:
-            FilterError: the program cannot follow the drives.
-        """
-        ...
-
-    def judge(self, program: Program, drives: Trajectories, path: ReferencePath, *, known_start: bool) -> Judged:
-        """Log p(y) of drives, linearised along a path that is improved from here."""
-        ...
-
-
 @dataclass(frozen=True)
 class ByLikelihood:
     """Scoring steps of the linearised program's log p(y), which judges as well."""
 
-    def fit(
-        self,
-        program: Program,
-        drives: Trajectories,
-        path: ReferencePath | None = None,
-        *,
-        known_start: bool,
-        information: Tensor | None = None,
-        hopeless: float = -math.inf,
-    ) -> Maximum:
-        return maximise(program, drives, path, known_start=known_start, information=information, hopeless=hopeless)
+    def fit(self, problem: Problem, path: ReferencePath | None = None, **settings: Any) -> Maximum:
+        """Move a program's parameters, in place, from a path that is found when None; settings are `maximise`'s.
 
-    def judge(self, program: Program, drives: Trajectories, path: ReferencePath, *, known_start: bool) -> Judged:
-        ahead = _at_rest(program, drives, path, known_start)
-        return Judged(ahead.log_likelihood, resting_path(ahead, drives))
+        Raises:
+            FilterError: the program cannot follow the drives.
+        """
+        return maximum_of(problem, path, **settings)
+
+    def judge(self, problem: Problem, path: ReferencePath) -> Judgement:
+        """Log p(y) of drives, linearised along a path that is improved from here."""
+        ahead = _at_rest(problem, path)
+        return Judgement(ahead.log_likelihood, resting_path(ahead, problem.data))
 
 
 @dataclass(frozen=True)
@@ -98,39 +77,27 @@ class ByDraws:
 
     Draws of the linearised program's posterior would be cheaper, but where limits bind their slopes are not those of
     log p(y): fits with them end beside its maximum, and whatever moves a fit towards it is then taken for an effect.
-
-    Attributes:
-        steps: E steps, each with a gradient step.
-        learning_rate: Adam's at the first step.
     """
 
-    steps: int = 60
-    learning_rate: float = 0.1
+    steps: int = 60  # E steps, each with a gradient step
+    learning_rate: float = 0.1  # Adam's at the first step
 
-    def fit(
-        self,
-        program: Program,
-        drives: Trajectories,
-        path: ReferencePath | None = None,
-        *,
-        known_start: bool,
-        information: Tensor | None = None,
-        hopeless: float = -math.inf,
-    ) -> Maximum:
-        return kept_maximum(program, lambda: self._climb(program, drives, path, known_start))
+    def fit(self, problem: Problem, path: ReferencePath | None = None, **_: Any) -> Maximum:
+        """See `ByLikelihood`."""
+        return kept_maximum(problem.program, lambda: self._climb(problem, path or problem.find_path()))
 
-    def _climb(self, program: Program, drives: Trajectories, path: ReferencePath | None, known_start: bool) -> Maximum:
-        path = path or find_path(program, drives, known_start=known_start)
-        before = self.judge(program, drives, path, known_start=known_start)
+    def _climb(self, problem: Problem, path: ReferencePath) -> Maximum:
+        program, data, known_start = problem.program, problem.data, problem.known_start
+        before = self.judge(problem, path)
         guide = LookaheadGuide(
             program, particles=PARTICLES, tempering=Constant(), known_start=known_start, search_again=math.inf
         )
-        guide.remember(before.path, drives)
+        guide.remember(before.path, data)
         optimization = Optimization(self.steps, learning_rate=self.learning_rate, averaging=0.95)
         began = copy.deepcopy(program.state_dict())
         with torch.enable_grad():
-            train(program, guide, drives, Validation(), optimization, known_start=known_start, progress=False)
-        after = self.judge(program, drives, before.path, known_start=known_start)
+            train(program, guide, data, Validation(), optimization, known_start=known_start, progress=False)
+        after = self.judge(problem, before.path)
         if not float(after.log_likelihood.sum()) > float(before.log_likelihood.sum()):
             program.load_state_dict(began)
             after = before
@@ -145,28 +112,138 @@ class ByDraws:
             gained=float((after.log_likelihood - before.log_likelihood).sum()),
         )
 
-    def judge(self, program: Program, drives: Trajectories, path: ReferencePath, *, known_start: bool) -> Judged:
-        ahead = _at_rest(program, drives, path, known_start)
-        with seeded(0, "judge"):
-            more = neglected(program, drives, known_start=known_start, particles=JUDGING, ahead=ahead)
-        return Judged(ahead.log_likelihood + more, resting_path(ahead, drives))
+    def judge(self, problem: Problem, path: ReferencePath) -> Judgement:
+        """See `ByLikelihood`."""
+        ahead = _at_rest(problem, path)
+        more = _neglected(problem, ahead, particles=JUDGING)
+        return Judgement(ahead.log_likelihood + more, resting_path(ahead, problem.data))
 
 
-def is_doubtful(program: Program, drives: Trajectories, path: ReferencePath, known_start: bool) -> bool:
+Fitting = ByLikelihood | ByDraws
+
+
+def is_doubtful(problem: Problem, path: ReferencePath) -> bool:
     """Whether the linearised program's log p(y) is off by more than half a nat a drive, or no particle filter that it
     leads can follow these drives to say so."""
-    ahead = _at_rest(program, drives, path, known_start)
+    ahead = _at_rest(problem, path)
     try:
-        with seeded(0, "judge"):
-            return (
-                float(neglected(program, drives, known_start=known_start, ahead=ahead).abs().mean())
-                > MAX_LINEARISATION_ERROR
-            )
+        return float(_neglected(problem, ahead).abs().mean()) > MAX_LINEARISATION_ERROR
     except FilterError:
         return True
 
 
-def _at_rest(program: Program, drives: Trajectories, path: ReferencePath, known_start: bool) -> Lookahead:
-    ahead = smooth(program, drives, path, known_start=known_start, passes=15, tolerance=0.02, kernels=False)
-    require_found(ahead, program, drives)
+def _at_rest(problem: Problem, path: ReferencePath) -> Lookahead:
+    ahead = problem.smooth(path, passes=15, tolerance=0.02, kernels=False)
+    require_found(ahead, problem.program, problem.data)
     return ahead
+
+
+def _neglected(problem: Problem, ahead: Lookahead, particles: int = 200) -> Tensor:
+    with seeded(0, "judge"):
+        return neglected(
+            problem.program, problem.data, known_start=problem.known_start, particles=particles, ahead=ahead
+        )
+
+
+@dataclass(frozen=True)
+class Judges:
+    """Programs, one a fold, that judge the drives they were not fitted to."""
+
+    programs: list[Program]
+    maxima: list[Maximum]  # where each ended
+    common: tuple[str, ...] = ()  # names of the learnable numbers that are the same in all
+
+
+def with_common_noise(problems: Sequence[Problem], maxima: Sequence[Maximum]) -> Judges:
+    """Return copies of programs with their process noise in common.
+
+    The sum of the folds' log p(y) is maximised in the noise of all and in every program's other numbers, from where
+    their fits ended. Programs without such noise are returned as they are.
+
+    Raises:
+        FilterError: the programs cannot follow their drives with one noise.
+    """
+    found = [noise_numbers(one.program, one.data, m.path) for one, m in zip(problems, maxima, strict=True)]
+    common = sorted(set().union(*found))
+    if not common:
+        return Judges([problem.program for problem in problems], list(maxima))
+    names = [part.name for part in elements(problems[0].program)]
+    copies = [replace(problem, program=copy.deepcopy(problem.program)) for problem in problems]
+    places = _places(len(names), common, len(copies))
+    terms = [
+        Term(problem, maximum.path, elements(problem.program), own)
+        for problem, maximum, own in zip(copies, maxima, places, strict=True)
+    ]
+    starts = _starts(terms, maxima)
+    for last, start in enumerate(starts, 1):
+        for term in terms:
+            set_values(term.parts, start[term.columns])
+        try:
+            ended = climb(terms, steps=STEPS, precision=PRECISION)
+        except FilterError:
+            if last == len(starts):
+                raise
+        else:
+            break
+    return Judges([problem.program for problem in copies], ended, tuple(names[index] for index in common))
+
+
+@torch.no_grad()
+def noise_numbers(program: Program, data: Trajectories, path: ReferencePath) -> set[int]:
+    """Return which learnable numbers say how large the process noise is, or how it goes on, and nothing else.
+
+    Those of the program itself multiply standard deviations of channels, in all rows alike, and leave their means.
+    """
+    forms = {variant.parameter: variant.effect.form for variant in attached(program)}
+    mean, spread = _moments(program, data, path)
+    found = set()
+    for index, part in enumerate(elements(program)):
+        name = part.name.split("[")[0]
+        if name in forms:
+            is_noise = forms[name] in FORMS
+        else:
+            with moved(part, MOVED):
+                mean_there, spread_there = _moments(program, data, path)
+            change = (spread_there / spread).log().nan_to_num(0.0, 0.0, 0.0)
+            alike = bool(((change - change.mean(1, keepdim=True)).abs() < LIKE).all())
+            still = bool(((mean_there - mean).abs() <= LIKE * spread).all())
+            is_noise = alike and still and bool((change.abs() > LIKE).any())
+        if is_noise:
+            found.add(index)
+    return found
+
+
+def _moments(program: Program, data: Trajectories, path: ReferencePath) -> tuple[Tensor, Tensor]:
+    """Return means of rows' channels and standard deviations of substeps' along a path, `(1, rows, C)` each."""
+    states = path.states[:-1].unsqueeze(0)
+    mean, spread = channel_moments(program, data, states)
+    if program.substeps > 1:
+        spread = substep_spreads(program, data, states)
+    return mean[:, data.transitions], spread[:, data.transitions]
+
+
+def _places(count: int, common: Sequence[int], programs: int) -> list[list[int]]:
+    """Where each program's numbers are among those of all: first the common ones, then the own ones of each."""
+    own = [index for index in range(count) if index not in common]
+    first = {index: place for place, index in enumerate([*common, *own])}
+    return [
+        [first[index] if index in common else first[index] + order * len(own) for index in range(count)]
+        for order in range(programs)
+    ]
+
+
+def _starts(terms: Sequence[Term], maxima: Sequence[Maximum]) -> list[Tensor]:
+    """Where to begin: at the maximum of the sum were every log p(y) a parabola, and where each program's own numbers
+    are, with the mean of the noise."""
+    count = 1 + max(max(term.columns) for term in terms)
+    information, pull = torch.zeros(count, count).double(), torch.zeros(count).double()
+    sums, weights = torch.zeros(count).double(), torch.zeros(count).double()
+    for term, maximum in zip(terms, maxima, strict=True):
+        index, values = torch.tensor(term.columns), values_of(term.parts)
+        information[index[:, None], index] += maximum.information
+        pull[index] += maximum.information @ values
+        sums[index] += maximum.information.diagonal() * values
+        weights[index] += maximum.information.diagonal()
+    parabola, singular = torch.linalg.solve_ex(information, pull)
+    means = sums / weights
+    return [means] if singular or not bool(torch.isfinite(parabola).all()) else [parabola, means]

@@ -12,14 +12,24 @@ import numpy as np
 
 from steady_ppl.comparison.result import Proof
 from steady_ppl.discovery.candidates import Candidate
-from steady_ppl.discovery.finding import Finding, Shape, gain_interval
-from steady_ppl.discovery.next_run import NextRun
+from steady_ppl.discovery.finding import Finding, NextRun, Shape, gain_interval
 from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.screening import ALPHA, Tested
 from steady_ppl.discovery.search import Search
+from steady_ppl.effects import Variant
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.text import aligned
+
+WIDTH, SHOWN = 100, 12
+IN_WORDS = {
+    "none": "No effect is missing as far as these drives can tell",
+    "dynamics": "The dynamics lack",
+    "actuator": "The actuators lack",
+    "sensor": "The sensor has",
+    "noise": "The noise is not as declared:",
+    "other": "Something is missing that is in no catalogue",
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -62,59 +72,60 @@ class Discovery(Displayed):
 
     @property
     def figures(self) -> dict[str, Any]:
-        """Everything as a plain dict, ready for JSON."""
-        return figures(self)
+        """Everything as a plain dict, ready for JSON; every figure is finite, None where there is none."""
+        first = self.findings[0] if self.findings else None
+        rows = {row["row"]: row for row in self.proof.figures["rows"]}
+        return {
+            "verdict": self.verdict,
+            "sentence": sentence(self),
+            "p_value": self.p_value,
+            "level": ALPHA,
+            "effect": first.variant.name if first else None,
+            "class": first.alike if first else [],
+            "confidence": first.confidence if first else None,
+            "complete": self.search.is_complete,
+            "effects": [_finding(finding) for finding in self.findings],
+            "candidates": [_candidate(self, tested) for tested in ranked(self)],
+            "shape": vars(self.shape) if self.shape else None,
+            "next_run": vars(self.next_run) if self.next_run else None,
+            "before": _side(rows["before"]),
+            "after": _side(rows["after"]),
+            "rounds": [
+                {"p_value": one.screening.tests.p_value, "added": one.chosen.variant.name if one.chosen else None}
+                for one in self.search.rounds
+            ],
+            "known_start": self.before.known_start,
+            "step": self.search.step.figures,
+            "step_with_found": self.search.with_found.figures if self.search.with_found else None,
+            "doubts": self.doubts,
+            "notes": self.notes,
+        }
 
     def __str__(self) -> str:
-        return as_text(self)
+        doubts = [line for doubt in self.doubts for line in textwrap.wrap(f"warning: {doubt}", WIDTH)]
+        lines = [*doubts, *textwrap.wrap(sentence(self), WIDTH)]
+        for finding in self.findings:
+            lines += ["", f"{finding.variant.name}: {finding.variant.effect.text}", f"  {finding.variant.effect.feels}"]
+        if shape := self.shape:
+            lines += ["", f"{shape.variable} [{shape.variable_unit}]  {shape.channel} [{shape.unit}]"]
+            rows = zip(shape.points, shape.curve, shape.band, strict=True)
+            lines += [f"{point:10.3g}  {height:10.3g} ± {band:.2g}" for point, height, band in rows]
+        lines += ["", *_table(self)]
+        if run := self.next_run:
+            said = (
+                f"To tell {' from '.join(run.between[:2])}, drive {run.way}: {run.separation:.1f} nats a drive, "
+                f"against {run.usual:.1f} of drives such as these."
+            )
+            lines += ["", *textwrap.wrap(said, WIDTH)]
+        known: set[str] = set()
+        if self.verdict != "none":
+            lines += ["", "On the validation drives:", str(self.proof)]
+            known = set(self.proof.notes)
+        notes = [line for note in self.notes if note not in known for line in textwrap.wrap(f"note: {note}", WIDTH)]
+        return "\n".join([*lines, *notes])
 
     def __repr__(self) -> str:
         return f"Discovery({sentence(self)!r})"
-
-
-WIDTH, SHOWN = 100, 12
-IN_WORDS = {
-    "none": "No effect is missing as far as these drives can tell",
-    "dynamics": "The dynamics lack",
-    "actuator": "The actuators lack",
-    "sensor": "The sensor has",
-    "noise": "The noise is not as declared:",
-    "other": "Something is missing that is in no catalogue",
-}
-
-
-def figures(found: Discovery) -> dict[str, Any]:
-    """Everything as a plain dict; every figure is finite, None where there is none."""
-    first = found.findings[0] if found.findings else None
-    rows = {row["row"]: row for row in found.proof.figures["rows"]}
-    return {
-        "verdict": found.verdict,
-        "sentence": sentence(found),
-        "p_value": found.p_value,
-        "level": ALPHA,
-        "effect": first.variant.name if first else None,
-        "class": first.alike if first else [],
-        "confidence": first.confidence if first else None,
-        "complete": found.search.is_complete,
-        "effects": [_finding(finding) for finding in found.findings],
-        "candidates": [_candidate(found, tested) for tested in ranked(found)],
-        "shape": vars(found.shape) if found.shape else None,
-        "next_run": vars(found.next_run) if found.next_run else None,
-        "before": _side(rows["before"]),
-        "after": _side(rows["after"]),
-        "rounds": [
-            {
-                "p_value": one.screening.tests.p_value,
-                "added": one.chosen.variant.name if one.chosen else None,
-            }
-            for one in found.search.rounds
-        ],
-        "known_start": found.before.known_start,
-        "step": found.search.step.figures,
-        "step_with_found": found.search.with_found.figures if found.search.with_found else None,
-        "doubts": found.doubts,
-        "notes": found.notes,
-    }
 
 
 def ranked(found: Discovery) -> list[Tested]:
@@ -127,25 +138,25 @@ def ranked(found: Discovery) -> list[Tested]:
         name = tests[index].variant.name
         return chosen.index(name) if name in chosen else len(chosen), -total.get(name, -math.inf), index
 
-    order = sorted(range(len(tests)), key=place)
-    return [tests[i] for i in order]
+    return [tests[i] for i in sorted(range(len(tests)), key=place)]
 
 
 def _candidate(found: Discovery, tested: Tested) -> dict[str, Any]:
-    fitted = _fitted(found, tested)
+    fitted, variant, null = _fitted(found, tested), tested.variant, tested.variant.effect.null
     interval = gain_interval(fitted, found.before.seed) if fitted else None
-    variant = tested.variant
+    scaled = math.isfinite(null)  # what has no scale where it is absent has the probe that told most
     return {
         "effect": "curve" if tested.is_curve else variant.name,
         "kind": "other" if tested.is_curve else variant.effect.verdict,
         "statistic": tested.statistic,
         "p_value": tested.p_value,
-        **_one_step(tested),
-        "absent": _finite(variant.effect.null),
+        "coefficient": _numbers(tested.coefficient + null) if scaled else tested.column.probe,
+        "sd": _numbers(tested.sd) if scaled else None,
+        "absent": null if scaled else None,
         "unit": variant.unit,
-        "options": {name: _plain(value) for name, value in variant.profiled.items()},
+        "options": _options(variant),
         "detection_limit": _numbers(limit_of(found, tested)),
-        "heldout_gain": _finite(fitted.total) if fitted else None,
+        "heldout_gain": fitted.total if fitted and math.isfinite(fitted.total) else None,
         "heldout_gain_ci": list(interval) if interval else None,
         "note": _note(tested, fitted),
     }
@@ -157,15 +168,6 @@ def _fitted(found: Discovery, tested: Tested) -> Candidate | None:
         return next((c for c in found.search.curves if c.variant.at == tested.variant.at), None)
     every = [one.candidate for one in found.search.found] + found.search.rounds[0].candidates
     return next((c for c in every if c.variant.name == tested.variant.name), None)
-
-
-def _one_step(tested: Tested) -> dict[str, Any]:
-    """The coefficient by one scoring step and its standard deviation; of what has no scale where it is absent, the
-    probe that told most."""
-    null = tested.variant.effect.null
-    if not math.isfinite(null):
-        return {"coefficient": tested.column.probe, "sd": None}
-    return {"coefficient": _numbers(tested.coefficient + null), "sd": _numbers(tested.sd)}
 
 
 def limit_of(found: Discovery, tested: Tested) -> np.ndarray:
@@ -203,7 +205,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "sd": finding.sd,
         "interval_90": [list(pair) for pair in finding.interval],
         "unit": finding.variant.unit,
-        "options": {name: _plain(value) for name, value in finding.variant.profiled.items()},
+        "options": _options(finding.variant),
         "equation": finding.variant.effect.equation,
         "text": finding.variant.effect.text,
         "heldout_gain": finding.gain,
@@ -216,9 +218,10 @@ def _side(row: dict[str, Any]) -> dict[str, Any]:
 
 def sentence(found: Discovery) -> str:
     """The verdict in one sentence, after a first one on the time step where that is too coarse."""
-    said = [found.search.step.sentence] if found.search.step.sentence else []
-    if found.search.with_found is not None and found.search.with_found.sentence:
-        said.append(f"with what was found below, {found.search.with_found.sentence}")
+    step, with_found = found.search.step, found.search.with_found
+    said = [step.sentence] if step.sentence else []
+    if with_found is not None and with_found.sentence:
+        said.append(f"with what was found below, {with_found.sentence}")
     if not said:
         return _verdict(found)
     first = "; ".join(said)
@@ -226,16 +229,14 @@ def sentence(found: Discovery) -> str:
 
 
 def _verdict(found: Discovery) -> str:
-    verdict, start = found.verdict, IN_WORDS[found.verdict]
-    if verdict == "none":
-        return f"{start} (p = {found.p_value:.2g}); the limits below say what could not have been seen."
-    if found.shape is not None:
-        shape = found.shape
-        return f"{start} (p = {found.p_value:.2g}): {shape.channel} lacks a curve of {shape.variable}{_times(found)}."
+    start, p_value, shape = IN_WORDS[found.verdict], f"(p = {found.p_value:.2g})", found.shape
+    if found.verdict == "none":
+        return f"{start} {p_value}; the limits below say what could not have been seen."
+    if shape is not None:
+        times = f" times {shape.times}" if shape.times else ""
+        return f"{start} {p_value}: {shape.channel} lacks a curve of {shape.variable}{times}."
     if not found.findings:
-        return (
-            f"{start} (p = {found.p_value:.2g}), and neither an effect nor a curve brings anything on held-out drives."
-        )
+        return f"{start} {p_value}, and neither an effect nor a curve brings anything on held-out drives."
     clauses: list[str] = []
     for kind in dict.fromkeys(finding.kind for finding in found.findings):
         said = [_said(finding, found.search.is_complete) for finding in found.findings if finding.kind == kind]
@@ -243,11 +244,7 @@ def _verdict(found: Discovery) -> str:
         clauses.append(f"{words} {' and '.join(said)}")
     if not found.search.is_complete:
         clauses.append("they do not explain all, so that an effect nobody has named may stand behind these names")
-    return f"{'; '.join(clauses)} (p = {found.p_value:.2g})."
-
-
-def _times(found: Discovery) -> str:
-    return f" times {found.shape.times}" if found.shape and found.shape.times else ""
+    return f"{'; '.join(clauses)} {p_value}."
 
 
 def _said(finding: Finding, is_complete: bool) -> str:
@@ -266,49 +263,14 @@ def _said(finding: Finding, is_complete: bool) -> str:
 def with_interval(finding: Finding) -> str:
     """A coefficient with its 90 % interval and unit."""
     unit = "" if finding.variant.unit in ("", "1") else f" {finding.variant.unit}"
-    said = [
-        f"{value:.3g} [{low:.3g}, {high:.3g}]"
-        for value, (low, high) in zip(finding.coefficient, finding.interval, strict=True)
-    ]
-    return ", ".join(said) + unit
-
-
-def as_text(found: Discovery) -> str:
-    """The verdict, the equation, the candidates, and before and after."""
-    doubts = [line for doubt in found.doubts for line in textwrap.wrap(f"warning: {doubt}", WIDTH)]
-    lines = [*doubts, *textwrap.wrap(sentence(found), WIDTH)]
-    for finding in found.findings:
-        lines += ["", f"{finding.variant.name}: {finding.variant.effect.text}", f"  {finding.variant.effect.feels}"]
-    if found.shape:
-        lines += [
-            "",
-            f"{found.shape.variable} [{found.shape.variable_unit}]  {found.shape.channel} [{found.shape.unit}]",
-        ]
-        rows = zip(found.shape.points, found.shape.curve, found.shape.band, strict=True)
-        lines += [f"{point:10.3g}  {height:10.3g} ± {band:.2g}" for point, height, band in rows]
-    lines += ["", *_table(found)]
-    if found.next_run:
-        lines += ["", *textwrap.wrap(_next(found), WIDTH)]
-    if found.verdict != "none":
-        lines += ["", "On the validation drives:", str(found.proof)]
-    said = set(found.proof.notes) if found.verdict != "none" else set()
-    notes = [line for note in found.notes if note not in said for line in textwrap.wrap(f"note: {note}", WIDTH)]
-    return "\n".join([*lines, *notes])
-
-
-def _next(found: Discovery) -> str:
-    run = found.next_run
-    assert run is not None
-    return (
-        f"To tell {' from '.join(run.between[:2])}, drive {run.way}: {run.separation:.1f} nats a drive, "
-        f"against {run.usual:.1f} of drives such as these."
-    )
+    pairs = zip(finding.coefficient, finding.interval, strict=True)
+    return ", ".join(f"{value:.3g} [{low:.3g}, {high:.3g}]" for value, (low, high) in pairs) + unit
 
 
 def _table(found: Discovery) -> list[str]:
     header = ["candidate", "kind", "test", "p", "held-out gain", "one step", "± sd", "limit", "unit"]
-    rows = [header, *(_line(found, tested) for tested in ranked(found)[:SHOWN])]
-    rest = ranked(found)[SHOWN:]
+    tests = ranked(found)
+    rows, rest = [header, *(_line(found, tested) for tested in tests[:SHOWN])], tests[SHOWN:]
     more = _limits(found, rest) if found.verdict == "none" else [f"and {len(rest)} more"] * bool(rest)
     return aligned(rows, left=(0, 1, len(header) - 1)) + more
 
@@ -351,9 +313,6 @@ def _numbers(values: np.ndarray) -> float | list[float] | None:
     return found[0] if len(found) == 1 else found
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
+def _options(variant: Variant) -> dict[str, Any]:
+    """Its knees, widths and places."""
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in variant.profiled.items()}

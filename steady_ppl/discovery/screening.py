@@ -1,61 +1,53 @@
-"""The score test of every effect at once, calibrated by drives that the fitted program makes itself.
+"""The tests of a fitted program: of every effect at once, and of its noise against the declared.
 
-A Lagrange-multiplier (score) test (Rao 1948) of each candidate, the fitted parameters projected out. The largest of all
-candidates is compared with the largest in each simulated set (Westfall and Young 1993), so that the level holds for the
-whole catalogue.
+A Lagrange-multiplier (score) test (Rao 1948) of each candidate, the fitted parameters projected out, calibrated by
+drives that the fitted program makes itself. The largest of all candidates is compared with the largest in each
+simulated set (Westfall and Young 1993), so that the level holds for the whole catalogue.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from scipy import optimize, stats
 from torch import Tensor
 
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.curves import NAME as CURVE
 from steady_ppl.discovery.effect_scores import Column, Simulated
-from steady_ppl.discovery.noise_departure import Departure
-from steady_ppl.effects import Variant
+from steady_ppl.discovery.refits import Fold, Refit, as_declared
+from steady_ppl.effects import Variant, attached, catalogue
+from steady_ppl.likelihood.parameters import Element, on_both_sides
+from steady_ppl.likelihood.scores import measured, substep_spreads
+from steady_ppl.model.program import Program
 
 ALPHA, POWER = 0.05, 0.95
-MIN_SHARE_OF_INFORMATION = 1e-4
-"""Share of a column's information that the fitted parameters must leave for it to be tested."""
+MIN_SHARE_OF_INFORMATION = 1e-4  # of a column, that the fitted parameters must leave for it to be tested
 CONTAINED = "the fitted parameters already explain it"
 UNEXCITED = "these drives never excite it"
 
 
 @dataclass(frozen=True)
 class Tested:
-    """A candidate's test: of its best column where it has several.
-
-    Attributes:
-        column: which.
-        statistic: the Lagrange multiplier; of a curve, with its prior.
-        p_value: of this candidate alone.
-        coefficient, sd: one scoring step from zero, and its standard deviation, `(k,)`.
-        detection_limit: the coefficient found with 95 % power at the family-wise level, each number alone, `(k,)`.
-        evidence: log Bayes factor of a curve, else zero.
-        untestable: why it has no test, else None.
-        alone: standard deviation of each number when the others are zero, `(k,)`.
-        effective: how many independent tests the best of its columns is like.
-        departure: whether it says that a fitted σ is not the declared one; there is nothing left to fit then.
-    """
+    """A candidate's test: of its best column where it has several."""
 
     column: Column
-    statistic: float
-    p_value: float
-    coefficient: np.ndarray
-    sd: np.ndarray
-    detection_limit: np.ndarray
-    evidence: float = 0.0
-    untestable: str | None = None
-    alone: np.ndarray | None = None
-    effective: float = 1.0
-    departure: bool = False
+    statistic: float  # the Lagrange multiplier; of a curve, with its prior
+    p_value: float  # of this candidate alone
+    coefficient: np.ndarray  # one scoring step from zero, (k,)
+    sd: np.ndarray  # its standard deviation, (k,)
+    detection_limit: np.ndarray  # found with 95 % power at the family-wise level, each number alone, (k,)
+    evidence: float = 0.0  # log Bayes factor of a curve
+    untestable: str | None = None  # why it has no test
+    alone: np.ndarray | None = None  # standard deviation of each number when the others are zero, (k,)
+    effective: float = 1.0  # how many independent tests the best of its columns is like
+    departure: bool = False  # whether it says that a fitted σ is not the declared: there is nothing left to fit then
 
     @property
     def variant(self) -> Variant:
@@ -70,40 +62,26 @@ class Tested:
 
 @dataclass(frozen=True)
 class Screened:
-    """All candidates' tests.
+    """All candidates' tests."""
 
-    Attributes:
-        tested: one a candidate, the smallest p-value first; all curves together are one.
-        curves: every curve's test, the largest evidence first.
-        p_value: family-wise, of the smallest.
-        critical: the single p-value below which the family-wise level is kept.
-        fitted: the Lagrange multiplier of the fitted parameters themselves, and how many they are: large where the fit
-            has not converged.
-        alike: candidate × candidate, the largest canonical correlation of their projected columns.
-    """
-
-    tested: list[Tested]
-    curves: list[Tested]
-    p_value: float
-    critical: float
+    tested: list[Tested]  # one a candidate, the smallest p-value first; all curves together are one
+    curves: list[Tested]  # every curve's test, the largest evidence first
+    p_value: float  # family-wise, of the smallest
+    critical: float  # the single p-value below which the family-wise level is kept
     fitted: tuple[float, int]
-    alike: Tensor
+    """The Lagrange multiplier of the fitted parameters themselves, large where the fit has not converged, and how many
+    they are."""
+    alike: Tensor  # candidate × candidate, the largest canonical correlation of their projected columns
 
 
 def screen(
-    observed: Tensor,
-    simulated: Simulated,
-    fitted: int,
-    columns: Sequence[Column],
-    departures: Sequence[Departure] = (),
+    observed: Tensor, simulated: Simulated, fitted: int, columns: Sequence[Column], departures: Sequence[Departure] = ()
 ) -> Screened:
     """Test every candidate.
 
     Args:
-        observed: scores of the drives, `(B, N)`: of the `fitted` parameters first and then of the columns.
+        observed: scores of the drives, `(B, N)`: of the `fitted` parameters first and then of the columns, in order.
         simulated: the same of simulated sets.
-        fitted: how many parameters were fitted.
-        columns: in the order of the scores.
         departures: of the fitted noise from the declared.
     """
     sums = simulated.scores.sum(1)
@@ -118,18 +96,21 @@ def screen(
     projected = scores[:, rest] - scores[:, own] @ solved
     before = information[rest, rest].diagonal()
 
+    ends = [*itertools.accumulate(column.size for column in columns)]
+    places = [slice(end - column.size, end) for column, end in zip(columns, ends, strict=True)]
+
     found, chosen, curves = [], [], []
     for members in _groups(columns):
-        tests = [_test(columns[i], _slice(columns, i), projected, left, before) for i in members]
+        tests = [_test(columns[i], places[i], projected, left, before) for i in members]
         alive = [test for test in tests if test is not None]
-        excited = any(bool((before[_slice(columns, i)] > 0).any()) for i in members)
-        found.append(_of_group(columns[members[0]], alive, len(sums), CONTAINED if excited else UNEXCITED))
-        chosen.append(min(alive, key=lambda test: test.rank).at if alive else _slice(columns, members[0]))
-        curves += [
-            _of_group(test.column, [test], len(sums), "")[0]
-            for test in alive
-            if test.column.variant.effect.name == CURVE
-        ]
+        if alive:
+            found.append(_best_of(alive))
+            chosen.append(min(alive, key=_Test.rank).place)
+        else:
+            excited = any(bool((before[places[i]] > 0).any()) for i in members)
+            found.append((_untestable(columns[members[0]], CONTAINED if excited else UNEXCITED), np.ones(len(scores))))
+            chosen.append(places[members[0]])
+        curves += [_best_of([test])[0] for test in alive if test.tested.is_curve]
     for departure in departures:
         found.append(_departed(departure, information[own, own], scores[:, own]))
         chosen.append(slice(0, 0))
@@ -154,45 +135,30 @@ def _critical(simulated: np.ndarray) -> float:
     return float(np.nextafter(np.sort(simulated)[max(0, allowed)], 0.0))
 
 
-@dataclass(frozen=True)
-class _Found:
-    column: Column
-    at: slice
-    statistic: float
-    p_values: np.ndarray
-    coefficient: np.ndarray
-    sd: np.ndarray
-    alone: np.ndarray
-    evidence: float = 0.0
+class _Test(NamedTuple):
+    """The test of one column, its place among all, and its p-values in every set, the drives' first."""
 
-    @property
+    tested: Tested
+    place: slice
+    p_values: np.ndarray
+
     def rank(self) -> tuple[float, float]:
         """Small where much is found, also where p-values are too small to be told apart."""
-        return float(self.p_values[0]), -self.statistic
+        return self.tested.p_value, -self.tested.statistic
 
 
-def _of_group(column: Column, alive: list[_Found], sets: int, otherwise: str) -> tuple[Tested, np.ndarray]:
-    """The test of the best of several columns, and its p-values in every set; where there is none, why."""
-    if not alive:
-        nothing = np.zeros(column.size)
-        endless = nothing + math.inf
-        return Tested(column, 0.0, 1.0, nothing, endless, endless, untestable=otherwise), np.ones(sets + 1)
-    p_values = np.stack([test.p_values for test in alive])
-    effective = _effective(p_values[:, 1:].min(0)) if len(alive) > 1 else 1.0
-    best = min(alive, key=lambda test: test.rank)
+def _best_of(tests: list[_Test]) -> tuple[Tested, np.ndarray]:
+    """The test of the best of several columns, and its p-values in every set."""
+    p_values = np.stack([test.p_values for test in tests])
+    effective = _effective(p_values[:, 1:].min(0)) if len(tests) > 1 else 1.0
     together = -np.expm1(effective * np.log1p(-np.minimum(p_values.min(0), 1 - 1e-12)))
-    tested = Tested(
-        column=best.column,
-        statistic=best.statistic,
-        p_value=float(together[0]),
-        coefficient=best.coefficient,
-        sd=best.sd,
-        detection_limit=best.sd,
-        evidence=best.evidence,
-        alone=best.alone,
-        effective=effective,
-    )
-    return tested, together
+    best = min(tests, key=_Test.rank).tested
+    return replace(best, p_value=float(together[0]), effective=effective), together
+
+
+def _untestable(column: Column, why: str) -> Tested:
+    nothing = np.zeros(column.size)
+    return Tested(column, 0.0, 1.0, nothing, nothing + math.inf, nothing + math.inf, untestable=why)
 
 
 def _limit(tested: Tested, critical: float) -> np.ndarray:
@@ -207,26 +173,24 @@ def _limit(tested: Tested, critical: float) -> np.ndarray:
     return math.sqrt(needed) * tested.alone
 
 
-def _test(column: Column, at: slice, projected: Tensor, left: Tensor, before: Tensor) -> _Found | None:
-    own, scores = left[at, at], projected[:, at]
+def _test(column: Column, place: slice, projected: Tensor, left: Tensor, before: Tensor) -> _Test | None:
+    own, scores = left[place, place], projected[:, place]
     if column.variant.effect.name == CURVE:
-        return _test_of_curve(column, at, scores, own) if bool((own.diagonal() > 0).any()) else None
-    if not bool((before[at] > 0).all()) or not bool((own.diagonal() > MIN_SHARE_OF_INFORMATION * before[at]).all()):
+        return _test_of_curve(column, place, scores, own) if bool((own.diagonal() > 0).any()) else None
+    enough = own.diagonal() > MIN_SHARE_OF_INFORMATION * before[place]
+    if not bool((before[place] > 0).all()) or not bool(enough.all()):
         return None
     steps = torch.linalg.solve(own, scores.T).T
     statistics = (scores * steps).sum(-1).numpy()
-    return _Found(
-        column=column,
-        at=at,
-        statistic=float(statistics[0]),
-        p_values=stats.chi2.sf(statistics, column.size),
-        coefficient=steps[0].numpy(),
-        sd=torch.linalg.inv(own).diagonal().sqrt().numpy(),
-        alone=own.diagonal().rsqrt().numpy(),
+    p_values = stats.chi2.sf(statistics, column.size)
+    sd, alone = torch.linalg.inv(own).diagonal().sqrt().numpy(), own.diagonal().rsqrt().numpy()
+    coefficient = steps[0].numpy()
+    return _Test(
+        Tested(column, float(statistics[0]), float(p_values[0]), coefficient, sd, sd, alone=alone), place, p_values
     )
 
 
-def _test_of_curve(column: Column, at: slice, scores: Tensor, own: Tensor) -> _Found:
+def _test_of_curve(column: Column, place: slice, scores: Tensor, own: Tensor) -> _Test:
     """A score test against the prior (Liu, Lin and Ghosh 2007): a weighted sum of χ² of one degree of freedom, matched
     by a scaled χ² of the same mean and variance (Satterthwaite)."""
     covariance = column.variant.effect.prior.covariance_matrix.double()
@@ -238,16 +202,19 @@ def _test_of_curve(column: Column, at: slice, scores: Tensor, own: Tensor) -> _F
     scale, freedom = float(weights.square().sum() / weights.sum()), float(weights.sum() ** 2 / weights.square().sum())
     statistics = squares.sum(-1).numpy()
     posterior = torch.linalg.inv(own + torch.linalg.inv(covariance))
-    return _Found(
-        column=column,
-        at=at,
-        statistic=float(statistics[0]),
-        p_values=stats.chi2.sf(statistics / scale, freedom),
+    p_values = stats.chi2.sf(statistics / scale, freedom)
+    sd = posterior.diagonal().sqrt().numpy()
+    tested = Tested(
+        column,
+        float(statistics[0]),
+        float(p_values[0]),
         coefficient=(posterior @ scores[0]).numpy(),
-        sd=posterior.diagonal().sqrt().numpy(),
-        alone=own.diagonal().rsqrt().numpy(),
+        sd=sd,
+        detection_limit=sd,
         evidence=0.5 * float(statistics[0]) - 0.5 * float(torch.log1p(values).sum()),
+        alone=own.diagonal().rsqrt().numpy(),
     )
+    return _Test(tested, place, p_values)
 
 
 def _departed(departure: Departure, information: Tensor, scores: Tensor) -> tuple[Tested, np.ndarray]:
@@ -257,17 +224,10 @@ def _departed(departure: Departure, information: Tensor, scores: Tensor) -> tupl
     sd = float((departure.slope @ step).sqrt())
     z = torch.cat([torch.tensor([departure.away]).double(), scores[1:] @ step]).numpy() / sd
     p_values = 2 * stats.norm.sf(np.abs(z))
-    sd *= math.sqrt(departure.share) * departure.factor
-    tested = Tested(
-        column=Column(departure.variant),
-        statistic=float(z[0] ** 2),
-        p_value=float(p_values[0]),
-        coefficient=np.array([departure.factor - 1]),
-        sd=np.array([sd]),
-        detection_limit=np.array([sd]),
-        alone=np.array([sd]),
-        departure=True,
-    )
+    sds = np.array([sd * (math.sqrt(departure.share) * departure.factor)])
+    coefficient = np.array([departure.factor - 1])
+    column = Column(departure.variant)
+    tested = Tested(column, float(z[0] ** 2), float(p_values[0]), coefficient, sds, sds, alone=sds, departure=True)
     return tested, p_values
 
 
@@ -283,11 +243,6 @@ def _groups(columns: Sequence[Column]) -> list[list[int]]:
         effect = column.variant.effect.name
         groups.setdefault(CURVE if effect == CURVE else column.variant.name, []).append(index)
     return list(groups.values())
-
-
-def _slice(columns: Sequence[Column], index: int) -> slice:
-    first = sum(column.size for column in columns[:index])
-    return slice(first, first + columns[index].size)
 
 
 def _alike(left: Tensor, chosen: Sequence[slice]) -> Tensor:
@@ -306,3 +261,88 @@ def _alike(left: Tensor, chosen: Sequence[slice]) -> Tensor:
             across = whitened[i] @ left[chosen[i], chosen[j]] @ whitened[j].T
             alike[i, j] = alike[j, i] = float(torch.linalg.matrix_norm(across, 2).clamp(max=1.0))
     return alike
+
+
+@dataclass(frozen=True)
+class Departure:
+    """Of the fitted standard deviations of some channels, or of the measurements, from the declared."""
+
+    variant: Variant  # `process_noise` of these channels, or `measurement_noise`
+    away: float  # log ratio of fitted to declared, their mean, on the drives that are tested
+    on_all: float  # the same of the judges, on the drives of all folds
+    share: float  # of the drives that are tested among all
+    slope: Tensor  # derivative of `away` in the fitted parameters, (P,)
+
+    @property
+    def factor(self) -> float:
+        """By what the noise differs."""
+        return math.exp(self.on_all)
+
+
+@torch.no_grad()
+def departures(declared: Program, now: Refit, parts: Sequence[Element]) -> list[Departure]:
+    """Of every group of channels and of the measurements, where their noise is learned and no guess (`guesses`).
+
+    `declared` is the program as it was before it was fitted, `parts` are the learnable numbers of the first fold's
+    program. What effects that were added to the program do to its noise is no departure.
+    """
+    if not parts:
+        return []
+    program, fold = now.program, now.folds[0]
+    effects = {known.parameter for known in attached(program)}
+    own = torch.tensor([part.name.split("[")[0] not in effects for part in parts])
+    found = []
+    for name, spread in SPREADS.items():
+        slope = _slope(spread, program, fold, parts) * own.unsqueeze(-1)
+        away = _away(spread, declared, program, fold)
+        mean = now.mean([_away(spread, declared, *one) for one in zip(now.judges.programs, now.folds, strict=True)])
+        variants = [v for effect in catalogue(program) if effect.name == name for v in effect.variants(program)]
+        for variant in variants:
+            index = _columns(program, variant)
+            index = [i for i in index if bool(slope[:, i].any()) and not _guessed(program, parts, slope[:, i])]
+            if index:
+                of_all = float(mean[index].mean())
+                found.append(
+                    Departure(variant, float(away[index].mean()), of_all, now.first_share, slope[:, index].mean(1))
+                )
+    return found
+
+
+def _slope(spread: Spread, program: Program, fold: Fold, parts: Sequence[Element]) -> Tensor:
+    """The derivative of log standard deviations in the parameters, `(P, C)` or `(P, K)`."""
+    slopes = []
+    for part in parts:
+        up, down = on_both_sides(part, lambda: spread(program, fold.drives, fold.path.states))
+        slopes.append((up - down) / (2 * part.step))
+    return torch.stack(slopes)
+
+
+def _away(spread: Spread, declared: Program, program: Program, fold: Fold) -> Tensor:
+    """Log ratios of standard deviations to the declared, `(C,)` or `(K,)`."""
+    here, there = (spread(one, fold.drives, fold.path.states) for one in (program, as_declared(declared, program)))
+    return here - there
+
+
+def _of_channels(program: Program, data: Trajectories, states: Tensor) -> Tensor:
+    spread = substep_spreads(program, data, states[:-1].unsqueeze(0))
+    return spread[0][data.transitions].log().mean(0).double()
+
+
+def _of_measurements(program: Program, data: Trajectories, states: Tensor) -> Tensor:
+    return measured(program, states.unsqueeze(0)).spread[0][data.rows].log().mean(0).double()
+
+
+Spread = Callable[[Program, Trajectories, Tensor], Tensor]
+SPREADS: dict[str, Spread] = {"process_noise": _of_channels, "measurement_noise": _of_measurements}
+
+
+def _columns(program: Program, variant: Variant) -> list[int]:
+    """Of the standard deviations that an effect multiplies."""
+    if "channels" not in variant.options:
+        return list(range(len(program.measurement_names)))
+    return [program.channel_names.index(channel) for channel in variant.options["channels"]]
+
+
+def _guessed(program: Program, parts: Sequence[Element], slope: Tensor) -> bool:
+    moving = [part.name for part, value in zip(parts, slope.tolist(), strict=True) if value]
+    return any(name.startswith(guess) for name in moving for guess in program.guesses)

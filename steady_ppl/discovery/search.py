@@ -6,10 +6,10 @@ is held-out log p(y), each drive judged by a program that was fitted without it,
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from steady_ppl.criticism.step_size import StepCheck, check_step
 from steady_ppl.data.trajectories import Trajectories
@@ -19,17 +19,17 @@ from steady_ppl.discovery.candidates import (
     NEAR_ALPHA,
     Candidate,
     Screening,
-    Settings,
+    at_its_best_place,
     fitted,
     judged,
     leaders,
     screen_program,
 )
-from steady_ppl.discovery.profile import at_its_best_place
-from steady_ppl.discovery.refits import Refit, Worth, first_refit, refit_near, refit_with
+from steady_ppl.discovery.refits import Refit, Threshold, first_refit, refit_near, refit_with
 from steady_ppl.discovery.screening import ALPHA, Tested
 from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import with_substeps
 from steady_ppl.utils.progress import stages
@@ -37,19 +37,37 @@ from steady_ppl.utils.progress import stages
 MIN_GAIN_OF_CURVE = 3.0  # nats by which a curve must be better than named effects
 
 
+MAX_NATS_BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
+MAX_NATS_OF_RIVAL = 12.0  # nats behind the best in its round, with which one is fitted again beside other effects
+MIN_NATS_OF_RUNAWAY = 25.0  # nats above every fit that it is a part of, from which a fit is not to be believed
+MAX_SHIFT_OF_SIZES = 0.08  # nats by which twice the substeps may move what is reported: 0.4 standard deviations
+MAX_SUBSTEPS_OF_FIT = 128  # of a fitted program, at most: what a coarser step leaves would be named as an effect
+MAX_EFFECTS, MAX_CURVES = 5, 3  # effects in a program, and adding curves that are fitted
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a search was told."""
+
+    declared: Program  # the program before it was fitted
+    sets: int = 200  # simulated sets of the first round
+    later_sets: int = 60  # of each further one
+    seed: int = 0  # of the simulated sets
+    withheld: Sequence[str] = ()  # names of effects that are left out of the catalogue
+
+    def screen(self, now: Refit, index: int) -> Screening:
+        """Test every candidate that a fitted program does not have, in a round counted from 0."""
+        sets = self.later_sets if index else self.sets
+        return screen_program(now, self.declared, sets=sets, seed=self.seed + index, withheld=self.withheld)
+
+
 @dataclass(frozen=True)
 class Round:
-    """What was tested, fitted and chosen.
+    """What was tested, fitted and chosen."""
 
-    Attributes:
-        screening: the tests of the program so far.
-        candidates: those that were fitted, best first.
-        chosen: what is added, None when the round ends the search.
-    """
-
-    screening: Screening
-    candidates: list[Candidate]
-    chosen: Candidate | None
+    screening: Screening  # the tests of the program so far
+    candidates: list[Candidate]  # those that were fitted, best first
+    chosen: Candidate | None  # what is added, None when the round ends the search
 
     @property
     def quiet(self) -> bool:
@@ -59,17 +77,11 @@ class Round:
 
 @dataclass(frozen=True)
 class Found:
-    """An effect that was chosen.
+    """An effect that was chosen."""
 
-    Attributes:
-        candidate: the best.
-        candidates: all that were fitted in its place, best first.
-        without: the program without it.
-    """
-
-    candidate: Candidate
-    candidates: list[Candidate]
-    without: Refit
+    candidate: Candidate  # the best
+    candidates: list[Candidate]  # all that were fitted in its place, best first
+    without: Refit  # the program without it
 
     @property
     def alike(self) -> list[Candidate]:
@@ -81,32 +93,20 @@ class Found:
 
 @dataclass
 class Search:
-    """What a search came to.
+    """What a search came to."""
 
-    Attributes:
-        known_start: the first states are certain.
-        base: the program as it stands, fitted.
-        gained: nats that fitting the program as it stands gained on the training drives.
-        rounds: in their order; the last tests the final program unless the search ended early.
-        found: the effects that were added.
-        final: the program with all of them, fitted.
-        step: the program as it stands beside itself at finer steps; all else is at the step that suits.
-        with_found: the program with what was found beside itself at finer steps, where these asked for a second search
-            at the step that suits; None where they did not.
-        curves: fits of curves in place of the first effect, best first, where effects alone did not explain the drives.
-        broke: effects that were taken back because the program with them blew up on drives of its own.
-    """
-
-    known_start: bool
-    base: Refit
-    final: Refit
-    step: StepCheck
-    gained: float
+    base: Refit  # the program as it stands, fitted
+    final: Refit  # the program with all effects that were found, fitted
+    step: StepCheck  # the program as it stands beside itself at finer steps; all else is at the step that suits
+    gained: float  # nats that fitting the program as it stands gained on the training drives
     with_found: StepCheck | None = None
-    rounds: list[Round] = field(default_factory=list)
-    found: list[Found] = field(default_factory=list)
+    """The program with what was found beside itself at finer steps, where these asked for a second search at the step
+    that suits; None where they did not."""
+    rounds: list[Round] = field(default_factory=list)  # the last tests the final program unless the search ended early
+    found: list[Found] = field(default_factory=list)  # the effects that were added
     curves: list[Candidate] = field(default_factory=list)
-    broke: list[str] = field(default_factory=list)
+    """Fits of curves in place of the first effect, best first, where effects alone did not explain the drives."""
+    diverged: list[str] = field(default_factory=list)  # effects taken back: the program blew up with them
 
     @property
     def is_complete(self) -> bool:
@@ -132,92 +132,59 @@ class Search:
         return best if not self.departed or best.total > CLEAR_GAIN or of_all <= tests.critical else None
 
     @property
-    def needs_a_name(self) -> bool:
-        """Whether neither a curve nor departed noise can be what the tests found."""
-        return self.curve is None and not self.departed
-
-    @property
     def gain(self) -> float:
         """Held-out log p(y) of the final program above the first, nats."""
         return float((self.final.held_out - self.base.held_out[: len(self.final.held_out)]).sum())
 
 
-MAX_NATS_BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
-MAX_SHIFT_OF_SIZES = 0.08  # nats by which twice the substeps may move what is reported: 0.4 standard deviations
-MAX_SUBSTEPS_OF_FIT = 128
-"""Substeps at which a program is fitted, at most: what a coarser step leaves would be named as an effect."""
-MAX_EFFECTS, MAX_CURVES = 5, 3  # effects in a program, and adding curves that are fitted
+def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
+    """Look for the effects that a program lacks, which is not changed.
 
-
-def search(
-    program: Program,
-    train: Trajectories,
-    valid: Trajectories,
-    *,
-    known_start: bool,
-    declared: Program | None = None,
-    sets: int = 200,
-    later_sets: int = 60,
-    seed: int = 0,
-    withheld: Sequence[str] = (),
-) -> Search:
-    """Look for the effects that a program lacks.
-
-    Args:
-        program: the state-space model; it is not changed.
-        train, valid: as returned by `for_program`; tests are made on the first, both choose.
-        known_start: the first states are certain.
-        declared: the program before it was fitted; `program` when None.
-        sets: simulated sets of the first round.
-        later_sets: of each further one.
-        seed: of the simulated sets.
-        withheld: names of effects that are left out of the catalogue.
+    It is tested by the drives of the problem; both they and `valid`, as returned by `for_program`, choose.
     """
-    settings = Settings(known_start, withheld)
-    declared = copy.deepcopy(declared or program)
 
     def first(program: Program, nearer: Program | None = None) -> Refit:
-        return first_refit(program, train, valid, known_start=known_start, seed=seed, nearer=nearer)
+        return first_refit(replace(problem, program=program), valid, seed=settings.seed, nearer=nearer)
 
+    program = problem.program
     with stages(("fitting the program as it stands", 1), ("comparing time steps", 1), ("", 8)) as begin:
         begin()
         base = first(program)
         gained = base.maxima[0].gained
         begin()
-        step = _step_of(base, known_start)
+        step = _step_of(base)
         if step.too_coarse:  # the step is no effect: what follows is about the program at the step that suits
-            program, declared = (with_substeps(one, step.suited.substeps) for one in (program, declared))
+            program, settings = _with_substeps(program, settings, step.suited.substeps)
             base = first(program, step.suited.program)
         begin()
-        found = _rounds(Search(known_start, base, base, step, gained), declared, settings, sets, later_sets, seed)
-        with_found = _step_of(found.final, known_start, found.found) if found.found else step
+        found = _rounds(Search(base, base, step, gained), settings)
+        with_found = _step_of(found.final, found.found) if found.found else step
         if found.found and with_found.too_coarse:  # what was found asks for a finer step: sizes are those of that step
             finer = with_found.suited.substeps
-            program, declared = (with_substeps(one, finer) for one in (program, declared))
+            program, settings = _with_substeps(program, settings, finer)
             base = first(program, with_substeps(found.base.program, finer))
-            again = Search(known_start, base, base, step, gained, with_found)
-            found = _rounds(again, declared, settings, sets, later_sets, seed)
+            found = _rounds(Search(base, base, step, gained, with_found), settings)
     return found
 
 
-def _step_of(refit: Refit, known_start: bool, found: Sequence[Found] = ()) -> StepCheck:
+def _with_substeps(program: Program, settings: Settings, substeps: int) -> tuple[Program, Settings]:
+    declared = with_substeps(settings.declared, substeps)
+    return with_substeps(program, substeps), replace(settings, declared=declared)
+
+
+def _step_of(refit: Refit, found: Sequence[Found] = ()) -> StepCheck:
     """A program that was fitted to the first fold beside itself at finer steps, on these drives; sizes of what was
     found must not go with the step."""
-    drives, maximum = refit.folds[0].drives, refit.maxima[0]
-    if not found:
-        return check_step(refit.program, drives, maximum, known_start=known_start, finest=MAX_SUBSTEPS_OF_FIT)
-    return check_step(
-        refit.program,
-        drives,
-        maximum,
-        known_start=known_start,
-        watched=[variant.parameter for variant in attached(refit.program)],
-        max_shift=MAX_SHIFT_OF_SIZES,
-        finest=MAX_SUBSTEPS_OF_FIT,
-    )
+    watched: dict[str, Any] = {}
+    if found:
+        parameters = [variant.parameter for variant in attached(refit.program)]
+        watched = {"watched": parameters, "max_shift": MAX_SHIFT_OF_SIZES}
+    fold = refit.folds[0]
+    settings = {"known_start": fold.known_start, "finest": MAX_SUBSTEPS_OF_FIT} | watched
+    return check_step(refit.program, fold.drives, refit.maxima[0], **settings)
 
 
-def _rounds(found: Search, declared: Program, settings: Settings, sets: int, later_sets: int, seed: int) -> Search:
+def _rounds(found: Search, settings: Settings) -> Search:
     """Test, fit and add until nothing is left."""
     with stages(("", 7), ("looking again", 1)) as begin:
         begin()
@@ -226,50 +193,46 @@ def _rounds(found: Search, declared: Program, settings: Settings, sets: int, lat
         with stages(*shares) as begin_part:
             for index in rounds:
                 begin_part()
-                count = sets if index == 0 else later_sets
                 try:
-                    screening = screen_program(found.final, declared, settings, sets=count, seed=seed + index)
+                    screening = settings.screen(found.final, index)
                 except FilterError:
                     if index == 0:
                         raise
                     taken_back = found.found.pop()
-                    found.final, found.broke = taken_back.without, [taken_back.candidate.variant.label]
+                    found.final, found.diverged = taken_back.without, [taken_back.candidate.variant.label]
                     break
                 begin_part()
-                if not _add_best(found, screening, settings, index):
+                if not _add_best(found, screening, index):
                     break
         begin()
         if len(found.found) > 1:
             before, final = list(found.found), found.final
-            look_again(found, settings)
+            prune(found)
             if set(labels(found.final)) != set(labels(final)):  # the same in another order has been tested
-                last = seed + MAX_EFFECTS + 1
                 try:
-                    screening = screen_program(found.final, declared, settings, sets=later_sets, seed=last)
-                    found.rounds.append(Round(screening, [], None))
+                    found.rounds.append(Round(settings.screen(found.final, MAX_EFFECTS + 1), [], None))
                 except FilterError:
-                    found.broke = [label for label in labels(found.final) if label not in labels(final)]
+                    found.diverged = [label for label in labels(found.final) if label not in labels(final)]
                     found.found, found.final = before, final
     return found
 
 
-def _add_best(found: Search, screening: Screening, settings: Settings, index: int) -> bool:
+def _add_best(found: Search, screening: Screening, index: int) -> bool:
     """Fit what the tests of a round point at and add the best, if it brings enough; whether anything was added."""
     found.rounds.append(Round(screening, [], None))
     if found.rounds[-1].quiet:
         return False
     if index == 1 and not found.curves:
-        found.curves = _curves(found.base, found.rounds[0].screening, settings)
+        found.curves = _curves(found.base, found.rounds[0].screening)
     if index == MAX_EFFECTS:
         return False
-    candidates = _refits(found.final, screening, settings, index == 0)
+    candidates = _refits(found.final, screening, index == 0)
     able = [c for c in candidates if c.is_judged and not c.against_its_sign]
     best = next((c for c in able if c.significant(screening.tests.critical)), None)
-    gains = best is not None
-    if index == 0 and not gains:
-        found.curves = _curves(found.base, screening, settings)
-    if index == 0 and not gains and found.needs_a_name:
-        best = next((c for c in able if c.total > NATS and c.tested.p_value <= NEAR_ALPHA), None)
+    if index == 0 and best is None:
+        found.curves = _curves(found.base, screening)
+        if found.curve is None and not found.departed:  # neither can be what the tests found
+            best = next((c for c in able if c.total > NATS and c.tested.p_value <= NEAR_ALPHA), None)
     found.rounds[-1] = Round(screening, candidates, best)
     if best is None:
         return False
@@ -279,49 +242,40 @@ def _add_best(found: Search, screening: Screening, settings: Settings, index: in
     return True
 
 
-def _refits(now: Refit, screening: Screening, settings: Settings, first: bool) -> list[Candidate]:
+def _refits(now: Refit, screening: Screening, first: bool) -> list[Candidate]:
     candidates: list[Candidate] = []
     chosen = leaders(screening.tests, first)
     with stages(*((f"fitting with {tested.variant.label}", 1) for tested in chosen)) as begin:
         for tested in chosen:
             begin()
-            candidates.append(fitted(now, tested, screening, settings, _worth(candidates)))
+            candidates.append(fitted(now, tested, screening, _threshold(candidates)))
     best = max((c for c in candidates if c.is_judged), key=lambda c: c.total, default=None)
     candidates = [c if c.is_judged else replace(c, behind=best) for c in candidates]
     close = max((candidate.total for candidate in candidates), default=0.0) - MAX_NATS_OF_RIVAL
-    found = [at_its_best_place(now, c, settings) if c.total > close else c for c in candidates]
+    found = [at_its_best_place(now, c) if c.total > close else c for c in candidates]
     return sorted(found, key=lambda candidate: -candidate.total)
 
 
-def _worth(candidates: Sequence[Candidate]) -> Worth:
+def _threshold(candidates: Sequence[Candidate]) -> Threshold:
     """What the next candidate must reach on the first fold, given those that were fitted."""
     fits = [c.refit for c in candidates if isinstance(c.refit, Refit)]
     drives = [float(fit.maxima[0].log_likelihood.sum()) for fit in fits]
     held_out = [float(fit.held_out_alone[: len(fit.folds[0].held_out)].sum()) for fit in fits]
-    return Worth(max(drives, default=-math.inf) - MAX_NATS_BEHIND, max(held_out, default=-math.inf) - NATS)
+    return Threshold(max(drives, default=-math.inf) - MAX_NATS_BEHIND, max(held_out, default=-math.inf) - NATS)
 
 
-def _curves(base: Refit, screening: Screening, settings: Settings) -> list[Candidate]:
-    every = screening.tests.curves
-    adding = [tested for tested in every if not tested.variant.options.get("times")]
-    multiplying = [tested for tested in every if tested.variant.options.get("times")]
-    found = []
-    for tested in [*adding[:MAX_CURVES], *multiplying[:1]]:
-        found.append(fitted(base, tested, screening, settings))
+def _curves(base: Refit, screening: Screening) -> list[Candidate]:
+    def multiplies(tested: Tested) -> bool:
+        return bool(tested.variant.options.get("times"))
 
     def worth(candidate: Candidate) -> float:
         """The simpler one, unless the other brings clearly more."""
-        return candidate.total - (MIN_GAIN_OF_CURVE if candidate.variant.options.get("times") else 0.0)
+        return candidate.total - (MIN_GAIN_OF_CURVE if multiplies(candidate.tested) else 0.0)
 
+    adding = [tested for tested in screening.tests.curves if not multiplies(tested)]
+    multiplying = [tested for tested in screening.tests.curves if multiplies(tested)]
+    found = [fitted(base, tested, screening) for tested in [*adding[:MAX_CURVES], *multiplying[:1]]]
     return sorted(found, key=worth, reverse=True)
-
-
-MAX_NATS_OF_RIVAL = 12.0
-"""Nats behind the best in its round, with which a candidate is looked at again beside other effects."""
-
-
-MIN_NATS_OF_RUNAWAY = 25.0
-"""Nats above every fit that it is a part of, from which a fit's likelihood is not to be believed."""
 
 
 def labels(refit: Refit) -> list[str]:
@@ -329,27 +283,23 @@ def labels(refit: Refit) -> list[str]:
     return [variant.label for variant in attached(refit.program)]
 
 
-def look_again(search: Search, settings: Settings) -> None:
+def prune(search: Search) -> None:
     """Drop effects that are not needed beside the others, and let the rivals of each have its place."""
     for found in list(search.found):
-        without = _without(search, found, settings)
+        without = _without(search, found)
         if isinstance(without, str):
             continue
-        rivals = [found.candidate] + [
-            c
-            for c in found.candidates
-            if c is not found.candidate and c.total > found.candidate.total - MAX_NATS_OF_RIVAL
-        ]
+        chosen, least = found.candidate, found.candidate.total - MAX_NATS_OF_RIVAL
+        rivals = [chosen, *(c for c in found.candidates if c is not chosen and c.total > least)]
         there = {variant.name for variant in attached(without.program)}
         again = []
         for rival in rivals:
             if rival.variant.name not in there and isinstance(rival.refit, Refit):
-                start = rival.refit.coefficient(rival.variant)
-                refit = refit_with(without, rival.variant, start, known_start=settings.known_start)
-                again.append(at_its_best_place(without, judged(without, rival.tested, refit), settings))
-        as_it_stands = judged(without, found.candidate.tested, search.final)
-        if all(c.total < as_it_stands.total for c in again if c.variant.name == found.candidate.variant.name):
-            again = [as_it_stands, *(c for c in again if c.variant.name != found.candidate.variant.name)]
+                refit = refit_with(without, rival.variant, rival.refit.coefficient(rival.variant))
+                again.append(at_its_best_place(without, judged(without, rival.tested, refit)))
+        as_it_stands = judged(without, chosen.tested, search.final)
+        if all(c.total < as_it_stands.total for c in again if c.variant.name == chosen.variant.name):
+            again = [as_it_stands, *(c for c in again if c.variant.name != chosen.variant.name)]
         again.sort(key=lambda candidate: -candidate.total)
         best = next((c for c in again if not c.against_its_sign), None)
         place = search.found.index(found)
@@ -361,18 +311,15 @@ def look_again(search: Search, settings: Settings) -> None:
             search.final = best.refit
 
 
-def _without(search: Search, found: Found, settings: Settings) -> Refit | str:
+def _without(search: Search, found: Found) -> Refit | str:
     """The program with the other effects, fitted one after the other and from where the fit of all ended: the likelier,
-    lest a fit that has stuck make an effect look needed."""
-    others = [other for other in search.found if other is not found]
-    variants = [other.candidate.variant for other in others]
-    afresh = _with_all(search.base, others, settings)
-    near = refit_near(search.base, search.final, variants, known_start=settings.known_start)
+    lest a fit that has stopped early make an effect look needed."""
+    others = [other.candidate for other in search.found if other is not found]
+    afresh = _with_all(search.base, others)
+    near = refit_near(search.base, search.final, [other.variant for other in others])
     if isinstance(afresh, str) or isinstance(near, str):
         return afresh if isinstance(near, str) else near
-    most = (
-        max(_objective(search.final), _objective(afresh)) + MIN_NATS_OF_RUNAWAY
-    )  # above all that it is a part of: it has run away
+    most = max(_objective(search.final), _objective(afresh)) + MIN_NATS_OF_RUNAWAY  # more: it has run away
     return near if _objective(afresh) < _objective(near) < most else afresh
 
 
@@ -380,11 +327,10 @@ def _objective(refit: Refit) -> float:
     return sum(maximum.objective for maximum in refit.maxima)
 
 
-def _with_all(base: Refit, effects: Sequence[Found], settings: Settings) -> Refit | str:
+def _with_all(base: Refit, candidates: Sequence[Candidate]) -> Refit | str:
     now: Refit | str = base
-    for found in effects:
-        if isinstance(now, str) or isinstance(found.candidate.refit, str):
+    for candidate in candidates:
+        if isinstance(now, str) or isinstance(candidate.refit, str):
             return now
-        start = found.candidate.refit.coefficient(found.candidate.variant)
-        now = refit_with(now, found.candidate.variant, start, known_start=settings.known_start)
+        now = refit_with(now, candidate.variant, candidate.refit.coefficient(candidate.variant))
     return now

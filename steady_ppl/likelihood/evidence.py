@@ -16,9 +16,9 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, require
 from steady_ppl.gaussian.information_filter import Lookahead
-from steady_ppl.gaussian.linearize import why_not_linear
-from steady_ppl.gaussian.smoother import find_and_smooth, means_as_path
+from steady_ppl.gaussian.smoother import means_as_path
 from steady_ppl.gaussian.twisted_proposal import Twist
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.smc.filter import particle_filter
 from steady_ppl.smc.genealogy import Filtered
@@ -35,9 +35,7 @@ def run_filter(
     kernels: bool | None = None,
 ) -> Filtered:
     """The particle filter at observation weight 1, bootstrap or looking ahead."""
-    proposal = None
-    if look_ahead:
-        proposal = Twist(find_and_smooth(program, data, known_start=known_start))
+    proposal = Twist(Problem(program, data, known_start).find_and_smooth()) if look_ahead else None
     return particle_filter(
         program,
         data,
@@ -51,17 +49,11 @@ def run_filter(
 
 @dataclass(frozen=True)
 class FilterChoice:
-    """Which filter suits a program: the one that looks ahead wherever its noise is normal.
+    """Which filter suits a program: the one that looks ahead wherever its noise is normal."""
 
-    Attributes:
-        particles: N, for each trajectory.
-        look_ahead: whether it looks ahead.
-        name: "lookahead", or "bootstrap" and why.
-    """
-
-    particles: int
+    particles: int  # N, for each trajectory
     look_ahead: bool
-    name: str
+    name: str  # "lookahead", or "bootstrap" and why
 
 
 def choose_filter(
@@ -73,7 +65,7 @@ def choose_filter(
     look_ahead: bool | None = None,
 ) -> FilterChoice:
     """Settle what is None: the filter by the program's noise, its particles (200 looking ahead, else 5000)."""
-    reason = why_not_linear(program, data, known_start=known_start) if look_ahead is None else "as asked"
+    reason = Problem(program, data, known_start).why_not_linear() if look_ahead is None else "as asked"
     ahead = reason is None if look_ahead is None else look_ahead
     name = "lookahead" if ahead else f"bootstrap ({reason})"
     count = (200 if ahead else 5000) if particles is None else particles
@@ -99,7 +91,7 @@ def neglected(
     Returns:
         `(B,)` nats, with the filter's Monte-Carlo error.
     """
-    ahead = ahead or find_and_smooth(program, data, known_start=known_start)
+    ahead = ahead or Problem(program, data, known_start).find_and_smooth()
     filtered = particle_filter(
         program, data, particles=particles, known_start=known_start, proposal=Twist(ahead), keep_history=False
     )
@@ -110,14 +102,11 @@ def neglected(
 class Evidence:
     """What a filter says of given drives, without their states.
 
-    Attributes:
-        log_likelihood: the estimate of log p(y) of each trajectory, `(B,)`.
-        scarce: share of each trajectory's measured rows after which hardly a particle was left, see `Filtered.scarce`,
-            `(B,)`. The estimate then hangs on a few particles: it scatters, and is mostly too low.
+    Where hardly a particle was left the estimate hangs on a few: it scatters, and is mostly too low.
     """
 
-    log_likelihood: Tensor
-    scarce: Tensor
+    log_likelihood: Tensor  # (B,), estimated
+    scarce: Tensor  # (B,) share of measured rows after which hardly a particle was left, see `Filtered.scarce`
 
 
 def evidence(
@@ -188,8 +177,9 @@ def smoothed_states(program: Program, data: Trajectories, *, known_start: bool) 
     Returns:
         `(T + 1, B, D)`.
     """
-    if why_not_linear(program, data, known_start=known_start) is None:
-        return means_as_path(find_and_smooth(program, data, known_start=known_start), data).states
+    problem = Problem(program, data, known_start)
+    if problem.why_not_linear() is None:
+        return means_as_path(problem.find_and_smooth(), data).states
     parts = [
         particle_filter(program, part, particles=2000, known_start=known_start).paths(100).states.mean(0)
         for part in in_parts(data, 2000)

@@ -1,5 +1,8 @@
 """Maximum likelihood (with priors, the posterior's mode) of a linearised program by scoring steps.
 
+For programs of some dozens of learnable numbers with normal noise. System identification calls it the prediction-error
+method; its predictor is the linearised program (Ljung 1999, System Identification, section 7.4).
+
 Steps solve the information matrix against the score. It begins as the cross products of the drives' scores (Berndt,
 Hall, Hall and Hausman 1974) unless it is known, and learns on the way (Broyden, Fletcher, Goldfarb and Shanno).
 """
@@ -10,6 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,9 +22,10 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
-from steady_ppl.likelihood.parameters import Element, elements, moved, set_values, values_of
-from steady_ppl.likelihood.scores import parameter_scores, smoothed
+from steady_ppl.gaussian.smoother import require_found, resting_path
+from steady_ppl.likelihood.parameters import Element, elements, on_both_sides, set_values, values_of
+from steady_ppl.likelihood.problem import Problem
+from steady_ppl.likelihood.scores import parameter_scores, smoothed, widens
 from steady_ppl.model.program import Program
 from steady_ppl.utils.journal import Piece, piece
 from steady_ppl.utils.progress import stages
@@ -33,6 +38,8 @@ SHARE_AGAINST_SCORE = 1 / 3
 no score there, and a fit cannot return."""
 FEWER = 0.8  # share of fits that take one step more, by which the time left is told
 MAX_DECREASE = 0.3  # nats by which an objective may fall: paths are at rest but for the tolerance
+MAX_ROUGHNESS = 1.5  # mean square deviation, in the program's own, from which noise is widened before a fit
+OUTLIER_SD, SEARCHES = 6.0, 3  # standard deviations by which an outlier is less likely, and searches for its path
 
 
 @dataclass(frozen=True)
@@ -65,7 +72,6 @@ class Maximum:
         return self.decrement is None or self.decrement < 0.1
 
 
-@torch.no_grad()
 def maximise(
     program: Program,
     data: Trajectories,
@@ -92,21 +98,18 @@ def maximise(
     Raises:
         FilterError: the program cannot be smoothed at its initial parameters.
     """
+    settings = {"information": information, "steps": steps, "precision": precision, "hopeless": hopeless}
+    return maximum_of(Problem(program, data, known_start), path, **settings)
+
+
+def maximum_of(problem: Problem, path: ReferencePath | None = None, **settings: Any) -> Maximum:
+    """`maximise` a problem; settings and errors are its."""
 
     def compute() -> Maximum:
-        parts = elements(program)
-        own = Term(program, data, path or find_path(program, data, known_start=known_start), parts, range(len(parts)))
-        (found,) = climb(
-            [own],
-            known_start=known_start,
-            information=information,
-            steps=steps,
-            precision=precision,
-            hopeless=hopeless,
-        )
+        (found,) = climb([Term.alone(problem, path or problem.find_path())], **settings)
         return found
 
-    return kept_maximum(program, compute)
+    return kept_maximum(problem.program, compute)
 
 
 def kept_maximum(program: Program, find: Callable[[], Maximum]) -> Maximum:
@@ -128,29 +131,24 @@ def kept_maximum(program: Program, find: Callable[[], Maximum]) -> Maximum:
 
 @dataclass(frozen=True)
 class Term:
-    """What a program adds to an objective.
+    """What a program adds to an objective. Programs whose `columns` name the same place have this number in common."""
 
-    Attributes:
-        program: its parameters are moved in place.
-        data: its drives.
-        path: near their posterior means.
-        parts: its learnable numbers.
-        columns: the place of each of them among all numbers of the objective, which are counted from 0 without gaps.
-            Programs that name the same place have this number in common.
-    """
+    problem: Problem  # its program's parameters are moved in place
+    path: ReferencePath  # near the posterior means of its drives
+    parts: list[Element]  # its learnable numbers
+    columns: list[int]  # the place of each among all numbers of the objective, counted from 0 without gaps
 
-    program: Program
-    data: Trajectories
-    path: ReferencePath
-    parts: list[Element]
-    columns: Sequence[int]
+    @classmethod
+    def alone(cls, problem: Problem, path: ReferencePath) -> Term:
+        """The only term of an objective."""
+        parts = elements(problem.program)
+        return cls(problem, path, parts, list(range(len(parts))))
 
 
 @torch.no_grad()
 def climb(
     terms: Sequence[Term],
     *,
-    known_start: bool,
     information: Tensor | None = None,
     steps: int = 25,
     precision: float = 0.02,
@@ -158,9 +156,7 @@ def climb(
 ) -> list[Maximum]:
     """Move the numbers of programs, in place, towards where the sum of their objectives is largest.
 
-    Args:
-        terms: what is added. A number that several have in common has its log prior once.
-        known_start, information, steps, precision, hopeless: those of `maximise`, of the sum.
+    A number that several terms have in common has its log prior once. Settings are those of `maximise`, of the sum.
 
     Returns:
         Of each program where it ended, with its own part of the information; `decrement` and `steps` are of the sum.
@@ -168,19 +164,21 @@ def climb(
     Raises:
         FilterError: the programs cannot be smoothed where they begin, or the drives do not tell their numbers apart.
     """
-    here = _look(terms, known_start)
+    here = _linearised(terms)
     for term, at in zip(terms, here.terms, strict=True):
-        require_found(at.ahead, term.program, term.data)
+        require_found(at.ahead, term.problem.program, term.problem.data)
     began = [at.objective for at in here.terms]
-    reach = _gathered(terms, [[MAX_MOVE * part.step for part in term.parts] for term in terms])
-    information = _firm(_of_drives(here) if information is None else information)
+    reach = torch.zeros(_size(terms), dtype=torch.float64)
+    for term in terms:
+        reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
+    information = _regularised(_of_drives(here) if information is None else information)
     taken, decrement, passes = 0, 0.0, PASSES
     with stages(*(("", FEWER**step) for step in range(steps + 1))) as begin:
         for taken in range(steps + 1):
             begin()
             move, singular = torch.linalg.solve_ex(information, here.gradient)
             if not singular and not float(here.gradient @ move) >= 0:  # it has ceased to be positive
-                information = _firm(_of_drives(here))
+                information = _regularised(_of_drives(here))
                 move, singular = torch.linalg.solve_ex(information, here.gradient)
             if singular:
                 raise FilterError(
@@ -193,7 +191,7 @@ def climb(
             move = move * min(1.0, 1 / max(1e-9, float((move.abs() / reach).max())))
             against = move * here.gradient < 0
             move = torch.where(against, move.clamp(-SHARE_AGAINST_SCORE * reach, SHARE_AGAINST_SCORE * reach), move)
-            share, there = _searched(terms, here, move, known_start, passes)
+            share, there = _searched(terms, here, move, passes)
             if there is not None:
                 information = _updated(information, share * move, here.gradient - there.gradient)
                 here = there
@@ -201,36 +199,35 @@ def climb(
                 break
             else:
                 passes = STALLED_PASSES
-                here = _look(_along(terms, here), known_start, passes)
-                information = _firm(_of_drives(here))
+                here = _linearised(_along(terms, here), passes)
+                information = _regularised(_of_drives(here))
     return [
-        _maximum(term, at, information, taken, decrement, before)
+        Maximum(
+            log_likelihood=at.ahead.log_likelihood,
+            objective=at.objective,
+            path=at.path,
+            names=tuple(part.name for part in term.parts),
+            information=information[term.columns][:, term.columns],
+            steps=taken,
+            decrement=decrement,
+            gained=at.objective - before,
+        )
         for term, at, before in zip(terms, here.terms, began, strict=True)
     ]
 
 
-def _owners(terms: Sequence[Term]) -> Counter[int]:
-    """How many programs have each number."""
-    return Counter(column for term in terms for column in term.columns)
+def _size(terms: Sequence[Term]) -> int:
+    """How many numbers an objective has."""
+    return len({column for term in terms for column in term.columns})
 
 
-def _gathered(terms: Sequence[Term], values: Sequence[Sequence[float]]) -> Tensor:
-    """Values of all numbers of an objective, `(P,)`, from those of each program."""
-    found = torch.zeros(len(_owners(terms)), dtype=torch.float64)
-    for term, own in zip(terms, values, strict=True):
-        found[list(term.columns)] = torch.as_tensor(own, dtype=torch.float64)
-    return found
-
-
-def _searched(
-    terms: Sequence[Term], here: _Here, move: Tensor, known_start: bool, passes: int
-) -> tuple[float, _Here | None]:
+def _searched(terms: Sequence[Term], here: _Here, move: Tensor, passes: int) -> tuple[float, _Here | None]:
     """The share of a move that does not fall, and where it leads; None where none does and nothing is moved."""
     share, before = 1.0 if bool(torch.isfinite(move).all()) else 0.0, [values_of(term.parts) for term in terms]
     while share > 0.01:
         for term, values in zip(terms, before, strict=True):
-            set_values(term.parts, values + share * move[list(term.columns)])
-        there = _try(_along(terms, here), known_start, passes, here.objective - MAX_DECREASE)
+            set_values(term.parts, values + share * move[term.columns])
+        there = _tried(_along(terms, here), passes, here.objective - MAX_DECREASE)
         if there is not None:
             return share, there
         share /= 3
@@ -240,12 +237,13 @@ def _searched(
 
 
 def _of_drives(here: _Here) -> Tensor:
+    """The information by the cross products of the drives' scores."""
     by_drive = here.scores - here.scores.mean(0)
     information = by_drive.T @ by_drive
     return information + 0.1 * torch.diag(information.diagonal())
 
 
-def _firm(information: Tensor) -> Tensor:
+def _regularised(information: Tensor) -> Tensor:
     return information + 1e-6 * torch.diag(information.diagonal()) + 1e-3 * torch.eye(len(information)).double()
 
 
@@ -259,8 +257,8 @@ class _TermHere:
 @dataclass(frozen=True)
 class _Here:
     terms: list[_TermHere]
-    scores: Tensor
-    gradient: Tensor
+    scores: Tensor  # (B, P), of the drives of all terms
+    gradient: Tensor  # (P,)
 
     @property
     def objective(self) -> float:
@@ -275,54 +273,14 @@ def _along(terms: Sequence[Term], here: _Here) -> list[Term]:
     return [replace(term, path=there.path) for term, there in zip(terms, here.terms, strict=True)]
 
 
-def _look(terms: Sequence[Term], known_start: bool, passes: int = PASSES) -> _Here:
-    return _scored(terms, _valued(terms, known_start, passes))
+def _linearised(terms: Sequence[Term], passes: int = PASSES) -> _Here:
+    return _scored(terms, _valued(terms, passes))
 
 
-def _valued(terms: Sequence[Term], known_start: bool, passes: int) -> list[_TermHere]:
-    found, owners = [], _owners(terms)
-    for term in terms:
-        program, data = term.program, term.data
-        ahead = smooth(
-            program, data, term.path, known_start=known_start, passes=passes, tolerance=TOLERANCE, kernels=False
-        )
-        prior = log_prior(program, _shares(term.parts, [owners[column] for column in term.columns]))
-        found.append(_TermHere(ahead, resting_path(ahead, data), float(ahead.log_likelihood.sum()) + prior))
-    return found
-
-
-def _scored(terms: Sequence[Term], found: list[_TermHere]) -> _Here:
-    scores, slopes, owners = [], [], _owners(terms)
-    for term, at in zip(terms, found, strict=True):
-        scores.append(parameter_scores(term.program, term.data, smoothed(at.ahead, term.data), term.parts))
-        shares = _shares(term.parts, [owners[column] for column in term.columns])
-        slopes.append(scores[-1].sum(0) + _slope_of_prior(term.program, term.parts, shares))
-    count = len(owners)
-    gradient = torch.zeros(count, dtype=torch.float64)
-    by_drive = []
-    for term, own, slope in zip(terms, scores, slopes, strict=True):
-        columns = list(term.columns)
-        gradient[columns] += slope
-        wide = own.new_zeros((len(own), count))
-        wide[:, columns] = own
-        by_drive.append(wide)
-    return _Here(found, torch.cat(by_drive), gradient)
-
-
-def posterior_score(program: Program, data: Trajectories, path: ReferencePath, known_start: bool) -> Tensor:
-    """The slope of log p(y) and the log prior where the program is, `(P,)`, along the best path near `path`.
-
-    Raises:
-        FilterError: the program diverges there.
-    """
-    parts = elements(program)
-    return _look([Term(program, data, path, parts, range(len(parts)))], known_start, STALLED_PASSES).gradient
-
-
-def _try(terms: Sequence[Term], known_start: bool, passes: int, least: float) -> _Here | None:
+def _tried(terms: Sequence[Term], passes: int, least: float) -> _Here | None:
     """None where the step went too far: the objective falls below `least`, or a program diverges there."""
     try:
-        found = _valued(terms, known_start, passes)
+        found = _valued(terms, passes)
         finite = all(bool(torch.isfinite(term.ahead.log_likelihood).all()) for term in found)
         if not finite or not sum(term.objective for term in found) >= least:
             return None
@@ -332,9 +290,43 @@ def _try(terms: Sequence[Term], known_start: bool, passes: int, least: float) ->
     return here if bool(torch.isfinite(here.gradient).all()) else None
 
 
-def _shares(parts: list[Element], owners: Sequence[int]) -> dict[str, float]:
-    """A program's share in the log prior of its parameters, which others may have in common with it."""
-    return {part.name.split("[")[0]: 1 / count for part, count in zip(parts, owners, strict=True)}
+def _valued(terms: Sequence[Term], passes: int) -> list[_TermHere]:
+    found = []
+    for term, shares in zip(terms, _shares(terms), strict=True):
+        ahead = term.problem.smooth(term.path, passes=passes, tolerance=TOLERANCE, kernels=False)
+        objective = float(ahead.log_likelihood.sum()) + log_prior(term.problem.program, shares)
+        found.append(_TermHere(ahead, resting_path(ahead, term.problem.data), objective))
+    return found
+
+
+def _scored(terms: Sequence[Term], found: list[_TermHere]) -> _Here:
+    gradient, by_drive = torch.zeros(_size(terms), dtype=torch.float64), []
+    for term, at, shares in zip(terms, found, _shares(terms), strict=True):
+        program, data = term.problem.program, term.problem.data
+        own = parameter_scores(program, data, smoothed(at.ahead, data), term.parts)
+        gradient[term.columns] += own.sum(0) + _slope_of_prior(program, term.parts, shares)
+        wide = own.new_zeros((len(own), len(gradient)))
+        wide[:, term.columns] = own
+        by_drive.append(wide)
+    return _Here(found, torch.cat(by_drive), gradient)
+
+
+def posterior_score(problem: Problem, path: ReferencePath) -> Tensor:
+    """The slope of log p(y) and the log prior where the program is, `(P,)`, along the best path near `path`.
+
+    Raises:
+        FilterError: the program diverges there.
+    """
+    return _linearised([Term.alone(problem, path)], STALLED_PASSES).gradient
+
+
+def _shares(terms: Sequence[Term]) -> list[dict[str, float]]:
+    """Each program's share in the log prior of its parameters, which others may have in common with it."""
+    owners = Counter(column for term in terms for column in term.columns)
+    return [
+        {part.name.split("[")[0]: 1 / owners[column] for part, column in zip(term.parts, term.columns, strict=True)}
+        for term in terms
+    ]
 
 
 def _slope_of_prior(program: Program, parts: list[Element], shares: dict[str, float]) -> Tensor:
@@ -342,10 +334,8 @@ def _slope_of_prior(program: Program, parts: list[Element], shares: dict[str, fl
     slope = torch.zeros(len(parts), dtype=torch.float64)
     for index, part in enumerate(parts):
         if part.name.split("[")[0] in program.priors:
-            with moved(part, part.step):
-                up = log_prior(program, shares)
-            with moved(part, -part.step):
-                slope[index] = (up - log_prior(program, shares)) / (2 * part.step)
+            up, down = on_both_sides(part, lambda: log_prior(program, shares))
+            slope[index] = (up - down) / (2 * part.step)
     return slope
 
 
@@ -370,15 +360,81 @@ def _updated(information: Tensor, step: Tensor, fall: Tensor) -> Tensor:
     return information - torch.outer(through, through) / expected + torch.outer(fall, fall) / seen
 
 
-def _maximum(term: Term, here: _TermHere, information: Tensor, taken: int, decrement: float, began: float) -> Maximum:
-    columns = list(term.columns)
-    return Maximum(
-        log_likelihood=here.ahead.log_likelihood,
-        objective=here.objective,
-        path=here.path,
-        names=tuple(part.name for part in term.parts),
-        information=information[columns][:, columns],
-        steps=taken,
-        decrement=decrement,
-        gained=here.objective - began,
-    )
+def fit_by_likelihood(program: Program, data: Trajectories, *, known_start: bool = False) -> Maximum:
+    """Move a program's parameters, in place, to where log p(y) of the linearised program plus the log prior is largest.
+
+    Paths are found by random starts: run it in a `seeded` block.
+
+    Args:
+        program: with normal noise, its parameters as declared or as another fit left them.
+        data: as returned by `for_program`.
+        known_start: the first state is certain.
+
+    Raises:
+        UsageError: more learnable numbers than can be looked at one by one.
+        FilterError: the drives cannot be smoothed.
+    """
+    problem = Problem(program, data, known_start)
+    with stages(("finding paths", 1), ("scoring steps", 3), ("drives that strayed", 1)) as begin:
+        begin()
+        path = widen_noise(problem)
+        begin()
+        found = maximum_of(problem, path)
+        begin()
+        return refit_outliers(problem, found)
+
+
+def refit_outliers(problem: Problem, maximum: Maximum) -> Maximum:
+    """Search again for the paths of drives far less likely than the others, which were found before the program was
+    fitted, and refit where they are better."""
+    for _ in range(SEARCHES):
+        each = maximum.log_likelihood / problem.data.observed.sum((0, 2)).clamp(min=1)
+        middle = each.median()
+        usual = 1.5 * (each - middle).abs().median()
+        outliers = (~(each >= middle - OUTLIER_SD * usual)).nonzero().flatten()
+        if not len(outliers):
+            break
+        part = problem.subset(outliers)
+        there = part.smooth(part.find_path(), kernels=False)
+        better = there.log_likelihood > maximum.log_likelihood[outliers] + 1
+        if not bool(better.any()):
+            break
+        states, noise = maximum.path.states.clone(), maximum.path.noise.clone()
+        found = resting_path(there, part.data)
+        states[:, outliers[better]], noise[:, outliers[better]] = found.states[:, better], found.noise[:, better]
+        before = maximum.gained - maximum.objective
+        maximum = maximum_of(problem, ReferencePath(states, noise))
+        maximum = replace(maximum, gained=maximum.objective + before)
+    return maximum
+
+
+def widen_noise(problem: Problem, path: ReferencePath | None = None) -> ReferencePath:
+    """Widen the program's noise, in place, where the drives are much rougher than it says; return paths, found anew.
+
+    A program that lacks a strong effect explains nothing at its declared noise: scores there lead nowhere. A path that
+    is given is returned where the noise is wide enough.
+    """
+    path = path or problem.find_path()
+    ahead = problem.smooth(path, kernels=False)
+    every = elements(problem.program)
+    parts = [part for part, wider in zip(every, widens(problem.program, every, problem.data), strict=True) if wider]
+    while parts and _roughness(ahead, problem.data) > MAX_ROUGHNESS:
+        before = values_of(parts)
+        for part in parts:
+            part.move(math.log(3.0))
+        wider_path = problem.find_path()
+        there = problem.smooth(wider_path, kernels=False)
+        if not float(there.log_likelihood.sum()) > float(ahead.log_likelihood.sum().nan_to_num(-math.inf)):
+            set_values(parts, before)
+            break
+        path, ahead = wider_path, there
+    return path
+
+
+def _roughness(ahead: Lookahead, data: Trajectories) -> float:
+    """Posterior mean square of the channels' or the measurements' standardised deviations, whichever is larger; 1 where
+    the program is right."""
+    at = smoothed(ahead, data)
+    parts = (at.channels, at.measurements)
+    means = [(p.mean.square() + p.variance)[p.present].mean() for p in parts if bool(p.present.any())]
+    return max(float(mean.nan_to_num(torch.inf)) for mean in means)

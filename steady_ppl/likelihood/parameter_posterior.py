@@ -12,7 +12,7 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
@@ -23,10 +23,10 @@ from torch.distributions import transform_to
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, require
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.gaussian.smoother import smooth
-from steady_ppl.likelihood.maximize import MAX_MOVE, PASSES, TOLERANCE, log_prior, maximise, posterior_score
-from steady_ppl.likelihood.parameters import Element, elements, moved, set_values, values_of
-from steady_ppl.model.program import Program, for_program
+from steady_ppl.likelihood.maximize import MAX_MOVE, PASSES, TOLERANCE, log_prior, maximum_of, posterior_score
+from steady_ppl.likelihood.parameters import Element, elements, on_both_sides, set_values, values_of
+from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.program import Program
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
@@ -103,27 +103,21 @@ def parameter_posterior(
     require(draws >= 1, "draws", draws, "at least 1")
     require(proposals >= 20, "proposals", proposals, "at least 20: a tail is told from the largest weights")
     program = copy.deepcopy(program).double()
-    data = for_program(program, table).without_truth(keep_start=known_start)
+    problem = Problem.of_table(program, table, known_start)
     with seeded(seed, "parameters"), stages(("finding the maximum", 1), ("weighing", 4)) as begin:
         begin()
-        maximum = maximise(program, data, known_start=known_start)
+        path = maximum_of(problem).path
         begin()
-        first = about_maximum(program, data, maximum.path, known_start)
-        proposed, log_weights = adapt(program, first, linearised(data, maximum.path, known_start), proposals)
+        proposed, log_weights = adapt(program, about_maximum(problem, path), linearised(problem, path), proposals)
         return resampled(program, proposed, log_weights, draws)
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A Student t in the space in which parameters are learned.
+    """A Student t in the space in which parameters are learned."""
 
-    Attributes:
-        centre: `(P,)`.
-        root: `(P, P)`, times its transpose the covariance of the normal that it is in the middle.
-    """
-
-    centre: Tensor
-    root: Tensor
+    centre: Tensor  # (P,)
+    root: Tensor  # (P, P), times its transpose the covariance of the normal that it is in the middle
 
     def draws(self, count: int) -> Tensor:
         """Values `(K, P)`."""
@@ -139,12 +133,11 @@ class Shape:
         return tail - torch.linalg.slogdet(self.root)[1]
 
 
-def about_maximum(program: Program, data: Trajectories, path: ReferencePath, known_start: bool = False) -> Shape:
+def about_maximum(problem: Problem, path: ReferencePath) -> Shape:
     """By the curvature where the program is; what the data do not tell is open by as much as a fit moves it at once."""
-    parts = elements(program)
+    parts = elements(problem.program)
     reach = torch.tensor([MAX_MOVE * part.step for part in parts], dtype=torch.float64)
-    information = observed_information(program, data, path, parts, known_start)
-    curvature, directions = torch.linalg.eigh(reach * information * reach[:, None])
+    curvature, directions = torch.linalg.eigh(reach * observed_information(problem, path, parts) * reach[:, None])
     return Shape(values_of(parts), reach[:, None] * directions * curvature.clamp(min=1.0).rsqrt())
 
 
@@ -179,27 +172,22 @@ def _shaped(shape: Shape, values: Tensor, log_weights: Tensor) -> Shape:
     return Shape(centre, root) if not failed else shape
 
 
-def observed_information(
-    program: Program, data: Trajectories, path: ReferencePath, parts: list[Element], known_start: bool
-) -> Tensor:
+def observed_information(problem: Problem, path: ReferencePath, parts: list[Element]) -> Tensor:
     """Minus the second derivatives of log p(y) and the log prior, `(P, P)`, by differences of exact scores."""
     columns = []
     for part in parts:
-        with moved(part, part.step):
-            up = posterior_score(program, data, path, known_start)
-        with moved(part, -part.step):
-            down = posterior_score(program, data, path, known_start)
+        up, down = on_both_sides(part, lambda: posterior_score(problem, path))
         columns.append((down - up) / (2 * part.step))
     found = torch.stack(columns)
     return (found + found.T) / 2
 
 
-def linearised(data: Trajectories, path: ReferencePath, known_start: bool = False) -> LogLikelihood:
+def linearised(problem: Problem, path: ReferencePath) -> LogLikelihood:
     """log p(y) of the linearised program as it stands, summed over drives."""
 
     def judge(program: Program) -> Tensor:
-        ahead = smooth(program, data, path, known_start=known_start, passes=PASSES, tolerance=TOLERANCE, kernels=False)
-        return ahead.log_likelihood.sum()
+        own = replace(problem, program=program)
+        return own.smooth(path, passes=PASSES, tolerance=TOLERANCE, kernels=False).log_likelihood.sum()
 
     return judge
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -15,23 +16,17 @@ from steady_ppl.model.program import Program
 
 MAX_PARAMETERS = 60  # parameters that are screened one by one; networks have more
 MIN_RELATIVE_MOVE = 1e-3  # of a number, by which differences move it at least: single precision has seven digits
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
 class Element:
-    """One number among a program's parameters, in the unconstrained space in which it is learned.
+    """One number among a program's parameters, in the unconstrained space in which it is learned."""
 
-    Attributes:
-        name: of the parameter, with an index where it has several numbers.
-        parameter: the tensor.
-        index: in its flat form.
-        step: by which finite differences move it.
-    """
-
-    name: str
+    name: str  # of the parameter, with an index where it has several numbers
     parameter: Tensor
-    index: int
-    step: float
+    index: int  # in its flat form
+    step: float  # by which finite differences move it
 
     def move(self, by: float) -> None:
         """Change it."""
@@ -75,6 +70,14 @@ def moved(part: Element, by: float) -> Iterator[None]:
         yield
     finally:
         part.parameter.data.view(-1)[part.index] = before
+
+
+def on_both_sides(part: Element, compute: Callable[[], Result]) -> tuple[Result, Result]:
+    """What is computed with a number one step up, and with it one step down."""
+    with moved(part, part.step):
+        up = compute()
+    with moved(part, -part.step):
+        return up, compute()
 
 
 def values_of(parts: Sequence[Element]) -> Tensor:

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import pyro.distributions as dist
 import torch
@@ -26,7 +27,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import Lookahead
-from steady_ppl.likelihood.parameters import Element, moved
+from steady_ppl.likelihood.parameters import Element, moved, on_both_sides
 from steady_ppl.model.handlers import (
     AtMean,
     Recording,
@@ -46,18 +47,12 @@ Moments = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True)
 class Deviations:
-    """The posterior of standardised deviations from their means, of channels or of measurements.
+    """The posterior of standardised deviations from their means, of channels or of measurements."""
 
-    Attributes:
-        mean, variance: `(rows, B, C)`, zero where there is none.
-        points: x̂, x̂ + v and x̂ − v for each component, `(1 + 2 C, rows, B, D)`.
-        present: `(rows, B, C)` bool.
-    """
-
-    mean: Tensor
-    variance: Tensor
-    points: Tensor
-    present: Tensor
+    mean: Tensor  # (rows, B, C), zero where there is none
+    variance: Tensor  # likewise
+    points: Tensor  # x̂, x̂ + v and x̂ − v for each component, (1 + 2 C, rows, B, D)
+    present: Tensor  # (rows, B, C) bool
 
     def of_mean(self, slope: Tensor) -> Tensor:
         """Score of a change of the means by `slope` deviations at `points`, `(1 + 2 C, rows, B, C)`; `(B,)`."""
@@ -91,44 +86,30 @@ class Deviations:
 
 @dataclass(frozen=True)
 class Smoothed:
-    """What scores need of a smoothed program.
+    """What scores need of a smoothed program."""
 
-    Attributes:
-        states: posterior means, `(T + 1, B, D)`.
-        channels: deviations of `(T, B, C)` channels.
-        lag: posterior covariance of each channel's deviation with its last one, `(T, B, C)`, zero at the first.
-        measurements: deviations of `(T + 1, B, K)` measurements.
-        sharpness: one over the standard deviations by which these are standardised, `(T + 1, B, K)`; those of the
-            normal that touches a Student t.
-        ahead: of which these are the moments.
-    """
-
-    states: Tensor
-    channels: Deviations
-    lag: Tensor
-    measurements: Deviations
-    sharpness: Tensor
-    ahead: Lookahead
+    states: Tensor  # posterior means, (T + 1, B, D)
+    channels: Deviations  # of (T, B, C) channels
+    lag: Tensor  # posterior covariance of each channel's deviation with its last one, (T, B, C), zero at the first
+    measurements: Deviations  # of (T + 1, B, K) measurements
+    sharpness: Tensor  # 1 / their standard deviations, (T + 1, B, K); those of the normal that touches a Student t
+    ahead: Lookahead  # of which these are the moments
 
 
 @dataclass(frozen=True)
 class Arrivals:
     """The posterior of ∇ log β(x'), of the measurements from the end of each row on.
 
-    Attributes:
-        mean, scale: of each component, in standard deviations and their size, `(T, B, D)`.
-        states, noise: posterior means and these ± their covariance with each component in standard deviations,
-            `(1 + 2 D, T, B, D)` and `(1 + 2 D, T, B, C)`.
-        angles: components of the state that are angles.
-        present: `(T, B)` bool.
+    `states` and `noise` are posterior means, and these ± their covariance with each component of ∇ log β(x') in
+    standard deviations.
     """
 
-    mean: Tensor
-    scale: Tensor
-    states: Tensor
-    noise: Tensor
-    angles: tuple[int, ...]
-    present: Tensor
+    mean: Tensor  # (T, B, D), in standard deviations
+    scale: Tensor  # their size, (T, B, D)
+    states: Tensor  # (1 + 2 D, T, B, D)
+    noise: Tensor  # (1 + 2 D, T, B, C)
+    angles: tuple[int, ...]  # components of the state that are angles
+    present: Tensor  # (T, B) bool
 
     def ends(self, program: Program, data: Trajectories) -> Tensor:
         """Where rows end from these states with this noise, `(1 + 2 D, T, B, D)`."""
@@ -226,13 +207,12 @@ def channel_moments(program: Program, data: Trajectories, states: Tensor, contro
     seen = Recording()
     with running(*states.shape[:-1]), seen, AtMean():
         sample_channels(program, states, controls[..., :-1, :, :], data.elapsed[:-1], data.steps)
-    means, spreads = [], []
-    for site, fn in seen.distributions.items():
-        mean, spread = normal_moments(fn, site)
-        means.append(as_vector(mean, fn.event_dim))
-        spreads.append(as_vector(spread, fn.event_dim))
-    left = states.shape[:-1]
-    return tuple(torch.cat([part.expand(*left, -1) for part in parts], -1) for parts in (means, spreads))  # type: ignore[return-value]
+    sites = (
+        [as_vector(part, fn.event_dim).expand(*states.shape[:-1], -1) for part in normal_moments(fn, site)]
+        for site, fn in seen.distributions.items()
+    )
+    mean, spread = (torch.cat(parts, -1) for parts in zip(*sites, strict=True))
+    return mean, spread
 
 
 @torch.no_grad()
@@ -265,23 +245,20 @@ def widens(program: Program, parts: Sequence[Element], data: Trajectories) -> li
 class Measured:
     """What is measured at some states: the sites' distributions."""
 
-    distributions: dict[str, object]
+    distributions: dict[str, Any]
+
+    def _of_sites(self, value: Callable[[str, Any], Tensor]) -> Tensor:
+        """What is computed of each site and its distribution, as one vector, `(..., K)`."""
+        return torch.cat([as_vector(value(site, fn), fn.event_dim) for site, fn in self.distributions.items()], -1)
 
     def shift(self, other: Measured) -> Tensor:
         """How much more `other` measures on average, on the circle where a measurement lives there, `(..., K)`."""
-        parts = []
-        for site, fn in self.distributions.items():
-            elsewhere = other.distributions[site]
-            parts.append(as_vector(residual(fn, elsewhere.mean), fn.event_dim))  # type: ignore[attr-defined]
-        return torch.cat(parts, -1)
+        return self._of_sites(lambda site, fn: residual(fn, other.distributions[site].mean))
 
     @property
     def reading(self) -> Tensor:
         """What is measured on average, `(..., K)`, on the circle where a measurement lives there."""
-        parts = []
-        for fn in self.distributions.values():
-            parts.append(as_vector(-residual(fn, torch.zeros_like(fn.mean)), fn.event_dim))  # type: ignore[attr-defined]
-        return torch.cat(parts, -1)
+        return self._of_sites(lambda _, fn: -residual(fn, torch.zeros_like(fn.mean)))
 
     def same(self, other: Measured) -> bool:
         """Whether `other` measures the same, with the same scales and tails."""
@@ -291,22 +268,18 @@ class Measured:
     @property
     def spread(self) -> Tensor:
         """Scales, `(..., K)`."""
-        parts = []
-        for fn in self.distributions.values():
-            base = unwrapped(fn)
-            parts.append(as_vector(base.scale, fn.event_dim))  # type: ignore[attr-defined]
-        return torch.cat(parts, -1)
+        return self._of_sites(lambda _, fn: unwrapped(fn).scale)
 
     @property
     def freedom(self) -> Tensor:
         """Degrees of freedom, `(..., K)`, infinite where the noise is normal."""
-        parts = []
-        for fn in self.distributions.values():
+
+        def of_site(_: str, fn: Any) -> Tensor:
             base = unwrapped(fn)
-            scale = base.scale
-            freedom = base.df if isinstance(base, dist.StudentT) else scale.new_tensor(torch.inf)
-            parts.append(as_vector(freedom.expand(scale.shape), fn.event_dim))  # type: ignore[attr-defined]
-        return torch.cat(parts, -1)
+            freedom = base.df if isinstance(base, dist.StudentT) else base.scale.new_tensor(torch.inf)
+            return freedom.expand(base.scale.shape)
+
+        return self._of_sites(of_site)
 
 
 @torch.no_grad()
@@ -322,10 +295,7 @@ def typical_spreads(program: Program, data: Trajectories, at: Smoothed) -> Momen
     """Root mean square standard deviations of the channels, `(C,)`, and of the measurements, `(K,)`."""
     spread = substep_spreads(program, data, at.channels.points[:1])
     sharp = measured(program, at.measurements.points[:1]).spread
-    return (
-        spread[0][data.transitions].square().mean(0).sqrt(),
-        sharp[0][data.rows].square().mean(0).sqrt(),
-    )
+    return spread[0][data.transitions].square().mean(0).sqrt(), sharp[0][data.rows].square().mean(0).sqrt()
 
 
 def parameter_scores(program: Program, data: Trajectories, at: Smoothed, parts: list[Element]) -> Tensor:
@@ -335,18 +305,11 @@ def parameter_scores(program: Program, data: Trajectories, at: Smoothed, parts: 
     score_of_moves = _of_channels(program, data, at) if program.substeps == 1 else _of_ends(program, data, at)
     columns = []
     for part in parts:
-        width = 2 * part.step
         score = score_of_moves(part)
-        with moved(part, part.step):
-            a_few_up = measured(program, at.measurements.points[:1])
-        with moved(part, -part.step):
-            a_few_down = measured(program, at.measurements.points[:1])
-        if not a_few_up.same(a_few_down):
-            here = measured(program, at.measurements.points)
-            with moved(part, part.step):
-                up = measured(program, at.measurements.points)
-            with moved(part, -part.step):
-                down = measured(program, at.measurements.points)
+        few_up, few_down = on_both_sides(part, lambda: measured(program, at.measurements.points[:1]))
+        if not few_up.same(few_down):
+            width, here = 2 * part.step, measured(program, at.measurements.points)
+            up, down = on_both_sides(part, lambda: measured(program, at.measurements.points))
             score = score + at.measurements.of_mean((here.shift(up) - here.shift(down)) * at.sharpness / width)
             score = score + at.measurements.of_spread((up.spread[0] / down.spread[0]).log() / width)
             score = score + (_of_tails(here, up, at) - _of_tails(here, down, at)) / width
@@ -359,12 +322,9 @@ def _of_channels(program: Program, data: Trajectories, at: Smoothed) -> Callable
     _, spread = channel_moments(program, data, at.channels.points[:1])
 
     def score(part: Element) -> Tensor:
-        with moved(part, part.step):
-            mean_up, spread_up = channel_moments(program, data, at.channels.points)
-        with moved(part, -part.step):
-            mean_down, spread_down = channel_moments(program, data, at.channels.points)
-        of_mean = at.channels.of_mean((mean_up - mean_down) / (2 * part.step * spread))
-        return of_mean + at.channels.of_spread((spread_up[0] / spread_down[0]).log() / (2 * part.step))
+        up, down = on_both_sides(part, lambda: channel_moments(program, data, at.channels.points))
+        of_mean = at.channels.of_mean((up[0] - down[0]) / (2 * part.step * spread))
+        return of_mean + at.channels.of_spread((up[1][0] / down[1][0]).log() / (2 * part.step))
 
     return score
 
@@ -374,10 +334,7 @@ def _of_ends(program: Program, data: Trajectories, at: Smoothed) -> Callable[[El
     arriving = arrivals(at.ahead, data)
 
     def score(part: Element) -> Tensor:
-        with moved(part, part.step):
-            up = arriving.ends(program, data)
-        with moved(part, -part.step):
-            down = arriving.ends(program, data)
+        up, down = on_both_sides(part, lambda: arriving.ends(program, data))
         return arriving.score(up - down) / (2 * part.step)
 
     return score

@@ -180,7 +180,7 @@ def test_the_interval_of_a_mean_is_nearly_students():
         ones = np.ones(count)
         found = paired(Sums(values, ones), Sums(other, ones), seed=0)
         low, high = stats.t.interval(0.95, count - 1, (values - other).mean(), stats.sem(values - other))
-        assert found.value == pytest.approx((values - other).mean())
+        assert found.difference == pytest.approx((values - other).mean())
         assert found.interval == pytest.approx((low, high), abs=0.12 * (high - low))
 
 
@@ -188,7 +188,7 @@ def test_drives_weigh_by_their_cells():
     ours, theirs = np.array([4.0, 4, 4, 4, 36]), np.ones(5)
     counts = np.array([1.0, 1, 1, 1, 9])
     found = paired(Sums(ours, counts, root=True), Sums(theirs * counts, counts, root=True), seed=0)
-    assert found.value == pytest.approx(1) and found.interval == pytest.approx((1, 1))
+    assert found.difference == pytest.approx(1) and found.interval == pytest.approx((1, 1))
     assert found.relative == pytest.approx(1)
 
 

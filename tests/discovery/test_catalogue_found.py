@@ -10,10 +10,11 @@ from discovery_limits import KNOWN, owner, with_effects
 from discovery_sets import EFFECTS, text_of_size
 from examples import example
 
-from steady_ppl import Program, for_program, simulate
+from steady_ppl import Program, simulate
 from steady_ppl.discovery.finding import findings
-from steady_ppl.discovery.search import search
+from steady_ppl.discovery.search import Settings, search
 from steady_ppl.effects import parsed
+from steady_ppl.likelihood.problem import Problem
 
 SEEN = [effect for effect in EFFECTS if effect != "coloured_noise"]  # white and coloured are alike at this noise
 DRIVES, ROWS = 12, 81
@@ -68,8 +69,8 @@ def assert_found(truth: Program, program: Program, text: str) -> None:
     truth = with_effects(truth, (text,))
     truth.duration = (ROWS - 1) * truth.step
     drives = [simulate(truth, DRIVES, seed=seed) for seed in (1, 2)]
-    train, valid = (for_program(program, table).without_truth(keep_start=True) for table in drives)
-    found = findings(search(program, train, valid, known_start=True, sets=50, later_sets=50))
+    train, valid = (Problem.of_table(program, table, known_start=True) for table in drives)
+    found = findings(search(train, valid.data, Settings(program, sets=50, later_sets=50)))
     name, where, *_ = parsed(text)
     assert found and ":".join(part for part in (name, where) if part) in found[0].alike, [
         finding.alike for finding in found

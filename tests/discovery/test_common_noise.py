@@ -15,15 +15,16 @@ from pyro.nn import PyroParam
 from models.linear_gaussian import LinearGaussian
 from steady_ppl import stack
 from steady_ppl.data.trajectories import joined
-from steady_ppl.discovery import common_noise
+from steady_ppl.discovery import fitting
 from steady_ppl.discovery.candidates import judged
-from steady_ppl.discovery.common_noise import noise_numbers, with_common_noise
-from steady_ppl.discovery.refits import Worth, first_refit, refit_with
+from steady_ppl.discovery.fitting import noise_numbers, with_common_noise
+from steady_ppl.discovery.refits import Threshold, first_refit, refit_with
 from steady_ppl.effects import chosen_variant
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path, smooth
 from steady_ppl.likelihood.maximize import Term, climb, maximise
 from steady_ppl.likelihood.parameters import elements, values_of
+from steady_ppl.likelihood.problem import Problem
 
 HIDDEN = 0.15  # m/s², process noise that the sensor of these drives nearly hides
 
@@ -52,7 +53,8 @@ def halves(seed: int, noise: float = HIDDEN, counts: tuple[int, int] = (4, 4)):
 
 
 def refitted(program, seed: int = 1, **options):
-    return first_refit(program, *halves(seed, **options), known_start=True, seed=0)
+    train, valid = halves(seed, **options)
+    return first_refit(Problem(program, train, True), valid, seed=0)
 
 
 def likelihood(programs, folds) -> float:
@@ -112,11 +114,11 @@ def test_programs_that_have_everything_in_common_are_one(priors):
         program = example("linear_gaussian")
         program.priors = priors
         parts = [elements(program)[index] for index in order]
-        terms.append(Term(program, data, find_path(program, data, known_start=True), parts, order))
-    first, second = climb(terms, known_start=True, precision=1e-4)
+        terms.append(Term(Problem(program, data, True), find_path(program, data, known_start=True), parts, order))
+    first, second = climb(terms, precision=1e-4)
     assert first.objective + second.objective == pytest.approx(whole.objective, abs=1e-3)
     for term in terms:
-        assert values_of(elements(term.program)).tolist() == pytest.approx(
+        assert values_of(elements(term.problem.program)).tolist() == pytest.approx(
             values_of(elements(pooled)).tolist(), abs=0.01
         )
     assert first.names == ("gain", "damping", "noise", "measurement_sd")
@@ -135,7 +137,7 @@ def test_effects_that_are_noise_are_in_common_too(effect):
     """Else the noise that one half wants comes back in the effect's coefficient."""
     base = refitted(example("linear_gaussian"), 2, noise=0.3, counts=(5, 5))
     variant = chosen_variant(base.program, effect)
-    found = refit_with(base, variant, 1.2 if variant.effect.null == 1 else 0.1, known_start=True)
+    found = refit_with(base, variant, 1.2 if variant.effect.null == 1 else 0.1)
     assert not isinstance(found, str)
     assert set(found.judges.common) == {"noise", found.judges.common[-1]} and found.in_common(variant) == 1
     one, other = found.coefficients(variant)
@@ -167,15 +169,15 @@ def test_a_program_without_learnable_noise_is_its_own_judge():
 
 def test_a_candidate_that_is_given_up_is_compared_with_fits_to_the_same_half(carts):
     variant = chosen_variant(carts.program, "acceleration_bias")
-    whole = refit_with(carts, variant, [0.0], known_start=True)
-    half = refit_with(carts, variant, [0.0], known_start=True, worth=Worth(drives=1e9, held_out=1e9))
+    whole = refit_with(carts, variant, [0.0])
+    half = refit_with(carts, variant, [0.0], threshold=Threshold(drives=1e9, held_out=1e9))
     assert not isinstance(whole, str) and not isinstance(half, str) and len(half.programs) == 1
     given_up, through = judged(carts, None, half), judged(carts, None, whole)
     torch.testing.assert_close(given_up.gain, through.alone[: len(given_up.gain)])
 
 
 def test_it_begins_elsewhere_where_the_parabola_leads_nowhere(carts, monkeypatch):
-    starts, tried = common_noise._starts, []
+    starts, tried = fitting._starts, []
 
     def far(terms, maxima):
         parabola, means = starts(terms, maxima)
@@ -187,10 +189,10 @@ def test_it_begins_elsewhere_where_the_parabola_leads_nowhere(carts, monkeypatch
             raise FilterError("beyond all measure")
         return climb(terms, **options)
 
-    monkeypatch.setattr(common_noise, "_starts", far)
-    monkeypatch.setattr(common_noise, "climb", seen)
-    data = [fold.drives for fold in carts.folds]
-    found = with_common_noise(carts.programs, carts.maxima, data, known_start=True)
+    monkeypatch.setattr(fitting, "_starts", far)
+    monkeypatch.setattr(fitting, "climb", seen)
+    problems = [fold.fitting(program) for program, fold in zip(carts.programs, carts.folds, strict=True)]
+    found = with_common_noise(problems, carts.maxima)
     assert len(tried) == 2
     best = likelihood(carts.judges.programs, carts.folds)
     assert likelihood(found.programs, carts.folds) == pytest.approx(best, abs=0.1)

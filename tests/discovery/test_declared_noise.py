@@ -8,9 +8,9 @@ import pytest
 import torch
 from examples import drives, example
 
-from steady_ppl.discovery.common_noise import Judges
-from steady_ppl.discovery.noise_departure import departures
+from steady_ppl.discovery.fitting import Judges
 from steady_ppl.discovery.refits import Fold, Refit
+from steady_ppl.discovery.screening import departures
 from steady_ppl.discovery.search import Found
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.likelihood.parameters import elements

@@ -15,15 +15,14 @@ from small import finite
 from torch.distributions import constraints
 
 import steady_ppl as st
+from steady_ppl.discovery.candidates import variance_of_places
 from steady_ppl.discovery.curves import knots_of
 from steady_ppl.discovery.discover import NOT_CONVERGED, _of_one_drive
-from steady_ppl.discovery.finding import _spread
-from steady_ppl.discovery.next_run import next_run
-from steady_ppl.discovery.profile import variance_of_places
+from steady_ppl.discovery.finding import _spread, next_run
 from steady_ppl.effects import Effect, chosen_variant, parsed
 from steady_ppl.effects.registry import _EFFECTS, register
-from steady_ppl.likelihood.fit import led_back
-from steady_ppl.likelihood.maximize import maximise
+from steady_ppl.likelihood.maximize import maximise, maximum_of, refit_outliers
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.plotting.discovery import unknown_effect
 
 DRIVES, ROWS, SETS = 10, 81, 50
@@ -184,7 +183,7 @@ def test_what_cannot_be_tested_says_why(clean):
 
 @pytest.mark.slow
 def test_a_fit_that_has_not_converged_is_said_before_any_ranking(monkeypatch):
-    monkeypatch.setattr("steady_ppl.discovery.refits.maximise", partial(maximise, steps=1))
+    monkeypatch.setattr("steady_ppl.discovery.refits.maximum_of", partial(maximum_of, steps=1))
     found = discovered("yaw_bias=0.1")
     assert not found.search.base.converged and NOT_CONVERGED in found.doubts
     assert str(found).startswith("warning: the program's own fit has not converged")
@@ -198,21 +197,20 @@ def test_not_knowing_a_knee_is_in_the_coefficients_interval():
     assert finding.variant.name == "thrust_saturation" and abs(finding.coefficient[0] - 0.8) < 3 * finding.sd[0]
     alone = _spread(found.search, finding.variant, 1)[0]
     (one,) = found.search.found
-    places = float(variance_of_places(one.without, one.candidate, known_start=True))
+    places = float(variance_of_places(one.without, one.candidate))
     assert places > 0.1 * alone**2 and finding.sd[0] ** 2 == pytest.approx(alone**2 + places, rel=1e-3)
 
 
-def test_a_drive_that_strayed_isled_back():
+def test_a_drive_whose_path_is_lost_is_fitted_again():
     program = owner()
     data = st.for_program(program, tables(program, drives=6, rows=41)[0]).without_truth(keep_start=True)
     right = maximise(program, data, known_start=True)
     lost, states = right.log_likelihood.clone(), right.path.states.clone()
     lost[2], states[1:, 2] = -500.0, 0.0
-    found = led_back(
-        program, data, replace(right, log_likelihood=lost, path=replace(right.path, states=states)), known_start=True
-    )
+    problem = Problem(program, data, True)
+    found = refit_outliers(problem, replace(right, log_likelihood=lost, path=replace(right.path, states=states)))
     assert torch.allclose(found.log_likelihood, right.log_likelihood, atol=0.3)
-    assert led_back(program, data, right, known_start=True) is right
+    assert refit_outliers(problem, right) is right
 
 
 @pytest.mark.slow
@@ -221,7 +219,7 @@ def test_the_next_run_tells_what_these_drives_do_not():
     found = discovered("linear_drag=0.1")
     (one,) = found.search.found
     brakes = [c for c in one.candidates if c.variant.name in ("linear_drag", "quadratic_drag")]
-    run = next_run(Unclear(brakes), True, 0)
+    run = next_run(Unclear(brakes), 0)
     assert run.between == ["linear_drag", "quadratic_drag"] and run.separation > max(0.0, run.usual)
     assert {len(values) for values in run.controls.values()} == {ROWS}
     low, high = (float(edge) for edge in torch.aminmax(found.search.base.folds[0].drives.controls[:-1]))

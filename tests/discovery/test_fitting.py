@@ -15,6 +15,7 @@ from steady_ppl.discovery.refits import Fold, first_by_draws, first_refit, refit
 from steady_ppl.effects import chosen_variant
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path
+from steady_ppl.likelihood.problem import Problem
 
 
 @pytest.mark.slow
@@ -25,9 +26,9 @@ def test_both_ways_agree_where_the_program_is_nearly_linear() -> None:
     fits = []
     for fitting in (ByLikelihood(), ByDraws(steps=200)):
         own = copy.deepcopy(program)
-        fits.append((own, fitting.fit(own, data, path, known_start=True)))
+        fits.append((own, fitting.fit(Problem(own, data, True), path)))
     (likely, first), (drawn, second) = fits
-    assert not is_doubtful(likely, data, first.path, known_start=True)
+    assert not is_doubtful(Problem(likely, data, True), first.path)
     assert abs(float((first.log_likelihood - second.log_likelihood).sum())) < 1.0
     assert float(likely.mass.detach()) == pytest.approx(float(drawn.mass.detach()), rel=0.02)
     assert second.gained > 10 and second.converged
@@ -36,9 +37,9 @@ def test_both_ways_agree_where_the_program_is_nearly_linear() -> None:
 def test_a_fit_never_ends_below_where_it_began() -> None:
     program = example("hovercraft", torch.float32)
     data = drives(program, 4, 41, seed=1)
-    ByLikelihood().fit(program, data, known_start=True)
+    ByLikelihood().fit(Problem(program, data, True))
     before = {name: value.clone() for name, value in program.named_parameters()}
-    fit = ByDraws(steps=3, learning_rate=5.0).fit(program, data, known_start=True)
+    fit = ByDraws(steps=3, learning_rate=5.0).fit(Problem(program, data, True))
     assert fit.gained == 0.0
     assert all(torch.equal(value, before[name]) for name, value in program.named_parameters())
 
@@ -48,17 +49,17 @@ def test_fits_by_draws_begin_at_the_likelier_program() -> None:
     data = drives(good, 4, 41, seed=1)
     far.mass = torch.tensor(4.5)
     path = find_path(good, data, known_start=True)
-    fold = Fold(data, path, data, path)
+    fold = Fold(data, path, data, path, True)
     for given, fitted in ((good, far), (far, good)):
-        first, second = starts_by_draws(given, fitted, fold, known_start=True)
+        first, second = starts_by_draws(given, fitted, fold)
         assert first.program is good and second.program is far
         assert first.log_likelihood > second.log_likelihood
         assert first.path.states.shape == path.states.shape
     stiff, still = good.with_effect("linear_drag", 1e3), good.with_effect("linear_drag", 0.0)
     for given, fitted in ((still, stiff), (stiff, still)):
-        assert [start.program is still for start in starts_by_draws(given, fitted, fold, known_start=True)] == [True]
+        assert [start.program is still for start in starts_by_draws(given, fitted, fold)] == [True]
     with pytest.raises(FilterError):
-        starts_by_draws(stiff, stiff, fold, known_start=True)
+        starts_by_draws(stiff, stiff, fold)
 
 
 def test_where_a_climb_by_draws_diverges_another_begins_at_the_program_as_given(monkeypatch) -> None:
@@ -66,7 +67,7 @@ def test_where_a_climb_by_draws_diverges_another_begins_at_the_program_as_given(
     data = drives(fitted, 4, 41, seed=1)
     given.mass = torch.tensor(1.8)
     path = find_path(fitted, data, known_start=True)
-    folds = [Fold(data, path, data, path)] * 2
+    folds = [Fold(data, path, data, path, True)] * 2
     began = []
 
     def train(program, guide, *arguments, **settings):
@@ -75,13 +76,13 @@ def test_where_a_climb_by_draws_diverges_another_begins_at_the_program_as_given(
             raise FilterError("the model diverges")
 
     monkeypatch.setattr("steady_ppl.discovery.fitting.train", train)
-    base = first_by_draws(given, [fitted, fitted], folds, True, seed=0)
+    base = first_by_draws(given, [fitted, fitted], folds, seed=0)
     assert began == pytest.approx([1.5, 1.8, 1.8])
     assert [float(program.mass.detach()) for program in base.programs] == pytest.approx([1.8, 1.8])
     assert isinstance(base.fitting, ByDraws)
     began.clear()
     with pytest.raises(FilterError, match="diverges"):
-        first_by_draws(fitted, [given, given], folds, True, seed=0)
+        first_by_draws(fitted, [given, given], folds, seed=0)
     assert began == pytest.approx([1.5])
 
 
@@ -91,24 +92,22 @@ def test_a_program_whose_linearised_likelihood_is_off_is_fitted_by_draws(monkeyp
     truth.noise = torch.tensor([2.0, 1.0, 1.0])
     train, valid = drives(truth, 6, 61, seed=1), drives(truth, 6, 61, seed=2)
     program = example("paper.py:PaperTruck", torch.float32)
-    assert is_doubtful(program, train, find_path(program, train, known_start=True), known_start=True)
+    assert is_doubtful(Problem(program, train, True), find_path(program, train, known_start=True))
     monkeypatch.setattr("steady_ppl.discovery.fitting.MAX_LINEARISATION_ERROR", 0.0)
-    base = first_refit(program, train, valid, known_start=True, seed=0)
+    base = first_refit(Problem(program, train, True), valid, seed=0)
     assert isinstance(base.fitting, ByDraws)
-    found = refit_with(base, chosen_variant(program, "lever_arm"), 0.1, known_start=True)
+    found = refit_with(base, chosen_variant(program, "lever_arm"), 0.1)
     assert not isinstance(found, str) and found.fitting == base.fitting
     assert float((found.held_out - base.held_out).sum()) > NATS
     likely, path = copy.deepcopy(found.program), found.folds[0].path
-    ByLikelihood().fit(likely, train, path, known_start=True)
-    there = found.fitting.judge(likely, train, path, known_start=True)
+    ByLikelihood().fit(Problem(likely, train, True), path)
+    there = found.fitting.judge(Problem(likely, train, True), path)
     assert float((found.maxima[0].log_likelihood - there.log_likelihood).sum()) > -NATS
 
 
 def test_a_nearly_linear_program_is_fitted_by_likelihood() -> None:
     program = example("hovercraft")
-    base = first_refit(
-        program, drives(program, 4, 41, seed=1), drives(program, 4, 41, seed=2), known_start=True, seed=0
-    )
+    base = first_refit(Problem(program, drives(program, 4, 41, seed=1), True), drives(program, 4, 41, seed=2), seed=0)
     assert isinstance(base.fitting, ByLikelihood)
 
 

@@ -13,9 +13,9 @@ from steady_ppl.discovery.candidates import gain_of_fits
 from steady_ppl.discovery.refits import first_refit, refit_near, refit_with
 from steady_ppl.effects import chosen_variant
 from steady_ppl.gaussian.smoother import smooth
-from steady_ppl.likelihood.fit import roomy_path
-from steady_ppl.likelihood.maximize import maximise
+from steady_ppl.likelihood.maximize import maximise, widen_noise
 from steady_ppl.likelihood.parameters import elements
+from steady_ppl.likelihood.problem import Problem
 
 
 def set_values(program, values) -> None:
@@ -77,12 +77,12 @@ def test_noise_is_widened_before_a_program_that_explains_nothing_is_fitted():
     program.noise = torch.tensor([0.08, 0.08, 0.05]).double()
     truth.noise = torch.tensor([0.08, 0.08, 0.05]).double()
     data = drives(truth.with_effect("yaw_quadratic_drag", 0.25), 6, 61)
-    path = roomy_path(program, data, True)
+    path = widen_noise(Problem(program, data, True))
     assert float(program.noise.detach().min()) > 0.1
     assert maximise(program, data, path, known_start=True).converged
     right = example("hovercraft")
     before = right.noise.detach().clone()
-    roomy_path(right, drives(right, 6, 41), True)
+    widen_noise(Problem(right, drives(right, 6, 41), True))
     assert torch.equal(right.noise.detach(), before)
 
 
@@ -90,8 +90,8 @@ def test_drives_are_judged_by_fits_that_have_seen_them_for_the_noise_alone():
     truth = example("hovercraft").with_effect("yaw_bias", 0.08)
     program = example("hovercraft")
     train, valid = drives(truth, 6, 41, seed=1), drives(truth, 8, 41, seed=2)
-    base = first_refit(program, train, valid, known_start=True, seed=0)
-    found = refit_with(base, chosen_variant(program, "yaw_bias", ""), 0.01, known_start=True)
+    base = first_refit(Problem(program, train, True), valid, seed=0)
+    found = refit_with(base, chosen_variant(program, "yaw_bias", ""), 0.01)
     assert not isinstance(found, str)
     assert found.held_out.shape == (14,)
     variant = chosen_variant(program, "yaw_bias", "")
@@ -111,10 +111,10 @@ def test_fits_begin_at_the_declared_noise_as_well_where_the_program_alone_explai
         one.noise = torch.tensor([0.08, 0.08, 0.05]).double()
     truth = truth.with_effect("range_dependent_noise", 0.1)
     train, valid = drives(truth, 6, 41, seed=1), drives(truth, 6, 41, seed=2)
-    base = first_refit(program, train, valid, known_start=True, seed=0)
-    assert base.rough is not None and float(base.program.noise.detach().max()) > 20 * 0.05
+    base = first_refit(Problem(program, train, True), valid, seed=0)
+    assert base.unwidened is not None and float(base.program.noise.detach().max()) > 20 * 0.05
     variant = chosen_variant(program, "range_dependent_noise", "")
-    found = refit_with(base, variant, 0.05, known_start=True)
+    found = refit_with(base, variant, 0.05)
     assert not isinstance(found, str)
     assert float(found.coefficient(variant)) == pytest.approx(0.1, rel=0.3)
     assert all(one.noise.detach().max() < base.program.noise.detach().max() / 20 for one in found.programs)
@@ -123,11 +123,11 @@ def test_fits_begin_at_the_declared_noise_as_well_where_the_program_alone_explai
 def test_a_fit_at_another_knee_is_the_one_from_nothing():
     truth, program = example("hovercraft").with_effect("thrust_saturation", 0.8, knee=0.6), example("hovercraft")
     train, valid = drives(truth, 5, 41, seed=1), drives(truth, 5, 41, seed=2)
-    base = first_refit(program, train, valid, known_start=True, seed=0)
-    assert base.rough is None
+    base = first_refit(Problem(program, train, True), valid, seed=0)
+    assert base.unwidened is None
     knees = [chosen_variant(program, "thrust_saturation", knee=knee) for knee in (0.5, 0.65)]
-    direct = [refit_with(base, knee, 0.5, known_start=True) for knee in knees]
-    near = refit_near(base, direct[0], [knees[1]], known_start=True)
+    direct = [refit_with(base, knee, 0.5) for knee in knees]
+    near = refit_near(base, direct[0], [knees[1]])
     assert gain_of_fits(base, near) == pytest.approx(gain_of_fits(base, direct[1]), abs=0.2)
     # fits rest within .02 nats of their maxima, .2 standard deviations: of two fits on two folds .4 nats, three of them
     assert float((near.held_out - direct[1].held_out).sum()) == pytest.approx(0.0, abs=1.2)

@@ -10,7 +10,7 @@ from examples import drives, example
 from oracles import cart_parameters, kalman
 
 import steady_ppl as st
-from steady_ppl.likelihood.evidence import find_and_smooth
+from steady_ppl.gaussian.smoother import find_and_smooth
 
 TRUTH = "hovercraft:HovercraftTruth"
 

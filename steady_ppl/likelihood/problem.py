@@ -1,0 +1,68 @@
+"""A program, its drives and what is known of their start: what every question of log p(y) is about."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from torch import Tensor
+
+from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.gaussian.information_filter import Lookahead
+from steady_ppl.gaussian.linearize import ReferencePath, why_not_linear
+from steady_ppl.gaussian.smoother import find_and_smooth, find_path, smooth
+from steady_ppl.model.program import Program, for_program
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A state-space model and drives, with or without their exact start.
+
+    Public functions take the three one by one and build this once.
+
+    Attributes:
+        program: the state-space model.
+        data: as returned by `for_program`.
+        known_start: the first states are certain.
+
+    Raises:
+        DataError: a known start, and some first state is not given.
+    """
+
+    program: Program
+    data: Trajectories
+    known_start: bool = False
+
+    def __post_init__(self) -> None:
+        if self.known_start:
+            _ = self.data.known_start
+
+    @classmethod
+    def of_table(cls, program: Program, table: Trajectories, known_start: bool) -> Problem:
+        """The columns of a table that a program reads, without the true states but for a known start."""
+        return cls(program, for_program(program, table), known_start).without_truth()
+
+    def without_truth(self) -> Problem:
+        """The same without the true states, but for a known start."""
+        return replace(self, data=self.data.without_truth(keep_start=self.known_start))
+
+    def subset(self, index: Sequence[int] | Tensor) -> Problem:
+        """The problem of some of the drives."""
+        return replace(self, data=self.data.subset(index))
+
+    def why_not_linear(self) -> str | None:
+        """Why the program cannot be linearised, None where it can; see `gaussian.linearize`."""
+        return why_not_linear(self.program, self.data, known_start=self.known_start)
+
+    def find_path(self) -> ReferencePath:
+        """A path near the posterior's best mode; see `gaussian.smoother`."""
+        return find_path(self.program, self.data, known_start=self.known_start)
+
+    def find_and_smooth(self) -> Lookahead:
+        """The lookahead along a path that is found from the measurements alone; see `gaussian.smoother`."""
+        return find_and_smooth(self.program, self.data, known_start=self.known_start)
+
+    def smooth(self, path: ReferencePath, **settings: Any) -> Lookahead:
+        """The lookahead along the posterior's mode near a path; see `gaussian.smoother`."""
+        return smooth(self.program, self.data, path, known_start=self.known_start, **settings)
