@@ -33,6 +33,7 @@ PROGRAMS = (
     "hovercraft_unknown_map",
 )
 FINEST = 64  # times as many substeps as a program has, that an effect of typical size may ask for
+QUICK = [("pendulum", "linear_drag"), ("pendulum", "coulomb_friction")]
 EFFECTS = [(name, effect.name) for name in ("hovercraft", "truck", "pendulum") for effect in catalogue(example(name))]
 DRIVES, DRAWS, EVERY = 6, 64, 9
 
@@ -86,7 +87,7 @@ def test_explicit_euler_does_not() -> None:
 @pytest.mark.parametrize(
     ("name", "effect"),
     [
-        pytest.param(name, effect, id=f"{name}-{effect}", marks=pytest.mark.slow if name != "pendulum" else ())
+        pytest.param(name, effect, id=f"{name}-{effect}", marks=pytest.mark.slow if (name, effect) not in QUICK else ())
         for name, effect in EFFECTS
     ],
 )

@@ -82,7 +82,7 @@ def test_nothing_is_left_of_a_new_folder_whose_block_fails(tmp_path: Path) -> No
 
 COMMANDS = {
     "discover": ("discover", HOVERCRAFT, "train.csv", "--valid", "valid.csv", "--known-start", "--simulations", "50"),
-    "fit": ("fit", HOVERCRAFT, "train.csv", "--known-start", "--steps", "40", "--set", "validate_every=5"),
+    "fit": ("fit", HOVERCRAFT, "train.csv", "--known-start", "--steps", "20", "--set", "validate_every=5"),
 }
 KEPT = {"discover": ("discovery.json", "parameters.safetensors"), "fit": ("parameters.safetensors", "run.json")}
 

@@ -53,6 +53,7 @@ def fit(program, table, valid=None, *, known_start=False, mark="", deadly=False,
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(tmp_path: Path, workers: int):
     (tmp_path / "mine.py").write_text(RECIPE.format())
