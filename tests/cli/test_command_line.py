@@ -148,5 +148,5 @@ def test_a_defect_of_the_library_is_one_line_and_code_1(tmp_path: Path, monkeypa
     def broken(*_, **__):
         raise RuntimeError("first line\n\nsecond line")
 
-    monkeypatch.setattr("steady_ppl.smc.simulate.simulate", broken)
+    monkeypatch.setattr("steady_ppl.simulate", broken)
     refused(1, "RuntimeError: first line", "simulate", TRUTH, "--out", tmp_path / "t.csv")
