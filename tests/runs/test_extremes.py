@@ -67,7 +67,7 @@ def test_a_seed_is_one_that_a_record_can_hold(work: Path, tmp_path: Path, monkey
     ids=["torch", "overflow", "numpy", "python"],
 )
 def test_more_memory_than_there_is_is_one_line(tmp_path: Path, monkeypatch, refused, greedy) -> None:
-    monkeypatch.setattr("steady_ppl.smc.simulate.simulate", lambda *_, **__: greedy())
+    monkeypatch.setattr("steady_ppl.simulate", lambda *_, **__: greedy())
     refused(1, "more memory than there is", "simulate", HOVERCRAFT, "--out", tmp_path / "new.csv")
 
 
