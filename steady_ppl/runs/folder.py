@@ -40,7 +40,7 @@ FINISHED_RECORD = {
     "seed": WHOLE,
     "settings": {str: ANYTHING},
     "kept_step": (WHOLE, None),
-    "history": [{"step": NUMBER}],
+    "history": [{str: ANYTHING}],
     "notes": LINES,
 }
 PAIR, NUMBERS = [NUMBER, NUMBER], (NUMBER, [(NUMBER, None)], None)
