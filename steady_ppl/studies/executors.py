@@ -15,7 +15,6 @@ import uuid
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
-from contextlib import suppress
 from typing import Any, NamedTuple
 
 from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
@@ -33,6 +32,7 @@ Say = Callable[[str], None]
 THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")
 ONE_THREAD = dict.fromkeys([*(f"{name}_NUM_THREADS" for name in THREADS), "VECLIB_MAXIMUM_THREADS"], "1")
 WORKER_WAIT = 30  # s for the first worker, and between looks at whether there still is one
+MAX_UNLOADED = 3  # processes in a row that die while they load, after which no other is started
 TRIES = 3  # of a job whose workers die; the scheduler itself tries it so often as it is set, four times at first
 HOLD, LONGEST_HOLD = 10, 60  # s for which a worker that is not used holds what it is given, or it would get it all
 MIN_REFUSED_JOBS = 4  # jobs whose files are others, at which a worker has been refused if its files alone are
@@ -89,57 +89,55 @@ class Local(Place):
 
 
 class _Process:
-    """A process of this machine; where it has died, the one in its place."""
+    """A process of this machine, which first loads what jobs need."""
 
     def __init__(self) -> None:
-        self.start()
-
-    def start(self) -> None:
-        """Start it, and let it load what it needs."""
         self.executor = ProcessPoolExecutor(1, env=ONE_THREAD)
         self.loaded = self.executor.submit(packages)
-
-    def replace(self) -> None:
-        """Start another one in its place.
-
-        Raises:
-            ComputationError: it died before it could begin a job.
-        """
-        if reason := self.loaded.exception():
-            raise ComputationError("workers die before they begin") from reason
-        self.executor.shutdown(kill_workers=True)
-        self.start()
+        self.died_idle = False
 
     def submit(self, job: Job) -> Future:
-        """Have a job computed."""
-        with suppress(BrokenProcessPool):
+        """What will hold the job's row, or that the process has died."""
+        try:
             return self.executor.submit(work.run, job)
-        self.replace()  # it died while it had nothing to do
-        return self.executor.submit(work.run, job)
+        except BrokenProcessPool as error:
+            self.died_idle, dead = True, Future[Row]()
+            dead.set_exception(error)
+            return dead
+
+    def end(self) -> None:
+        """End it, whatever it is doing."""
+        self.executor.shutdown(kill_workers=True)
 
 
 def _rows(jobs: Sequence[Job], workers: int, died: list[Job], say: Say) -> Generator[Row]:
     """The rows of jobs, but of those whose processes have `died`."""
-    waiting, processes = list(reversed(jobs)), [_Process() for _ in range(workers)]
-    running: dict[Future, tuple[Job, _Process]] = {}
-    idle = list(processes)
+    waiting, running, idle, unloaded = list(reversed(jobs)), dict[Future, tuple[Job, _Process]](), list[_Process](), 0
     try:
         while waiting or running:
-            while waiting and idle:
-                job, process = waiting.pop(), idle.pop()
+            while waiting and len(running) < workers:
+                job, process = waiting.pop(), idle.pop() if idle else _Process()
                 running[process.submit(job)] = job, process
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 job, process = running.pop(future)
-                idle.append(process)
-                if isinstance(future.exception(), BrokenProcessPool):
-                    process.replace()
+                if not isinstance(future.exception(), BrokenProcessPool):
+                    idle.append(process)
+                    unloaded = 0
+                    yield future.result()
+                    continue
+                process.end()
+                if reason := process.loaded.exception():
+                    unloaded += 1
+                    if unloaded == MAX_UNLOADED:
+                        raise ComputationError("workers die before they begin") from reason
+                if reason or process.died_idle:
+                    waiting.append(job)
+                else:
                     say(f"a worker died of {job.label}")
                     died.append(job)
-                else:
-                    yield future.result()
     finally:
-        for process in processes:
-            process.executor.shutdown(kill_workers=True)
+        for process in [*idle, *(process for _, process in running.values())]:
+            process.end()
 
 
 class Cluster(Place):

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
+from dask_cluster import wait_for
 from small import steady
 from small_studies import STUDY, written
 
 from steady_ppl.errors import ComputationError
+from steady_ppl.runs.fit import packages
 from steady_ppl.studies import executors
 from steady_ppl.studies.executors import TRIES, Attempts, Local
 from steady_ppl.studies.plan_file import read_plan
@@ -104,6 +107,42 @@ def test_workers_that_die_before_they_begin_end_a_study(tmp_path: Path, monkeypa
     monkeypatch.setattr(executors, "packages", os.abort)  # what a worker does first
     with pytest.raises(ComputationError, match="workers die before they begin: 0 of 6 jobs are kept"):
         run_study(read_plan(written(tmp_path)), tmp_path / "out", Local(2))
+
+
+def test_one_worker_that_dies_before_it_begins_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    mark = tmp_path / "died"
+
+    def dies_once() -> dict[str, str]:
+        try:
+            mark.touch(exist_ok=False)
+        except FileExistsError:
+            return packages()
+        os.abort()
+
+    monkeypatch.setattr(executors, "packages", dies_once)
+    said: list[str] = []
+    found = list(Local(2).results(read_plan(written(tmp_path)).jobs, said.append))
+    assert [row["outcome"] for row in found] == ["done"] * 6 and said == []
+
+
+def test_a_worker_that_dies_while_it_has_nothing_to_do_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made: list[executors._Process] = []
+
+    class Process(executors._Process):
+        def __init__(self) -> None:
+            super().__init__()
+            made.append(self)
+
+    monkeypatch.setattr(executors, "_Process", Process)
+    said: list[str] = []
+    rows = Local(1).results(read_plan(written(tmp_path)).jobs, said.append)
+    found = [next(rows)]
+    executor = made[0].executor
+    for process_id in executor._processes:
+        os.kill(process_id, signal.SIGKILL)
+    wait_for(lambda: executor._flags.broken is not None)
+    found += rows
+    assert [row["outcome"] for row in found] == ["done"] * 6 and said == [] and len(made) == 2
 
 
 def test_a_cluster_gives_up_every_job_that_kills_and_none_that_only_waited():
