@@ -6,7 +6,7 @@ Definitions: STEADY (IROS 2022), section V, as its authors' code computes them.
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import Counter
 
 import torch
 from pyro.poutine.messenger import Messenger
@@ -120,8 +120,9 @@ def _ends_of_roll_outs(
         torch.stack([values[k : k + starts] for k in range(horizon)])
         for values in (acting_controls(program, data), data.elapsed, data.steps)
     )
-    (end,) = deque(roll_out(program, states, *given, handler=handler), maxlen=1)
-    return end
+    for end in roll_out(program, states, *given, handler=handler):
+        states = end
+    return states
 
 
 def map_errors(program: Program, surveyed: Program) -> Errors:

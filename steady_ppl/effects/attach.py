@@ -150,7 +150,8 @@ def coefficient(program: Program, variant: Variant) -> Tensor:
 
 
 def _push(base: Any, variant: Variant) -> Methods:
-    def transition(self: Any, *given: Tensor) -> Tensor:
+    def transition(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
+        given = (state, control, time, step)
         mean = interventions.channel_means(self, partial(base.transition, self), *given) if variant.needs_mean else None
         with interventions.pushed(self, variant(self, *given, c=coefficient(self, variant), mean=mean)):
             return base.transition(self, *given)
@@ -208,15 +209,23 @@ def _colour(base: Any, variant: Variant) -> Methods:
     return methods | {"states": (*base.states, *deviations), "resting": (*base.resting, *deviations)}
 
 
-def _within(method: str, handler: Callable[..., interventions.Altering]) -> Callable[[Any, Variant], Methods]:
-    """The base's method under a handler, which is made of the program, its effect and the method's arguments."""
+def _spread(base: Any, variant: Variant) -> Methods:
+    def transition(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
+        with interventions.widened(self, variant(self, state, control, time, step, c=coefficient(self, variant))):
+            return base.transition(self, state, control, time, step)
+
+    return {"transition": transition}
+
+
+def _observing(handler: Callable[..., interventions.Altering]) -> Callable[[Any, Variant], Methods]:
+    """`observe` under a handler, which is made of the program, its effect and the state."""
 
     def around(base: Any, variant: Variant) -> Methods:
-        def altered(self: Any, *given: Tensor) -> Any:
-            with handler(self, partial(variant, self, c=coefficient(self, variant)), *given):
-                return getattr(base, method)(self, *given)
+        def observe(self: Any, state: Tensor) -> None:
+            with handler(self, partial(variant, self, c=coefficient(self, variant)), state):
+                return base.observe(self, state)
 
-        return {method: altered}
+        return {"observe": observe}
 
     return around
 
@@ -225,11 +234,11 @@ _AROUND: dict[str, Callable[[Any, Variant], Methods]] = {
     "push": _push,
     "command": _command,
     "history": _history,
-    "measured": _within("observe", lambda program, act, state: interventions.misread(program, partial(act, state))),
+    "measured": _observing(lambda program, act, state: interventions.misread(program, partial(act, state))),
     "viewpoint": _viewpoint,
-    "spread": _within("transition", lambda program, act, *given: interventions.widened(program, act(*given))),
-    "blur": _within("observe", lambda program, act, state: interventions.blurred(act(state))),
-    "tails": _within("observe", lambda program, act, state: interventions.heavy_tailed(act())),
+    "spread": _spread,
+    "blur": _observing(lambda program, act, state: interventions.blurred(act(state))),
+    "tails": _observing(lambda program, act, state: interventions.heavy_tailed(act())),
     "colour": _colour,
 }
 

@@ -75,7 +75,7 @@ def find(name: str, program: Program) -> Effect:
 def _applicable(effects: list[Effect], program: Program) -> Effect:
     for effect in effects:
         reason = effect.lacks(program)
-        if reason is None:
+        if not reason:
             return effect
     raise UsageError(f"effect {effect.name} does not apply to {type(program).__name__}: {reason}")
 

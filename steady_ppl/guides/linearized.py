@@ -90,8 +90,13 @@ class LinearizedGuide(PathGuide):
         for label in part.labels:
             self.memory[f"searched/{label}"] = torch.tensor(progress, dtype=torch.float64)
         weight = self.tempering(progress)
-        given: Any = {"known_start": self.known_start, "observation_weight": weight, "may_fail": known is not None}
-        ahead = find_and_smooth(self.program, part, **given)
+        ahead = find_and_smooth(
+            self.program,
+            part,
+            known_start=self.known_start,
+            observation_weight=weight,
+            may_fail=known is not None,
+        )
         found = resting_path(ahead, part)
         better = ahead.log_likelihood > (-torch.inf if known is None else known[trajectories])  # not where it is a nan
         kept = better.nonzero().flatten().tolist()
@@ -146,8 +151,7 @@ class GaussianGuide(LinearizedGuide):
         ahead = self.look_ahead(data, progress)
         require_found(ahead, self.program, data)
         kernels = data.time.numel() >= WORTH_COMPILING
-        given = (self.program, data, ahead, self.draws)
-        paths = smoother_paths(*given, known_start=self.known_start, kernels=kernels)
+        paths = smoother_paths(self.program, data, ahead, self.draws, known_start=self.known_start, kernels=kernels)
         self.in_plain_torch = self.in_plain_torch or paths.in_plain_torch
         self.keep(paths, data)
         return {"observation_weight": weight} | self._figures(ahead)
@@ -158,9 +162,9 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
 
     Args:
         particles: N, for each trajectory.
+        tempering, known_start, passes, search_again: of `LinearizedGuide`.
         resample_below: share of N under which the effective sample size triggers resampling.
         untwisted, tempered: see `Twist`.
-        more: of `LinearizedGuide`.
     """
 
     def __init__(
@@ -169,12 +173,22 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
         *,
         particles: int = 100,
         draws: int = 100,
+        tempering: Tempering | None = None,
+        known_start: bool = False,
+        passes: int = 1,
+        search_again: float = 0.2,
         resample_below: float = 0.5,
         untwisted: float = 0.01,
         tempered: float = 1.0,
-        **more: Any,
     ) -> None:
-        super().__init__(program, draws=draws, **more)
+        super().__init__(
+            program,
+            draws=draws,
+            tempering=tempering,
+            known_start=known_start,
+            passes=passes,
+            search_again=search_again,
+        )
         require(particles >= 1, "particles", particles, "at least 1")
         self.particles, self.resample_below = particles, resample_below
         self.untwisted, self.tempered = untwisted, tempered

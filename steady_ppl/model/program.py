@@ -60,14 +60,14 @@ def _parsed(declared: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]
     return tuple(name.strip() for name, _, _ in parts), tuple(unit.rstrip("] ") for _, _, unit in parts)
 
 
-class _Components:
-    """The names or the units of what a program declares."""
-
-    def __init__(self, declared: str, part: Callable[[Sequence[str]], tuple[str, ...]]) -> None:
-        self.declared, self.part = declared, part
-
-    def __get__(self, program: Any, kind: type) -> tuple[str, ...]:
-        return self if program is None else self.part(getattr(program, self.declared))  # type: ignore[return-value]
+def _components(declared: str) -> tuple[property, property]:
+    """The names and the units of what a program declares."""
+    return (
+        property(lambda program: names(getattr(program, declared)), doc=f"Names of the `{declared}`, without units."),
+        property(
+            lambda program: units(getattr(program, declared)), doc=f"Units of the `{declared}`, '' where none is."
+        ),
+    )
 
 
 class Program(PyroModule):
@@ -205,10 +205,10 @@ class Program(PyroModule):
         """
         return control
 
-    state_names, state_units = _Components("states", names), _Components("states", units)
-    control_names, control_units = _Components("controls", names), _Components("controls", units)
-    measurement_names, measurement_units = _Components("measurements", names), _Components("measurements", units)
-    channel_names, channel_units = _Components("channels", names), _Components("channels", units)
+    state_names, state_units = _components("states")
+    control_names, control_units = _components("controls")
+    measurement_names, measurement_units = _components("measurements")
+    channel_names, channel_units = _components("channels")
 
     @property
     def angle_indices(self) -> tuple[int, ...]:

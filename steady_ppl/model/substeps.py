@@ -14,7 +14,6 @@ counts as a tenth.
 from __future__ import annotations
 
 import copy
-from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -87,8 +86,9 @@ def advance(program: Program, state: Tensor, control: Tensor, time: Tensor, step
     with seen, _at(parts[0]) as given:
         state = program.transition(state, *given)
     noise = {site: standardised(fn, seen.values[site], site) for site, fn in seen.distributions.items()}
-    ((after, _),) = deque(_through(program, state, parts[1:], noise), maxlen=1)
-    return after
+    for after, _ in _through(program, state, parts[1:], noise):
+        state = after
+    return state
 
 
 def sample_channels(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> None:
@@ -104,8 +104,9 @@ def sample_row(program: Program, state: Tensor, control: Tensor, time: Tensor, s
     if program.substeps == 1:
         return program.transition(state, control, time, step)
     noise = _sample(program, state, control, time, step)
-    ((after, _),) = deque(_through(program, state, _parts(program, control, time, step), noise), maxlen=1)
-    return after
+    for after, _ in _through(program, state, _parts(program, control, time, step), noise):
+        state = after
+    return state
 
 
 def channel_values(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pyro
@@ -12,7 +13,7 @@ from small import steady
 
 from inference import steady as recipe
 from steady_ppl import Fit, Joint, UsageError, load_program, simulate
-from steady_ppl.effects import attached, record
+from steady_ppl.effects import attached, chosen_variant, record
 from steady_ppl.guides.base import true_paths
 from steady_ppl.model.handlers import Recording, Replaying
 from steady_ppl.model.substeps import acting_controls, sample_row
@@ -51,6 +52,33 @@ def test_step_after_step_is_the_same_as_all_steps_at_once(name: str, effects: tu
     torch.testing.assert_close(torch.cat([after for after, _ in one_by_one]), together, **close)
     torch.testing.assert_close(torch.cat([part for _, part in one_by_one]), density, **close)
     torch.testing.assert_close(together[data.transitions], states[1:][data.transitions], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        "linear_drag",
+        "actuator_delay",
+        "heavy_tails",
+        "bearing_bias",
+        "lever_arm",
+        "process_noise:yaw",
+        "coloured_noise:yaw",
+    ],
+)
+def test_its_methods_take_their_arguments_by_name(effect: str) -> None:
+    program = example("hovercraft").with_effect(effect)
+    state, control = torch.zeros(2, len(program.state_names)).double(), torch.zeros(2, 2).double()
+    time, step = torch.zeros(2).double(), torch.full((2,), 0.1).double()
+    with pyro.plate("drives", 2):
+        assert program.transition(state=state, control=control, time=time, step=step).shape == state.shape
+        program.observe(state=state)
+
+
+def test_an_effect_that_lacks_nothing_may_say_so_in_no_words() -> None:
+    program = example("hovercraft")
+    effect = replace(chosen_variant(program, "linear_drag").effect, lacks=lambda program: "")
+    assert chosen_variant(program, effect).effect is effect and effect.variants(program)
 
 
 def test_the_prior_of_a_coefficient_counts_in_the_joint_density() -> None:

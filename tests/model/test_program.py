@@ -222,6 +222,23 @@ def test_names_and_units_come_apart() -> None:
     assert units(declared) == ("N", "m/s²", "N m", "", "")
 
 
+def test_names_say_of_what_they_are_and_cannot_be_written() -> None:
+    program = example("hovercraft")
+    assert "`channels`" in type(program).channel_units.__doc__
+    with pytest.raises(AttributeError, match="no setter"):
+        program.state_names = ("x",)
+
+
+def test_an_earlier_state_lies_back_at_its_velocity_however_many_channels_move_it() -> None:
+    program = example("pendulum")
+    position, velocity = program.motion[next(iter(program.motion))]
+    program.motion = {"push": (position, velocity), "pull": (position, velocity)}
+    state = torch.tensor([1.0, 2.0])
+    moved = program.earlier(state, torch.tensor(0.1))
+    at, rate = (program.state_names.index(name) for name in (position, velocity))
+    assert moved[at] == pytest.approx(float(state[at] - 0.1 * state[rate])) and moved[rate] == state[rate]
+
+
 def test_errors_are_reported_for_the_programs_groups_or_for_each_component() -> None:
     assert error_groups(example("hovercraft")) == {
         "location": (0, 1),
