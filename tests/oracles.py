@@ -31,6 +31,26 @@ def cart_parameters(program) -> dict[str, Tensor]:
     return {name: getattr(program, name).double() for name in ("gain", "damping", "noise", "measurement_sd")}
 
 
+def cart_evidence(program, data: Trajectories) -> Tensor:
+    """log p(y) of all drives of the cart, differentiable."""
+    return kalman(data, cart_parameters(program)).log_likelihood.sum()
+
+
+def cart_maximum(program, data: Trajectories) -> float:
+    """Bring gain and damping of the cart to their maximum of log p(y), which is returned."""
+
+    def closure() -> Tensor:
+        optimizer.zero_grad()
+        loss = -cart_evidence(program, data)
+        loss.backward()
+        return loss
+
+    free = [program.gain_unconstrained, program.damping_unconstrained]
+    optimizer = torch.optim.LBFGS(free, max_iter=50, line_search_fn="strong_wolfe")
+    optimizer.step(closure)
+    return float(cart_evidence(program, data).detach())
+
+
 @dataclass(frozen=True)
 class Kalman:
     """`(rows, B, ...)` moments given the measurements up to a row (`predicted_`: before it), and log p(y), `(B,)`."""

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.errors import TrainingError, require
+from steady_ppl.errors import RunError, TrainingError, require
 from steady_ppl.gaussian.linearize import why_not_linear
 from steady_ppl.likelihood.evidence import log_likelihood
 from steady_ppl.model.joint import Joint
@@ -238,6 +238,11 @@ def _require_finite_gradient(name: str, value: Tensor, step: int) -> None:
 
 def _judge(state: Checkpoint, held_out: list[float], figures: dict[str, float]) -> None:
     """Note a validation, and keep the averaged parameters if they are as good as the best."""
+    if state.best_held_out and len(state.best_held_out) != len(held_out):
+        raise RunError(
+            f"the checkpoint is damaged: it knows {len(state.best_held_out)} held-out log p(y), and there are "
+            f"{len(held_out)}"
+        )
     entry = {"step": float(state.step), **figures}
     if held_out:
         entry["log_likelihood"] = sum(held_out) / len(held_out)

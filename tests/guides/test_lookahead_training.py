@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 from examples import drives, example
-from oracles import cart_parameters, kalman
+from oracles import cart_evidence, cart_maximum
 from torch import Tensor
 
 from steady_ppl import (
@@ -166,23 +166,11 @@ def test_the_maximum_likelihood_estimate_of_the_cart_is_learned(guide):
         step = 0.5
         rates = {"noise": 0.0, "measurement_sd": 0.0}
 
-    program, best, truth = Slow().double(), Slow().double(), Cart().double()
+    program, truth = Slow().double(), Cart().double()
     truth.step = 0.5
     data = drives(truth, 6, 16, gaps=True)
 
-    def evidence(candidate) -> Tensor:
-        return kalman(data, cart_parameters(candidate)).log_likelihood.sum()
-
-    def closure() -> Tensor:
-        optimizer.zero_grad()
-        loss = -evidence(best)
-        loss.backward()
-        return loss
-
-    free = [best.gain_unconstrained, best.damping_unconstrained]
-    optimizer = torch.optim.LBFGS(free, max_iter=50, line_search_fn="strong_wolfe")
-    optimizer.step(closure)
-    start, top = float(evidence(program).detach()), float(evidence(best).detach())
+    start, top = float(cart_evidence(program, data).detach()), cart_maximum(Slow().double(), data)
     assert top - start > 100
     # Adam soon forgets the first scores, which are exact and thereby huge
     optimization = Optimization(steps=60, learning_rate=0.2, betas=(0.8, 0.9), averaging=0.8, validate_every=60)
@@ -196,7 +184,7 @@ def test_the_maximum_likelihood_estimate_of_the_cart_is_learned(guide):
         progress=False,
     )
     # d standard errors off the estimate cost d² / 2 nats: half of one
-    assert top - float(evidence(program).detach()) < 0.125
+    assert top - float(cart_evidence(program, data).detach()) < 0.125
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pyro
 import pytest
 import torch
 from examples import drives, example
-from oracles import cart_parameters, kalman
+from oracles import cart_evidence, cart_maximum
 from pyro.nn import pyro_method
 from torch import nn
 
@@ -27,6 +27,8 @@ from steady_ppl import (
     stack,
     train,
 )
+from steady_ppl.training.checkpoint import Checkpoint
+from steady_ppl.training.loop import _judge
 from steady_ppl.utils.tensor_files import read_tensors
 
 Cart = type(example("linear_gaussian"))
@@ -443,30 +445,22 @@ def test_steady_learns_the_maximum_likelihood_estimate_of_the_cart():
         step = 0.5
         rates = {"noise": 0.0, "measurement_sd": 0.0}
 
-    program, best = Slow().double(), Slow().double()
-    truth = Cart().double()
+    program, truth = Slow().double(), Cart().double()
     truth.step = 0.5
     data = drives(truth, 6, 16, gaps=True)
 
-    def evidence(candidate) -> torch.Tensor:
-        return kalman(data, cart_parameters(candidate)).log_likelihood.sum()
-
-    def closure() -> torch.Tensor:
-        optimizer.zero_grad()
-        loss = -evidence(best)
-        loss.backward()
-        return loss
-
-    free = [best.gain_unconstrained, best.damping_unconstrained]
-    optimizer = torch.optim.LBFGS(free, max_iter=50, line_search_fn="strong_wolfe")
-    optimizer.step(closure)
-    start, top = float(evidence(program).detach()), float(evidence(best).detach())
+    start, top = float(cart_evidence(program, data).detach()), cart_maximum(Slow().double(), data)
     assert top - start > 100
     guide = SMCGuide(program, particles=200, draws=20, tempering=Constant())
     optimization = Optimization(steps=100, learning_rate=0.2, validate_every=100)
     train(program, guide, data, Validation(), optimization, progress=False)
     # d standard errors off the estimate cost d² / 2 nats: half of one
-    assert top - float(evidence(program).detach()) < 0.125
+    assert top - float(cart_evidence(program, data).detach()) < 0.125
+
+
+def test_a_checkpoint_of_other_validation_drives_is_refused():
+    with pytest.raises(RunError, match=r"it knows 2 held-out log p\(y\), and there are 1"):
+        _judge(Checkpoint(4, [], {}, {}, {}, best_held_out=[1.0, 2.0]), [1.5], {})
 
 
 def test_gradients_are_scaled_down_to_their_norm(data, monkeypatch):

@@ -15,9 +15,7 @@ from steady_ppl.data.rosbag.mapping import BagColumn
 from steady_ppl.errors import DataError
 
 MAX_ROWS = 10_000_000
-MAX_PAUSE_RATIO = (
-    20  # times the usual time between commands, or the step if that is longer, from which holding one is said
-)
+MAX_PAUSE_RATIO = 20  # times the usual time between commands or the step, the longer, from which a pause is reported
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,14 @@ _on_lateral_velocity = partial(_force, lacks=needs_grip)
     lacks=_needs_wheels,
 )
 def response_time(
-    self: Any, state: Tensor, *given: Tensor, c: Tensor, channels: Sequence[str], mean: Mapping[str, Tensor]
+    self: Any,
+    state: Tensor,
+    control: Tensor,
+    time: Tensor,
+    step: Tensor,
+    c: Tensor,
+    channels: Sequence[str],
+    mean: Mapping[str, Tensor],
 ) -> dict[str, Tensor]:
     r"""dv/dt = (v_told - v) / (c + τ), τ what the program has (its step where it says nothing)
 
@@ -51,7 +58,6 @@ def response_time(
     feels: gets to what it is told, or back to it when pushed off, little by little
     occurs: speed controllers with little gain, hydraulic steering, heavy wheels
     """
-    *_, step = given
     slower, carried = c / (c + self.settles_in(step)), self.carried(state)
     return {channel: (carried[channel] - mean[channel]) * slower for channel in channels}
 
@@ -108,39 +114,44 @@ def reverse_steering(self: Any, state: Tensor, control: Tensor, time: Tensor, c:
 
 
 @_on_lateral_velocity("m", typical=0.1, limit=1.0)
-def lever_arm(self: Any, state: Tensor, *given: Tensor, c: Tensor, mean: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def lever_arm(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
     r"""v_y = c ω
 
     equation: v_y \to c\,\omega
     feels: the tracked point swings around the axle that does not slip
     occurs: a tag that is mounted before or behind the rear axle
     """
-    yaw_rate, (*_, step) = state[..., 5], given
-    return {"lateral": c * (yaw_rate / self.settles_in(step) + mean["yaw"])}
+    return {"lateral": c * (state[..., 5] / self.settles_in(step) + mean["yaw"])}
 
 
 @_on_lateral_velocity("rad", typical=0.05, limit=0.5)
-def crab_angle(self: Any, state: Tensor, *given: Tensor, c: Tensor, mean: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def crab_angle(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
     r"""v_y = c v_x
 
     equation: v_y \to c\,v_x
     feels: points beside where it goes
     occurs: axles that are not square to the frame, a tag that is turned against the vehicle, a farm machine on a slope
     """
-    (forward, lateral, yaw_rate), (*_, step) = self.body_velocity(state), given
+    forward, lateral, yaw_rate = self.body_velocity(state)
     change = mean["forward"] + lateral * yaw_rate
     return {"lateral": c * (forward / self.settles_in(step) + change)}
 
 
 @_on_lateral_velocity("s", typical=0.05, limit=0.5)
-def slip_angle(self: Any, state: Tensor, *given: Tensor, c: Tensor, mean: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def slip_angle(
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
     r"""v_y = -c v_x ω
 
     equation: v_y \to -c\,v_x\,\omega
     feels: slides outwards in curves, the more the faster
     occurs: tyres under side force in fast curves
     """
-    (forward, lateral, yaw_rate), (*_, step) = self.body_velocity(state), given
+    forward, lateral, yaw_rate = self.body_velocity(state)
     change = (mean["forward"] + lateral * yaw_rate) * yaw_rate + forward * mean["yaw"]
     return {"lateral": -c * (forward * yaw_rate / self.settles_in(step) + change)}
 
