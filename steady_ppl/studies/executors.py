@@ -12,6 +12,7 @@ from __future__ import annotations
 import logging
 import time
 import uuid
+import warnings
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
@@ -81,10 +82,13 @@ class Local(Place):
 
     def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
         left = list(jobs)
-        for workers in (*[self.workers] * (TRIES - 1), 1):
-            died: list[Job] = []
-            yield from _rows(left, min(workers, len(left)), died, say)
-            left = died
+        with warnings.catch_warnings():
+            # loky replaces a process that has grown, and says so where it is given its next job
+            warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
+            for workers in (*[self.workers] * (TRIES - 1), 1):
+                died: list[Job] = []
+                yield from _rows(left, min(workers, len(left)), died, say)
+                left = died
         yield from map(given_up, left)
 
 

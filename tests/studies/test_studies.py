@@ -145,6 +145,34 @@ def test_a_worker_that_dies_while_it_has_nothing_to_do_is_replaced(tmp_path: Pat
     assert [row["outcome"] for row in found] == ["done"] * 6 and said == [] and len(made) == 2
 
 
+GROWING = """
+import os, time
+from pathlib import Path
+from steady_ppl import Fit
+
+kept = []
+
+def fit(program, table, valid=None, *, known_start=False, mark="", seed=0):
+    (Path(mark) / str(os.getpid())).touch()
+    kept.append(b"1" * 400_000_000)
+    time.sleep(1.1)  # so often loky looks at the memory
+    return Fit(program, "mine", {{}}, seed=seed, known_start=known_start)
+"""
+
+
+def test_a_worker_that_has_grown_is_replaced_without_a_word(tmp_path: Path, recwarn: pytest.WarningsRecorder):
+    (tmp_path / "mine.py").write_text(GROWING.format())
+    (tmp_path / "workers").mkdir()
+    text = STUDY[: STUDY.index("[[method]]")] + (
+        '[[method]]\nname = "mine"\nprogram = "{model}"\nrecipe = "mine.py"\n'
+        f'settings = {{{{mark = "{tmp_path / "workers"}"}}}}\n'
+    )
+    said: list[str] = []
+    found = list(Local(1).results(read_plan(written(tmp_path, text)).jobs, said.append))
+    assert [row["outcome"] for row in found] == ["done"] * 2 and said == [] and not recwarn.list
+    assert len(list((tmp_path / "workers").iterdir())) == 2
+
+
 def test_a_cluster_gives_up_every_job_that_kills_and_none_that_only_waited():
     attempts, deadly = Attempts(), [f"deadly {place}" for place in range(16)]
     for key in [*deadly, "waits"]:
