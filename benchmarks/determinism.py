@@ -73,7 +73,7 @@ class Condition:
 
 CONDITIONS = (
     Condition("again", {}, True),
-    Condition("kernels compiled anew", {"NUMBA_CACHE_DIR": "cache"}, True),
+    Condition("kernels compiled anew", {"NUMBA_CACHE_DIR": "cache", "STEADY_KERNEL_CACHE": "off"}, True),
     Condition("two threads", {"OMP_NUM_THREADS": "2"}, False),
 )
 

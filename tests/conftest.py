@@ -1,4 +1,4 @@
-"""Every test starts from the same random numbers, alone or among others."""
+"""Every test starts from the same random numbers, and keeps kernels in a folder of its session."""
 
 from __future__ import annotations
 
@@ -40,6 +40,14 @@ y = ["log_likelihood"]
 def _same_random_numbers():
     with torch.random.fork_rng():
         torch.manual_seed(0)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _kernels_of_the_tests(tmp_path_factory: pytest.TempPathFactory):
+    """Machine code is kept in a folder of this session: none comes from the user's, none goes there."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("STEADY_KERNEL_CACHE", str(tmp_path_factory.mktemp("kernels")))
         yield
 
 

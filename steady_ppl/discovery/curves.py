@@ -124,9 +124,14 @@ def between(values: Tensor, knots: Sequence[float], circular: bool) -> tuple[Ten
 
 
 def height(values: Tensor, knots: Sequence[float], circular: bool, c: Tensor) -> Tensor:
-    """The curve of heights `c` `(K,)` at some values, `(...)`."""
-    before, behind, share = between(values, knots, circular)
-    return (1 - share) * c[before] + share * c[behind]
+    """The curve of heights `c` `(K,)` at some values, `(...)`: each knot has a hat that ends at the next ones."""
+    count = len(knots)
+    place = ((values - knots[0]) / (knots[1] - knots[0])).unsqueeze(-1)
+    if circular:
+        apart = torch.remainder(place - torch.arange(count).to(place) + count / 2, count) - count / 2
+    else:
+        apart = place.clamp(0, count - 1) - torch.arange(count).to(place)
+    return ((1 - apart.abs()).clamp(min=0) * c).sum(-1)
 
 
 def by_height(values: Tensor, weights: Tensor, knots: Sequence[float], circular: bool) -> Tensor:

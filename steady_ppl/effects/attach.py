@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
+from weakref import WeakKeyDictionary, WeakValueDictionary
 
 import pyro
 import pyro.distributions as dist
@@ -22,6 +23,7 @@ from steady_ppl.model import interventions
 from steady_ppl.model.program import Program, names
 
 Methods = dict[str, Any]
+_GROWN: WeakKeyDictionary[type[Program], WeakValueDictionary[Variant, type[Program]]] = WeakKeyDictionary()
 
 
 def with_effect(
@@ -51,16 +53,25 @@ def attach(program: Program, variant: Variant, value: Value | None = None) -> Pr
         variant = replace(variant, called=f"{variant.parameter}_effect")
     name, effect = variant.parameter, variant.effect
     start = _start(variant, value, next(program.parameters(), torch.zeros(())))
-    base = type(program)
-    title = "".join(part.capitalize() for part in name.split("_"))
-    about = {"__module__": base.__module__, "__doc__": base.__doc__, "attached": {name: variant}}
-    program.__class__ = type(f"{base.__name__}With{title}", (base,), {**about, **_AROUND[effect.form](base, variant)})
+    program.__class__ = _class_with(type(program), variant)
     with pyro.settings.context(module_local_params=True):
         setattr(program, name, PyroParam(start, _constraint(effect)))
     program.priors = {**program.priors, name: prior(effect)}  # type: ignore[misc]
     rate = float(variant.typical.abs().max()) if effect.null == 0 else 1.0  # Adam's steps are of this size in any unit
     program.rates = {name: rate, **program.rates}  # type: ignore[misc]
     return program
+
+
+def _class_with(base: type[Program], variant: Variant) -> type[Program]:
+    """A program's class with an effect; the same one for the same effect, so that kernels are shared."""
+    known = _GROWN.setdefault(base, WeakValueDictionary())
+    if variant not in known:
+        title = "".join(part.capitalize() for part in variant.parameter.split("_"))
+        about = {"__module__": base.__module__, "__doc__": base.__doc__, "attached": {variant.parameter: variant}}
+        methods = _AROUND[variant.effect.form](base, variant)
+        known[variant] = grown = type(f"{base.__name__}With{title}", (base,), {**about, **methods})
+        return grown
+    return known[variant]
 
 
 def attach_listed(program: Program) -> Program:

@@ -132,6 +132,7 @@ def linearize(
     known_start: bool = False,
     observation_weight: float = 1.0,
     kernels: bool | None = None,
+    angles: tuple[int, ...] | None = None,
 ) -> Linearization:
     """Differentiate the program along a path, all trajectories and times at once.
 
@@ -142,6 +143,7 @@ def linearize(
         known_start: the first state is certain.
         observation_weight: tempers the observations.
         kernels: differentiate by kernels where they can serve; None: if there are rows enough, see `on_all_rows`.
+        angles: `Linearization.angles`, where they are known.
 
     Raises:
         ProgramError: a site has another distribution, or an operation has no derivative.
@@ -152,7 +154,8 @@ def linearize(
             return advance(program, state, control, time, step)
 
     states, noise = path.states, path.noise
-    angles = _on_a_circle(program, data, states[0, :1])
+    if angles is None:
+        angles = angles_on_a_circle(program, data, states[0, :1])
     along = {"state": states[:-1], "noise": noise}
     given = {"control": acting_controls(program, data)[:-1], "time": data.elapsed[:-1], "step": data.steps}
     moved, (by_state, by_noise), in_plain_torch = _jacobians(program, step, along, given, kernels)
@@ -250,7 +253,7 @@ def _start(program: Program, data: Trajectories, first: Tensor, known_start: boo
     return began - first, start_noise
 
 
-def _on_a_circle(program: Program, data: Trajectories, state: Tensor) -> tuple[int, ...]:
+def angles_on_a_circle(program: Program, data: Trajectories, state: Tensor) -> tuple[int, ...]:
     """The declared angles of which a whole turn changes neither what is measured nor where the program goes; an angle
     that a plain normal measures counts its turns. Looked at from one state, `(1, D)`."""
     angles = list(program.angle_indices)

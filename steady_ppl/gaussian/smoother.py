@@ -16,7 +16,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
-from steady_ppl.gaussian.linearize import ReferencePath, linearize
+from steady_ppl.gaussian.linearize import ReferencePath, angles_on_a_circle, linearize
 from steady_ppl.kernels.jit import on_all_rows
 from steady_ppl.model.handlers import (
     KnownStart,
@@ -66,9 +66,10 @@ def smooth(
     """
 
     def look(path: ReferencePath) -> Lookahead:
-        given: Any = {"known_start": known_start, "observation_weight": observation_weight, "kernels": kernels}
         return look_ahead(linearize(program, data, path, **given))
 
+    given: dict[str, Any] = {"known_start": known_start, "observation_weight": observation_weight, "kernels": kernels}
+    given["angles"] = angles_on_a_circle(program, data, path.states[0, :1])
     if passes == 1:
         return look(path)
     accepted = path = ReferencePath(path.states, torch.where(data.transitions[..., None], path.noise, 0.0))

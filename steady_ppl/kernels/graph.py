@@ -15,7 +15,7 @@ from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, fx
+from torch import Tensor
 
 from steady_ppl.errors import SteadyError
 
@@ -76,7 +76,7 @@ class ScalarGraph:
         levels: for each scalar, what it depends on.
         vectors: products and elementwise operations on long vectors.
         outputs: the scalars to be returned, in order.
-        parameters: nodes of the traced graph whose values the kernel takes, one after the other.
+        parameters: places on the tape whose values the kernel takes, one after the other.
     """
 
     levels_of_inputs: dict[str, int]
@@ -84,7 +84,7 @@ class ScalarGraph:
     levels: list[int] = field(default_factory=list)
     vectors: list[Product | Each] = field(default_factory=list)
     outputs: list[int] = field(default_factory=list)
-    parameters: list[fx.Node] = field(default_factory=list)
+    parameters: list[int] = field(default_factory=list)
     numbers: dict[Scalar, int] = field(default_factory=dict)
     operations: int = 0
 
@@ -368,12 +368,16 @@ CHOICES: dict[str, Callable[[Tangents, Any, Any], Any]] = {
 }
 
 
-def jacobian(graph: ScalarGraph, outputs: Sequence[int], inputs: Sequence[int]) -> list[int]:
-    """The derivative of every output in every input, the outputs' rows one after the other."""
+def derivatives(graph: ScalarGraph, outputs: Sequence[int], inputs: Sequence[int]) -> list[list[int | None]]:
+    """The derivatives of every output in every input, None where they are zero."""
     by_input = [Tangents(graph, number) for number in inputs]
     for number in range(max(outputs) + 1):  # in their order, so that no recursion gets deep
         for tangents in by_input:
             tangents.of(number)
-    zero = graph.constant(0.0)
-    found = [[tangents.of(output) for tangents in by_input] for output in outputs]
-    return [zero if derivative is None else derivative for row in found for derivative in row]
+    return [[tangents.of(output) for tangents in by_input] for output in outputs]
+
+
+def jacobian(graph: ScalarGraph, outputs: Sequence[int], inputs: Sequence[int]) -> list[int]:
+    """The derivative of every output in every input, the outputs' rows one after the other."""
+    zero, rows = graph.constant(0.0), derivatives(graph, outputs, inputs)
+    return [zero if derivative is None else derivative for row in rows for derivative in row]

@@ -3,45 +3,50 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import itertools
-from collections import ChainMap
+from collections import ChainMap, Counter, OrderedDict
 from collections.abc import Callable, Sequence
-from functools import lru_cache
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from llvmlite import binding
-from torch import Tensor, fx, nn
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch import Tensor, nn
 
 from steady_ppl.kernels.codegen import LANES, NAME, source
-from steady_ppl.kernels.graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph, jacobian
-from steady_ppl.kernels.lowering import Translation, evaluate
+from steady_ppl.kernels.graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph, derivatives, jacobian
+from steady_ppl.kernels.lowering import Translation
+from steady_ppl.kernels.store import machine_code
 from steady_ppl.utils.text import one_line
 
-TRACES = 8  # of one method of one program; each takes some tenths of a second
+TRACES = 32  # of one method of programs of one class; each takes some hundredths of a second
+SELDOM = 16
+"""Of one program's runs on all rows those are compared with torch whose number is a power of two or a multiple of it."""
+KERNELS = 256  # that are kept in memory
+FEW = 1000  # numbers of a tensor that are looked at one by one
 ROWS_WORTH_COMPILING = 1000  # of all trajectories together
 KEEPS_CHANGING = "its settings or tensors change from run to run"
 DIFFERENT = "its kernel and its own lines come to different numbers"
 Compiled = TypeVar("Compiled")
 Array = np.ndarray
 Examples = dict[str, Tensor]  # of the arguments of a function
-_COMPILED: WeakKeyDictionary[nn.Module, dict[Any, Any]] = WeakKeyDictionary()
+_COMPILED: WeakKeyDictionary[type[nn.Module], dict[Any, Any]] = WeakKeyDictionary()
+_RUNS: WeakKeyDictionary[nn.Module, Counter[str]] = WeakKeyDictionary()
 
 
 class Kernel:
     """A compiled function.
 
     Args:
-        text: its `source`.
+        key: a digest of what its source is made of.
+        text: writes its `source`.
         inputs, outputs: how many arrays it takes, and how many numbers a particle it gives.
     """
 
-    def __init__(self, text: str, inputs: int, outputs: int) -> None:
+    def __init__(self, key: str, text: Callable[[], str], inputs: int, outputs: int) -> None:
         self.outputs = outputs
-        self._engine = _machine_code(text)
+        self._engine = machine_code(key, text)
         arguments = [ctypes.c_void_p] * (inputs + 4) + [ctypes.c_int64] * 3
         self._call = ctypes.CFUNCTYPE(None, *arguments)(self._engine.get_function_address(NAME))
 
@@ -68,98 +73,142 @@ class Kernel:
         self._call(*pointers, which, out.ctypes.data, trajectories, particles, uniform.shape[1])
 
 
-def _machine_code(text: str) -> Any:
-    binding.initialize_native_target()
-    binding.initialize_native_asmprinter()
-    module = binding.parse_assembly(text)
-    target = binding.Target.from_default_triple()
-    machine = target.create_target_machine(
-        cpu=binding.get_host_cpu_name(), features=binding.get_host_cpu_features().flatten(), opt=3
-    )
-    options = binding.create_pipeline_tuning_options(speed_level=2)
-    builder = binding.create_pass_builder(machine, options)
-    builder.getModulePassManager().run(module, builder)
-    engine = binding.create_mcjit_compiler(module, machine)
-    engine.finalize_object()
-    return engine
-
-
-class _ReadsNumbers(TorchDispatchMode):
-    """Refuses to trace what a number read from a tensor decides: it would be the same for ever."""
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if func is torch.ops.aten._local_scalar_dense.default:
-            raise NotCompilable("it reads a number out of a tensor (float(), .item(), if)")
-        return func(*args, **(kwargs or {}))
-
-
 class Method:
-    """A function of a program as a kernel.
+    """A function of a program as a kernel, for all programs that are alike, see `signature`.
 
     Args:
+        program: what the function belongs to.
         function: of one particle of one trajectory, `(1, 1, 1, ·)`; returns tensors.
         particle: examples of the arguments that differ between particles, the first ones.
         trajectory: examples of those that differ between trajectories only.
         along: the arguments in which to differentiate; the Jacobian's rows follow the values.
+        by_parameters: differentiate in the parameters that the kernel takes; these derivatives come last.
 
     Attributes:
         values: how many numbers the function returns.
+        slopes: value and parameter of each derivative that `by_parameters` adds, those that are zero left out.
 
     Raises:
         NotCompilable: it cannot be traced, or what it does has no kernel.
     """
 
     def __init__(
-        self, function: Callable[..., Any], particle: Examples, trajectory: Examples, *, along: Sequence[str] = ()
+        self,
+        program: nn.Module,
+        function: Callable[..., Any],
+        particle: Examples,
+        trajectory: Examples,
+        *,
+        along: Sequence[str] = (),
+        by_parameters: bool = False,
     ) -> None:
         try:
             with torch.no_grad():
-                self._compile(function, particle, trajectory, along)
+                self._compile(program, function, particle, trajectory, along, by_parameters)
         except NotCompilable:
             raise
         except Exception as error:  # whatever torch, the translation or the compiler makes of an unforeseen program
             raise NotCompilable(f"it cannot be compiled: {one_line(error)}") from error
 
     def _compile(
-        self, function: Callable[..., Any], particle: Examples, trajectory: Examples, along: Sequence[str]
+        self,
+        program: nn.Module,
+        function: Callable[..., Any],
+        particle: Examples,
+        trajectory: Examples,
+        along: Sequence[str],
+        by_parameters: bool,
     ) -> None:
-        from torch.fx.experimental.proxy_tensor import make_fx  # takes a second to import
-
-        with _ReadsNumbers():
-            self.traced = make_fx(torch.func.functionalize(function))(*particle.values(), *trajectory.values())
         levels = dict.fromkeys(particle, PARTICLE) | dict.fromkeys(trajectory, TRAJECTORY)
-        translation = Translation(self.traced, levels)
-        self.graph: ScalarGraph = translation.run()
+        translation = Translation(particle | trajectory, levels, _tensors(program))
+        with translation:
+            made = torch.func.functionalize(function)(*particle.values(), *trajectory.values())
+        translation.end(made)
+        self.tape, self.graph = translation.tape, translation.graph
         self.values = len(self.graph.outputs)
+        self.slopes: list[tuple[int, int]] = []
+        values = list(self.graph.outputs)
         if along:
             inputs = [self.graph.scalar("input", name, k) for name in along for k in range(particle[name].numel())]
-            self.graph.outputs += jacobian(self.graph, self.graph.outputs, inputs)
-        self.by_parameters = [node for node in self.traced.graph.nodes if node in translation.known]
+            self.graph.outputs += jacobian(self.graph, values, inputs)
+        if by_parameters:
+            self._add_slopes(values)
         columns, at = {}, 0
         for name, example in trajectory.items():
             columns[name], at = at, at + example.numel()
-        text = source(self.graph, tuple(particle), columns)
-        self.kernel = _compiled(text, len(particle), len(self.graph.outputs))
+        self.kernel = _kernel(self.graph, tuple(particle), columns)
 
-    def parameters(self) -> Array:
-        """What the kernel takes of the parameters, as they are now."""
-        known: dict[fx.Node, Any] = {}
-        with torch.no_grad():
-            for node in self.by_parameters:
-                known[node] = evaluate(node, known)
-            parts = [known[node].detach().to(torch.float32).flatten() for node in self.graph.parameters]
-            return torch.cat([*parts, torch.zeros(1)]).numpy()
+    def _add_slopes(self, values: Sequence[int]) -> None:
+        if self.graph.vectors:
+            raise NotCompilable("no derivatives in the weights of a network")
+        count = sum(operation == "parameter" for operation, _ in self.graph.scalars)
+        parameters = [self.graph.scalar("parameter", k) for k in range(count)]
+        for value, row in enumerate(derivatives(self.graph, values, parameters)):
+            for parameter, derivative in enumerate(row):
+                if derivative is not None:
+                    self.graph.outputs.append(derivative)
+                    self.slopes.append((value, parameter))
+
+    @torch.no_grad()
+    def parameters(self, program: nn.Module) -> Array:
+        """What the kernel takes of a program's parameters, as they are now."""
+        return self._taken(self.tape.run(_tensors(program))).numpy()
+
+    def _taken(self, values: Sequence[Tensor]) -> Tensor:
+        parts = [values[place].detach().to(torch.float32).flatten() for place in self.graph.parameters]
+        return torch.cat([*parts, torch.zeros(1)])
+
+    @torch.no_grad()
+    def by_number(self, program: nn.Module, numbers: Sequence[Number]) -> Tensor:
+        """What the kernel's parameters change by with each of a program's learnable numbers, `(Q, P)`."""
+        tensors = _tensors(program)
+        names = {id(tensor): name for name, tensor in tensors.items()}
+        values = self.tape.run(tensors)
+        columns = []
+        for number in numbers:
+            moved = []
+            for by in (number.step, -number.step):
+                other = number.parameter.detach().clone()
+                other.view(-1)[number.index] += by
+                moved.append(self._taken(self.tape.run_again(values, names[id(number.parameter)], other)))
+            columns.append((moved[0] - moved[1]).double() / (2 * number.step))
+        return torch.stack(columns, -1)
 
 
-@lru_cache(maxsize=64)
-def _compiled(text: str, inputs: int, outputs: int) -> Kernel:
-    """The kernel of a source, which programs share that differ in their parameters only."""
-    return Kernel(text, inputs, outputs)
+class Number(Protocol):
+    """One learnable number."""
+
+    @property
+    def parameter(self) -> Tensor:
+        """Among whose numbers it is."""
+
+    @property
+    def index(self) -> int:
+        """In its flat form."""
+
+    @property
+    def step(self) -> float:
+        """By which differences move it."""
+
+
+_KERNELS: OrderedDict[str, Kernel] = OrderedDict()
+
+
+def _kernel(graph: ScalarGraph, inputs: tuple[str, ...], columns: dict[str, int]) -> Kernel:
+    """The kernel of a graph, which programs share that differ in their parameters only."""
+    told = repr((graph.scalars, graph.levels, graph.vectors, graph.outputs, inputs, columns))
+    key = hashlib.sha256(told.encode()).hexdigest()
+    if key not in _KERNELS:
+        _KERNELS[key] = Kernel(key, lambda: source(graph, inputs, columns), len(inputs), len(graph.outputs))
+        if len(_KERNELS) > KERNELS:
+            _KERNELS.popitem(last=False)
+    _KERNELS.move_to_end(key)
+    return _KERNELS[key]
 
 
 def compiled(program: nn.Module, name: str, build: Callable[[], Compiled]) -> Compiled | str:
-    """What was compiled of a program under a name, as its settings are now, built once; or why there is none."""
-    known = _COMPILED.setdefault(program, {})
+    """What was compiled under a name for programs like this one, built once; or why there is none."""
+    known = _COMPILED.setdefault(type(program), {})
     key = (name, signature(program))
     if key not in known and sum(at == name for at, _ in known) >= TRACES:
         return KEEPS_CHANGING
@@ -174,20 +223,29 @@ def compiled(program: nn.Module, name: str, build: Callable[[], Compiled]) -> Co
 
 def discard(program: nn.Module, name: str) -> str:
     """Give up what was compiled under a name."""
-    _COMPILED[program][name, signature(program)] = DIFFERENT
+    _COMPILED[type(program)][name, signature(program)] = DIFFERENT
     return DIFFERENT
 
 
+def _tensors(program: nn.Module) -> dict[str, Tensor]:
+    return dict(itertools.chain(program.named_parameters(), program.named_buffers()))
+
+
 def signature(program: nn.Module) -> tuple[Any, ...]:
-    """What a trace takes as given: which tensors a program has, and its settings."""
-    tensors = (*program.named_parameters(), *program.named_buffers())
+    """What a trace takes as given: the shapes of a program's tensors, and its settings."""
     settings = [
-        (at, name, id(value) if isinstance(value, Tensor) else repr(value))
+        (at, name, _content(value) if isinstance(value, Tensor) else repr(value))
         for at, module in program.named_modules()
         for name, value in _settings(module).items()
         if isinstance(value, bool | int | float | str | tuple | list | Tensor)
     ]
-    return tuple((name, id(tensor)) for name, tensor in tensors), tuple(settings)
+    shapes = tuple((name, tuple(tensor.shape), tensor.dtype) for name, tensor in _tensors(program).items())
+    return shapes, tuple(settings)
+
+
+def _content(tensor: Tensor) -> Any:
+    """A tensor that is no parameter, by its numbers; a large one is only itself."""
+    return (tuple(tensor.shape), *tensor.flatten().tolist()) if tensor.numel() <= FEW else id(tensor)
 
 
 def _settings(module: nn.Module) -> dict[str, Any]:
@@ -227,6 +285,56 @@ def on_all_rows(
         The value `(rows, B, V)` and the Jacobians `(rows, B, V, ·)`; why there is no kernel; None where it is not
         worth one.
     """
+    found = _computed(program, f"{name} on all rows", function, arguments, kernels, along=along)
+    if not isinstance(found, tuple):
+        return found
+    method, values, rest = found
+    widths = [arguments[at].shape[-1] for at in along]
+    return values, list(rest.unflatten(-1, (method.values, sum(widths))).split(widths, -1)) if along else []
+
+
+class Slopes(NamedTuple):
+    """What a function's components change by with the parameters that a kernel takes, where that is not zero.
+
+    Attributes:
+        function: its own values, `(rows, B, V)`.
+        components: of the function, one for each slope, `(N,)`.
+        values: the slopes, `(N, rows, B)`.
+        by_number: what the kernel's parameter of each slope changes by with each learnable number, `(N, P)`.
+    """
+
+    function: Tensor
+    components: Tensor
+    values: Tensor
+    by_number: Tensor
+
+
+def slopes_on_all_rows(
+    program: nn.Module,
+    name: str,
+    function: Callable[..., Tensor],
+    arguments: dict[str, Tensor],
+    numbers: Sequence[Number],
+    kernels: bool | None = None,
+) -> Slopes | str | None:
+    """A function's slopes in a program's learnable numbers; otherwise as `on_all_rows`."""
+    found = _computed(program, f"{name} by parameters", function, arguments, kernels, by_parameters=True)
+    if not isinstance(found, tuple):
+        return found
+    method, values, rest = found
+    components, parameters = torch.tensor(method.slopes, dtype=torch.int64).view(-1, 2).unbind(-1)
+    return Slopes(values, components, rest.movedim(-1, 0), method.by_number(program, numbers)[parameters])
+
+
+def _computed(
+    program: nn.Module,
+    name: str,
+    function: Callable[..., Tensor],
+    arguments: dict[str, Tensor],
+    kernels: bool | None,
+    **derivatives: Any,
+) -> tuple[Method, Tensor, Tensor] | str | None:
+    """The kernel, the function's value and the derivatives `(rows, B, ·)`."""
     first = next(iter(arguments.values()))
     rows, trajectories = first.shape[:2]
     if kernels is None:
@@ -235,18 +343,23 @@ def on_all_rows(
         return None
     if first.device.type != "cpu" or first.dtype != torch.float32:
         return f"{str(first.dtype).removeprefix('torch.')} on {first.device.type}"
-    name = f"{name} on all rows"
     examples = {at: value[:1, :1].unsqueeze(0).clone() for at, value in arguments.items()}
-    method = compiled(program, name, lambda: Method(lambda *values: (function(*values),), examples, {}, along=along))
+
+    def build() -> Method:
+        return Method(program, lambda *values: (function(*values),), examples, {}, **derivatives)
+
+    method = compiled(program, name, build)
     if isinstance(method, str):
         return method
-    found = _run(method, arguments, rows, trajectories)
+    found = _run(method, program, arguments, rows, trajectories)
     values, rest = found[..., : method.values], found[..., method.values :]
-    plain = function(*(_a_few(value) for value in arguments.values()))
-    if not close(_a_few(values), plain):
-        return discard(program, name)
-    widths = [arguments[at].shape[-1] for at in along]
-    return values, list(rest.unflatten(-1, (method.values, sum(widths))).split(widths, -1)) if along else []
+    runs = _RUNS.setdefault(program, Counter())
+    runs[name] += 1
+    if runs[name].bit_count() == 1 or runs[name] % SELDOM == 0:
+        plain = function(*(_a_few(value) for value in arguments.values()))
+        if not close(_a_few(values), plain):
+            return discard(program, name)
+    return method, values, rest
 
 
 def _a_few(values: Tensor) -> Tensor:
@@ -254,10 +367,10 @@ def _a_few(values: Tensor) -> Tensor:
     return values.flatten(0, 1)[None, :: max(1, values.shape[0] * values.shape[1] // LANES)]
 
 
-def _run(method: Method, arguments: dict[str, Tensor], rows: int, trajectories: int) -> Tensor:
+def _run(method: Method, program: nn.Module, arguments: dict[str, Tensor], rows: int, trajectories: int) -> Tensor:
     """Everything that the kernel computes, `(rows, B, ·)`."""
     cells = rows * trajectories
     inputs = [value.float().reshape(cells, 1, -1).permute(2, 1, 0).contiguous().numpy() for value in arguments.values()]
     out = torch.empty(len(method.graph.outputs), 1, cells)
-    method.kernel(method.parameters(), np.zeros((1, 0), np.float32), inputs, None, out.numpy())
+    method.kernel(method.parameters(program), np.zeros((1, 0), np.float32), inputs, None, out.numpy())
     return out.squeeze(1).t().reshape(rows, trajectories, -1)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, fx
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map
 
 from steady_ppl.kernels.graph import NotCompilable, ScalarGraph
+from steady_ppl.kernels.tape import Tape
 
 aten: Any = torch.ops.aten
 
@@ -43,77 +45,101 @@ ELEMENTWISE = _packets(
 FILLED = {aten.zeros_like: 0.0, aten.new_zeros: 0.0, aten.zeros: 0.0, aten.ones_like: 1.0, aten.new_ones: 1.0}
 
 
-class Translation:
-    """From a traced graph to scalars: tensors of values become tensors of scalars' numbers, of the same shape."""
+class Translation(TorchDispatchMode):
+    """Notes what torch does meanwhile: tensors of values become tensors of scalars' numbers, of the same shape.
 
-    def __init__(self, traced: fx.GraphModule, levels_of_inputs: dict[str, int]) -> None:
-        self.traced, self.graph = traced, ScalarGraph(levels_of_inputs)
-        self.known: dict[fx.Node, Any] = {}  # what depends on parameters alone, as torch computes it
-        self.numbers: dict[fx.Node, Any] = {}
-        self.offset = 0
+    What depends on the program's tensors alone stays with torch, on a tape.
 
-    def run(self) -> ScalarGraph:
-        inputs = iter(self.graph.levels_of_inputs)
-        for node in self.traced.graph.nodes:
-            if node.op == "placeholder":
-                shape, name = node.meta["val"].shape, next(inputs)
-                elements = [self.graph.scalar("input", name, k) for k in range(shape.numel())]
-                self.numbers[node] = torch.tensor(elements, dtype=torch.int64).view(shape)
-            elif node.op == "output":
-                for value in fx.node.map_arg(node.args[0], self._number):
-                    self.graph.outputs += value.flatten().tolist()
-            elif _is_random(node):
-                raise NotCompilable(f"{node.target} draws random numbers of its own")
-            elif all(argument in self.known for argument in node.all_input_nodes):
-                self.known[node] = evaluate(node, self.known)
-            else:
-                self.numbers[node] = self._translate(node)
-        return self.graph
+    Args:
+        inputs: the arguments of what is traced, by name.
+        levels: what each of them differs between.
+        tensors: the program's, by name.
+    """
 
-    def _number(self, node: fx.Node) -> Any:
-        """The scalars' numbers of a node; parameters become inputs of the kernel when they are first needed."""
-        if node not in self.numbers:
-            value = self.known[node]
-            if not isinstance(value, Tensor):
-                return value
-            elements = [self.graph.scalar("parameter", self.offset + k) for k in range(value.numel())]
-            self.numbers[node] = torch.tensor(elements, dtype=torch.int64).view(value.shape)
-            self.graph.parameters.append(node)
-            self.offset += value.numel()
-        return self.numbers[node]
+    def __init__(self, inputs: Mapping[str, Tensor], levels: dict[str, int], tensors: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        self.graph, self.tape = ScalarGraph(levels), Tape(tensors)
+        self._kept: list[Tensor] = []  # a tensor that is kept shares its `id` with no later one
+        self._numbers: dict[int, Tensor] = {}
+        self._places: dict[int, Tensor] = {}  # of values on the tape that a kernel takes: place → scalars' numbers
+        self._offset = 0
+        for name, example in inputs.items():
+            elements = [self.graph.scalar("input", name, k) for k in range(example.numel())]
+            self._keep(example, torch.tensor(elements, dtype=torch.int64).view(example.shape))
 
-    def _translate(self, node: fx.Node) -> Any:
-        arguments: Any = fx.node.map_arg(node.args, self._number)
-        keywords: Any = fx.node.map_arg(node.kwargs, self._number)
-        if node.target is operator.getitem:
-            return arguments[0][arguments[1]]
-        packet = getattr(node.target, "overloadpacket", None)
-        self._check_kind(node)
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # or torch would load its compiler, a second, to leave this alone
+
+    def _keep(self, value: Tensor, numbers: Tensor) -> None:
+        self._kept.append(value)
+        self._numbers[id(value)] = numbers
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if func is aten._local_scalar_dense.default:
+            raise NotCompilable("it reads a number out of a tensor (float(), .item(), if)")
+        if torch.Tag.nondeterministic_seeded in func.tags:
+            raise NotCompilable(f"{func} draws random numbers of its own")
+        made = func(*args, **kwargs)
+        if not any(id(leaf) in self._numbers for leaf in tree_leaves((args, kwargs))):
+            self.tape.note(func, args, kwargs, made)
+            return made
+        numbers = self._translate(func, args, kwargs, made)
+        for value, own in zip(tree_leaves(made), tree_leaves(numbers), strict=True):
+            self._keep(value, own)
+        return made
+
+    def end(self, outputs: Sequence[Tensor]) -> None:
+        """What was traced returned these."""
+        for value in outputs:
+            self.graph.outputs += self._number(value).flatten().tolist()
+        self.tape.cut(self.graph.parameters)
+        self._kept.clear()
+        self._numbers.clear()
+
+    def _number(self, value: Any) -> Any:
+        """The scalars' numbers of a tensor; parameters become inputs of the kernel when they are first needed."""
+        if not isinstance(value, Tensor):
+            return value
+        if id(value) in self._numbers:
+            return self._numbers[id(value)]
+        place = self.tape.place(value)
+        if place not in self._places:
+            elements = [self.graph.scalar("parameter", self._offset + k) for k in range(value.numel())]
+            self._places[place] = torch.tensor(elements, dtype=torch.int64).view(value.shape)
+            self.graph.parameters.append(place)
+            self._offset += value.numel()
+        return self._places[place]
+
+    def _translate(self, func: Any, args: Any, kwargs: Any, made: Any) -> Any:
+        packet = func.overloadpacket
+        self._check_kind(packet, args, kwargs, made)
+        if packet in (aten.index, aten.index_select):
+            return self._at_known(func, args)
+        arguments, keywords = tree_map(self._number, (args, kwargs))
         if packet in MOVING:
             return MOVING[packet](*arguments, **keywords)
         if packet in ELEMENTWISE and not keywords:
             return self._each(ELEMENTWISE[packet], *arguments)
-        if packet in (aten.index, aten.index_select):
-            return self._at_known(node)
         if packet in FILLED:
-            return torch.full(node.meta["val"].shape, self.graph.constant(FILLED[packet]), dtype=torch.int64)
-        special = getattr(self, f"_{packet.__name__.lstrip('_')}", None) if packet else None
+            return torch.full(made.shape, self.graph.constant(FILLED[packet]), dtype=torch.int64)
+        special = getattr(self, f"_{packet.__name__.lstrip('_')}", None)
         if special is None:
-            raise NotCompilable(f"no kernel for {node.target}")
+            raise NotCompilable(f"no kernel for {func}")
         return special(*arguments, **keywords)
 
-    def _check_kind(self, node: fx.Node) -> None:
+    def _check_kind(self, packet: Any, args: Any, kwargs: Any, made: Any) -> None:
         """Kernels compute in single precision and with truth values."""
-        kind = getattr(node.meta.get("val"), "dtype", torch.float32)
-        if kind not in (torch.float32, torch.bool):
-            raise NotCompilable(f"it computes in {str(kind).removeprefix('torch.')}")
-        name = str(getattr(node.target, "overloadpacket", "")).rsplit(".")[-1]
-        if kind == torch.bool and name in ("add", "mul", "maximum", "minimum"):
+        first, name = tree_leaves(made)[0].dtype, packet.__name__
+        if first not in (torch.float32, torch.bool):
+            raise NotCompilable(f"it computes in {str(first).removeprefix('torch.')}")
+        if first == torch.bool and name in ("add", "mul", "maximum", "minimum"):
             raise NotCompilable("arithmetic with truth values")
-        for argument in node.all_input_nodes[:1] if "index" in name else node.all_input_nodes:
-            taken = getattr(argument.meta.get("val"), "dtype", torch.float32)
-            if taken not in (torch.float32, torch.bool):
-                raise NotCompilable(f"it computes with {str(taken).removeprefix('torch.')}")
+        taken = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+        for value in taken[:1] if "index" in name else taken:
+            if value.dtype not in (torch.float32, torch.bool):
+                raise NotCompilable(f"it computes with {str(value.dtype).removeprefix('torch.')}")
 
     def _each(self, operation: str, *operands: Any) -> Tensor:
         """An elementwise operation on operands that broadcast; numbers of Python are constants."""
@@ -122,14 +148,12 @@ class Translation:
         elements = self.graph.each(operation, *(tensor.flatten().tolist() for tensor in tensors))
         return torch.tensor(elements, dtype=torch.int64).view(tensors[0].shape)
 
-    def _at_known(self, node: fx.Node) -> Tensor:
+    def _at_known(self, func: Any, args: Any) -> Tensor:
         """Elements at places that are known now."""
-        if any(argument not in self.known for argument in node.all_input_nodes[1:]):
+        value, *rest = args
+        if any(id(leaf) in self._numbers for leaf in tree_leaves(rest)):
             raise NotCompilable("it looks elements up at places that depend on the state")
-        value = self._number(node.all_input_nodes[0])
-        rest = fx.node.map_arg(node.args[1:], self.known.__getitem__)
-        target: Callable[..., Tensor] = node.target  # type: ignore[assignment]
-        return target(value, *rest)
+        return func(self._number(value), *rest)
 
     def _copy(self, value: Tensor, other: Tensor, non_blocking: bool = False) -> Tensor:
         return other.broadcast_to(value.shape)
@@ -230,16 +254,3 @@ class Translation:
         if dtype not in (None, torch.float32):
             raise NotCompilable(f"it converts to {str(dtype).removeprefix('torch.')}")
         return self._each("number", value)
-
-
-def evaluate(node: fx.Node, known: dict[fx.Node, Any]) -> Any:
-    """What torch makes of a node whose arguments are known, or a tensor of the function's own."""
-    if node.op == "get_attr":
-        return operator.attrgetter(str(node.target))(node.graph.owning_module)
-    arguments, keywords = fx.node.map_arg((node.args, dict(node.kwargs)), known.__getitem__)
-    target: Callable[..., Any] = node.target  # type: ignore[assignment]
-    return target(*arguments, **keywords)
-
-
-def _is_random(node: fx.Node) -> bool:
-    return torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ())

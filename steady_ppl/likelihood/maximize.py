@@ -293,7 +293,7 @@ def _tried(terms: Sequence[Term], passes: int, least: float) -> _Here | None:
 def _valued(terms: Sequence[Term], passes: int) -> list[_TermHere]:
     found = []
     for term, shares in zip(terms, _shares(terms), strict=True):
-        ahead = term.problem.smooth(term.path, passes=passes, tolerance=TOLERANCE, kernels=False)
+        ahead = term.problem.smooth(term.path, passes=passes, tolerance=TOLERANCE)
         objective = float(ahead.log_likelihood.sum()) + log_prior(term.problem.program, shares)
         found.append(_TermHere(ahead, resting_path(ahead, term.problem.data), objective))
     return found
@@ -395,7 +395,7 @@ def refit_outliers(problem: Problem, maximum: Maximum) -> Maximum:
         if not len(outliers):
             break
         part = problem.subset(outliers)
-        there = part.smooth(part.find_path(), kernels=False)
+        there = part.smooth(part.find_path())
         better = there.log_likelihood > maximum.log_likelihood[outliers] + 1
         if not bool(better.any()):
             break
@@ -415,7 +415,7 @@ def widen_noise(problem: Problem, path: ReferencePath | None = None) -> Referenc
     is given is returned where the noise is wide enough.
     """
     path = path or problem.find_path()
-    ahead = problem.smooth(path, kernels=False)
+    ahead = problem.smooth(path)
     every = elements(problem.program)
     parts = [part for part, wider in zip(every, widens(problem.program, every, problem.data), strict=True) if wider]
     while parts and _roughness(ahead, problem.data) > MAX_ROUGHNESS:
@@ -423,7 +423,7 @@ def widen_noise(problem: Problem, path: ReferencePath | None = None) -> Referenc
         for part in parts:
             part.move(math.log(3.0))
         wider_path = problem.find_path()
-        there = problem.smooth(wider_path, kernels=False)
+        there = problem.smooth(wider_path)
         if not float(there.log_likelihood.sum()) > float(ahead.log_likelihood.sum().nan_to_num(-math.inf)):
             set_values(parts, before)
             break

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import pyro.distributions as dist
@@ -27,6 +28,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import Lookahead
+from steady_ppl.kernels.jit import Slopes, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import Element, moved, on_both_sides
 from steady_ppl.model.handlers import (
     AtMean,
@@ -80,8 +82,32 @@ class Deviations:
 
     def of_spread(self, slope: Tensor) -> Tensor:
         """Score of a change of the log standard deviations by `slope`, `(rows, B, C)`; `(B,)`."""
-        excess = self.mean.square() + self.variance - 1
-        return torch.where(self.present, excess * slope, 0.0).sum((0, -1))
+        return torch.where(self.present, self.excess * slope, 0.0).sum((0, -1))
+
+    @cached_property
+    def excess(self) -> Tensor:
+        """By how much mean squares are larger than under the program, `(rows, B, C)`."""
+        return self.mean.square() + self.variance - 1
+
+    def of_slopes(self, slopes: Slopes, sharpness: Tensor) -> Tensor:
+        """Scores of learnable numbers, `(B, P)`.
+
+        Args:
+            slopes: of the means and, after them, of the log standard deviations, at `points` row by row.
+            sharpness: 1 / the standard deviations, `(rows, B, C)`.
+        """
+        count, rows = self.mean.shape[-1], self.mean.shape[0]
+        of_means = slopes.components < count
+        at, values = slopes.components[of_means], slopes.values[of_means].unflatten(1, (-1, rows))
+        here, up, down = (values[range(len(at)), point] for point in (0 * at, 1 + at, 1 + count + at))
+        mean, sharp, present = (part.movedim(-1, 0) for part in (self.mean, sharpness, self.present))
+        by_mean = torch.where(present[at], (mean[at] * here + (up - down) / 2) * sharp[at], 0.0)
+        at = slopes.components[~of_means] - count
+        by_spread = torch.where(present[at], self.excess.movedim(-1, 0)[at] * slopes.values[~of_means, :rows], 0.0)
+        return (
+            by_mean.sum(1).double().t() @ slopes.by_number[of_means]
+            + by_spread.sum(1).double().t() @ slopes.by_number[~of_means]
+        )
 
 
 @dataclass(frozen=True)
@@ -113,9 +139,8 @@ class Arrivals:
 
     def ends(self, program: Program, data: Trajectories) -> Tensor:
         """Where rows end from these states with this noise, `(1 + 2 D, T, B, D)`."""
-        controls = acting_controls(program, data)[:-1]
-        with running(*self.states.shape[:-1]), Standardised(self.noise):
-            return advance(program, self.states, controls, data.elapsed[:-1], data.steps).double()
+        given = (acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
+        return _row_ends(program, self.states, self.noise, *given).double()
 
     def score(self, change: Tensor) -> Tensor:
         """Of a change of where rows end, `(1 + 2 D, T, B, D)`; `(B,)`."""
@@ -124,6 +149,15 @@ class Arrivals:
         apart = (change[1 : 1 + count] - change[1 + count :]).diagonal(dim1=0, dim2=-1) / 2
         by_row = (self.scale * (self.mean * change[0] + apart)).sum(-1)
         return torch.where(self.present, by_row, 0.0).sum(0)
+
+    def of_slopes(self, slopes: Slopes) -> Tensor:
+        """Scores of learnable numbers from the slopes of where rows end, row by row; `(B, P)`."""
+        count, rows, at = self.mean.shape[-1], self.mean.shape[0], slopes.components
+        values = slopes.values.unflatten(1, (-1, rows))
+        here, up, down = (values[range(len(at)), point].double() for point in (0 * at, 1 + at, 1 + count + at))
+        mean, scale = self.mean.movedim(-1, 0)[at], self.scale.movedim(-1, 0)[at]
+        by_row = torch.where(self.present, scale * (mean * here + (up - down) / 2), 0.0)
+        return by_row.sum(1).t() @ slopes.by_number
 
 
 def arrivals(ahead: Lookahead, data: Trajectories) -> Arrivals:
@@ -204,9 +238,13 @@ def channel_moments(program: Program, data: Trajectories, states: Tensor, contro
     """Means and standard deviations of rows' channels at states `(P, T, B, D)`, each `(P, T, B, C)`; `controls` are the
     acting ones, `(T + 1, B, U)` or `(P, T + 1, B, U)`, or as `acting` gives them."""
     controls = acting_controls(program, data) if controls is None else controls
+    return _moments_of_channels(program, states, controls[..., :-1, :, :], data.elapsed[:-1], data.steps)
+
+
+def _moments_of_channels(program: Program, states: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Moments:
     seen = Recording()
     with running(*states.shape[:-1]), seen, AtMean():
-        sample_channels(program, states, controls[..., :-1, :, :], data.elapsed[:-1], data.steps)
+        sample_channels(program, states, control, time, step)
     sites = (
         [as_vector(part, fn.event_dim).expand(*states.shape[:-1], -1) for part in normal_moments(fn, site)]
         for site, fn in seen.distributions.items()
@@ -302,42 +340,86 @@ def parameter_scores(program: Program, data: Trajectories, at: Smoothed, parts: 
     """Scores of a program's own parameters, `(B, P)`."""
     if not parts:
         return at.states.new_zeros((len(data), 0)).double()
-    score_of_moves = _of_channels(program, data, at) if program.substeps == 1 else _of_ends(program, data, at)
+    moving = _of_channels if program.substeps == 1 else _of_ends
+    return moving(program, data, at, parts) + _of_measurements(program, at, parts)
+
+
+def _of_channels(program: Program, data: Trajectories, at: Smoothed, parts: list[Element]) -> Tensor:
+    """The parameters' part in the channels' moments, `(B, P)`."""
+    points = at.channels.points
+
+    def moments(state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
+        mean, sd = _moments_of_channels(program, state, control, time, step)
+        return torch.cat([mean, sd.log()], -1)
+
+    slopes = slopes_on_all_rows(program, "moments", moments, _by_row(program, data, state=points), parts)
+    if isinstance(slopes, Slopes):
+        rows, count = at.channels.mean.shape[0], at.channels.mean.shape[-1]
+        return at.channels.of_slopes(slopes, (-slopes.function[:rows, :, count:]).exp())
+    _, spread = channel_moments(program, data, points[:1])
     columns = []
     for part in parts:
-        score = score_of_moves(part)
-        few_up, few_down = on_both_sides(part, lambda: measured(program, at.measurements.points[:1]))
+        up, down = on_both_sides(part, lambda: channel_moments(program, data, points))
+        of_mean = at.channels.of_mean((up[0] - down[0]) / (2 * part.step * spread))
+        columns.append(of_mean + at.channels.of_spread((up[1][0] / down[1][0]).log() / (2 * part.step)))
+    return torch.stack(columns, -1).double()
+
+
+def _of_ends(program: Program, data: Trajectories, at: Smoothed, parts: list[Element]) -> Tensor:
+    """The parameters' part in where rows end, `(B, P)`."""
+    arriving = arrivals(at.ahead, data)
+
+    def ends(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
+        return _row_ends(program, state, noise, control, time, step)
+
+    given = _by_row(program, data, state=arriving.states, noise=arriving.noise)
+    slopes = slopes_on_all_rows(program, "ends", ends, given, parts)
+    if isinstance(slopes, Slopes):
+        return arriving.of_slopes(slopes)
+    columns = []
+    for part in parts:
+        up, down = on_both_sides(part, lambda: arriving.ends(program, data))
+        columns.append(arriving.score(up - down) / (2 * part.step))
+    return torch.stack(columns, -1)
+
+
+def _of_measurements(program: Program, at: Smoothed, parts: list[Element]) -> Tensor:
+    """The parameters' part in what is measured, `(B, P)`."""
+    points, found = at.measurements.points, at.measurements
+
+    def readings(state: Tensor) -> Tensor:
+        there = measured(program, state)
+        return torch.cat([there.reading, there.spread.log().expand(there.reading.shape)], -1)
+
+    if not bool(torch.isfinite(measured(program, points[:1, :1, :1]).freedom).any()):
+        slopes = slopes_on_all_rows(program, "readings", readings, {"state": points.flatten(0, 1)}, parts)
+        if isinstance(slopes, Slopes):
+            return found.of_slopes(slopes, at.sharpness)
+    columns = []
+    for part in parts:
+        score = at.states.new_zeros(points.shape[2])
+        few_up, few_down = on_both_sides(part, lambda: measured(program, points[:1]))
         if not few_up.same(few_down):
-            width, here = 2 * part.step, measured(program, at.measurements.points)
-            up, down = on_both_sides(part, lambda: measured(program, at.measurements.points))
-            score = score + at.measurements.of_mean((here.shift(up) - here.shift(down)) * at.sharpness / width)
-            score = score + at.measurements.of_spread((up.spread[0] / down.spread[0]).log() / width)
+            width, here = 2 * part.step, measured(program, points)
+            up, down = on_both_sides(part, lambda: measured(program, points))
+            score = score + found.of_mean((here.shift(up) - here.shift(down)) * at.sharpness / width)
+            score = score + found.of_spread((up.spread[0] / down.spread[0]).log() / width)
             score = score + (_of_tails(here, up, at) - _of_tails(here, down, at)) / width
         columns.append(score)
     return torch.stack(columns, -1).double()
 
 
-def _of_channels(program: Program, data: Trajectories, at: Smoothed) -> Callable[[Element], Tensor]:
-    """How a parameter's part in the channels' moments is scored, `(B,)`."""
-    _, spread = channel_moments(program, data, at.channels.points[:1])
-
-    def score(part: Element) -> Tensor:
-        up, down = on_both_sides(part, lambda: channel_moments(program, data, at.channels.points))
-        of_mean = at.channels.of_mean((up[0] - down[0]) / (2 * part.step * spread))
-        return of_mean + at.channels.of_spread((up[1][0] / down[1][0]).log() / (2 * part.step))
-
-    return score
+def _by_row(program: Program, data: Trajectories, **along: Tensor) -> dict[str, Tensor]:
+    """Points `(P, T, B, ·)` and what the program is given there, with all rows of all points in front."""
+    given = {"control": acting_controls(program, data)[:-1], "time": data.elapsed[:-1], "step": data.steps}
+    count = len(next(iter(along.values())))
+    given = {name: value.expand(count, *value.shape) for name, value in given.items()}
+    return {name: value.flatten(0, 1) for name, value in (along | given).items()}
 
 
-def _of_ends(program: Program, data: Trajectories, at: Smoothed) -> Callable[[Element], Tensor]:
-    """How a parameter's part in where rows end is scored, `(B,)`."""
-    arriving = arrivals(at.ahead, data)
-
-    def score(part: Element) -> Tensor:
-        up, down = on_both_sides(part, lambda: arriving.ends(program, data))
-        return arriving.score(up - down) / (2 * part.step)
-
-    return score
+def _row_ends(program: Program, states: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
+    with running(*states.shape[:-1]), Standardised(noise):
+        return advance(program, states, control, time, step)
 
 
 def _of_tails(here: Measured, other: Measured, at: Smoothed) -> Tensor:

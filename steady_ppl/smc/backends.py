@@ -119,10 +119,10 @@ class _Methods:
             return (recording.total(),)
 
         noise = torch.zeros(*one, self.channels)
-        self.transition = Method(transition, {"state": first, "noise": noise}, inputs)
+        self.transition = Method(program, transition, {"state": first, "noise": noise}, inputs)
         measurement, observed = data.measurements[:1, :1].unsqueeze(0), torch.ones_like(data.observed[:1, :1])
         measured = {"measurement": measurement, "observed": observed.unsqueeze(0), "weight": torch.ones(())}
-        self.observe = Method(observe, {"state": first}, measured)
+        self.observe = Method(program, observe, {"state": first}, measured)
         if self.transition.values != self.results or self.observe.values != 1:
             raise NotCompilable("its results for one particle have other shapes: it mixes particles or trajectories")
 
@@ -133,7 +133,8 @@ class CompiledStepping(Stepping):
     def __init__(self, methods: _Methods, plain: Stepping) -> None:
         super().__init__(plain.program, plain.data, plain.observation_weight)
         self.methods, self.plain, self.event_dims = methods, plain, methods.event_dims
-        data, self.moving, self.observing = plain.data, methods.transition.parameters(), methods.observe.parameters()
+        data, program = plain.data, plain.program
+        self.moving, self.observing = methods.transition.parameters(program), methods.observe.parameters(program)
         moved = (plain.controls[:-1], data.elapsed[:-1, :, None], data.steps[..., None])
         self.moved = torch.cat(moved, -1).float().contiguous().numpy()
         weight = torch.as_tensor(self.observation_weight, dtype=torch.float32).expand(data.time.shape).unsqueeze(-1)

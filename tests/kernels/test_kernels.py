@@ -42,11 +42,12 @@ def kernel_of(
     names = [f"x{i}" for i in range(len(inputs))]
     particle = {name: one[:1, 0].clone() for name, one in zip(names, inputs, strict=True)}
     shared = {} if uniform is None else {"u": uniform[:1].clone()}
-    method = Method(lambda *values: (function(*values),), particle, shared, along=names if differentiate else ())
+    along = names if differentiate else ()
+    method = Method(nn.Module(), lambda *values: (function(*values),), particle, shared, along=along)
     out = torch.empty(len(method.graph.outputs), *inputs[0].shape)
     columns = (torch.zeros(len(inputs[0]), 1) if uniform is None else uniform[:, None]).numpy()
     given = [one.unsqueeze(0).contiguous().numpy() for one in inputs]
-    method.kernel(method.parameters(), columns, given, None, out.numpy())
+    method.kernel(method.parameters(nn.Module()), columns, given, None, out.numpy())
     return out[method.values :] if differentiate else out
 
 
@@ -258,7 +259,7 @@ def test_what_has_no_kernel_is_refused(function, says):
 def test_a_kernel_looks_its_first_input_up_at_the_ancestors():
     graph = ScalarGraph({"state": PARTICLE, "noise": PARTICLE})
     graph.outputs = [graph.scalar("add", graph.scalar("input", "state", 1), graph.scalar("input", "noise", 0))]
-    kernel = Kernel(source(graph, ["state", "noise"], {}), 2, 1)
+    kernel = Kernel("a sum", lambda: source(graph, ["state", "noise"], {}), 2, 1)
     torch.manual_seed(0)
     state, noise = torch.randn(2, 3, 40), torch.randn(1, 3, 40)
     ancestors = torch.randint(40, (3, 40))

@@ -1,0 +1,144 @@
+"""Kernels that programs share, and their derivatives in learnable numbers."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from examples import drives, example
+
+from steady_ppl import seeded
+from steady_ppl.discovery.curves import height
+from steady_ppl.gaussian.linearize import ReferencePath, linearize
+from steady_ppl.kernels import jit
+from steady_ppl.kernels.jit import Slopes, slopes_on_all_rows
+from steady_ppl.likelihood.parameters import elements, on_both_sides
+from steady_ppl.model.handlers import Standardised, running
+from steady_ppl.model.substeps import acting_controls, advance, with_substeps
+
+PROGRAMS = ["hovercraft.py:HovercraftTruth", "truck", "pendulum", "linear_gaussian"]
+
+
+@pytest.fixture(autouse=True)
+def compile_everything(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", 1)
+
+
+def ends(program):
+    """Where rows end."""
+
+    def function(state, noise, control, time, step):
+        with running(*state.shape[:-1]), Standardised(noise):
+            return advance(program, state, control, time, step)
+
+    return function
+
+
+def arguments(program, data):
+    rows, count = data.steps.shape
+    with seeded(1, "states"):
+        states = torch.randn(rows, count, len(program.states))
+        noise = torch.randn(rows, count, len(program.channels))
+    controls = acting_controls(program, data)[:-1]
+    return {"state": states, "noise": noise, "control": controls, "time": data.elapsed[:-1], "step": data.steps}
+
+
+@pytest.mark.parametrize("substeps", [1, 2])
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_slopes_are_the_differences_of_the_programs_own_lines(name: str, substeps: int):
+    program = with_substeps(example(name, torch.float32), substeps)
+    data = drives(program, 2, 9)
+    given = arguments(program, data)
+    parts = elements(program)
+    found = slopes_on_all_rows(program, "ends", ends(program), given, parts)
+    assert isinstance(found, Slopes), found
+    double = copy.deepcopy(program).double()
+    exact = [value.double() for value in given.values()]
+    for index, part in enumerate(elements(double)):
+        up, down = on_both_sides(part, lambda: ends(double)(*exact))
+        expected = (up - down) / (2 * part.step)
+        slope = torch.zeros_like(expected)
+        for component, values, by_number in zip(found.components, found.values, found.by_number, strict=True):
+            slope[..., component] += values.double() * by_number[index]
+        apart = (slope - expected).abs() > 1e-3 * expected.abs().max() + 1e-6
+        assert apart.double().mean() < 0.03, part.name  # a few rows stand at a limit, which differences step over
+
+
+def test_copies_share_a_kernel_and_have_their_own_numbers():
+    program = example("hovercraft.py:HovercraftTruth", torch.float32).with_effect("wind", (0.1, 0.2))
+    data = drives(program, 2, 9)
+    other = copy.deepcopy(program)
+    with torch.no_grad():
+        for parameter in other.parameters():
+            parameter += 0.1
+    path = ReferencePath(torch.randn(9, 2, 6), torch.randn(8, 2, 3))
+    for which in (program, other):
+        by_kernel, by_torch = (linearize(which, data, path, kernels=kernels) for kernels in (True, False))
+        assert by_kernel.in_plain_torch is None
+        torch.testing.assert_close(by_kernel.state, by_torch.state, rtol=1e-4, atol=2e-5)
+        torch.testing.assert_close(by_kernel.offset, by_torch.offset, rtol=1e-4, atol=2e-5)
+    kept = [name for name, _ in jit._COMPILED[type(program)]]
+    assert sorted(kept) == ["measure on all rows", "step on all rows"]
+
+
+def test_programs_with_the_same_effect_are_of_one_class():
+    program = example("hovercraft")
+    one = program.with_effect("linear_drag", 0.1)
+    variant = type(one).attached["linear_drag"]
+    assert type(program.with_effect(variant, 0.3)) is type(program.with_effect(variant, 0.5)) is type(one)
+    assert type(one.with_effect("wind")) is not type(one)
+
+
+class Hidden(type(example("hovercraft"))):
+    """What it does depends on a number that no signature tells."""
+
+    def __init__(self):
+        super().__init__()
+        self.hidden = {"drag": 0.0}
+
+    def transition(self, state, control, time, step):
+        return super().transition(state * (1 - self.hidden["drag"]), control, time, step)
+
+
+def test_a_program_that_differs_in_what_nothing_tells_is_not_run_by_the_others_kernel():
+    program = Hidden()
+    data = drives(program, 2, 9)
+    other = copy.deepcopy(program)
+    other.hidden["drag"] = 0.5
+    path = ReferencePath(torch.randn(9, 2, 6), torch.randn(8, 2, 3))
+    assert linearize(program, data, path).in_plain_torch is None
+    found, expected = linearize(other, data, path), linearize(other, data, path, kernels=False)
+    assert found.in_plain_torch == jit.DIFFERENT and torch.equal(found.state, expected.state)
+
+
+class InPlace(type(example("hovercraft"))):
+    """Writes into a tensor of its own, as torch allows."""
+
+    def transition(self, state, control, time, step):
+        moved = torch.zeros_like(state)
+        moved[..., :2] = state[..., :2]
+        moved[..., 2:] += state[..., 2:]
+        moved[..., 4].mul_(0.5)
+        return super().transition(moved, control, time, step)
+
+
+def test_a_program_that_writes_into_its_tensors_is_compiled():
+    program = InPlace()
+    data = drives(program, 2, 9)
+    path = ReferencePath(torch.randn(9, 2, 6), torch.randn(8, 2, 3))
+    found, expected = linearize(program, data, path), linearize(program, data, path, kernels=False)
+    assert found.in_plain_torch is None
+    torch.testing.assert_close(found.state, expected.state, rtol=1e-4, atol=2e-5)
+
+
+@pytest.mark.parametrize("circular", [False, True])
+def test_a_curve_is_straight_between_its_knots(circular: bool):
+    knots, heights = (-1.0, 0.0, 1.0, 2.0), torch.tensor([1.0, 3.0, -2.0, 0.5])
+    values = torch.tensor([-9.0, -1.0, -0.5, 0.0, 0.25, 1.5, 2.0, 2.5, float("nan")])
+    expected = torch.tensor([1.0, 1.0, 2.0, 3.0, 1.75, -0.75, 0.5, 0.5])
+    if circular:  # a turn is four: after the last knot comes the first
+        expected = torch.tensor([1.0, 1.0, 2.0, 3.0, 1.75, -0.75, 0.5, 0.75])
+    found = height(values, knots, circular, heights)
+    torch.testing.assert_close(found[:-1], expected)
+    assert bool(found[-1].isnan())
