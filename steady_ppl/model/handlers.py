@@ -18,6 +18,7 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.errors import ProgramError
+from steady_ppl.utils.shapes import broadcast_shapes
 
 
 class ByColumn(Messenger):
@@ -112,7 +113,7 @@ class Broadcasting(Messenger):
         if fn.batch_shape == self.left:
             return
         try:
-            message["fn"] = fn.expand(torch.broadcast_shapes(fn.batch_shape, self.left))
+            message["fn"] = fn.expand(broadcast_shapes(fn.batch_shape, self.left))
         except RuntimeError:
             raise ProgramError(
                 f"site {message['name']!r} has batch shape {tuple(fn.batch_shape)} and event shape "

@@ -27,6 +27,7 @@ from steady_ppl.model.handlers import (
 )
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import row_ends
+from steady_ppl.utils.shapes import broadcast_shapes
 
 Change = Callable[[Any, slice], Any]
 
@@ -124,7 +125,7 @@ class Coloured(Altering):
     def beside(self, state: Tensor) -> Tensor:
         """A state and the deviations side by side, `(..., D + C)`: the new ones where the row ends, else the last."""
         deviations = torch.cat(self.deviations, -1) if row_ends() else self.last
-        left = torch.broadcast_shapes(state.shape[:-1], deviations.shape[:-1])
+        left = broadcast_shapes(state.shape[:-1], deviations.shape[:-1])
         return torch.cat([state.expand(*left, -1), deviations.expand(*left, -1)], -1)
 
     def _pyro_post_sample(self, message: Any) -> None:

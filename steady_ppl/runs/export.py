@@ -12,6 +12,7 @@ from steady_ppl.gaussian.predict import errors
 from steady_ppl.model.handlers import AtMean, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting, advance
+from steady_ppl.utils.shapes import broadcast_shapes
 
 PROBED, PUSHES = 200, (1e-3, 1.0, -1e3)  # rows and sizes of a command that is looked for in what acts later
 
@@ -94,7 +95,7 @@ class Dynamics(nn.Module):
                 )
             past = controls[:0]
         try:
-            shape = torch.broadcast_shapes(state.shape[:-1], controls.shape[1:-1], past.shape[1:-1])
+            shape = broadcast_shapes(state.shape[:-1], controls.shape[1:-1], past.shape[1:-1])
         except RuntimeError:
             told = ", ".join(str(tuple(values.shape)) for values in (state, controls, past))
             raise UsageError(f"state, controls and past of shapes {told} do not go together") from None
