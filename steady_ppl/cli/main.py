@@ -5,6 +5,7 @@ Exit codes: 0 done, 1 the computation failed or was interrupted, 2 bad usage or 
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from steady_ppl.cli.progress import progress_line
 from steady_ppl.errors import SteadyError
 from steady_ppl.utils.progress import listening
 from steady_ppl.utils.text import commanded, one_line, quietly, say, tell
+from steady_ppl.utils.threads import ONE_THREAD
 
 INTERRUPTED = 130  # what typer returns for Ctrl-C
 # left out of the help, which then fits one screen; as --debug, which the line of an unexpected error names
@@ -194,7 +196,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run() -> None:
-    """The console script."""
+    """The console script. Its process has one thread, whatever the environment says; see `utils.threads`."""
+    os.environ.update(ONE_THREAD)  # before torch and numpy load
     sys.exit(main())
 
 

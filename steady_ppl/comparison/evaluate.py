@@ -27,8 +27,10 @@ from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import aligned
+from steady_ppl.utils.threads import one_thread
 
 
+@one_thread()
 def evaluate(
     fit: Fit,
     table: Trajectories,

@@ -34,12 +34,14 @@ from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
+from steady_ppl.utils.threads import one_thread
 
 SECONDS = (1.0, 3.0)
 MAX_RESIDUAL_SD = 4.0
 """Standard deviations of a single residual; beside a landmark the linearised program knows no more."""
 
 
+@one_thread()
 @torch.no_grad()
 def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0) -> Check:
     """Compare a fitted program with measurements.

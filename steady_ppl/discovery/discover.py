@@ -32,12 +32,14 @@ from steady_ppl.runs.recipes import fingerprint
 from steady_ppl.utils.journal import journal
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
+from steady_ppl.utils.threads import one_thread
 
 FITTED_FURTHER = 10.0  # nats that fitting a run further may gain before it is said
 FEWEST_DRIVES, FEWEST_SETS = 5, 50
 NOT_CONVERGED = "the program's own fit has not converged: no ranking below is to be trusted"
 
 
+@one_thread()
 def discover(
     program: Program | Fit,
     train: Trajectories,

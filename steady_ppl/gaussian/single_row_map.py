@@ -17,11 +17,13 @@ from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.model.handlers import broadcast_event, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.validate import step_size
+from steady_ppl.utils.threads import one_thread
 
 DAMPING = 1e-2  # of the first step, relative to the curvature
 AT_ONCE = 50_000  # rows of all places and drives
 
 
+@one_thread()
 @torch.no_grad()
 def fixes(program: Program, data: Trajectories, *, places: int = 32, passes: int = 20) -> Tensor:
     """The most probable state of each row given its own measurements.

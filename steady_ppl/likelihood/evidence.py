@@ -22,8 +22,10 @@ from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.smc.filter import particle_filter
 from steady_ppl.smc.genealogy import Filtered
+from steady_ppl.utils.threads import one_thread
 
 
+@one_thread()
 def run_filter(
     program: Program,
     data: Trajectories,
@@ -158,11 +160,13 @@ def evidence(
     return Evidence(torch.cat(values), torch.cat(scarce))
 
 
+@one_thread()
 def log_likelihood(program: Program, data: Trajectories, **settings: Any) -> Tensor:
     """The estimate of `evidence`, `(B,)`; settings and errors are its."""
     return evidence(program, data, **settings).log_likelihood
 
 
+@one_thread()
 def smoothed_states(program: Program, data: Trajectories, *, known_start: bool) -> Tensor:
     """Posterior means of the states given all measurements.
 

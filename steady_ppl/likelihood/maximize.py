@@ -29,6 +29,7 @@ from steady_ppl.likelihood.scores import parameter_scores, smoothed, widens
 from steady_ppl.model.program import Program
 from steady_ppl.utils.journal import Piece, piece
 from steady_ppl.utils.progress import stages
+from steady_ppl.utils.threads import one_thread
 
 PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
 STALLED_PASSES = 30  # linearisations a step once no share of a step was accepted: some path swings about its mode
@@ -360,6 +361,7 @@ def _updated(information: Tensor, step: Tensor, fall: Tensor) -> Tensor:
     return information - torch.outer(through, through) / expected + torch.outer(fall, fall) / seen
 
 
+@one_thread()
 def fit_by_likelihood(program: Program, data: Trajectories, *, known_start: bool = False) -> Maximum:
     """Move a program's parameters, in place, to where log p(y) of the linearised program plus the log prior is largest.
 

@@ -29,6 +29,7 @@ from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
+from steady_ppl.utils.threads import one_thread
 
 if TYPE_CHECKING:
     import arviz
@@ -74,6 +75,7 @@ class ParameterPosterior:
         return arviz.from_dict(posterior={name: draws[None] for name, draws in columns})
 
 
+@one_thread()
 @torch.no_grad()
 def parameter_posterior(
     program: Program,

@@ -14,8 +14,10 @@ from steady_ppl.reporting.drives import chosen, given, maps, of_run
 from steady_ppl.reporting.html import Report
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.progress import stages
+from steady_ppl.utils.threads import one_thread
 
 
+@one_thread()
 def report(
     runs: Mapping[str, Fit],
     data: Trajectories,

@@ -26,6 +26,7 @@ from steady_ppl.training.loop import Trained
 from steady_ppl.utils.files import whole_file
 from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.tensor_files import read_tensors, write_tensors
+from steady_ppl.utils.threads import one_thread
 
 if TYPE_CHECKING:
     import arviz
@@ -100,6 +101,7 @@ class Fit(Displayed):
         with run_folder(folder, force=force) as opened:
             self.save_into(opened, train)
 
+    @one_thread()
     def save_into(
         self, folder: Path, train: Trajectories | None = None, begun: Mapping[str, Any] | None = None
     ) -> None:

@@ -25,6 +25,7 @@ from steady_ppl.utils.angles import draws_on_one_turn, paths_on_one_turn
 from steady_ppl.utils.files import whole_file
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
+from steady_ppl.utils.threads import one_thread
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", FutureWarning)  # an advertisement of arviz 1, once a day
@@ -36,6 +37,7 @@ INTERVAL = (0.05, 0.95)
 SUFFIXES = (".csv", ".parquet", ".nc")
 
 
+@one_thread()
 def posterior(
     program: Program,
     data: Trajectories,
@@ -204,6 +206,7 @@ def netcdf(draws: arviz.InferenceData) -> memoryview:
     return draws.to_datatree().to_netcdf(None, engine="h5netcdf")
 
 
+@one_thread()
 @torch.no_grad()
 def forecast(
     program: Program,

@@ -20,6 +20,7 @@ from steady_ppl.runs.fit import Fit, program_source, sha256, versions
 from steady_ppl.runs.folder import CHECKPOINT, require_same, run_folder, write_record
 from steady_ppl.runs.workbench import workbench
 from steady_ppl.utils.tensor_files import read_tensors
+from steady_ppl.utils.threads import one_thread
 
 Recipe = Callable[..., Fit]
 KINDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a word", "None": "none"}
@@ -88,6 +89,7 @@ def trains(recipe: Recipe) -> bool:
     return any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
 
 
+@one_thread()
 def run_recipe(
     name: str,
     program: Program,

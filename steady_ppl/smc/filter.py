@@ -27,6 +27,7 @@ from steady_ppl.smc.backends import Stepping, stepping_for
 from steady_ppl.smc.genealogy import Filtered, event_dims
 from steady_ppl.smc.proposal import Proposal
 from steady_ppl.smc.resampling import Resampler, effective_sample_size, normalise, systematic, take
+from steady_ppl.utils.threads import one_thread
 
 STEPS_WORTH_COMPILING = 1_000_000  # steps of particles, which take the program's own lines a second
 OnFrame = Callable[[int, Tensor, Tensor, Tensor], None]
@@ -210,6 +211,7 @@ class ParticleFilter:
         return torch.where(self.inside[row], values, 0.0) if self.ended[row] else values
 
 
+@one_thread()
 @torch.no_grad()
 def particle_filter(
     program: Program,

@@ -18,8 +18,10 @@ from steady_ppl.smc.filter import roll_out
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import one_line
+from steady_ppl.utils.threads import one_thread
 
 
+@one_thread()
 @torch.no_grad()
 def simulate(
     program: Program,

@@ -26,12 +26,11 @@ from steady_ppl.studies import job as work
 from steady_ppl.studies.fingerprints import JobFiles
 from steady_ppl.studies.plan import Job
 from steady_ppl.utils.text import one_line, shown
+from steady_ppl.utils.threads import ONE_THREAD
 
 Row = dict[str, Any]
 Say = Callable[[str], None]
 
-THREADS = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")
-ONE_THREAD = dict.fromkeys([*(f"{name}_NUM_THREADS" for name in THREADS), "VECLIB_MAXIMUM_THREADS"], "1")
 WORKER_WAIT = 30  # s for the first worker, and between looks at whether there still is one
 MAX_UNLOADED = 3  # processes in a row that die while they load, after which no other is started
 TRIES = 3  # of a job whose workers die; the scheduler itself tries it so often as it is set, four times at first

@@ -31,6 +31,7 @@ from steady_ppl.studies.fingerprints import PARTS, TABLES, JobFiles, is_program
 from steady_ppl.studies.plan import HELD_OUT, IN_LIMITS, Job
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import one_line
+from steady_ppl.utils.threads import one_thread
 
 ERRORS = ("forward", "forward_mean", "state_estimation")
 CHANGED = "its program, recipe or table is not what it was when the study was begun: the same command tries it again"
@@ -45,8 +46,7 @@ def run(job: Job) -> dict[str, Any]:
         most memory that this process took: on Linux during the job, else until its end), `packages` with their
         versions and the figures.
     """
-    with _one_at_a_time:
-        torch.set_num_threads(1)
+    with _one_at_a_time, one_thread():
         began = time.perf_counter()
         _forget_peak()
         try:

@@ -26,6 +26,7 @@ from steady_ppl.smc.filter import STEPS_WORTH_COMPILING
 from steady_ppl.training.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import tell
+from steady_ppl.utils.threads import one_thread
 
 SEVERAL = 10  # validations are in a training
 SETTLED = 1.0  # nats a drive by which held-out log p(y) may rise at the end of a training that has converged
@@ -122,6 +123,7 @@ class Trained:
         return risen if risen > SETTLED else None
 
 
+@one_thread()
 def train(
     program: Program,
     guide: Guide,
