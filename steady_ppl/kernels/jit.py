@@ -21,8 +21,7 @@ from steady_ppl.kernels.store import machine_code
 from steady_ppl.utils.text import one_line
 
 TRACES = 32  # of one method of programs of one class; each takes some hundredths of a second
-SELDOM = 16
-"""Of one program's runs on all rows those are compared with torch whose number is a power of two or a multiple of it."""
+SELDOM = 16  # of a program's runs on all rows: those of this number, its multiples and powers of two are compared
 KERNELS = 256  # that are kept in memory
 FEW = 1000  # numbers of a tensor that are looked at one by one
 ROWS_WORTH_COMPILING = 1000  # of all trajectories together
