@@ -5,8 +5,8 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import itertools
-from collections import ChainMap, Counter, OrderedDict
-from collections.abc import Callable, Sequence
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol, TypeVar
 from weakref import WeakKeyDictionary
 
@@ -31,6 +31,7 @@ Compiled = TypeVar("Compiled")
 Array = np.ndarray
 Examples = dict[str, Tensor]  # of the arguments of a function
 _COMPILED: WeakKeyDictionary[type[nn.Module], dict[Any, Any]] = WeakKeyDictionary()
+_NAMES: WeakKeyDictionary[type[nn.Module], list[tuple[type, list[str]]]] = WeakKeyDictionary()
 _RUNS: WeakKeyDictionary[nn.Module, Counter[str]] = WeakKeyDictionary()
 
 
@@ -235,10 +236,10 @@ def signature(program: nn.Module) -> tuple[Any, ...]:
     settings = [
         (at, name, _content(value) if isinstance(value, Tensor) else repr(value))
         for at, module in program.named_modules()
-        for name, value in _settings(module).items()
+        for name, value in _settings(module)
         if isinstance(value, bool | int | float | str | tuple | list | Tensor)
     ]
-    shapes = tuple((name, tuple(tensor.shape), tensor.dtype) for name, tensor in _tensors(program).items())
+    shapes = tuple((name, tensor.shape, tensor.dtype) for name, tensor in _tensors(program).items())
     return shapes, tuple(settings)
 
 
@@ -247,10 +248,26 @@ def _content(tensor: Tensor) -> Any:
     return (tuple(tensor.shape), *tensor.flatten().tolist()) if tensor.numel() <= FEW else id(tensor)
 
 
-def _settings(module: nn.Module) -> dict[str, Any]:
+def _settings(module: nn.Module) -> Iterator[tuple[str, Any]]:
     """A module's attributes: its own, its class's and its bases'."""
-    own = itertools.takewhile(lambda base: base is not nn.Module, type(module).__mro__)
-    return dict(ChainMap(vars(module), *(dict(vars(base)) for base in own if not base.__module__.startswith("torch."))))
+    own = vars(module)
+    yield from own.items()
+    kind = type(module)
+    if kind not in _NAMES:
+        _NAMES[kind] = _names_of(kind)
+    for base, names in _NAMES[kind]:
+        yield from ((name, vars(base)[name]) for name in names if name not in own and name in vars(base))
+
+
+def _names_of(kind: type[nn.Module]) -> list[tuple[type, list[str]]]:
+    """The settings among the attributes of a class, each in the first of its bases that has it."""
+    found, known = [], set[str]()
+    for base in itertools.takewhile(lambda base: base is not nn.Module, kind.__mro__):
+        names = [name for name in vars(base) if name not in known and not name.startswith("__")]
+        known.update(names)
+        if not base.__module__.startswith("torch."):
+            found.append((base, [name for name in names if not callable(vars(base)[name])]))
+    return found
 
 
 def close(mine: Tensor, theirs: Tensor) -> bool:
