@@ -5,15 +5,16 @@ exp(c − ½ δᵀ Λ δ + λᵀ δ) in deviations δ from the path. Sampling ea
 where it leads draws from the posterior, forward in time: the optimal twist of Guarniero, Johansen and Lee (2017) and of
 Whiteley and Lee (2014), and with a linear program the smoother itself.
 
-The recursions are compiled, on numpy arrays in double precision; rows or intervals first, trajectories second. A
-matrix that is not positive definite turns into NaN, which log p(y) then shows.
+The recursions are compiled, on numpy arrays in double precision, eight trajectories at once, see `lanes`; rows or
+intervals first, blocks of trajectories second. A matrix that is not positive definite turns into NaN, which log p(y)
+then shows.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,20 +22,40 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from steady_ppl.gaussian.lanes import (
+    LANES,
+    add_dot,
+    add_gram,
+    add_outer,
+    add_product,
+    in_lanes,
+    out_of_lanes,
+    set_scaled,
+)
 from steady_ppl.gaussian.linearize import LinearArrays, Linearization
-from steady_ppl.gaussian.matrices import Array, add_product, add_times, array, arrays, propagate, set_product, set_times
+from steady_ppl.gaussian.matrices import Array
 
 
 class Potential(NamedTuple):
-    """exp(c − ½ δᵀ Λ δ + λᵀ δ) of every row: Λ `(T + 1, B, D, D)`, λ `(T + 1, B, D)` and c `(T + 1, B)`."""
+    """exp(c − ½ δᵀ Λ δ + λᵀ δ) of a state in lanes: Λ `(..., D, D, LANES)`, λ `(..., D, 1, LANES)` and c
+    `(..., 1, 1, LANES)`."""
 
     precision: Array
     information: Array
     log_scale: Array
 
+    @classmethod
+    def empty(cls, *left: int, dimension: int) -> Potential:
+        return cls(
+            np.empty((*left, dimension, dimension, LANES)),
+            np.empty((*left, dimension, 1, LANES)),
+            np.empty((*left, 1, 1, LANES)),
+        )
+
 
 class Steering(NamedTuple):
-    """Noise that leads to the later measurements, ε ~ N(shift − gain δ, factor factorᵀ); tensors or arrays.
+    """Noise that leads to the later measurements, ε ~ N(shift − gain δ, factor factorᵀ); tensors, or arrays in lanes,
+    whose shift is a matrix of one column.
 
     Attributes:
         shift: `(..., C)`.
@@ -47,14 +68,21 @@ class Steering(NamedTuple):
     factor: Any
 
     @classmethod
-    def empty(cls, noise: Tensor) -> Steering:
-        """Room in the host's memory for the steering of noise that enters by `(..., D, C)`."""
-        *left, dimension, channels = noise.shape
-        shapes = ((channels,), (channels, dimension), (channels, channels))
-        return cls(*(torch.empty(*left, *shape, dtype=noise.dtype) for shape in shapes))
+    def in_lanes(cls, *left: int, dimension: int, channels: int) -> Steering:
+        """Room for arrays."""
+        return cls(*(np.empty((*left, channels, columns, LANES)) for columns in (1, dimension, channels)))
 
-    def to(self, device: torch.device) -> Steering:
-        return Steering(*(part.to(device) for part in self))
+    def tensors(self, like: Tensor) -> Steering:
+        """Out of lanes, of as many trajectories as `(..., B, D)` has, on its device."""
+        shift, gain, factor = (out_of_lanes(part, like.shape[-2]).to(like.device) for part in self)
+        return Steering(shift.squeeze(-1), gain, factor)
+
+
+class InLanes(NamedTuple):
+    """A linearization and the steering of its intervals."""
+
+    given: LinearArrays
+    steps: Steering
 
 
 @dataclass(frozen=True)
@@ -71,6 +99,7 @@ class Lookahead:
         starts: steering of the start's noise, `(W, B, ...)`, its deviation zero.
         steps: of every interval's noise, `(T, B, ...)`.
         log_likelihood: log p(y) of the linearised program, `(B,)`, observations tempered as in the linearization.
+        lanes: what the recursions read of it.
     """
 
     linearization: Linearization
@@ -82,11 +111,19 @@ class Lookahead:
     starts: Steering
     steps: Steering
     log_likelihood: Tensor
+    lanes: InLanes = field(repr=False)
 
     def means(self) -> tuple[Tensor, Tensor]:
         """Posterior means of the linearised program, on the path's own turn: states `(T + 1, B, D)` and noise
         `(T, B, C)`."""
-        return self._forward(self.starts.shift[0], torch.zeros_like(self.steps.shift))
+        deviations, noise = self.means_in_lanes()
+        moved = self._tensor(deviations).squeeze(-1)
+        return self.linearization.path.states + moved, self._tensor(noise).squeeze(-1)
+
+    def means_in_lanes(self) -> tuple[Array, Array]:
+        """The means, of the states less the path's: `(T + 1, blocks, D, 1, LANES)`; and `(T, blocks, C, 1, LANES)`."""
+        states, noise = self._forward(self.starts.shift[:1], self.lanes.steps.shift[None].copy())
+        return states[0], noise[0]
 
     def draws(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
         """Independent draws of the linearised program's posterior.
@@ -102,72 +139,72 @@ class Lookahead:
         start = shift + _times(factor, torch.randn_like(shift))
         turns = self.windings[winding]
         random = torch.randn(count, *self.steps.shift.shape, dtype=shift.dtype, device=shift.device)
-        states, noise = self._forward(start, _times(self.steps.factor, random), turns)
-        return start, states + (turns + self.linearization.start_turn).unsqueeze(1), noise
+        noise = self.steps.shift + _times(self.steps.factor, random)
+        rolled = self._forward(start, in_lanes(noise.unsqueeze(-1)), turns)
+        states, noise = (self._tensor(part).squeeze(-1) for part in rolled)
+        turned = self.linearization.path.states + (turns + self.linearization.start_turn).unsqueeze(1)
+        return start, turned + states, noise
 
     def covariances(self) -> tuple[Tensor, Tensor, Tensor]:
         """Posterior covariances on the path's own turn: of the states, `(T + 1, B, D, D)`, of the noise of each
         interval, `(T, B, C, C)`, and of the state that it moves with it, `(T, B, D, C)`."""
-        linear, steps = self.linearization, self.steps
-        spread = linear.start_noise @ self.starts.factor[0]
-        rows, (trajectories, dimension, channels) = len(linear.offset) + 1, linear.noise.shape[1:]
-        shapes = ((rows, dimension, dimension), (rows - 1, channels, channels), (rows - 1, dimension, channels))
-        found = [linear.offset.new_empty((shape[0], trajectories, *shape[1:]), device="cpu") for shape in shapes]
-        found[0][0] = spread @ spread.mT
-        covariances(linear.arrays(), array(steps.gain), array(steps.factor), arrays(*found))
-        states, noises, across = (part.to(linear.offset.device) for part in found)
+        states, noises, across = (self._tensor(part) for part in self.covariances_in_lanes())
         return states, noises, across
 
-    def _forward(self, start: Tensor, random: Tensor, turns: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
-        """States and noise of the linearised program for standard normals; `start` is the start's noise itself."""
-        linear, steps = self.linearization, self.steps
+    def covariances_in_lanes(self) -> tuple[Array, Array, Array]:
+        spread = self.linearization.start_noise @ self.starts.factor[0]
+        return covariances(self.lanes.given, self.lanes.steps, in_lanes(spread @ spread.mT))
+
+    def _forward(self, start: Tensor, noise: Array, turns: Tensor | float = 0.0) -> tuple[Array, Array]:
+        """States, less the path's, and noise in lanes: what the start's noise `(M, B, C₀)` and each interval's at a
+        deviation of zero lead to."""
+        linear = self.linearization
         begin = linear.start_offset + _times(linear.start_noise, start) - turns
-        random = steps.shift + random
-        moved = linear.state - linear.noise @ steps.gain  # δ' = moved δ + pushed
-        pushed = linear.offset + _times(linear.noise, random)
-        deviations = begin.new_empty((*pushed.shape[:-3], len(moved) + 1, *begin.shape[-2:]), device="cpu")
-        deviations[..., 0, :, :] = begin
-        draws, filled = (values.reshape(-1, *values.shape[-3:]) for values in (pushed, deviations))
-        roll_out(array(moved), array(draws), filled.numpy())
-        deviations = deviations.to(begin.device)
-        return linear.path.states + deviations, random - _times(steps.gain, deviations[..., :-1, :, :])
+        return roll_out(self.lanes.given, self.lanes.steps.gain, in_lanes(begin.unsqueeze(-1)), noise), noise
+
+    def _tensor(self, blocks: Array) -> Tensor:
+        linear = self.linearization
+        return out_of_lanes(blocks, linear.offset.shape[1]).to(linear.offset.device)
 
 
 def look_ahead(linear: Linearization) -> Lookahead:
     """Run the backward information filter."""
-    weighted = linear.measurement * linear.precision.unsqueeze(-1)
-    seen = (
-        weighted.mT @ linear.measurement,
-        _times(weighted.mT, linear.residual),
-        linear.log_scale - 0.5 * (linear.precision * linear.residual.square()).sum(-1),
-    )
-    futures, steps = tuple(torch.empty_like(part, device="cpu") for part in seen), Steering.empty(linear.noise)
-    given = linear.arrays()
-    backward(given, Potential(*arrays(*seen)), Potential(*arrays(*futures)), Steering(*arrays(*steps)))
-    device = linear.offset.device
-    precision, information, log_scale = (part.to(device) for part in futures)
+    device, (trajectories, dimension, starting) = linear.offset.device, linear.start_noise.shape
+    given = _in_lanes(linear)
+    rows, blocks, *_ = given.measurement.shape
+    futures = Potential.empty(rows, blocks, dimension=dimension)
+    steps = Steering.in_lanes(rows - 1, blocks, dimension=dimension, channels=linear.noise.shape[-1])
+    first = backward(given, in_lanes(linear.log_scale[..., None, None]), futures, steps)
     windings = _windings(linear)
     offsets = linear.start_offset - windings.unsqueeze(1)
-    starts = Steering.empty(linear.start_noise.expand(len(windings), *linear.start_noise.shape))
-    masses = torch.empty(offsets.shape[:-1], dtype=offsets.dtype)
-    ahead = (precision[0] + seen[0][0], information[0] + seen[1][0], log_scale[0] + seen[2][0])
-    first, filled = Potential(*arrays(*ahead)), Steering(*arrays(*starts))
-    integrate_starts(given, first, array(offsets), filled, masses.numpy())
-    spread = (linear.start_noise @ starts.factor[0].to(device)).square().sum(-1)[:, list(linear.angles)]
-    vague = (spread > 1).any(-1).cpu()  # the measurements leave an angle open: one turn's integral covers the others
-    masses[1:, vague] = -torch.inf
+    begun = Steering.in_lanes(len(windings), blocks, dimension=dimension, channels=starting)
+    totals = integrate_starts(given.start_noise, first, in_lanes(offsets.unsqueeze(-1)), begun)
+    masses = out_of_lanes(totals, trajectories).flatten(1).to(device)
+    starts = begun.tensors(linear.start_offset)
+    if len(windings) > 1:
+        spread = (linear.start_noise[:, list(linear.angles)] @ starts.factor[0]).square().sum(-1)
+        vague = (spread > 1).any(-1)  # the measurements leave an angle open: one turn's integral covers the others
+        masses[1:].masked_fill_(vague, -torch.inf)
     log_likelihood = masses.logsumexp(0)
+    precision, information, log_scale = (out_of_lanes(part, trajectories).to(device) for part in futures)
     return Lookahead(
         linearization=linear,
         precision=precision,
-        information=information,
-        log_scale=log_scale,
+        information=information.squeeze(-1),
+        log_scale=log_scale.flatten(1),
         windings=windings,
-        winding_masses=(masses - log_likelihood).to(device),
-        starts=starts.to(device),
-        steps=steps.to(device),
-        log_likelihood=log_likelihood.to(device),
+        winding_masses=masses - log_likelihood,
+        starts=starts,
+        steps=steps.tensors(linear.offset),
+        log_likelihood=log_likelihood,
+        lanes=InLanes(given, steps),
     )
+
+
+def _in_lanes(linear: Linearization) -> LinearArrays:
+    matrices = ("start_noise", "state", "noise", "measurement")
+    parts = ((name, getattr(linear, name)) for name in LinearArrays._fields)
+    return LinearArrays(*(in_lanes(part if name in matrices else part.unsqueeze(-1)) for name, part in parts))
 
 
 def _windings(linear: Linearization) -> Tensor:
@@ -188,137 +225,193 @@ def _times(matrix: Tensor, vectors: Tensor) -> Tensor:
     return (matrix @ vectors.movedim(0, -1)).movedim(-1, 0)
 
 
-@njit(cache=True, error_model="numpy")
-def integrate(precision: Array, information: Array, noise: Array, offset: Array, out: Steering) -> float:
-    """∫ ψ(μ + offset + G ε) N(ε; 0, I) dε as a function of μ, and the noise's conditional given μ.
+class Room(NamedTuple):
+    """What `integrate` works in: to allocate takes as long as a product."""
 
-    ψ(x) = exp(−½ xᵀ Λ x + λᵀ x). With S = (I + GᵀΛG)⁻¹ and u = λ − Λ offset the integral is again of that form, with
-    Λ − ΛGSGᵀΛ and u − ΛGSGᵀu, times a constant; and ε | μ ~ N(S Gᵀ(u − Λμ), S).
+    pushed: Array
+    by_noise: Array
+    pull: Array
+    gram: Array
+    root: Array
+    half: Array
+    white: Array
+
+
+@njit(cache=True, error_model="numpy")
+def _room(dimension: int, channels: int) -> Room:
+    square, wide = (channels, channels, LANES), (channels, dimension, LANES)
+    return Room(
+        pushed=np.zeros((dimension, 1, LANES)),
+        by_noise=np.zeros(wide),
+        pull=np.zeros((channels, 1, LANES)),
+        gram=np.zeros(square),
+        root=np.zeros(square),
+        half=np.zeros(wide),
+        white=np.zeros((channels, 1, LANES)),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def integrate(ahead: Potential, noise: Array, offset: Array, out: Steering, room: Room) -> None:
+    """∫ ψ(μ + offset + G ε) N(ε; 0, I) dε as a function of μ, and the noise's conditional given μ; in lanes.
+
+    ψ(x) = exp(c − ½ xᵀ Λ x + λᵀ x). With S = (I + GᵀΛG)⁻¹ and u = λ − Λ offset the integral is again of that form,
+    with Λ − ΛGSGᵀΛ and u − ΛGSGᵀu, times a constant; and ε | μ ~ N(S Gᵀ(u − Λμ), S).
 
     Args:
-        precision, information: Λ `(D, D)` and λ `(D,)`, overwritten by those of the integral.
-        noise, offset: G `(D, C)` and `(D,)`.
+        ahead: c, Λ and λ, overwritten by those of the integral.
+        noise, offset: G `(D, C, LANES)` and `(D, 1, LANES)`.
         out: filled with ε ~ N(shift − gain μ, factor factorᵀ).
-
-    Returns:
-        The logarithm of the constant.
+        room: from `_room`.
     """
-    dimension, channels = noise.shape
-    constant = 0.0
-    pushed = np.zeros(dimension)
-    add_times(pushed, precision, offset)
-    for i in range(dimension):
-        constant += (information[i] - 0.5 * pushed[i]) * offset[i]
-        information[i] -= pushed[i]
-    # root rootᵀ = I + GᵀΛG; the columns of `half` are root⁻¹ (Gᵀu, GᵀΛ), by forward substitution
-    half, root = np.zeros((channels, 1 + dimension)), np.eye(channels)
-    by_noise = half[:, 1:]
-    add_product(by_noise, noise.T, precision.T)
-    add_product(root, noise.T, by_noise.T)
-    add_times(half[:, 0], noise.T, information)
+    precision, information, log_scale = ahead
+    channels = len(out.factor)
+    pushed, by_noise, pull, gram, root, half, white = room
+    for part in room:
+        part[:] = 0.0
+    for part in out:
+        part[:] = 0.0
+    add_gram(log_scale, information, offset, 1.0)
+    add_product(pushed, precision, offset, 1.0)
+    add_gram(log_scale, pushed, offset, -0.5)
+    information -= pushed
+    add_gram(by_noise, noise, precision, 1.0)
+    add_product(gram, by_noise, noise, 1.0)
+    add_gram(pull, noise, information, 1.0)
+    # root rootᵀ = I + GᵀΛG, and factor = root⁻ᵀ
     for a in range(channels):
         for b in range(a):
-            for c in range(b):
-                root[a, b] -= root[a, c] * root[b, c]
-            root[a, b] /= root[b, b]
-        for c in range(a):
-            root[a, a] -= root[a, c] * root[a, c]
-        root[a, a] = math.sqrt(root[a, a])
-        constant -= math.log(root[a, a])
-    for a in range(channels):
-        for i in range(1 + dimension):
-            for b in range(a):
-                half[a, i] -= root[a, b] * half[b, i]
-            half[a, i] /= root[a, a]
-        constant += 0.5 * half[a, 0] * half[a, 0]
-    add_times(information, by_noise.T, half[:, 0], -1.0)
-    add_product(precision, by_noise.T, by_noise, -1.0)
-    # back substitution: root⁻ᵀ (half, I)
-    out.shift[:], out.gain[:], out.factor[:] = half[:, 0], by_noise, np.eye(channels)
-    for a in range(channels - 1, -1, -1):
-        for b in range(a + 1, channels):
-            out.shift[a] -= root[b, a] * out.shift[b]
-            for i in range(dimension):
-                out.gain[a, i] -= root[b, a] * out.gain[b, i]
-            for c in range(channels):
-                out.factor[a, c] -= root[b, a] * out.factor[b, c]
-        out.shift[a] /= root[a, a]
-        for i in range(dimension):
-            out.gain[a, i] /= root[a, a]
-        for c in range(channels):
-            out.factor[a, c] /= root[a, a]
-    return constant
-
-
-@njit(cache=True, error_model="numpy")
-def integrate_starts(given: LinearArrays, ahead: Potential, offset: Array, steering: Steering, total: Array) -> None:
-    """`integrate` for every start: of each trajectory `(B, ...)`, on each of several turns.
-
-    `ahead` is what all rows' measurements say of the first state. The offsets are `(W, B, D)`. Fills the steering and
-    the logarithm of the integral, `(W, B)`.
-    """
-    for w in range(offset.shape[0]):
-        for b in range(offset.shape[1]):
-            out = Steering(steering.shift[w, b], steering.gain[w, b], steering.factor[w, b])
-            precision, information = ahead.precision[b].copy(), ahead.information[b].copy()
-            total[w, b] = ahead.log_scale[b] + integrate(
-                precision, information, given.start_noise[b], offset[w, b], out
+            add_dot(root, a * channels + b, gram, a * channels, 1, out.factor, b, channels, b + 1, 1.0)
+        add_dot(gram, a * channels + a, root, a * channels, 1, root, a * channels, 1, a, -1.0)
+        pivot, scale = gram[a, a], out.factor[a, a]
+        for lane in range(LANES):
+            log_scale[0, 0, lane] -= 0.5 * math.log1p(pivot[lane])
+            scale[lane] = 1.0 / math.sqrt(1.0 + pivot[lane])
+        for b in range(a):
+            add_dot(
+                out.factor, b * channels + a, out.factor, b * channels + b, 1, root, a * channels + b, 1, a - b, -1.0
             )
+            out.factor[b, a] *= scale
+    # root⁻¹ (GᵀΛ, Gᵀu), and root⁻ᵀ times these
+    add_gram(half, out.factor, by_noise, 1.0)
+    add_gram(white, out.factor, pull, 1.0)
+    add_gram(log_scale, white, white, 0.5)
+    add_gram(information, half, white, -1.0)
+    add_gram(precision, half, half, -1.0)
+    add_product(out.shift, out.factor, white, 1.0)
+    add_product(out.gain, out.factor, half, 1.0)
 
 
 @njit(cache=True, error_model="numpy")
-def backward(given: LinearArrays, seen: Potential, futures: Potential, steering: Steering) -> None:
+def integrate_starts(noise: Array, ahead: Potential, offset: Array, steering: Steering) -> Array:
+    """`integrate` for every start: of each block of trajectories, on each of several turns.
+
+    `ahead` is what all rows' measurements say of the first state. The offsets are `(W, blocks, D, 1, LANES)`. Fills the
+    steering, and returns the logarithm of the integral, `(W, blocks, 1, 1, LANES)`.
+    """
+    total, room = np.empty((*offset.shape[:2], 1, 1, LANES)), _room(*noise.shape[1:3])
+    for w in range(offset.shape[0]):
+        for k in range(offset.shape[1]):
+            out = Steering(steering.shift[w, k], steering.gain[w, k], steering.factor[w, k])
+            total[w, k] = ahead.log_scale[k]
+            first = Potential(ahead.precision[k].copy(), ahead.information[k].copy(), total[w, k])
+            integrate(first, noise[k], offset[w, k], out, room)
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def backward(given: LinearArrays, log_scale: Array, futures: Potential, steering: Steering) -> Potential:
     """The backward information filter of δ' = F δ + offset + G ε, for every trajectory.
 
-    From what each row's own measurements say, `seen`, it fills what all later ones say of a row's state, `futures`, and
-    the noise that they ask for in each interval.
+    It fills what all later measurements say of each row's state, `futures`, and the noise that they ask for in each
+    interval. Returns what all measurements say of the first state. `log_scale` is of each row's own measurements.
     """
-    intervals, trajectories, dimension = given.offset.shape
-    precision, information = np.zeros((dimension, dimension)), np.zeros(dimension)
-    half, gain = np.zeros((dimension, dimension)), np.zeros(steering.gain.shape[2:])
-    for b in range(trajectories):
-        precision[:], information[:], scale = 0.0, 0.0, 0.0
-        for t in range(intervals, -1, -1):
-            futures.precision[t, b], futures.information[t, b], futures.log_scale[t, b] = precision, information, scale
+    rows, blocks, components, dimension, lanes = given.measurement.shape
+    first = Potential(
+        np.zeros((blocks, dimension, dimension, lanes)),
+        np.zeros((blocks, dimension, 1, lanes)),
+        np.zeros((blocks, 1, 1, lanes)),
+    )
+    weighted, pull = np.zeros((components, dimension, lanes)), np.zeros((components, 1, lanes))
+    half, gain = np.zeros((dimension, dimension, lanes)), np.zeros(steering.gain.shape[2:])
+    moved, room = np.zeros((dimension, 1, lanes)), _room(dimension, steering.gain.shape[2])
+    for k in range(blocks):
+        ahead = Potential(first.precision[k], first.information[k], first.log_scale[k])
+        for t in range(rows - 1, -1, -1):
+            futures.precision[t, k], futures.information[t, k] = ahead.precision, ahead.information
+            futures.log_scale[t, k] = ahead.log_scale
+            by_state, apart = given.measurement[t, k], given.residual[t, k]
+            set_scaled(weighted, by_state, given.precision[t, k])
+            set_scaled(pull, apart, given.precision[t, k])
+            add_gram(ahead.precision, weighted, by_state, 1.0)
+            add_gram(ahead.information, by_state, pull, 1.0)
+            add_gram(ahead.log_scale, apart, pull, -0.5)
+            ahead.log_scale[:] += log_scale[t, k]
             if t > 0:
-                precision += seen.precision[t, b]
-                information += seen.information[t, b]
-                out = Steering(steering.shift[t - 1, b], gain, steering.factor[t - 1, b])
-                noise, offset, forward = given.noise[t - 1, b], given.offset[t - 1, b], given.state[t - 1, b]
-                scale += seen.log_scale[t, b] + integrate(precision, information, noise, offset, out)
-                set_product(steering.gain[t - 1, b], gain, forward)
-                set_product(half, precision, forward)
-                set_product(precision, forward.T, half)
-                futures.information[t - 1, b] = information
-                set_times(information, forward.T, futures.information[t - 1, b])
+                forward = given.state[t - 1, k]
+                out = Steering(steering.shift[t - 1, k], gain, steering.factor[t - 1, k])
+                integrate(ahead, given.noise[t - 1, k], given.offset[t - 1, k], out, room)
+                steering.gain[t - 1, k] = 0.0
+                add_product(steering.gain[t - 1, k], gain, forward, 1.0)
+                half[:], moved[:] = 0.0, ahead.information
+                add_product(half, ahead.precision, forward, 1.0)
+                ahead.precision[:], ahead.information[:] = 0.0, 0.0
+                add_gram(ahead.precision, forward, half, 1.0)
+                add_gram(ahead.information, forward, moved, 1.0)
+    return first
 
 
 @njit(cache=True, error_model="numpy")
-def roll_out(moved: Array, pushed: Array, deviations: Array) -> None:
-    """Fill δ' = moved δ + pushed row by row: `(T, B, D, D)`, `(M, T, B, D)` and δ `(M, T + 1, B, D)`, its first row
-    given."""
-    draws, intervals, trajectories, _ = pushed.shape
+def roll_out(given: LinearArrays, gain: Array, begin: Array, noise: Array) -> Array:
+    """δ' = F δ + offset + G ε row by row, from the first, `(M, blocks, D, 1, LANES)`.
+
+    `noise` is ε at δ = 0, `(M, T, blocks, C, 1, LANES)`; from it, gain δ is taken off.
+    """
+    draws, intervals, blocks = noise.shape[:3]
+    deviations = np.empty((draws, intervals + 1, *begin.shape[1:]))
     for m in range(draws):
+        deviations[m, 0] = begin[m]
         for t in range(intervals):
-            deviations[m, t + 1] = pushed[m, t]
-            for b in range(trajectories):
-                add_times(deviations[m, t + 1, b], moved[t, b], deviations[m, t, b])
+            deviations[m, t + 1] = given.offset[t]
+            for k in range(blocks):
+                here, there, own = deviations[m, t, k], deviations[m, t + 1, k], noise[m, t, k]
+                add_product(own, gain[t, k], here, -1.0)
+                add_product(there, given.state[t, k], here, 1.0)
+                add_product(there, given.noise[t, k], own, 1.0)
+    return deviations
 
 
 @njit(cache=True, error_model="numpy")
-def covariances(given: LinearArrays, gain: Array, factor: Array, found: tuple[Array, Array, Array]) -> None:
-    """Fill the posterior covariances of δ' = F δ + G ε with ε ~ N(shift − gain δ, factor factorᵀ), as
-    `Lookahead.covariances` returns them, that of the first state given."""
-    states, noises, across = found
-    intervals, trajectories, dimension, channels = given.noise.shape
-    moved, spread = np.zeros((dimension, dimension)), np.zeros((dimension, channels))
+def covariances(given: LinearArrays, steering: Steering, first: Array) -> tuple[Array, Array, Array]:
+    """Posterior covariances of δ' = F δ + G ε with ε ~ N(shift − gain δ, factor factorᵀ), as `Lookahead.covariances`
+    returns them, in lanes; that of the first state is given."""
+    intervals, blocks, dimension, channels, lanes = given.noise.shape
+    states = np.zeros((intervals + 1, blocks, dimension, dimension, lanes))
+    noises = np.zeros((intervals, blocks, channels, channels, lanes))
+    across = np.zeros((intervals, blocks, dimension, channels, lanes))
+    moved, spread = np.zeros((dimension, dimension, lanes)), np.zeros((dimension, channels, lanes))
+    half = np.zeros((dimension, dimension, lanes))
+    states[0] = first
     for t in range(intervals):
-        for b in range(trajectories):
-            across[t, b] = 0.0
-            add_product(across[t, b], states[t, b], gain[t, b].T, -1.0)
-            set_product(noises[t, b], factor[t, b], factor[t, b].T)
-            add_product(noises[t, b], gain[t, b], across[t, b], -1.0)
-            moved[:] = given.state[t, b]
-            add_product(moved, given.noise[t, b], gain[t, b], -1.0)
-            set_product(spread, given.noise[t, b], factor[t, b])
-            propagate(states[t + 1, b], states[t, b], moved, spread)
+        for k in range(blocks):
+            gain, factor, noise = steering.gain[t, k], steering.factor[t, k], given.noise[t, k]
+            add_outer(across[t, k], states[t, k], gain, -1.0)
+            add_outer(noises[t, k], factor, factor, 1.0)
+            add_product(noises[t, k], gain, across[t, k], -1.0)
+            moved[:], half[:], spread[:] = given.state[t, k], 0.0, 0.0
+            add_product(moved, noise, gain, -1.0)
+            add_product(half, moved, states[t, k], 1.0)
+            add_product(spread, noise, factor, 1.0)
+            _add_symmetric(states[t + 1, k], half, moved)
+            _add_symmetric(states[t + 1, k], spread, spread)
+    return states, noises, across
+
+
+@njit(cache=True, error_model="numpy")
+def _add_symmetric(out: Array, left: Array, right: Array) -> None:
+    """out += left rightᵀ, which is symmetric: to the bit."""
+    rows, inner, _ = left.shape
+    for i in range(rows):
+        for j in range(i + 1):
+            add_dot(out, i * rows + j, left, i * inner, 1, right, j * inner, 1, inner, 1.0)
+            out[j, i] = out[i, j]

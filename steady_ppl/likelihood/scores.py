@@ -28,6 +28,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import Lookahead
+from steady_ppl.gaussian.moments import posterior_moments
 from steady_ppl.kernels.jit import Slopes, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import Element, moved, on_both_sides
 from steady_ppl.model.handlers import (
@@ -189,43 +190,18 @@ def arrivals(ahead: Lookahead, data: Trajectories) -> Arrivals:
 
 def smoothed(ahead: Lookahead, data: Trajectories) -> Smoothed:
     """Posterior moments of a linearised program, whose path is its posterior mean or near it."""
-    linear, steps = ahead.linearization, ahead.steps
-    states, noise = ahead.means()
-    moved = (states - linear.path.states).unsqueeze(-1)
-    covariance, every, sway = ahead.covariances()
-    then = linear.state @ sway + linear.noise @ every  # of the next state with a channel's deviation
-    lag = torch.zeros_like(noise)
-    lag[1:] = -(steps.gain[1:] @ then[:-1]).diagonal(dim1=-2, dim2=-1)
-    weight = linear.precision.sqrt()
-    seen = linear.measurement * weight.unsqueeze(-1)
-    known = weight * linear.residual - (seen @ moved).squeeze(-1)
-    uncertain = seen @ covariance
-    kind = data.controls.dtype
-    inside = data.transitions.unsqueeze(-1).expand_as(noise)
-    states = torch.where(data.rows.unsqueeze(-1), states, states[:1])
+    precision, kind = ahead.linearization.precision, data.controls.dtype
+    found = posterior_moments(ahead, data)
+    lag = torch.from_numpy(found.lag).movedim(0, -1).to(precision.device)
+    inside = data.transitions.unsqueeze(-1).expand_as(lag)
     return Smoothed(
-        states=by_component(states.to(kind)),
-        channels=Deviations(
-            mean=by_component(noise.to(kind)),
-            variance=by_component(every.diagonal(dim1=-2, dim2=-1).to(kind)),
-            points=_points(states[:-1], sway, kind),
-            present=inside,
-        ),
+        states=by_component(found.states.to(kind)),
+        channels=Deviations(**found.channels.tensors(precision.device), present=inside),
         lag=torch.where(inside, lag, 0.0),
-        measurements=Deviations(
-            mean=by_component(known.to(kind)),
-            variance=by_component((uncertain * seen).sum(-1).to(kind)),
-            points=_points(states, -uncertain.mT, kind),
-            present=linear.precision > 0,
-        ),
-        sharpness=by_component(weight.to(kind)),
+        measurements=Deviations(**found.measurements.tensors(precision.device), present=precision > 0),
+        sharpness=by_component(precision.sqrt().to(kind)),
         ahead=ahead,
     )
-
-
-def _points(states: Tensor, sway: Tensor, kind: torch.dtype) -> Tensor:
-    apart = sway.movedim(-1, 0)
-    return by_component(torch.cat([states.unsqueeze(0), states + apart, states - apart]).to(kind))
 
 
 def by_component(values: Tensor) -> Tensor:

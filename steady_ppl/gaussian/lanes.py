@@ -1,0 +1,110 @@
+"""Small matrices of eight trajectories at once, for compiled recursions: an entry is a vector of eight numbers.
+
+A processor multiplies all eight in one or two instructions; one trajectory's matrix is too small for that. Arrays are
+`(..., rows, columns, LANES)` and contiguous in C's order; a vector is a matrix of one column. numba's cache of the
+recursions does not see what changes here: remove `__pycache__` after an edit.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from torch import Tensor
+
+from steady_ppl.gaussian.matrices import Array
+
+LANES = 8
+_intrinsic: Any = intrinsic  # whose annotations count the typing context among the arguments of a call
+_VECTOR = ir.VectorType(ir.DoubleType(), LANES)
+
+
+def in_lanes(matrices: Tensor) -> Array:
+    """`(..., B, R, C)` as `(..., blocks, R, C, LANES)` in the host's memory, the last block filled with zeros."""
+    missing = -matrices.shape[-3] % LANES
+    if missing:
+        matrices = torch.nn.functional.pad(matrices, (0, 0, 0, 0, 0, missing))
+    return matrices.unflatten(-3, (-1, LANES)).movedim(-3, -1).contiguous().numpy(force=True)
+
+
+def out_of_lanes(blocks: Array, trajectories: int) -> Tensor:
+    """What `in_lanes` was given, of so many trajectories."""
+    return torch.from_numpy(blocks).movedim(-1, -3).flatten(-4, -3)[..., :trajectories, :, :].contiguous()
+
+
+@_intrinsic
+def add_dot(typing, out, at, left, first, step, right, start, stride, count, sign):  # type: ignore[no-untyped-def]
+    """out[at] += sign · Σₖ left[first + k step] right[start + k stride], of `count` products in every lane.
+
+    Entries are counted through the array, whatever its dimensions. LLVM's own vectoriser leaves such loops alone: it
+    does not know that the arrays are apart.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        out, at, left, first, step, right, start, stride, count, sign = arguments
+        whole = ir.IntType(64)
+
+        def entry(kind: Any, array: Any, index: Any) -> Any:
+            data = context.make_array(kind)(context, builder, array).data
+            return builder.bitcast(builder.gep(data, [builder.mul(index, whole(LANES))]), _VECTOR.as_pointer())
+
+        def factor(kind: Any, array: Any, begin: Any, apart: Any, k: Any) -> Any:
+            return builder.load(entry(kind, array, builder.add(begin, builder.mul(k, apart))), align=8)
+
+        kinds = signature.args
+        total = cgutils.alloca_once_value(builder, ir.Constant(_VECTOR, [0.0] * LANES))
+        with cgutils.for_range(builder, count) as loop:
+            one = factor(kinds[2], left, first, step, loop.index)
+            other = factor(kinds[5], right, start, stride, loop.index)
+            builder.store(builder.fadd(builder.load(total), builder.fmul(one, other)), total)
+        signs = ir.Constant(_VECTOR, ir.Undefined)
+        for lane in range(LANES):
+            signs = builder.insert_element(signs, sign, ir.IntType(32)(lane))
+        place = entry(kinds[0], out, at)
+        change = builder.fmul(signs, builder.load(total))
+        builder.store(builder.fadd(builder.load(place, align=8), change), place, align=8)
+        return context.get_dummy_value()
+
+    n = types.intp
+    return types.void(out, n, left, n, n, right, n, n, n, types.float64), generate
+
+
+@njit(cache=True, error_model="numpy")
+def add_product(out: Array, left: Array, right: Array, sign: float) -> None:
+    """out += sign · left right."""
+    (rows, columns, _), inner = out.shape, left.shape[1]
+    for i in range(rows):
+        for j in range(columns):
+            add_dot(out, i * columns + j, left, i * inner, 1, right, j, columns, inner, sign)
+
+
+@njit(cache=True, error_model="numpy")
+def add_gram(out: Array, left: Array, right: Array, sign: float) -> None:
+    """out += sign · leftᵀ right."""
+    (rows, columns, _), inner = out.shape, left.shape[0]
+    for i in range(rows):
+        for j in range(columns):
+            add_dot(out, i * columns + j, left, i, rows, right, j, columns, inner, sign)
+
+
+@njit(cache=True, error_model="numpy")
+def add_outer(out: Array, left: Array, right: Array, sign: float) -> None:
+    """out += sign · left rightᵀ."""
+    (rows, columns, _), inner = out.shape, left.shape[1]
+    for i in range(rows):
+        for j in range(columns):
+            add_dot(out, i * columns + j, left, i * inner, 1, right, j * inner, 1, inner, sign)
+
+
+@njit(cache=True, error_model="numpy")
+def set_scaled(out: Array, matrix: Array, scale: Array) -> None:
+    """Each row of a matrix times its entry of a vector."""
+    rows, columns, _ = matrix.shape
+    for i in range(rows):
+        for j in range(columns):
+            for lane in range(LANES):
+                out[i, j, lane] = matrix[i, j, lane] * scale[i, 0, lane]
