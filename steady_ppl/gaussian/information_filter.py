@@ -23,7 +23,6 @@ from numba import njit
 from torch import Tensor
 
 from steady_ppl.gaussian.lanes import (
-    LANES,
     add_dot,
     add_gram,
     add_outer,
@@ -45,11 +44,11 @@ class Potential(NamedTuple):
     log_scale: Array
 
     @classmethod
-    def empty(cls, *left: int, dimension: int) -> Potential:
+    def empty(cls, *left: int, lanes: int, dimension: int) -> Potential:
         return cls(
-            np.empty((*left, dimension, dimension, LANES)),
-            np.empty((*left, dimension, 1, LANES)),
-            np.empty((*left, 1, 1, LANES)),
+            np.empty((*left, dimension, dimension, lanes)),
+            np.empty((*left, dimension, 1, lanes)),
+            np.empty((*left, 1, 1, lanes)),
         )
 
 
@@ -68,9 +67,9 @@ class Steering(NamedTuple):
     factor: Any
 
     @classmethod
-    def in_lanes(cls, *left: int, dimension: int, channels: int) -> Steering:
+    def in_lanes(cls, *left: int, lanes: int, dimension: int, channels: int) -> Steering:
         """Room for arrays."""
-        return cls(*(np.empty((*left, channels, columns, LANES)) for columns in (1, dimension, channels)))
+        return cls(*(np.empty((*left, channels, columns, lanes)) for columns in (1, dimension, channels)))
 
     def tensors(self, like: Tensor) -> Steering:
         """Out of lanes, of as many trajectories as `(..., B, D)` has, on its device."""
@@ -171,13 +170,13 @@ def look_ahead(linear: Linearization) -> Lookahead:
     """Run the backward information filter."""
     device, (trajectories, dimension, starting) = linear.offset.device, linear.start_noise.shape
     given = _in_lanes(linear)
-    rows, blocks, *_ = given.measurement.shape
-    futures = Potential.empty(rows, blocks, dimension=dimension)
-    steps = Steering.in_lanes(rows - 1, blocks, dimension=dimension, channels=linear.noise.shape[-1])
+    rows, blocks, *_, lanes = given.measurement.shape
+    futures = Potential.empty(rows, blocks, lanes=lanes, dimension=dimension)
+    steps = Steering.in_lanes(rows - 1, blocks, lanes=lanes, dimension=dimension, channels=linear.noise.shape[-1])
     first = backward(given, in_lanes(linear.log_scale[..., None, None]), futures, steps)
     windings = _windings(linear)
     offsets = linear.start_offset - windings.unsqueeze(1)
-    begun = Steering.in_lanes(len(windings), blocks, dimension=dimension, channels=starting)
+    begun = Steering.in_lanes(len(windings), blocks, lanes=lanes, dimension=dimension, channels=starting)
     totals = integrate_starts(given.start_noise, first, in_lanes(offsets.unsqueeze(-1)), begun)
     masses = out_of_lanes(totals, trajectories).flatten(1).to(device)
     starts = begun.tensors(linear.start_offset)
@@ -238,16 +237,16 @@ class Room(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def _room(dimension: int, channels: int) -> Room:
-    square, wide = (channels, channels, LANES), (channels, dimension, LANES)
+def _room(dimension: int, channels: int, lanes: int) -> Room:
+    square, wide = (channels, channels, lanes), (channels, dimension, lanes)
     return Room(
-        pushed=np.zeros((dimension, 1, LANES)),
+        pushed=np.zeros((dimension, 1, lanes)),
         by_noise=np.zeros(wide),
-        pull=np.zeros((channels, 1, LANES)),
+        pull=np.zeros((channels, 1, lanes)),
         gram=np.zeros(square),
         root=np.zeros(square),
         half=np.zeros(wide),
-        white=np.zeros((channels, 1, LANES)),
+        white=np.zeros((channels, 1, lanes)),
     )
 
 
@@ -284,7 +283,7 @@ def integrate(ahead: Potential, noise: Array, offset: Array, out: Steering, room
             add_dot(root, a * channels + b, gram, a * channels, 1, out.factor, b, channels, b + 1, 1.0)
         add_dot(gram, a * channels + a, root, a * channels, 1, root, a * channels, 1, a, -1.0)
         pivot, scale = gram[a, a], out.factor[a, a]
-        for lane in range(LANES):
+        for lane in range(len(pivot)):
             log_scale[0, 0, lane] -= 0.5 * math.log1p(pivot[lane])
             scale[lane] = 1.0 / math.sqrt(1.0 + pivot[lane])
         for b in range(a):
@@ -309,7 +308,7 @@ def integrate_starts(noise: Array, ahead: Potential, offset: Array, steering: St
     `ahead` is what all rows' measurements say of the first state. The offsets are `(W, blocks, D, 1, LANES)`. Fills the
     steering, and returns the logarithm of the integral, `(W, blocks, 1, 1, LANES)`.
     """
-    total, room = np.empty((*offset.shape[:2], 1, 1, LANES)), _room(*noise.shape[1:3])
+    total, room = np.empty((*offset.shape[:2], 1, 1, noise.shape[3])), _room(*noise.shape[1:])
     for w in range(offset.shape[0]):
         for k in range(offset.shape[1]):
             out = Steering(steering.shift[w, k], steering.gain[w, k], steering.factor[w, k])
@@ -334,7 +333,7 @@ def backward(given: LinearArrays, log_scale: Array, futures: Potential, steering
     )
     weighted, pull = np.zeros((components, dimension, lanes)), np.zeros((components, 1, lanes))
     half, gain = np.zeros((dimension, dimension, lanes)), np.zeros(steering.gain.shape[2:])
-    moved, room = np.zeros((dimension, 1, lanes)), _room(dimension, steering.gain.shape[2])
+    moved, room = np.zeros((dimension, 1, lanes)), _room(dimension, steering.gain.shape[2], lanes)
     for k in range(blocks):
         ahead = Potential(first.precision[k], first.information[k], first.log_scale[k])
         for t in range(rows - 1, -1, -1):

@@ -20,20 +20,51 @@ from steady_ppl.gaussian.matrices import Array
 
 LANES = 8
 _intrinsic: Any = intrinsic  # whose annotations count the typing context among the arguments of a call
-_VECTOR = ir.VectorType(ir.DoubleType(), LANES)
+
+
+def lanes_for(trajectories: int) -> int:
+    """One or two trajectories go one by one: blocks of mostly zeros would be no faster."""
+    return LANES if trajectories > 2 else 1
 
 
 def in_lanes(matrices: Tensor) -> Array:
     """`(..., B, R, C)` as `(..., blocks, R, C, LANES)` in the host's memory, the last block filled with zeros."""
-    missing = -matrices.shape[-3] % LANES
+    lanes = lanes_for(matrices.shape[-3])
+    missing = -matrices.shape[-3] % lanes
     if missing:
         matrices = torch.nn.functional.pad(matrices, (0, 0, 0, 0, 0, missing))
-    return matrices.unflatten(-3, (-1, LANES)).movedim(-3, -1).contiguous().numpy(force=True)
+    return matrices.unflatten(-3, (-1, lanes)).movedim(-3, -1).contiguous().numpy(force=True)
 
 
 def out_of_lanes(blocks: Array, trajectories: int) -> Tensor:
     """What `in_lanes` was given, of so many trajectories."""
     return torch.from_numpy(blocks).movedim(-1, -3).flatten(-4, -3)[..., :trajectories, :, :].contiguous()
+
+
+def _add_dot(context: Any, builder: Any, kinds: Any, arguments: Any, lanes: int) -> None:
+    """The instructions of `add_dot`, for arrays of so many lanes."""
+    out, at, left, first, step, right, start, stride, count, sign = arguments
+    vector = ir.VectorType(ir.DoubleType(), lanes)
+
+    def entry(kind: Any, array: Any, index: Any) -> Any:
+        data = context.make_array(kind)(context, builder, array).data
+        return builder.gep(builder.bitcast(data, vector.as_pointer()), [index])
+
+    def factor(kind: Any, array: Any, begin: Any, apart: Any, k: Any) -> Any:
+        return builder.load(entry(kind, array, builder.add(begin, builder.mul(k, apart))), align=8)
+
+    total = cgutils.alloca_once_value(builder, ir.Constant(vector, [0.0] * lanes))
+    builder.store(ir.Constant(vector, [0.0] * lanes), total)
+    with cgutils.for_range(builder, count) as loop:
+        one = factor(kinds[2], left, first, step, loop.index)
+        other = factor(kinds[5], right, start, stride, loop.index)
+        builder.store(builder.fadd(builder.load(total), builder.fmul(one, other)), total)
+    signs = ir.Constant(vector, ir.Undefined)
+    for lane in range(lanes):
+        signs = builder.insert_element(signs, sign, ir.IntType(32)(lane))
+    place = entry(kinds[0], out, at)
+    change = builder.fmul(signs, builder.load(total))
+    builder.store(builder.fadd(builder.load(place, align=8), change), place, align=8)
 
 
 @_intrinsic
@@ -45,28 +76,12 @@ def add_dot(typing, out, at, left, first, step, right, start, stride, count, sig
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        out, at, left, first, step, right, start, stride, count, sign = arguments
-        whole = ir.IntType(64)
-
-        def entry(kind: Any, array: Any, index: Any) -> Any:
-            data = context.make_array(kind)(context, builder, array).data
-            return builder.bitcast(builder.gep(data, [builder.mul(index, whole(LANES))]), _VECTOR.as_pointer())
-
-        def factor(kind: Any, array: Any, begin: Any, apart: Any, k: Any) -> Any:
-            return builder.load(entry(kind, array, builder.add(begin, builder.mul(k, apart))), align=8)
-
-        kinds = signature.args
-        total = cgutils.alloca_once_value(builder, ir.Constant(_VECTOR, [0.0] * LANES))
-        with cgutils.for_range(builder, count) as loop:
-            one = factor(kinds[2], left, first, step, loop.index)
-            other = factor(kinds[5], right, start, stride, loop.index)
-            builder.store(builder.fadd(builder.load(total), builder.fmul(one, other)), total)
-        signs = ir.Constant(_VECTOR, ir.Undefined)
-        for lane in range(LANES):
-            signs = builder.insert_element(signs, sign, ir.IntType(32)(lane))
-        place = entry(kinds[0], out, at)
-        change = builder.fmul(signs, builder.load(total))
-        builder.store(builder.fadd(builder.load(place, align=8), change), place, align=8)
+        lanes = builder.extract_value(context.make_array(signature.args[0])(context, builder, arguments[0]).shape, 2)
+        with builder.if_else(builder.icmp_signed("==", lanes, lanes.type(LANES))) as (wide, single):
+            with wide:
+                _add_dot(context, builder, signature.args, arguments, LANES)
+            with single:
+                _add_dot(context, builder, signature.args, arguments, 1)
         return context.get_dummy_value()
 
     n = types.intp
@@ -103,8 +118,8 @@ def add_outer(out: Array, left: Array, right: Array, sign: float) -> None:
 @njit(cache=True, error_model="numpy")
 def set_scaled(out: Array, matrix: Array, scale: Array) -> None:
     """Each row of a matrix times its entry of a vector."""
-    rows, columns, _ = matrix.shape
+    rows, columns, lanes = matrix.shape
     for i in range(rows):
         for j in range(columns):
-            for lane in range(LANES):
+            for lane in range(lanes):
                 out[i, j, lane] = matrix[i, j, lane] * scale[i, 0, lane]

@@ -20,11 +20,6 @@ def array(tensor: Tensor) -> Array:
     return tensor.contiguous().numpy(force=True)
 
 
-def arrays(*tensors: Tensor) -> Any:
-    """`array` of each."""
-    return tuple(array(tensor) for tensor in tensors)
-
-
 @njit(cache=True, error_model="numpy", inline="always")
 def add_product(out: Array, left: Array, right: Array, sign: float = 1.0) -> None:
     """out += sign · left right, of matrices."""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import Lookahead, Steering
-from steady_ppl.gaussian.lanes import LANES, add_outer, add_product, out_of_lanes
+from steady_ppl.gaussian.lanes import add_outer, add_product, out_of_lanes
 from steady_ppl.gaussian.linearize import LinearArrays
 from steady_ppl.gaussian.matrices import Array
 
@@ -85,7 +85,7 @@ def fill(
     across, variance = np.zeros((dimension, count, lanes)), np.zeros((count, count, lanes))
     for t in range(rows):
         for k in range(blocks):
-            few = min(LANES, drives - k * LANES)
+            few = min(lanes, drives - k * lanes)
             weight = np.sqrt(given.precision[t, k])
             for a in range(count):
                 apart[a] = weight[a] * given.residual[t, k, a]
