@@ -174,12 +174,12 @@ def with_common_noise(problems: Sequence[Problem], maxima: Sequence[Maximum]) ->
         Term(problem, maximum.path, elements(problem.program), own)
         for problem, maximum, own in zip(copies, maxima, places, strict=True)
     ]
-    starts = _starts(terms, maxima)
+    information, starts = _starts(terms, maxima)
     for last, start in enumerate(starts, 1):
         for term in terms:
             set_values(term.parts, start[term.columns])
         try:
-            ended = climb(terms, steps=STEPS, precision=PRECISION)
+            ended = climb(terms, information=information, steps=STEPS, precision=PRECISION)
         except FilterError:
             if last == len(starts):
                 raise
@@ -232,9 +232,9 @@ def _places(count: int, common: Sequence[int], programs: int) -> list[list[int]]
     ]
 
 
-def _starts(terms: Sequence[Term], maxima: Sequence[Maximum]) -> list[Tensor]:
-    """Where to begin: at the maximum of the sum were every log p(y) a parabola, and where each program's own numbers
-    are, with the mean of the noise."""
+def _starts(terms: Sequence[Term], maxima: Sequence[Maximum]) -> tuple[Tensor, list[Tensor]]:
+    """The information of all numbers, and where to begin: at the maximum of the sum were every log p(y) a parabola, and
+    where each program's own numbers are, with the mean of the noise."""
     count = 1 + max(max(term.columns) for term in terms)
     information, pull = torch.zeros(count, count).double(), torch.zeros(count).double()
     sums, weights = torch.zeros(count).double(), torch.zeros(count).double()
@@ -246,4 +246,5 @@ def _starts(terms: Sequence[Term], maxima: Sequence[Maximum]) -> list[Tensor]:
         weights[index] += maximum.information.diagonal()
     parabola, singular = torch.linalg.solve_ex(information, pull)
     means = sums / weights
-    return [means] if singular or not bool(torch.isfinite(parabola).all()) else [parabola, means]
+    is_none = singular or not bool(torch.isfinite(parabola).all())
+    return information, [means] if is_none else [parabola, means]

@@ -237,7 +237,9 @@ def refit_near(base: Refit, near: Refit, variants: Sequence[Variant]) -> Refit |
         for program, fitted in zip(programs, near.programs, strict=True):
             own = program.state_dict()
             program.load_state_dict(own | {name: value for name, value in fitted.state_dict().items() if name in own})
-        return _refit(programs, near.folds, [None] * len(programs), fitting=near.fitting)
+        same = near.maxima[0].names == tuple(part.name for part in elements(programs[0]))
+        learned = near.maxima[0].information if same else None
+        return _refit(programs, near.folds, [None] * len(programs), learned, fitting=near.fitting)
     except SteadyError as error:
         return str(error)
 
@@ -266,7 +268,8 @@ def _refit(
     for program, begun, known, floor in zip(programs, folds, maxima, least, strict=True):
         fold = _wide_fold(begun, program)
         share = len(fold.drives) / len(folds[0].drives)
-        guess = None if information is None else share * information
+        learned = found[0].information if found else information
+        guess = None if learned is None or len(learned) != len(elements(program)) else share * learned
         anew = None if unwidened is None else _fitted_anew(fold.fitting(as_declared(unwidened, program)), floor)
         if anew is not None:
             floor = max(floor, float(anew[1].log_likelihood.sum()))

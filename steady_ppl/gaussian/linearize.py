@@ -198,7 +198,7 @@ def linearize_sensors(
     measured, by, in_plain_torch = _jacobians(program, measure, {"state": states}, given, kernels, outputs=count)
     residuals, log_sd, log_density = measured.chunk(3, -1)
     by_measured = -by[0][..., :count, :]
-    observed = data.observed & torch.isfinite(by_measured).all(-1)  # a bearing to where one stands has no derivative
+    observed = data.observed & torch.isfinite(by_measured.sum(-1))  # a bearing to where one stands has no derivative
     return Sensors(
         residual=torch.where(observed, residuals, 0.0).double(),
         measurement=torch.where(observed[..., None], by_measured, 0.0).double(),

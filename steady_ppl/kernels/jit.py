@@ -164,8 +164,11 @@ class Method:
         tensors = _tensors(program)
         names = {id(tensor): name for name, tensor in tensors.items()}
         values = self.tape.run(tensors)
-        columns = []
+        columns, here = [], self._taken(values)
         for number in numbers:
+            if not self.tape.takes(names[id(number.parameter)]):
+                columns.append(torch.zeros_like(here, dtype=torch.float64))
+                continue
             moved = []
             for by in (number.step, -number.step):
                 other = number.parameter.detach().clone()

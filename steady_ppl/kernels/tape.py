@@ -96,6 +96,10 @@ class Tape:
         self._steps = steps[::-1]
         self._places.clear()
 
+    def takes(self, name: str) -> bool:
+        """Whether one of the program's tensors is on it."""
+        return name in self._program.values()
+
     def run(self, tensors: Mapping[str, Tensor]) -> list[Tensor]:
         """Values by place, for a program's tensors as they are now."""
         values = [

@@ -29,6 +29,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.moments import posterior_moments
+from steady_ppl.kernels.graph import NotCompilable
 from steady_ppl.kernels.jit import Slopes, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import Element, moved, on_both_sides
 from steady_ppl.model.handlers import (
@@ -285,6 +286,11 @@ class Measured:
         return self._of_sites(lambda _, fn: unwrapped(fn).scale)
 
     @property
+    def heavy_tailed(self) -> bool:
+        """Whether some site is a Student t."""
+        return any(isinstance(unwrapped(fn), dist.StudentT) for fn in self.distributions.values())
+
+    @property
     def freedom(self) -> Tensor:
         """Degrees of freedom, `(..., K)`, infinite where the noise is normal."""
 
@@ -365,12 +371,13 @@ def _of_measurements(program: Program, at: Smoothed, parts: list[Element]) -> Te
 
     def readings(state: Tensor) -> Tensor:
         there = measured(program, state)
+        if there.heavy_tailed:
+            raise NotCompilable("the degrees of freedom of a Student t have no slope")
         return torch.cat([there.reading, there.spread.log().expand(there.reading.shape)], -1)
 
-    if not bool(torch.isfinite(measured(program, points[:1, :1, :1]).freedom).any()):
-        slopes = slopes_on_all_rows(program, "readings", readings, {"state": points.flatten(0, 1)}, parts)
-        if isinstance(slopes, Slopes):
-            return found.of_slopes(slopes, at.sharpness)
+    slopes = slopes_on_all_rows(program, "readings", readings, {"state": points.flatten(0, 1)}, parts)
+    if isinstance(slopes, Slopes):
+        return found.of_slopes(slopes, at.sharpness)
     columns = []
     for part in parts:
         score = at.states.new_zeros(points.shape[2])
