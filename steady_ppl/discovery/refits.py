@@ -268,8 +268,7 @@ def _refit(
     for program, begun, known, floor in zip(programs, folds, maxima, least, strict=True):
         fold = _wide_fold(begun, program)
         share = len(fold.drives) / len(folds[0].drives)
-        learned = found[0].information if found else information
-        guess = None if learned is None or len(learned) != len(elements(program)) else share * learned
+        guess = None if information is None else share * information
         anew = None if unwidened is None else _fitted_anew(fold.fitting(as_declared(unwidened, program)), floor)
         if anew is not None:
             floor = max(floor, float(anew[1].log_likelihood.sum()))
