@@ -171,13 +171,14 @@ def states(
     The table has for each state its median and the ends of its 90 % interval, `…_low` and `…_high`.
     """
     from steady_ppl.runs.diagnostics import diagnose_units
-    from steady_ppl.runs.posterior import require_states_file, write_states
+    from steady_ppl.runs.posterior import drawn_states, require_states_file, write_states
     from steady_ppl.smc.genealogy import few_starts
 
     require_states_file(out)
     require_place(out)
     fit, drives = st.Fit.load(run, program), st.read_table(table)
-    posterior = fit.posterior(drives, draws=draws, particles=particles, seed=seed)
+    settings: dict[str, Any] = {"draws": draws, "particles": particles, "known_start": fit.known_start, "seed": seed}
+    posterior = drawn_states(fit.program, drives, **settings)
     write_states(posterior, out)
     tell(f"{out}: {len(drives)} drives, {draws} draws of each")
     scarce = few_starts(float(posterior["sample_stats"]["roots"].min()))

@@ -15,6 +15,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.program import Program, names, units
 from steady_ppl.plotting.check import band, measured, strips
 from steady_ppl.runs.fit import Fit
+from steady_ppl.runs.posterior import drawn_states
 from steady_ppl.utils.angles import nearest_turn
 
 AROUND = 0.5  # s shown before and after a stretch
@@ -189,7 +190,7 @@ def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: 
     where the table has it, the truth; a run's components are its program's, in their order."""
     bands = {name: map(shown.of, band(found, name)) for name in ("one step", list(found.horizons)[-1])}
     data = found.data.subset(shown.drives)
-    posterior = fit.posterior(data, draws=draws, seed=seed)["posterior"]
+    posterior = drawn_states(fit.program, data, draws=draws, known_start=fit.known_start, seed=seed)["posterior"]
     states = found.program.state_names
     quantiles = np.stack([posterior[name].quantile(QUANTILES, ("chain", "draw")).values for name in states], -1)
     quantiles = quantiles.swapaxes(1, 2)  # (3, rows, B, D)

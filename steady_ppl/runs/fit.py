@@ -108,9 +108,9 @@ class Fit(Displayed):
         """Write into an open run folder; `begun` is what its record already says."""
         write_tensors(folder / PARAMETERS, self.program.state_dict())
         if train is not None:
-            from steady_ppl.runs.posterior import netcdf
+            from steady_ppl.runs.posterior import drawn_states, netcdf
 
-            drawn = self.posterior(train, draws=50, seed=self.seed)
+            drawn = drawn_states(self.program, train, draws=50, known_start=self.known_start, seed=self.seed)
             with whole_file(folder / POSTERIOR, RunError) as beside:
                 beside.write_bytes(netcdf(drawn))
         write_record(folder, {**(begun or {}), **self.record(folder)})

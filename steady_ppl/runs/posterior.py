@@ -1,11 +1,12 @@
-"""Posterior trajectories and forecasts as ArviZ InferenceData; states as files."""
+"""Posterior trajectories and forecasts as ArviZ InferenceData; states as files, for which ArviZ is not loaded."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -27,17 +28,17 @@ from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.threads import one_thread
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore", FutureWarning)  # an advertisement of arviz 1, once a day
+if TYPE_CHECKING:
     import arviz
 
 OF_ROW = ("trajectory", "row")
 DIMENSIONS = ("chain", "draw", *OF_ROW)
+Groups = Mapping[str, xarray.Dataset]
+"""Those of ArviZ's InferenceData, which is such a mapping itself."""
 INTERVAL = (0.05, 0.95)
 SUFFIXES = (".csv", ".parquet", ".nc")
 
 
-@one_thread()
 def posterior(
     program: Program,
     data: Trajectories,
@@ -67,6 +68,24 @@ def posterior(
         used; `constant_data`: time, controls and, where known, the true states. Units are in each variable's
         attributes.
     """
+    drawn = drawn_states(
+        program, data, draws=draws, particles=particles, every=every, known_start=known_start, seed=seed
+    )
+    return _for_arviz(drawn)
+
+
+@one_thread()
+def drawn_states(
+    program: Program,
+    data: Trajectories,
+    *,
+    draws: int = 100,
+    particles: int | None = None,
+    every: int = 1,
+    known_start: bool = False,
+    seed: int = 0,
+) -> dict[str, xarray.Dataset]:
+    """What `posterior` returns, its groups in a dictionary."""
     run = for_program(program, data).observed_every(every)
     refuse_long(run)
     states, evidence, sizes, roots = (list[Tensor]() for _ in range(4))
@@ -110,15 +129,23 @@ def posterior(
         variables[site if site not in variables else f"{site}_noise"] = ((*DIMENSIONS, dimension), values, attributes)
     measured = program.measurement_names, program.measurement_units
     about = {"program": type(program).__name__, "particles": choice.particles, "filter": choice.name}
-    return arviz.InferenceData(
-        posterior=xarray.Dataset(variables, coordinates, about),
-        sample_stats=_health(run, coordinates, torch.cat(sizes, 1), torch.cat(roots)),
-        observed_data=xarray.Dataset(
+    return {
+        "posterior": xarray.Dataset(variables, coordinates, about),
+        "sample_stats": _health(run, coordinates, torch.cat(sizes, 1), torch.cat(roots)),
+        "observed_data": xarray.Dataset(
             _columns("measured_", *measured, torch.where(run.observed, run.measurements, torch.nan)),
             {name: coordinates[name] for name in OF_ROW},
         ),
-        constant_data=_constants(program, run, coordinates, torch.cat(evidence)),
-    )
+        "constant_data": _constants(program, run, coordinates, torch.cat(evidence)),
+    }
+
+
+def _for_arviz(groups: Groups) -> arviz.InferenceData:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # an advertisement of arviz 1, once a day
+        import arviz  # with matplotlib and scipy.stats, 1.2 s
+    given: dict[str, Any] = dict(groups)
+    return arviz.InferenceData(**given)
 
 
 def _draws(values: Tensor) -> np.ndarray:
@@ -154,11 +181,11 @@ def _constants(program: Program, data: Trajectories, coordinates: dict, evidence
     return xarray.Dataset(variables, {name: coordinates[name] for name in OF_ROW})
 
 
-def states_frame(posterior: arviz.InferenceData) -> pd.DataFrame:
+def states_frame(posterior: Groups) -> pd.DataFrame:
     """Median and 90 % interval of every state, a row a trajectory and time step.
 
     Args:
-        posterior: of `Fit.posterior`.
+        posterior: of `Fit.posterior`, or `drawn_states`.
 
     Returns:
         Columns `trajectory`, `time` (s) and for each state component `name`, `name_low`, `name_high`, in its unit.
@@ -185,7 +212,7 @@ def require_states_file(path: Path) -> None:
         raise UsageError(f"{path}: states are written as {', '.join(SUFFIXES)}")
 
 
-def write_states(posterior: arviz.InferenceData, path: Path) -> None:
+def write_states(posterior: Groups, path: Path) -> None:
     """Write a posterior whole or not at all: a table of medians and intervals, or all draws as netCDF.
 
     Raises:
@@ -201,9 +228,9 @@ def write_states(posterior: arviz.InferenceData, path: Path) -> None:
             states_frame(posterior).to_parquet(beside, index=False)
 
 
-def netcdf(draws: arviz.InferenceData) -> memoryview:
+def netcdf(draws: Groups) -> memoryview:
     """The bytes of a netCDF file. HDF5 is kept away from disks: on one that is full it prints pages and may crash."""
-    return draws.to_datatree().to_netcdf(None, engine="h5netcdf")
+    return xarray.DataTree.from_dict(dict(draws)).to_netcdf(None, engine="h5netcdf")
 
 
 @one_thread()
@@ -257,7 +284,7 @@ def forecast(
         if bool(future[0, drive]):
             raise DataError(f"trajectory {label} begins after {float(last[drive]):g} s", trajectory=label)
     known = replace(table, observed=table.observed & ~future[..., None].to(table.observed.device))
-    found = posterior(program, known, draws=draws, particles=particles, known_start=known_start, seed=seed)
+    found = drawn_states(program, known, draws=draws, particles=particles, known_start=known_start, seed=seed)
     states = np.stack([found["posterior"][name].values[0] for name in program.state_names], -1)
     path = torch.from_numpy(states).to(run.controls).nan_to_num(0.0).transpose(1, 2)
     with seeded(seed, "forecast"):
@@ -275,8 +302,6 @@ def forecast(
         about = {"units": unit, "circular": int(circular[index])}
         variables[f"measured_{name}"] = (DIMENSIONS, np.where(there, values[None], np.nan), about)
     coordinates = found["posterior"].coords
-    found.add_groups(
-        predictions=xarray.Dataset(variables, {name: coordinates[name] for name in DIMENSIONS}),
-        predictions_constant_data=xarray.Dataset(constants, {name: coordinates[name] for name in OF_ROW}),
-    )
-    return found
+    found["predictions"] = xarray.Dataset(variables, {name: coordinates[name] for name in DIMENSIONS})
+    found["predictions_constant_data"] = xarray.Dataset(constants, {name: coordinates[name] for name in OF_ROW})
+    return _for_arviz(found)
