@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from steady_ppl.criticism.baselines import Reference
 from steady_ppl.criticism.result import Check, subject, unit_of, verdict
 from steady_ppl.errors import UsageError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 MEASURED, NEAR, FAR, REFERENCE, FLOOR = "black", "#0072b2", "#d55e00", "#cc79a7", "#009e73"
 COMPONENTS = 4  # panels at most
@@ -23,9 +24,11 @@ WIDTH = 165  # letters of a line over the whole width
 
 def check_picture(found: Check) -> Figure:
     """One figure of everything; made without pyplot's list of figures, so that nothing needs to be closed."""
+    import matplotlib.pyplot as plt
+
     with plt.rc_context({"axes.titlesize": 9, "axes.labelsize": 8}):
         shown = min(COMPONENTS, len(found.program.measurement_names))
-        figure = Figure(figsize=(13, 2.2 * max(shown, 3) + 1.3), layout="constrained")
+        figure = plt.Figure(figsize=(13, 2.2 * max(shown, 3) + 1.3), layout="constrained")
         left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1.25, 1), squeeze=False))
         drive = representative(found)
         panels = left.subplots(shown, 1, sharex=True, squeeze=False)[:, 0]
@@ -193,6 +196,8 @@ def innovations(found: Check, trajectory: str, *, axes: Axes | None = None) -> A
     """
     if trajectory not in found.data.labels:
         raise UsageError(f"no trajectory {trajectory!r}; there are {', '.join(found.data.labels)}")
+    import matplotlib.pyplot as plt
+
     axes = axes if axes is not None else plt.subplots(figsize=(7, 3), layout="constrained")[1]
     drive, prediction = found.data.labels.index(trajectory), found.predictions[1]
     time = found.data.elapsed[1:, drive].numpy(force=True)

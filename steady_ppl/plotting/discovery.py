@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.curves import variables
@@ -25,6 +22,10 @@ from steady_ppl.model.interventions import channel_means
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, row_controls
 from steady_ppl.plotting.comparison import open_loop_picture
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 CHOSEN, ALIKE, OTHER, LIMIT = "#d55e00", "#e69f00", "#0072b2", "#009e73"  # Okabe and Ito
 MAX_CANDIDATES = 9  # candidates of a group
@@ -57,7 +58,9 @@ def discovery_picture(found: Discovery) -> Figure:
     """One figure of everything; made without pyplot's list of figures, so that nothing needs to be closed."""
     rows = sum(2 + len(group.candidates) for group in _groups(found))
     height = max(7.5, 4.5 + 0.24 * rows) if rows else 2.2 + 0.19 * len(_remaining(found))
-    figure = Figure(figsize=(12, height), layout="constrained")
+    import matplotlib.pyplot as plt
+
+    figure = plt.Figure(figsize=(12, height), layout="constrained")
     if rows:
         left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1, 1.05), squeeze=False))
         above, below = left.subplots(2, 1, height_ratios=(height - 3.5, 3))
@@ -287,4 +290,6 @@ def unknown_effect(found: Discovery, *, axes: Axes | None = None) -> Axes:
     """
     if found.shape is None:
         raise UsageError(f"there is no curve to draw: the verdict is {found.verdict}")
+    import matplotlib.pyplot as plt
+
     return curve_panel(found, axes if axes is not None else plt.subplots(figsize=(6, 4), layout="constrained")[1])

@@ -7,11 +7,10 @@ import io
 from collections.abc import Callable, Sequence
 from functools import partial, singledispatch
 from operator import attrgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
 from steady_ppl.comparison.result import Proof, verdict as comparison_verdict
 from steady_ppl.criticism.result import Check, verdict as criticism_verdict
@@ -23,6 +22,9 @@ from steady_ppl.plotting.check import check_picture
 from steady_ppl.plotting.comparison import proof_picture
 from steady_ppl.plotting.discovery import discovery_picture
 from steady_ppl.runs.fit import Fit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MAX_NUMBERS = 12  # numbers of a parameter that are shown one by one
 DOTS = 90  # an inch, of pictures

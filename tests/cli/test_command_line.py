@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from small import HOVERCRAFT, TRUTH, simulated, steady, written
+from small import FEW, HOVERCRAFT, TRUTH, simulated, steady, written
 from truck_logs import command_log, pose_log, write as write_logs
 
 from steady_ppl import read_table
@@ -150,3 +150,21 @@ def test_a_defect_of_the_library_is_one_line_and_code_1(tmp_path: Path, monkeypa
 
     monkeypatch.setattr("steady_ppl.simulate", broken)
     refused(1, "RuntimeError: first line", "simulate", TRUTH, "--out", tmp_path / "t.csv")
+
+
+def test_a_command_loads_nothing_that_it_does_not_use(tmp_path: Path) -> None:
+    """No compiler of torch, no algebra, nothing that draws; small tables have no kernels, which torch traces."""
+    table, run = written(tmp_path / "t.csv"), tmp_path / "run"
+    commands = [
+        ["simulate", str(HOVERCRAFT), "--trajectories", "1", "--out", str(tmp_path / "s.csv")],
+        ["fit", str(HOVERCRAFT), str(table), *map(str, FEW), "--out", str(run)],
+        ["states", str(run), str(table), "--draws", "3", "--particles", "20", "--out", str(tmp_path / "states.nc")],
+    ]
+    code = (
+        "import sys; from steady_ppl.cli.main import main\n"
+        f"assert [main(words) for words in {commands}] == [0, 0, 0]\n"
+        "heavy = {'torch._dynamo', 'torch._inductor', 'sympy', 'matplotlib', 'arviz', 'scipy.stats', 'plotly'}\n"
+        "print(sorted(heavy & sys.modules.keys()))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
