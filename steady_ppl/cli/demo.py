@@ -98,14 +98,12 @@ class Size:
 
     Attributes:
         train, valid, test: drives to fit, to choose by, and locked away until the proof.
-        steps: E steps of each fit, fewer than the recipe takes by itself.
         simulations: sets that calibrate the tests of `check` and `discover`; their own numbers when None.
     """
 
     train: int = 16
     valid: int = 16
     test: int = 32
-    steps: int = 100
     simulations: int | None = None
 
     @property
@@ -142,15 +140,15 @@ def demonstrate(
     with chdir(out):
         record_drives(tour, size)
         tour.step("Fit the owner's program, which has none")
-        tour.result(_fit(tour, OWNERS, "before", size))
+        tour.result(_fit(tour, OWNERS, "before"))
         tour.step("Compare: does it explain even the drives that it was fitted to?")
         sets = size.calibration
         tour.steady(f"check runs/before train.csv{sets} --json check.json --picture check.png", keep="check.txt")
         tour.result(_read("check.json")["verdict"])
         grown = add(tour, discover(tour, size))
         tour.step("Fit again, in the same way, on the same drives; and the true structure, as the yardstick")
-        said = _fit(tour, grown, "after", size)
-        _fit(tour, TRUTH, "oracle", size)
+        said = _fit(tour, grown, "after")
+        _fit(tour, TRUTH, "oracle")
         tour.result(said)
         prove(tour)
         tour.step("See it: everything on one page")
@@ -243,9 +241,9 @@ def summary(figures: Mapping[str, Any]) -> list[str]:
     return aligned(lines)
 
 
-def _fit(tour: Tour, program: str, run: str, size: Size) -> str:
+def _fit(tour: Tour, program: str, run: str) -> str:
     """The fitted program, in a line."""
-    said = tour.steady(f"fit {program} train.csv --valid valid.csv --known-start --steps {size.steps} --out runs/{run}")
+    said = tour.steady(f"fit {program} train.csv --valid valid.csv --known-start --out runs/{run}")
     return said.splitlines()[0].removeprefix(f"runs/{run}: ") + "."
 
 

@@ -28,12 +28,13 @@ def fit(
     out: Annotated[Path, typer.Option("--out", help="Run folder to write.")],
     valid: Annotated[Path | None, typer.Option(help="Held-out drives that decide when to stop.")] = None,
     recipe: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help=f"{', '.join(RECIPES)}, or a recipe of your own: PATH.py.",
+            help=f"{', '.join(RECIPES)}, or a recipe of your own: PATH.py. The one that suits MODEL when not given: "
+            "likelihood for some dozens of numbers that can be linearised, else steady.",
             autocompletion=lambda incomplete: [name for name in RECIPES if name.startswith(incomplete)],
         ),
-    ] = "steady",
+    ] = None,
     guide: Annotated[
         GuideName | None, typer.Option(help="The E step: the first three steady's, the others svi's.")
     ] = None,

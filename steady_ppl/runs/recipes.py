@@ -13,11 +13,13 @@ import torch
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, require
+from steady_ppl.likelihood.parameters import MAX_PARAMETERS
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.loading import program_file, run_file
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.runs.diagnostics import diagnose_fit, diagnose_units
 from steady_ppl.runs.fit import Fit, program_source, sha256, versions
-from steady_ppl.runs.folder import CHECKPOINT, require_same, run_folder, write_record
+from steady_ppl.runs.folder import CHECKPOINT, read_record, require_same, run_folder, write_record
 from steady_ppl.runs.workbench import workbench
 from steady_ppl.utils.tensor_files import read_tensors
 from steady_ppl.utils.threads import one_thread
@@ -89,9 +91,42 @@ def trains(recipe: Recipe) -> bool:
     return any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
 
 
+def suited_recipe(
+    program: Program,
+    table: Trajectories,
+    options: Mapping[str, Any],
+    *,
+    known_start: bool = False,
+    device: str = "cpu",
+) -> tuple[str, str]:
+    """The recipe for a program where none is named, and why, in words.
+
+    `likelihood` takes some dozens of learnable numbers and noise that can be linearised; `steady` takes any program.
+
+    Args:
+        program, table, known_start: what is to be fitted.
+        options: settings that are given; those that `likelihood` has not ask for `steady`.
+        device: "cpu" or "cuda".
+    """
+    own = inspect.signature(find_recipe("likelihood")).parameters
+    foreign = [name for name in options if name not in own]
+    if foreign:
+        return "steady", f"{foreign[0]} is a setting of it"
+    if device != "cpu":
+        return "steady", f"it computes on {device}"
+    count = sum(value.numel() for value in program.parameters() if value.requires_grad)
+    if not 0 < count <= MAX_PARAMETERS:
+        return "steady", f"{count} learnable numbers, where likelihood takes 1 to {MAX_PARAMETERS}"
+    problem = Problem.of_table(program, table, known_start)
+    why = problem.why_not_linear()
+    if why is not None:
+        return "steady", f"likelihood needs a program that can be linearised: {why.split(': looking')[0]}"
+    return "likelihood", f"{count} learnable numbers and noise that can be linearised; --recipe steady takes any"
+
+
 @one_thread()
 def run_recipe(
-    name: str,
+    name: str | None,
     program: Program,
     table: Trajectories,
     valid: Trajectories | None,
@@ -108,7 +143,7 @@ def run_recipe(
     """Fit and save. Every input is checked before the run folder is made.
 
     Args:
-        name: the recipe.
+        name: the recipe; the one that suits the program when None, see `suited_recipe`, or that of the run on `resume`.
         options: its own keyword arguments; one that it does not take is an error.
         folder: the run.
         device: "cpu" or "cuda".
@@ -118,6 +153,11 @@ def run_recipe(
         UsageError: unknown recipe or option, or no such device.
         RunError: the folder exists, or does not match on `resume`.
     """
+    reason = ""
+    if name is None:
+        name, reason = suited_recipe(program, table, options, known_start=known_start, device=device)
+        if resume and (begun_with := read_record(folder)["recipe"]) != name:
+            name, reason = begun_with, ""
     recipe = find_recipe(name)
     require_settings(f"recipe {name}", recipe, options)
     if device == "cuda" and not torch.cuda.is_available():
@@ -161,6 +201,8 @@ def run_recipe(
         if not isinstance(fitted, Fit):
             raise UsageError(f"recipe {name} returned {type(fitted).__name__}, not a Fit")
         fitted.notes += doubts + diagnose_fit(fitted, declared)
+        if reason:
+            fitted.notes.insert(0, f"recipe {name}: {reason}")
         if valid is None and trains(recipe) and not (fitted.trained and fitted.trained.interrupted):
             fitted.notes.append("no --valid table: trained to the last step, nothing held out decides when to stop")
         fitted.save_into(folder, table, begun)

@@ -16,7 +16,7 @@ from steady_ppl.errors import ComputationError
 from steady_ppl.runs.folder import write_record
 
 STEADY = typer.main.get_command(app)
-QUICK = Size(train=6, valid=6, test=8, steps=25, simulations=50)
+QUICK = Size(train=6, valid=6, test=8, simulations=50)
 FILES = [f"{name}.{kind}" for name in ("check", "discovery", "proof") for kind in ("json", "png", "txt")]
 
 

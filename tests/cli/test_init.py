@@ -41,7 +41,7 @@ from pathlib import Path
 import typer
 from steady_ppl.cli.demo import Size, demonstrate
 from steady_ppl.cli.main import app
-demonstrate(Path("demo"), typer.main.get_command(app), size=Size(train=6, valid=6, test=8, steps=25, simulations=50))
+demonstrate(Path("demo"), typer.main.get_command(app), size=Size(train=6, valid=6, test=8, simulations=50))
 """
 
 
