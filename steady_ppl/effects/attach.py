@@ -65,13 +65,13 @@ def attach(program: Program, variant: Variant, value: Value | None = None) -> Pr
 def _class_with(base: type[Program], variant: Variant) -> type[Program]:
     """A program's class with an effect; the same one for the same effect, so that kernels are shared."""
     known = _GROWN.setdefault(base, WeakValueDictionary())
-    if variant not in known:
+    grown = known.get(variant)
+    if grown is None:
         title = "".join(part.capitalize() for part in variant.parameter.split("_"))
         about = {"__module__": base.__module__, "__doc__": base.__doc__, "attached": {variant.parameter: variant}}
         methods = _AROUND[variant.effect.form](base, variant)
         known[variant] = grown = type(f"{base.__name__}With{title}", (base,), {**about, **methods})
-        return grown
-    return known[variant]
+    return grown
 
 
 def attach_listed(program: Program) -> Program:

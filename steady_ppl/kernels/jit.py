@@ -18,6 +18,7 @@ from steady_ppl.kernels.codegen import LANES, NAME, source
 from steady_ppl.kernels.graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph, derivatives, jacobian
 from steady_ppl.kernels.lowering import Translation
 from steady_ppl.kernels.store import machine_code
+from steady_ppl.kernels.tape import first_names, where
 from steady_ppl.utils.text import one_line
 
 TRACES = 32  # of one method of programs of one class; each takes some hundredths of a second
@@ -162,18 +163,19 @@ class Method:
     def by_number(self, program: nn.Module, numbers: Sequence[Number]) -> Tensor:
         """What the kernel's parameters change by with each of a program's learnable numbers, `(Q, P)`."""
         tensors = _tensors(program)
-        names = {id(tensor): name for name, tensor in tensors.items()}
+        names = first_names(tensors)
         values = self.tape.run(tensors)
         columns, here = [], self._taken(values)
         for number in numbers:
-            if not self.tape.takes(names[id(number.parameter)]):
+            name = names[where(number.parameter)]
+            if not self.tape.takes(name):
                 columns.append(torch.zeros_like(here, dtype=torch.float64))
                 continue
             moved = []
             for by in (number.step, -number.step):
                 other = number.parameter.detach().clone()
                 other.view(-1)[number.index] += by
-                moved.append(self._taken(self.tape.run_again(values, names[id(number.parameter)], other)))
+                moved.append(self._taken(self.tape.run_again(values, name, other)))
             columns.append((moved[0] - moved[1]).double() / (2 * number.step))
         return torch.stack(columns, -1)
 
@@ -231,24 +233,38 @@ def discard(program: nn.Module, name: str) -> str:
 
 
 def _tensors(program: nn.Module) -> dict[str, Tensor]:
-    return dict(itertools.chain(program.named_parameters(), program.named_buffers()))
+    """A program's parameters and buffers, and the tensors among its settings."""
+    found = dict(itertools.chain(program.named_parameters(), program.named_buffers()))
+    for at, module in program.named_modules():
+        for name, value in _settings(module):
+            for index, part in enumerate(value if isinstance(value, tuple | list) else (value,)):
+                if isinstance(part, Tensor):
+                    found[f"{at}.{name}[{index}] among the settings"] = part
+    return found
 
 
 def signature(program: nn.Module) -> tuple[Any, ...]:
-    """What a trace takes as given: the shapes of a program's tensors, and its settings."""
+    """What a trace takes as given: the shapes of a program's tensors, which of them are one, and its settings."""
     settings = [
-        (at, name, _content(value) if isinstance(value, Tensor) else repr(value))
+        (at, name, _content(value))
         for at, module in program.named_modules()
         for name, value in _settings(module)
         if isinstance(value, bool | int | float | str | tuple | list | Tensor)
     ]
-    shapes = tuple((name, tensor.shape, tensor.dtype) for name, tensor in _tensors(program).items())
-    return shapes, tuple(settings)
+    tensors = _tensors(program)
+    names = first_names(tensors)
+    shapes = [(name, names.get(where(one)), one.shape, one.dtype) for name, one in tensors.items()]
+    whole = [(name, _content(one)) for name, one in program.named_buffers() if not one.dtype.is_floating_point]
+    return tuple(shapes), tuple(whole), tuple(settings)
 
 
-def _content(tensor: Tensor) -> Any:
-    """A tensor that is no parameter, by its numbers; a large one is only itself."""
-    return (tuple(tensor.shape), *tensor.flatten().tolist()) if tensor.numel() <= FEW else id(tensor)
+def _content(value: Any) -> Any:
+    """What a setting holds; of a tensor the numbers, or which it is if there are many."""
+    if isinstance(value, tuple | list):
+        return type(value).__name__, *map(_content, value)
+    if not isinstance(value, Tensor):
+        return repr(value)
+    return (tuple(value.shape), *value.flatten().tolist()) if value.numel() <= FEW else id(value)
 
 
 def _settings(module: nn.Module) -> Iterator[tuple[str, Any]]:

@@ -153,6 +153,8 @@ class Translation(TorchDispatchMode):
         value, *rest = args
         if any(id(leaf) in self._numbers for leaf in tree_leaves(rest)):
             raise NotCompilable("it looks elements up at places that depend on the state")
+        if any(isinstance(leaf, Tensor) and self.tape.varies(leaf) for leaf in tree_leaves(rest)):
+            raise NotCompilable("it looks elements up at places that depend on parameters")
         return func(self._number(value), *rest)
 
     def _copy(self, value: Tensor, other: Tensor, non_blocking: bool = False) -> Tensor:

@@ -1,0 +1,165 @@
+"""What a trace must not take for constant, and what programs of one class must not take from one another."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from steady_ppl.kernels import jit
+from steady_ppl.kernels.jit import Slopes, on_all_rows, slopes_on_all_rows
+from steady_ppl.kernels.tape import Tape
+
+STATES = torch.linspace(-2.0, 2.0, 90).view(10, 3, 3)
+Lines = Callable[[Any, Tensor], Tensor]
+
+
+@pytest.fixture(autouse=True)
+def _compile_everything(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", 1)
+
+
+@dataclass(frozen=True)
+class Number:
+    """The first of a parameter."""
+
+    parameter: Tensor
+    index: int = 0
+    step: float = 0.01
+
+
+def program() -> Any:
+    """Of a class of its own, so that it shares nothing with that of another test."""
+
+    class Program(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.gain, self.rate = nn.Parameter(torch.tensor([0.5, 0.7, 0.9])), nn.Parameter(torch.tensor([1.5]))
+            self.register_buffer("order", torch.tensor([0, 2, 1]))
+            self.places = torch.tensor([1.0, 2.0, 3.0])
+            self.listed = [torch.tensor([1.00001])]
+
+    return Program()
+
+
+def found(which: nn.Module, lines: Lines) -> Tensor | str | None:
+    """What it comes to, by a kernel where there is one."""
+    result = on_all_rows(which, "lines", lambda state: lines(which, state), {"state": STATES})
+    return result if isinstance(result, str | None) else result[0]
+
+
+def assert_own(which: nn.Module, lines: Lines) -> None:
+    result = found(which, lines)
+    assert isinstance(result, Tensor), result
+    torch.testing.assert_close(result, lines(which, STATES).detach(), rtol=1e-6, atol=1e-6)
+
+
+def times(one: Any, state: Tensor) -> Tensor:
+    gain = one.gain * 2
+    gain *= one.rate
+    return state * gain
+
+
+def through_a_view(one: Any, state: Tensor) -> Tensor:
+    gain = one.gain.clone()
+    gain[0] = one.rate[0]
+    return state * gain
+
+
+def into_given(one: Any, state: Tensor) -> Tensor:
+    return state * torch.mul(one.gain.detach(), one.rate.detach(), out=torch.empty_like(one.gain))
+
+
+@pytest.mark.parametrize("lines", [times, through_a_view, into_given])
+def test_a_tensor_of_parameters_that_is_written_into_is_left_to_torch(lines: Lines) -> None:
+    """Differences ran the writing once more on what it had written: slopes were hundreds of times too large."""
+    which = program()
+    numbers = [Number(which.gain), Number(which.rate)]
+    slopes = slopes_on_all_rows(which, "lines", lambda state: lines(which, state), {"state": STATES}, numbers)
+    assert isinstance(slopes, str) and "writes into a tensor" in slopes
+
+
+def test_writing_into_new_tensors_keeps_its_slopes() -> None:
+    which = program()
+
+    def lines(state: Tensor) -> Tensor:
+        gain = torch.zeros(3)
+        gain[0] = which.gain[0]
+        gain[1:] = which.rate
+        return state * gain
+
+    numbers = [Number(which.gain), Number(which.rate)]
+    slopes = slopes_on_all_rows(which, "lines", lines, {"state": STATES}, numbers)
+    assert isinstance(slopes, Slopes), slopes
+    torch.testing.assert_close(slopes.by_number.sum(0), torch.tensor([1.0, 2.0]).double(), rtol=1e-4, atol=1e-4)
+
+
+def test_a_copy_does_not_feel_what_is_written_into_anothers_settings() -> None:
+    def lines(one: Any, state: Tensor) -> Tensor:
+        return state * one.places * one.listed[0]
+
+    first = program()
+    second = copy.deepcopy(first)
+    for _ in range(5):  # so that the next run is none of those that are compared
+        assert_own(first, lines)
+        assert_own(second, lines)
+    first.places += 1
+    first.listed[0] *= 2
+    assert_own(second, lines)
+    assert_own(first, lines)
+
+
+def test_listed_tensors_differ_in_all_their_digits() -> None:
+    first = program()
+    second = copy.deepcopy(first)
+    second.listed[0] = torch.tensor([1.00004])  # both are shown as 1.0000
+    assert jit.signature(first) != jit.signature(second)
+    for one in (first, second):
+        assert_own(one, lambda one, state: state * one.listed[0])
+
+
+def test_whole_numbers_that_change_are_traced_anew() -> None:
+    which = program()
+    for _ in range(5):
+        assert_own(which, lambda one, state: state[..., one.order])
+    which.order.copy_(torch.tensor([1, 0, 2]))
+    assert_own(which, lambda one, state: state[..., one.order])
+
+
+def test_places_that_depend_on_parameters_are_left_to_torch() -> None:
+    assert "depend on parameters" in str(found(program(), lambda one, state: state[..., one.gain.argsort()]))
+
+
+def test_a_transposed_view_of_a_parameter_is_not_taken_for_it() -> None:
+    which = program()
+    which.matrix = nn.Parameter(torch.eye(3))
+    which.turned = which.matrix.data.t()
+    for _ in range(5):
+        assert_own(which, lambda one, state: state @ one.turned)
+    which.matrix.data[0, 1] = 5.0
+    assert_own(which, lambda one, state: state @ one.turned)
+
+
+def test_parameters_that_are_one_tensor_have_the_same_slopes() -> None:
+    which = program()
+    which.other = nn.Parameter(which.gain.data)
+    numbers = [Number(which.gain), Number(which.other)]
+    slopes = slopes_on_all_rows(which, "lines", lambda state: state * which.gain, {"state": STATES}, numbers)
+    assert isinstance(slopes, Slopes), slopes
+    assert torch.equal(slopes.by_number[:, 0], slopes.by_number[:, 1])
+    apart = copy.deepcopy(which)
+    apart.other = nn.Parameter(torch.ones(3))
+    assert jit.signature(apart) != jit.signature(which)
+
+
+def test_a_tape_keeps_no_tensor_of_the_program_that_was_traced() -> None:
+    which = program()
+    assert_own(which, lambda one, state: state * (one.gain * torch.tensor([1.0, 2.0, 3.0])))
+    (method,) = jit._COMPILED[type(which)].values()
+    tape: Tape = method.tape
+    assert sum(value.numel() for value in tape._values) == 3  # the constant
