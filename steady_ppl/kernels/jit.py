@@ -376,6 +376,8 @@ def _computed(
         kernels = rows * trajectories >= ROWS_WORTH_COMPILING
     if not kernels:
         return None
+    if rows * trajectories < LANES:
+        return f"fewer than {LANES} rows"
     if first.device.type != "cpu" or first.dtype != torch.float32:
         return f"{str(first.dtype).removeprefix('torch.')} on {first.device.type}"
     examples = {at: value[:1, :1].unsqueeze(0).clone() for at, value in arguments.items()}

@@ -318,6 +318,7 @@ def typical_spreads(program: Program, data: Trajectories, at: Smoothed) -> Momen
     return spread[0][data.transitions].square().mean(0).sqrt(), sharp[0][data.rows].square().mean(0).sqrt()
 
 
+@torch.no_grad()
 def parameter_scores(program: Program, data: Trajectories, at: Smoothed, parts: list[Element]) -> Tensor:
     """Scores of a program's own parameters, `(B, P)`."""
     if not parts:
@@ -335,16 +336,19 @@ def _of_channels(program: Program, data: Trajectories, at: Smoothed, parts: list
         return torch.cat([mean, sd.log()], -1)
 
     slopes = slopes_on_all_rows(program, "moments", moments, _by_row(program, data, state=points), parts)
+    scores, left = at.states.new_zeros((len(data), len(parts))).double(), list(range(len(parts)))
     if isinstance(slopes, Slopes):
         rows, count = at.channels.mean.shape[0], at.channels.mean.shape[-1]
-        return at.channels.of_slopes(slopes, (-slopes.function[:rows, :, count:]).exp())
-    _, spread = channel_moments(program, data, points[:1])
-    columns = []
-    for part in parts:
+        scores = at.channels.of_slopes(slopes, (-slopes.function[:rows, :, count:]).exp())
+        left = _of_actuators(program, data, parts)
+    if left:
+        _, spread = channel_moments(program, data, points[:1])
+    for index in left:
+        part = parts[index]
         up, down = on_both_sides(part, lambda: channel_moments(program, data, points))
         of_mean = at.channels.of_mean((up[0] - down[0]) / (2 * part.step * spread))
-        columns.append(of_mean + at.channels.of_spread((up[1][0] / down[1][0]).log() / (2 * part.step)))
-    return torch.stack(columns, -1).double()
+        scores[:, index] = of_mean + at.channels.of_spread((up[1][0] / down[1][0]).log() / (2 * part.step))
+    return scores
 
 
 def _of_ends(program: Program, data: Trajectories, at: Smoothed, parts: list[Element]) -> Tensor:
@@ -356,13 +360,21 @@ def _of_ends(program: Program, data: Trajectories, at: Smoothed, parts: list[Ele
 
     given = _by_row(program, data, state=arriving.states, noise=arriving.noise)
     slopes = slopes_on_all_rows(program, "ends", ends, given, parts)
+    scores, left = at.states.new_zeros((len(data), len(parts))).double(), list(range(len(parts)))
     if isinstance(slopes, Slopes):
-        return arriving.of_slopes(slopes)
-    columns = []
-    for part in parts:
-        up, down = on_both_sides(part, lambda: arriving.ends(program, data))
-        columns.append(arriving.score(up - down) / (2 * part.step))
-    return torch.stack(columns, -1)
+        scores, left = arriving.of_slopes(slopes), _of_actuators(program, data, parts)
+    for index in left:
+        up, down = on_both_sides(parts[index], lambda: arriving.ends(program, data))
+        scores[:, index] = arriving.score(up - down) / (2 * parts[index].step)
+    return scores
+
+
+def _of_actuators(program: Program, data: Trajectories, parts: list[Element]) -> list[int]:
+    """Which learnable numbers change the acting controls: a kernel is given these and knows no slopes of theirs."""
+    if type(program).actuators is Program.actuators:
+        return []
+    sides = (on_both_sides(part, lambda: acting_controls(program, data)) for part in parts)
+    return [index for index, (up, down) in enumerate(sides) if not torch.equal(up, down)]
 
 
 def _of_measurements(program: Program, at: Smoothed, parts: list[Element]) -> Tensor:

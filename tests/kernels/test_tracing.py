@@ -163,3 +163,8 @@ def test_a_tape_keeps_no_tensor_of_the_program_that_was_traced() -> None:
     (method,) = jit._COMPILED[type(which)].values()
     tape: Tape = method.tape
     assert sum(value.numel() for value in tape._values) == 3  # the constant
+
+
+def test_fewer_rows_than_a_kernel_takes_are_left_to_torch() -> None:
+    few = {"state": STATES[:1]}
+    assert "fewer than" in str(on_all_rows(program(), "lines", lambda state: state, few, kernels=True))

@@ -13,8 +13,10 @@ from steady_ppl.discovery.curves import curves
 from steady_ppl.discovery.effect_scores import Column, Scoring
 from steady_ppl.effects import attach, chosen_variant, parsed
 from steady_ppl.gaussian.smoother import find_path, means_as_path, smooth
+from steady_ppl.kernels import jit
 from steady_ppl.likelihood.parameters import elements, moved
 from steady_ppl.likelihood.scores import Smoothed, parameter_scores, smoothed, typical_spreads
+from steady_ppl.model.substeps import with_substeps
 
 EFFECTS = (
     "linear_drag",
@@ -82,6 +84,19 @@ def test_scores_of_parameters_are_slopes_of_log_likelihood(hovercraft):
         expected = (up - down) / 0.02
         apart = (found[:, index] - expected).abs().max() / expected.abs().max()
         assert apart < 0.06, f"{part.name}: {found[:, index].tolist()} for {expected.tolist()}"
+
+
+@pytest.mark.parametrize("substeps", [1, 2])
+@pytest.mark.parametrize("effect", ["actuator_lag", "dead_zone", "battery_sag"])
+def test_kernels_and_torch_find_the_same_scores_of_an_actuator(effect, substeps, monkeypatch):
+    """Kernels take the acting controls as they are: they found none of what an actuator's parameter changes."""
+    program = with_substeps(example("hovercraft", torch.float32).with_effect(effect), substeps)
+    data = drives(program, 3, 12)
+    at, _ = at_rest(program, data)
+    plain = parameter_scores(program, data, at, elements(program))
+    monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", 1)
+    found = parameter_scores(program, data, at, elements(program))
+    torch.testing.assert_close(found, plain, rtol=1e-2, atol=1e-2 * float(plain.abs().max()))
 
 
 @pytest.mark.parametrize("text", EFFECTS)
