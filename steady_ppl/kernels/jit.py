@@ -28,12 +28,13 @@ FEW = 1000  # numbers of a tensor that are looked at one by one
 ROWS_WORTH_COMPILING = 1000  # of all trajectories together
 KEEPS_CHANGING = "its settings or tensors change from run to run"
 DIFFERENT = "its kernel and its own lines come to different numbers"
+NO_SLOPES = "some of its slopes are no numbers"
 Compiled = TypeVar("Compiled")
 Array = np.ndarray
 Examples = dict[str, Tensor]  # of the arguments of a function
 _COMPILED: WeakKeyDictionary[type[nn.Module], dict[Any, Any]] = WeakKeyDictionary()
-_NAMES: WeakKeyDictionary[type[nn.Module], list[tuple[type, list[str]]]] = WeakKeyDictionary()
-_RUNS: WeakKeyDictionary[nn.Module, Counter[str]] = WeakKeyDictionary()
+_NAMES: WeakKeyDictionary[type[nn.Module], list[tuple[int, list[str]]]] = WeakKeyDictionary()
+_RUNS: WeakKeyDictionary[nn.Module, Counter[Method]] = WeakKeyDictionary()
 
 
 class Kernel:
@@ -274,18 +275,20 @@ def _settings(module: nn.Module) -> Iterator[tuple[str, Any]]:
     kind = type(module)
     if kind not in _NAMES:
         _NAMES[kind] = _names_of(kind)
-    for base, names in _NAMES[kind]:
-        yield from ((name, vars(base)[name]) for name in names if name not in own and name in vars(base))
+    for at, names in _NAMES[kind]:
+        given = vars(kind.__mro__[at])
+        yield from ((name, given[name]) for name in names if name not in own and name in given)
 
 
-def _names_of(kind: type[nn.Module]) -> list[tuple[type, list[str]]]:
-    """The settings among the attributes of a class, each in the first of its bases that has it."""
+def _names_of(kind: type[nn.Module]) -> list[tuple[int, list[str]]]:
+    """The settings among the attributes of a class, each in the first of its bases that has it, by their order: a base
+    itself would keep the class, which is the first of them, for ever."""
     found, known = [], set[str]()
-    for base in itertools.takewhile(lambda base: base is not nn.Module, kind.__mro__):
+    for at, base in enumerate(itertools.takewhile(lambda base: base is not nn.Module, kind.__mro__)):
         names = [name for name in vars(base) if name not in known and not name.startswith("__")]
         known.update(names)
         if not base.__module__.startswith("torch."):
-            found.append((base, [name for name in names if not callable(vars(base)[name])]))
+            found.append((at, [name for name in names if not callable(vars(base)[name])]))
     return found
 
 
@@ -357,6 +360,8 @@ def slopes_on_all_rows(
     if not isinstance(found, tuple):
         return found
     method, values, rest = found
+    if not bool(torch.isfinite(rest.sum())):  # a root of zero, say, over which differences step
+        return NO_SLOPES
     components, parameters = torch.tensor(method.slopes, dtype=torch.int64).view(-1, 2).unbind(-1)
     return Slopes(values, components, rest.movedim(-1, 0), method.by_number(program, numbers)[parameters])
 
@@ -391,8 +396,8 @@ def _computed(
     found = _run(method, program, arguments, rows, trajectories)
     values, rest = found[..., : method.values], found[..., method.values :]
     runs = _RUNS.setdefault(program, Counter())
-    runs[name] += 1
-    if runs[name].bit_count() == 1 or runs[name] % SELDOM == 0:
+    runs[method] += 1
+    if runs[method].bit_count() == 1 or runs[method] % SELDOM == 0:
         plain = function(*(_a_few(value) for value in arguments.values()))
         if not close(_a_few(values), plain):
             return discard(program, name)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import gc
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -168,3 +170,38 @@ def test_a_tape_keeps_no_tensor_of_the_program_that_was_traced() -> None:
 def test_fewer_rows_than_a_kernel_takes_are_left_to_torch() -> None:
     few = {"state": STATES[:1]}
     assert "fewer than" in str(on_all_rows(program(), "lines", lambda state: state, few, kernels=True))
+
+
+def test_slopes_that_are_no_numbers_are_left_to_torch() -> None:
+    which = program()
+
+    def lines(state: Tensor) -> Tensor:
+        return (state - which.gain).norm(dim=-1, keepdim=True)
+
+    still = {"state": which.gain.detach().expand(10, 3, 3)}
+    assert slopes_on_all_rows(which, "lines", lines, still, [Number(which.gain)]) == jit.NO_SLOPES
+
+
+def test_a_kernel_is_compared_when_a_program_first_runs_with_it() -> None:
+    """Not only when the program's runs of all kernels come to a power of two."""
+    which = program()
+    which.strength = 1.0
+
+    def lines(one: Any, state: Tensor) -> Tensor:
+        return state * one.strength * one.gain.detach().numpy().sum().item()  # of which no trace knows
+
+    for _ in range(4):
+        assert_own(which, lines)
+    which.strength = 2.0
+    assert_own(copy.deepcopy(which), lines)
+    which.gain.data += 1.0
+    assert found(which, lines) == jit.DIFFERENT
+
+
+def test_a_class_goes_when_nobody_has_it() -> None:
+    which = program()
+    assert_own(which, lambda one, state: state * one.gain * one.places)
+    kind = weakref.ref(type(which))
+    del which
+    gc.collect()
+    assert kind() is None
