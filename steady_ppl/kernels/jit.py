@@ -6,7 +6,7 @@ import ctypes
 import hashlib
 import itertools
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol, TypeVar
 from weakref import WeakKeyDictionary
 
@@ -29,6 +29,8 @@ ROWS_WORTH_COMPILING = 1000  # of all trajectories together
 KEEPS_CHANGING = "its settings or tensors change from run to run"
 DIFFERENT = "its kernel and its own lines come to different numbers"
 NO_SLOPES = "some of its slopes are no numbers"
+SETTING = bool | int | float | str | tuple | list | dict | np.ndarray | Tensor
+OF_MODULES = vars(nn.Module()).keys() - {"training"}  # attributes in which torch keeps parameters, buffers and hooks
 Compiled = TypeVar("Compiled")
 Array = np.ndarray
 Examples = dict[str, Tensor]  # of the arguments of a function
@@ -238,10 +240,15 @@ def _tensors(program: nn.Module) -> dict[str, Tensor]:
     found = dict(itertools.chain(program.named_parameters(), program.named_buffers()))
     for at, module in program.named_modules():
         for name, value in _settings(module):
-            for index, part in enumerate(value if isinstance(value, tuple | list) else (value,)):
+            for index, part in enumerate(_members(value)):
                 if isinstance(part, Tensor):
                     found[f"{at}.{name}[{index}] among the settings"] = part
     return found
+
+
+def _members(value: Any) -> Iterable[Any]:
+    """What a setting holds, or itself."""
+    return value.values() if isinstance(value, dict) else value if isinstance(value, tuple | list) else (value,)
 
 
 def signature(program: nn.Module) -> tuple[Any, ...]:
@@ -250,7 +257,7 @@ def signature(program: nn.Module) -> tuple[Any, ...]:
         (at, name, _content(value))
         for at, module in program.named_modules()
         for name, value in _settings(module)
-        if isinstance(value, bool | int | float | str | tuple | list | Tensor)
+        if isinstance(value, SETTING)
     ]
     tensors = _tensors(program)
     names = first_names(tensors)
@@ -260,9 +267,13 @@ def signature(program: nn.Module) -> tuple[Any, ...]:
 
 
 def _content(value: Any) -> Any:
-    """What a setting holds; of a tensor the numbers, or which it is if there are many."""
+    """What a setting tells; of a tensor the numbers, or which it is if there are many."""
+    if isinstance(value, dict):
+        return tuple((repr(name), _content(part)) for name, part in value.items() if isinstance(part, SETTING))
     if isinstance(value, tuple | list):
         return type(value).__name__, *map(_content, value)
+    if isinstance(value, np.ndarray):
+        return str(value.dtype), value.shape, value.tobytes()
     if not isinstance(value, Tensor):
         return repr(value)
     return (tuple(value.shape), *value.flatten().tolist()) if value.numel() <= FEW else id(value)
@@ -271,7 +282,7 @@ def _content(value: Any) -> Any:
 def _settings(module: nn.Module) -> Iterator[tuple[str, Any]]:
     """A module's attributes: its own, its class's and its bases'."""
     own = vars(module)
-    yield from own.items()
+    yield from ((name, value) for name, value in own.items() if name not in OF_MODULES)
     kind = type(module)
     if kind not in _NAMES:
         _NAMES[kind] = _names_of(kind)

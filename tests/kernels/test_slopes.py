@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -95,17 +96,17 @@ class Hidden(type(example("hovercraft"))):
 
     def __init__(self):
         super().__init__()
-        self.hidden = {"drag": 0.0}
+        self.hidden = SimpleNamespace(drag=0.0)
 
     def transition(self, state, control, time, step):
-        return super().transition(state * (1 - self.hidden["drag"]), control, time, step)
+        return super().transition(state * (1 - self.hidden.drag), control, time, step)
 
 
 def test_a_program_that_differs_in_what_nothing_tells_is_not_run_by_the_others_kernel():
     program = Hidden()
     data = drives(program, 2, 9)
     other = copy.deepcopy(program)
-    other.hidden["drag"] = 0.5
+    other.hidden.drag = 0.5
     path = ReferencePath(torch.randn(9, 2, 6), torch.randn(8, 2, 3))
     assert linearize(program, data, path).in_plain_torch is None
     found, expected = linearize(other, data, path), linearize(other, data, path, kernels=False)

@@ -9,8 +9,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import pyro
 import pytest
 import torch
+from pyro.distributions import constraints
+from pyro.nn import PyroModule, PyroParam
 from torch import Tensor, nn
 
 from steady_ppl.kernels import jit
@@ -205,3 +209,29 @@ def test_a_class_goes_when_nobody_has_it() -> None:
     del which
     gc.collect()
     assert kind() is None
+
+
+@pytest.mark.parametrize("kind", [dict, list, np.array])
+def test_a_limit_that_few_rows_reach_is_told_apart(kind: Callable[[Any], Any]) -> None:
+    """Too few for a comparison to find out that the kernel is another program's."""
+    first = program()
+    second = copy.deepcopy(first)
+    for one, limit in ((first, 1.99), (second, 1.9)):
+        one.limits = kind({"place": limit}) if kind is dict else kind([limit])
+
+    def lines(one: Any, state: Tensor) -> Tensor:
+        return state.clamp(max=float(one.limits["place" if kind is dict else 0]))
+
+    assert_own(first, lines)
+    assert_own(second, lines)
+
+
+def test_parameters_between_other_bounds_have_a_kernel_each() -> None:
+    class Bounded(PyroModule):
+        def __init__(self, bounds: Any) -> None:
+            super().__init__()
+            with pyro.settings.context(module_local_params=True):
+                self.share = PyroParam(torch.tensor(0.5), bounds)
+
+    for bounds in (constraints.unit_interval, constraints.interval(0.0, 2.0), constraints.unit_interval):
+        assert_own(Bounded(bounds), lambda one, state: state * one.share)
