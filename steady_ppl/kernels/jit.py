@@ -22,7 +22,7 @@ from steady_ppl.kernels.tape import first_names, where
 from steady_ppl.utils.text import one_line
 
 TRACES = 32  # of one method of programs of one class; each takes some hundredths of a second
-SELDOM = 16  # of a program's runs on all rows: those of this number, its multiples and powers of two are compared
+SELDOM = 4  # of a program's runs on all rows: those of this number, its multiples and powers of two are compared
 KERNELS = 256  # that are kept in memory
 FEW = 1000  # numbers of a tensor that are looked at one by one
 ROWS_WORTH_COMPILING = 1000  # of all trajectories together

@@ -172,6 +172,7 @@ def climb(
     reach = torch.zeros(_size(terms), dtype=torch.float64)
     for term in terms:
         reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
+    is_given = information is not None
     information = _regularised(_of_drives(here) if information is None else information)
     taken, decrement, passes = 0, 0.0, PASSES
     with stages(*(("", FEWER**step) for step in range(steps + 1))) as begin:
@@ -186,6 +187,10 @@ def climb(
                     "the likeliest parameters cannot be found: the drives do not tell them apart (singular)"
                 )
             decrement = 0.5 * float(here.gradient @ move)
+            if taken == 0 and is_given and decrement < precision:  # by what was known elsewhere: seen here as well?
+                information = _regularised(_of_drives(here))
+                move, _ = torch.linalg.solve_ex(information, here.gradient)
+                decrement = 0.5 * float(here.gradient @ move)
             behind = taken >= 6 and here.log_likelihood < hopeless
             if decrement < precision or taken == steps or behind:
                 break
