@@ -129,10 +129,12 @@ sys.exit(main(sys.argv[1:]))"""
         )
 
 
-def killed_and_resumed(desk: Path, name: str, out: str, moment: float) -> str:
-    """Kill a command after so many seconds and let it end; whether it had `ended` first, was caught `early`, before
-    there was anything to go on with, or `resumed`."""
+def killed_and_resumed(desk: Path, name: str, out: str, moment: float, *, of_begun: bool) -> str:
+    """Kill a command after so many seconds, or so many after it has begun, and let it end; whether it had `ended`
+    first, was caught `early`, before there was anything to go on with, or `resumed`."""
     process = started(desk, *COMMANDS[name], "--out", out)
+    while of_begun and not begun(desk / out) and process.poll() is None:
+        time.sleep(0.01)
     try:
         assert process.wait(moment) == 0
         return "ended"
@@ -214,11 +216,11 @@ def test_a_search_on_a_disk_that_fills_up_goes_on_when_there_is_room(desk: Path,
 def test_twenty_random_kills_change_nothing(desk: Path, name: str) -> None:
     (first, whole), random, caught = undisturbed(desk, name), np.random.default_rng(20), []
     for trial in range(20):
-        began = time.perf_counter()
-        caught.append(killed_and_resumed(desk, name, f"{name}_{trial}", float(random.uniform(0.9 * first, whole))))
+        of_begun = trial % 4 > 0  # the others while it loads, or when it is about to begin
+        moment = float(random.uniform(0, whole - first) if of_begun else random.uniform(0, 1.2 * first))
+        caught.append(killed_and_resumed(desk, name, f"{name}_{trial}", moment, of_begun=of_begun))
         if caught[-1] == "ended":  # the machine is less busy than when it was timed
-            whole = min(whole, time.perf_counter() - began)
-            first = min(first, whole)
+            whole = first + 0.8 * (whole - first)
         same_results(desk, name, f"{name}_{trial}")
     assert caught.count("resumed") >= 10, caught
 
