@@ -246,5 +246,5 @@ def _starts(terms: Sequence[Term], maxima: Sequence[Maximum]) -> tuple[Tensor, l
         weights[index] += maximum.information.diagonal()
     parabola, singular = torch.linalg.solve_ex(information, pull)
     means = sums / weights
-    is_none = singular or not bool(torch.isfinite(parabola).all())
-    return information, [means] if is_none else [parabola, means]
+    has_maximum = not singular and bool(torch.isfinite(parabola).all())
+    return information, [parabola, means] if has_maximum else [means]

@@ -22,7 +22,7 @@ from steady_ppl.kernels.tape import first_names, where
 from steady_ppl.utils.text import one_line
 
 TRACES = 32  # of one method of programs of one class; each takes some hundredths of a second
-SELDOM = 4  # of a program's runs on all rows: those of this number, its multiples and powers of two are compared
+COMPARED_EVERY = 4  # of a program's runs on all rows; the first two are compared as well
 KERNELS = 256  # that are kept in memory
 FEW = 1000  # numbers of a tensor that are looked at one by one
 ROWS_WORTH_COMPILING = 1000  # of all trajectories together
@@ -408,7 +408,7 @@ def _computed(
     values, rest = found[..., : method.values], found[..., method.values :]
     runs = _RUNS.setdefault(program, Counter())
     runs[method] += 1
-    if runs[method].bit_count() == 1 or runs[method] % SELDOM == 0:
+    if runs[method] <= 2 or runs[method] % COMPARED_EVERY == 0:
         plain = function(*(_a_few(value) for value in arguments.values()))
         if not close(_a_few(values), plain):
             return discard(program, name)

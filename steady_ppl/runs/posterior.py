@@ -39,7 +39,13 @@ INTERVAL = (0.05, 0.95)
 SUFFIXES = (".csv", ".parquet", ".nc")
 
 
-def posterior(
+def posterior(program: Program, data: Trajectories, **settings: Any) -> arviz.InferenceData:
+    """What `drawn_states` returns, for ArviZ; settings are its."""
+    return _for_arviz(drawn_states(program, data, **settings))
+
+
+@one_thread()
+def drawn_states(
     program: Program,
     data: Trajectories,
     *,
@@ -48,7 +54,7 @@ def posterior(
     every: int = 1,
     known_start: bool = False,
     seed: int = 0,
-) -> arviz.InferenceData:
+) -> dict[str, xarray.Dataset]:
     """Draw whole trajectories given all of their measurements.
 
     Args:
@@ -68,24 +74,6 @@ def posterior(
         used; `constant_data`: time, controls and, where known, the true states. Units are in each variable's
         attributes.
     """
-    drawn = drawn_states(
-        program, data, draws=draws, particles=particles, every=every, known_start=known_start, seed=seed
-    )
-    return _for_arviz(drawn)
-
-
-@one_thread()
-def drawn_states(
-    program: Program,
-    data: Trajectories,
-    *,
-    draws: int = 100,
-    particles: int | None = None,
-    every: int = 1,
-    known_start: bool = False,
-    seed: int = 0,
-) -> dict[str, xarray.Dataset]:
-    """What `posterior` returns, its groups in a dictionary."""
     run = for_program(program, data).observed_every(every)
     refuse_long(run)
     states, evidence, sizes, roots = (list[Tensor]() for _ in range(4))
