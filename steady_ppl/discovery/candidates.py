@@ -13,7 +13,16 @@ from torch import Tensor
 
 from steady_ppl.discovery.curves import curves
 from steady_ppl.discovery.effect_scores import Column, Simulated, columns_of, scores_along, simulate_scores
-from steady_ppl.discovery.refits import ALWAYS, BY_LIKELIHOOD, Refit, Threshold, refit_near, refit_with
+from steady_ppl.discovery.refits import (
+    ALWAYS,
+    BY_LIKELIHOOD,
+    Fits,
+    Refit,
+    Threshold,
+    fit_near,
+    judged_fits,
+    refit_with,
+)
 from steady_ppl.discovery.screening import ALPHA, Screened, Tested, departures, screen
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.errors import FilterError
@@ -193,12 +202,12 @@ def judged(now: Refit, tested: Tested, refit: Refit | str) -> Candidate:
     return Candidate(tested, refit, alone if given_up else refit.held_out - now.held_out, alone)
 
 
-def gain_of_first_fold(now: Refit, refit: Refit) -> float:
+def gain_of_first_fold(now: Fits, refit: Fits) -> float:
     """Nats of log p(y) by which a fit explains better the drives that it was fitted to."""
     return float((refit.maxima[0].log_likelihood - now.maxima[0].log_likelihood).sum())
 
 
-def gain_of_fits(now: Refit, refit: Refit) -> float:
+def gain_of_fits(now: Fits, refit: Fits) -> float:
     """The same of the drives of every fold, each by the fit to it."""
     pairs = zip(refit.maxima, now.maxima, strict=False)
     return float(sum((one.log_likelihood - other.log_likelihood).sum() for one, other in pairs))
@@ -226,18 +235,16 @@ def at_its_best_place(now: Refit, candidate: Candidate) -> Candidate:
     if isinstance(candidate.refit, str) or not candidate.variant.profiled:
         return candidate
     grid, at, tested = _grid(now, candidate), candidate.variant, candidate.tested
-    fit: Refit | str = candidate.refit
-    if not candidate.is_judged:
-        fit = refit_with(now, at, candidate.refit.coefficient(at))
-        if isinstance(fit, str):
-            return candidate
+    begun = candidate.refit if candidate.is_judged else refit_with(now, at, candidate.refit.coefficient(at))
+    if isinstance(begun, str):
+        return candidate
+    fit: Fits = begun
 
     def try_all(variants: Iterable[Variant]) -> None:
         nonlocal at, fit
         for variant in variants:
-            assert isinstance(fit, Refit)
-            other = refit_near(now, fit, [variant])
-            if isinstance(other, Refit) and gain_of_fits(now, other) > gain_of_fits(now, fit) + MIN_GAIN_OF_PLACE:
+            other = fit_near(now, fit, [variant])
+            if isinstance(other, Fits) and gain_of_fits(now, other) > gain_of_fits(now, fit) + MIN_GAIN_OF_PLACE:
                 at, fit = variant, other
 
     try_all(variant for variant in grid if variant.label != candidate.variant.label)
@@ -248,7 +255,8 @@ def at_its_best_place(now: Refit, candidate: Candidate) -> Candidate:
                 try_all(_beside(at, grid, name, share))
             if at is before:
                 break
-    there = judged(now, replace(tested, column=replace(tested.column, variant=at)), fit)
+    refit = begun if fit is begun else judged_fits(fit)
+    there = judged(now, replace(tested, column=replace(tested.column, variant=at)), refit)
     return there if there.total > candidate.total else candidate
 
 
@@ -261,14 +269,14 @@ def variance_of_places(now: Refit, candidate: Candidate) -> Tensor:
     """
     assert isinstance(candidate.refit, Refit)
     at, grid, near = candidate.variant, _grid(now, candidate), candidate.refit
-    here, best = near.coefficient(at).flatten().double(), gain_of_fits(now, near)
+    here, best = near.mean_coefficient(at).flatten().double(), gain_of_fits(now, near)
 
     def fitted(variant: Variant) -> tuple[Tensor, float] | None:
         """How the coefficient changes, and by how much the likelihood falls."""
-        refit = refit_near(now, near, [variant])
-        if isinstance(refit, str):
+        fits = fit_near(now, near, [variant])
+        if isinstance(fits, str):
             return None
-        return refit.coefficient(variant).flatten().double() - here, best - gain_of_fits(now, refit)
+        return fits.mean_coefficient(variant).flatten().double() - here, best - gain_of_fits(now, fits)
 
     variance, ways = torch.zeros_like(here), list[_Way]()
     for name in at.profiled:

@@ -133,7 +133,7 @@ def is_doubtful(problem: Problem, path: ReferencePath) -> bool:
 
 
 def _at_rest(problem: Problem, path: ReferencePath) -> Lookahead:
-    ahead = problem.smooth(path, passes=15, tolerance=0.02, kernels=False)
+    ahead = problem.smooth(path, passes=15, tolerance=0.02)
     require_found(ahead, problem.program, problem.data)
     return ahead
 

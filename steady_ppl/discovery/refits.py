@@ -51,6 +51,7 @@ class Threshold:
 
     drives: float = -math.inf
     held_out: float = -math.inf
+    hopeless: bool = False  # whether a fit is given up on its way where it will not reach that of its drives
 
 
 ALWAYS = Threshold()
@@ -58,13 +59,34 @@ BY_LIKELIHOOD, BY_DRAWS, FIRST_BY_DRAWS = ByLikelihood(), ByDraws(), ByDraws(ste
 
 
 @dataclass(frozen=True)
-class Refit:
+class Fits:
     """A program fitted on each fold; folds come one after another."""
 
     programs: list[Program]  # one a fold, fitted to its drives alone
-    judges: Judges  # the same with their process noise in common, if fits by likelihood ended on every fold
     maxima: list[Maximum]  # one a fold
     folds: list[Fold]  # with the paths of these programs
+    fitting: Fitting  # how it was fitted, and how fits with an effect are
+
+    @property
+    def program(self) -> Program:
+        """The one fitted on the first fold."""
+        return self.programs[0]
+
+    def mean_coefficient(self, variant: Variant) -> Tensor:
+        """An effect's coefficient: nearly that of a fit to all drives together."""
+        return self.mean([coefficient(program, _there(program, variant)).detach().clone() for program in self.programs])
+
+    def mean(self, values: Sequence[Tensor]) -> Tensor:
+        """Of values of the folds, weighted by their drives."""
+        weights = [len(fold.drives) for fold in self.folds]
+        return torch.stack([w * value for w, value in zip(weights, values, strict=True)]).sum(0) / sum(weights)
+
+
+@dataclass(frozen=True)
+class Refit(Fits):
+    """What was fitted on each fold, and how it explains the drives that were kept from it."""
+
+    judges: Judges  # the programs with their process noise in common, if fits by likelihood ended on every fold
     held_out: Tensor
     """log p(y) of each drive under the judge fitted without it, but for the noise in common, `(B,)`; of the first fold
     only where the rest was not worth fitting."""
@@ -72,12 +94,6 @@ class Refit:
     unwidened: Program | None = None
     """The program before its fit made its noise many times wider, from whose parameters fits with an effect begin as
     well; None where it did not."""
-    fitting: Fitting = BY_LIKELIHOOD  # how it was fitted, and how fits with an effect are
-
-    @property
-    def program(self) -> Program:
-        """The one fitted on the first fold."""
-        return self.programs[0]
 
     def coefficients(self, variant: Variant) -> list[Tensor]:
         """An effect's coefficient on each fold."""
@@ -95,11 +111,6 @@ class Refit:
             if parameter.requires_grad:
                 parameter.data.copy_(self.mean([values[name].data for values in learned]))
         return mean
-
-    def mean(self, values: Sequence[Tensor]) -> Tensor:
-        """Of values of the folds, weighted by their drives."""
-        weights = [len(fold.drives) for fold in self.folds]
-        return torch.stack([w * value for w, value in zip(weights, values, strict=True)]).sum(0) / sum(weights)
 
     @property
     def first_share(self) -> float:
@@ -223,7 +234,7 @@ def refit_with(
         return str(error)
 
 
-def refit_near(base: Refit, near: Refit, variants: Sequence[Variant]) -> Refit | str:
+def fit_near(base: Fits, near: Fits, variants: Sequence[Variant]) -> Fits | str:
     """The program with effects, fitted from where another that shares parameters with it ended, or why it cannot be.
 
     `near` has one of the `variants` at another knee, width or place, or more of them; `base` has none.
@@ -238,8 +249,28 @@ def refit_near(base: Refit, near: Refit, variants: Sequence[Variant]) -> Refit |
             own = program.state_dict()
             program.load_state_dict(own | {name: value for name, value in fitted.state_dict().items() if name in own})
         same = near.maxima[0].names == tuple(part.name for part in elements(programs[0]))
-        learned = near.maxima[0].information if same else None
-        return _refit(programs, near.folds, [None] * len(programs), learned, fitting=near.fitting)
+        folds = [_wide_fold(fold, program) for fold, program in zip(near.folds, programs, strict=True)]
+        maxima = []
+        for program, fold in zip(programs, folds, strict=True):
+            share = len(fold.drives) / len(folds[0].drives)
+            guess = share * near.maxima[0].information if same else None
+            maxima.append(near.fitting.fit(fold.fitting(program), fold.path, information=guess))
+        ended = [replace(fold, path=maximum.path) for fold, maximum in zip(folds, maxima, strict=True)]
+        return Fits(programs, maxima, ended, near.fitting)
+    except SteadyError as error:
+        return str(error)
+
+
+def refit_near(base: Fits, near: Fits, variants: Sequence[Variant]) -> Refit | str:
+    """`fit_near`, and how that explains the drives that were kept from it."""
+    fits = fit_near(base, near, variants)
+    return fits if isinstance(fits, str) else judged_fits(fits)
+
+
+def judged_fits(fits: Fits) -> Refit | str:
+    """How a program explains the drives that were kept from its fits, or why it cannot follow them."""
+    try:
+        return _refit(fits.programs, fits.folds, fits.maxima, fitting=fits.fitting)
     except SteadyError as error:
         return str(error)
 
@@ -269,6 +300,8 @@ def _refit(
         fold = _wide_fold(begun, program)
         share = len(fold.drives) / len(folds[0].drives)
         guess = None if information is None else share * information
+        if threshold.hopeless and not fitted:
+            floor = max(floor, threshold.drives)
         anew = None if unwidened is None else _fitted_anew(fold.fitting(as_declared(unwidened, program)), floor)
         if anew is not None:
             floor = max(floor, float(anew[1].log_likelihood.sum()))
@@ -294,7 +327,7 @@ def _refit(
             fitting.judge(fold.judging(program), fold.held_out_path).log_likelihood
             for program, fold in zip(judges.programs, judged_folds, strict=True)
         ]
-    return Refit(fitted, judges, found, judged_folds, torch.cat(held_out), alone, unwidened, fitting)
+    return Refit(fitted, found, judged_folds, fitting, judges, torch.cat(held_out), alone, unwidened)
 
 
 def _fitted_anew(problem: Problem, floor: float) -> tuple[Program, Maximum] | None:

@@ -25,7 +25,7 @@ from steady_ppl.discovery.candidates import (
     leaders,
     screen_program,
 )
-from steady_ppl.discovery.refits import Refit, Threshold, first_refit, refit_near, refit_with
+from steady_ppl.discovery.refits import ALWAYS, Refit, Threshold, first_refit, refit_near, refit_with
 from steady_ppl.discovery.screening import ALPHA, Tested
 from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
@@ -39,6 +39,7 @@ MIN_GAIN_OF_CURVE = 3.0  # nats by which a curve must be better than named effec
 
 MAX_NATS_BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
 MAX_NATS_OF_RIVAL = 12.0  # nats behind the best in its round, with which one is fitted again beside other effects
+SAME = 0.2  # nats within which fits from two starts have ended at the same place
 MIN_NATS_OF_RUNAWAY = 25.0  # nats above every fit that it is a part of, from which a fit is not to be believed
 MAX_SHIFT_OF_SIZES = 0.08  # nats by which twice the substeps may move what is reported: 0.4 standard deviations
 MAX_SUBSTEPS_OF_FIT = 128  # of a fitted program, at most: what a coarser step leaves would be named as an effect
@@ -124,7 +125,7 @@ class Search:
     def curve(self) -> Candidate | None:
         """The curve that explains the drives better than all effects that were found; where the noise alone may be what
         the tests found, one that is significant itself."""
-        best = next((curve for curve in self.curves if isinstance(curve.refit, Refit)), None)
+        best = next((curve for curve in self.curves if curve.is_judged), None)
         if best is None or best.total <= self.gain + MIN_GAIN_OF_CURVE:
             return None
         tests = self.rounds[0].screening.tests
@@ -186,7 +187,7 @@ def _step_of(refit: Refit, found: Sequence[Found] = ()) -> StepCheck:
 
 def _rounds(found: Search, settings: Settings) -> Search:
     """Test, fit and add until nothing is left."""
-    with stages(("", 7), ("looking again", 1)) as begin:
+    with stages(("", 6), ("looking again", 1), ("fitting curves", 1)) as begin:
         begin()
         rounds = range(MAX_EFFECTS + 1)
         shares = [part for index in rounds for part in (("testing every effect", 1 / 2**index), ("", 1 / 2**index))]
@@ -214,6 +215,9 @@ def _rounds(found: Search, settings: Settings) -> Search:
                 except FilterError:
                     found.diverged = [label for label in labels(found.final) if label not in labels(final)]
                     found.found, found.final = before, final
+        begin()
+        if len(found.rounds) > 1 and not found.rounds[1].quiet:
+            found.curves = _curves(found)
     return found
 
 
@@ -222,15 +226,13 @@ def _add_best(found: Search, screening: Screening, index: int) -> bool:
     found.rounds.append(Round(screening, [], None))
     if found.rounds[-1].quiet:
         return False
-    if index == 1 and not found.curves:
-        found.curves = _curves(found.base, found.rounds[0].screening)
     if index == MAX_EFFECTS:
         return False
     candidates = _refits(found.final, screening, index == 0)
     able = [c for c in candidates if c.is_judged and not c.against_its_sign]
     best = next((c for c in able if c.significant(screening.tests.critical)), None)
     if index == 0 and best is None:
-        found.curves = _curves(found.base, screening)
+        found.curves = _curves(found)
         if found.curve is None and not found.departed:  # neither can be what the tests found
             best = next((c for c in able if c.total > NATS and c.tested.p_value <= NEAR_ALPHA), None)
     found.rounds[-1] = Round(screening, candidates, best)
@@ -264,7 +266,15 @@ def _threshold(candidates: Sequence[Candidate]) -> Threshold:
     return Threshold(max(drives, default=-math.inf) - MAX_NATS_BEHIND, max(held_out, default=-math.inf) - NATS)
 
 
-def _curves(base: Refit, screening: Screening) -> list[Candidate]:
+def _curves(search: Search) -> list[Candidate]:
+    """Fits of the curves that the first tests point at, to the program as it stands; those that are behind all named
+    effects together on the first fold are given up."""
+    base, screening = search.base, search.rounds[0].screening
+    named, threshold = None, ALWAYS
+    if search.found:
+        named = judged(base, search.found[0].candidate.tested, search.final)
+        threshold = replace(_threshold([named]), hopeless=True)
+
     def multiplies(tested: Tested) -> bool:
         return bool(tested.variant.options.get("times"))
 
@@ -274,7 +284,8 @@ def _curves(base: Refit, screening: Screening) -> list[Candidate]:
 
     adding = [tested for tested in screening.tests.curves if not multiplies(tested)]
     multiplying = [tested for tested in screening.tests.curves if multiplies(tested)]
-    found = [fitted(base, tested, screening) for tested in [*adding[:MAX_CURVES], *multiplying[:1]]]
+    chosen = [*adding[:MAX_CURVES], *multiplying[:1]]
+    found = [replace(fitted(base, tested, screening, threshold), behind=named) for tested in chosen]
     return sorted(found, key=worth, reverse=True)
 
 
@@ -287,7 +298,7 @@ def prune(search: Search) -> None:
     """Drop effects that are not needed beside the others, and let the rivals of each have its place."""
     for found in list(search.found):
         without = _without(search, found)
-        if isinstance(without, str):
+        if isinstance(without, str) or without is found.without:  # beside which it was chosen among the same rivals
             continue
         chosen, least = found.candidate, found.candidate.total - MAX_NATS_OF_RIVAL
         rivals = [chosen, *(c for c in found.candidates if c is not chosen and c.total > least)]
@@ -315,12 +326,13 @@ def _without(search: Search, found: Found) -> Refit | str:
     """The program with the other effects, fitted one after the other and from where the fit of all ended: the likelier,
     lest a fit that has stopped early make an effect look needed."""
     others = [other.candidate for other in search.found if other is not found]
-    afresh = _with_all(search.base, others)
+    was_so = set(labels(found.without)) == {other.variant.label for other in others}
+    afresh = found.without if was_so else _with_all(search.base, others)
     near = refit_near(search.base, search.final, [other.variant for other in others])
     if isinstance(afresh, str) or isinstance(near, str):
         return afresh if isinstance(near, str) else near
     most = max(_objective(search.final), _objective(afresh)) + MIN_NATS_OF_RUNAWAY  # more: it has run away
-    return near if _objective(afresh) < _objective(near) < most else afresh
+    return near if _objective(afresh) + SAME < _objective(near) < most else afresh
 
 
 def _objective(refit: Refit) -> float:

@@ -94,7 +94,7 @@ def maximise(
         information: `(P, P)` of the learnable numbers, where it is known.
         steps: scoring steps at most.
         precision: stop when another step would gain less, nats.
-        hopeless: give up where a few steps have not brought log p(y) above this.
+        hopeless: give up after a few steps where log p(y) would not reach this were it to go on rising as in the last.
 
     Raises:
         FilterError: the program cannot be smoothed at its initial parameters.
@@ -174,7 +174,7 @@ def climb(
         reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
     is_given = information is not None
     information = _regularised(_of_drives(here) if information is None else information)
-    taken, decrement, passes = 0, 0.0, PASSES
+    taken, decrement, risen, passes = 0, 0.0, 0.0, PASSES
     with stages(*(("", FEWER**step) for step in range(steps + 1))) as begin:
         for taken in range(steps + 1):
             begin()
@@ -191,7 +191,7 @@ def climb(
                 information = _regularised(_of_drives(here))
                 move, _ = torch.linalg.solve_ex(information, here.gradient)
                 decrement = 0.5 * float(here.gradient @ move)
-            behind = taken >= 6 and here.log_likelihood < hopeless
+            behind = taken >= 6 and here.log_likelihood + (steps - taken) * risen < hopeless
             if decrement < precision or taken == steps or behind:
                 break
             move = move * min(1.0, 1 / max(1e-9, float((move.abs() / reach).max())))
@@ -200,7 +200,7 @@ def climb(
             share, there = _searched(terms, here, move, passes)
             if there is not None:
                 information = _updated(information, share * move, here.gradient - there.gradient)
-                here = there
+                risen, here = max(0.0, there.log_likelihood - here.log_likelihood), there
             elif passes == STALLED_PASSES:
                 break
             else:

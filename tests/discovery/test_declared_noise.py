@@ -9,7 +9,7 @@ import torch
 from examples import drives, example
 
 from steady_ppl.discovery.fitting import Judges
-from steady_ppl.discovery.refits import Fold, Refit
+from steady_ppl.discovery.refits import BY_LIKELIHOOD, Fold, Refit
 from steady_ppl.discovery.screening import departures
 from steady_ppl.discovery.search import Found
 from steady_ppl.gaussian.linearize import ReferencePath
@@ -23,7 +23,7 @@ def fitted(*programs) -> Refit:
         data = drives(program, count, 9)
         path = ReferencePath(data.states, torch.zeros(8, count, 3).double())
         folds.append(Fold(data, path, data, path))
-    return Refit(list(programs), Judges(list(programs), []), [], folds, torch.zeros(6), torch.zeros(6))
+    return Refit(list(programs), [], folds, BY_LIKELIHOOD, Judges(list(programs), []), torch.zeros(6), torch.zeros(6))
 
 
 @pytest.mark.parametrize("effect", ["range_dependent_noise", "coloured_noise:yaw"])
