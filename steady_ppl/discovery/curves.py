@@ -14,6 +14,7 @@ from typing import Any
 
 import pyro.distributions as dist
 import torch
+from pyro.distributions.transforms import LowerCholeskyAffine
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
@@ -182,8 +183,22 @@ def _effect(form: str, variable: str, knots: Sequence[float], spread: float, uni
         typical=tuple(spread for _ in knots),
         limit=HEIGHT_SD * spread,
         components=tuple(f"{knot:.3g}" for knot in knots),
-        prior=dist.MultivariateNormal(torch.zeros(len(knots)), covariance_matrix=covariance.float()),
+        prior=_normal(covariance.float()),
     )
+
+
+def prior_covariance(effect: Effect) -> Tensor:
+    """Of a curve's heights, `(K, K)`, in double precision."""
+    (along,) = effect.prior.transforms
+    root: Tensor = along.scale_tril.double()
+    return root @ root.T
+
+
+def _normal(covariance: Tensor) -> Any:
+    """A normal about zero: `MultivariateNormal` loads sympy, half a second."""
+    zeros = torch.zeros(len(covariance))
+    along = LowerCholeskyAffine(zeros, torch.linalg.cholesky(covariance))
+    return dist.TransformedDistribution(dist.Normal(zeros, 1.0).to_event(1), [along])
 
 
 def _correlation(knots: Sequence[float], circular: bool) -> Tensor:

@@ -16,7 +16,7 @@ from steady_ppl.effects import Variant, attach, attached, coefficient
 from steady_ppl.errors import FilterError, SteadyError
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.likelihood.maximize import Maximum, fit_by_likelihood, maximum_of, refit_outliers
-from steady_ppl.likelihood.parameters import elements, values_of
+from steady_ppl.likelihood.parameters import Element, elements, values_of
 from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import widens
 from steady_ppl.model.program import Program
@@ -215,20 +215,22 @@ def refit_with(
     variant: Variant,
     value: float | Sequence[float] | Tensor,
     *,
-    information: Tensor | None = None,
+    information: Tensor | Maximum | None = None,
     threshold: Threshold = ALWAYS,
 ) -> Refit | str:
     """The program with an effect whose coefficient begins at `value`, or why it cannot be fitted.
 
     Args:
         base: the program without.
-        information: of the first fold's drives, the coefficient last.
+        information: of the first fold's drives, the coefficient last; or a fit that learned all these numbers.
         threshold: what the first fold must reach for the second to be fitted as well.
     """
     try:
         programs = [attach(copy.deepcopy(program), variant, value) for program in base.programs]
         least = [float(maximum.log_likelihood.sum()) - MAX_LOSS for maximum in base.maxima]
         nothing = [None] * len(programs)
+        if isinstance(information, Maximum):
+            information = _information(information, elements(programs[0]))
         return _refit(programs, base.folds, nothing, information, least, threshold, base.unwidened, base.fitting)
     except SteadyError as error:
         return str(error)
@@ -248,23 +250,17 @@ def fit_near(base: Fits, near: Fits, variants: Sequence[Variant]) -> Fits | str:
         for program, fitted in zip(programs, near.programs, strict=True):
             own = program.state_dict()
             program.load_state_dict(own | {name: value for name, value in fitted.state_dict().items() if name in own})
-        same = near.maxima[0].names == tuple(part.name for part in elements(programs[0]))
+        known = _information(near.maxima[0], elements(programs[0]))
         folds = [_wide_fold(fold, program) for fold, program in zip(near.folds, programs, strict=True)]
         maxima = []
         for program, fold in zip(programs, folds, strict=True):
             share = len(fold.drives) / len(folds[0].drives)
-            guess = share * near.maxima[0].information if same else None
+            guess = None if known is None else share * known
             maxima.append(near.fitting.fit(fold.fitting(program), fold.path, information=guess))
         ended = [replace(fold, path=maximum.path) for fold, maximum in zip(folds, maxima, strict=True)]
         return Fits(programs, maxima, ended, near.fitting)
     except SteadyError as error:
         return str(error)
-
-
-def refit_near(base: Fits, near: Fits, variants: Sequence[Variant]) -> Refit | str:
-    """`fit_near`, and how that explains the drives that were kept from it."""
-    fits = fit_near(base, near, variants)
-    return fits if isinstance(fits, str) else judged_fits(fits)
 
 
 def judged_fits(fits: Fits) -> Refit | str:
@@ -336,6 +332,14 @@ def _fitted_anew(problem: Problem, floor: float) -> tuple[Program, Maximum] | No
         return problem.program, maximum_of(problem, hopeless=floor)
     except FilterError:
         return None
+
+
+def _information(maximum: Maximum, parts: Sequence[Element]) -> Tensor | None:
+    """Of learnable numbers, as a fit in which they and perhaps others were learned left it; None if some were not."""
+    if not {part.name for part in parts} <= set(maximum.names):
+        return None
+    index = [maximum.names.index(part.name) for part in parts]
+    return maximum.information[index][:, index]
 
 
 def _there(program: Program, variant: Variant) -> Variant:

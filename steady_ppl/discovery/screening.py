@@ -19,7 +19,7 @@ from scipy import optimize, stats
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.discovery.curves import NAME as CURVE
+from steady_ppl.discovery.curves import NAME as CURVE, prior_covariance
 from steady_ppl.discovery.effect_scores import Column, Simulated
 from steady_ppl.discovery.refits import Fold, Refit, as_declared
 from steady_ppl.effects import Variant, attached, catalogue
@@ -193,7 +193,7 @@ def _test(column: Column, place: slice, projected: Tensor, left: Tensor, before:
 def _test_of_curve(column: Column, place: slice, scores: Tensor, own: Tensor) -> _Test:
     """A score test against the prior (Liu, Lin and Ghosh 2007): a weighted sum of χ² of one degree of freedom, matched
     by a scaled χ² of the same mean and variance (Satterthwaite)."""
-    covariance = column.variant.effect.prior.covariance_matrix.double()
+    covariance = prior_covariance(column.variant.effect)
     root = torch.linalg.cholesky(covariance)
     values, turn = torch.linalg.eigh(root.T @ own @ root)
     values = values.clamp(min=0)

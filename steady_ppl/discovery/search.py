@@ -25,7 +25,16 @@ from steady_ppl.discovery.candidates import (
     leaders,
     screen_program,
 )
-from steady_ppl.discovery.refits import ALWAYS, Refit, Threshold, first_refit, refit_near, refit_with
+from steady_ppl.discovery.refits import (
+    ALWAYS,
+    Fits,
+    Refit,
+    Threshold,
+    first_refit,
+    fit_near,
+    judged_fits,
+    refit_with,
+)
 from steady_ppl.discovery.screening import ALPHA, Tested
 from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
@@ -306,7 +315,8 @@ def prune(search: Search) -> None:
         again = []
         for rival in rivals:
             if rival.variant.name not in there and isinstance(rival.refit, Refit):
-                refit = refit_with(without, rival.variant, rival.refit.coefficient(rival.variant))
+                begin = rival.refit.coefficient(rival.variant)
+                refit = refit_with(without, rival.variant, begin, information=search.final.maxima[0])
                 again.append(at_its_best_place(without, judged(without, rival.tested, refit)))
         as_it_stands = judged(without, chosen.tested, search.final)
         if all(c.total < as_it_stands.total for c in again if c.variant.name == chosen.variant.name):
@@ -328,15 +338,15 @@ def _without(search: Search, found: Found) -> Refit | str:
     others = [other.candidate for other in search.found if other is not found]
     was_so = set(labels(found.without)) == {other.variant.label for other in others}
     afresh = found.without if was_so else _with_all(search.base, others)
-    near = refit_near(search.base, search.final, [other.variant for other in others])
+    near = fit_near(search.base, search.final, [other.variant for other in others])
     if isinstance(afresh, str) or isinstance(near, str):
-        return afresh if isinstance(near, str) else near
+        return afresh if isinstance(near, str) else judged_fits(near)
     most = max(_objective(search.final), _objective(afresh)) + MIN_NATS_OF_RUNAWAY  # more: it has run away
-    return near if _objective(afresh) + SAME < _objective(near) < most else afresh
+    return judged_fits(near) if _objective(afresh) + SAME < _objective(near) < most else afresh
 
 
-def _objective(refit: Refit) -> float:
-    return sum(maximum.objective for maximum in refit.maxima)
+def _objective(fits: Fits) -> float:
+    return sum(maximum.objective for maximum in fits.maxima)
 
 
 def _with_all(base: Refit, candidates: Sequence[Candidate]) -> Refit | str:
@@ -344,5 +354,6 @@ def _with_all(base: Refit, candidates: Sequence[Candidate]) -> Refit | str:
     for candidate in candidates:
         if isinstance(now, str) or isinstance(candidate.refit, str):
             return now
-        now = refit_with(now, candidate.variant, candidate.refit.coefficient(candidate.variant))
+        begin, known = candidate.refit.coefficient(candidate.variant), candidate.refit.maxima[0]
+        now = refit_with(now, candidate.variant, begin, information=known)
     return now

@@ -17,7 +17,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
 from steady_ppl.gaussian.linearize import ReferencePath, angles_on_a_circle, linearize
-from steady_ppl.kernels.jit import on_all_rows
+from steady_ppl.kernels.jit import on_all_rows, unchanged
 from steady_ppl.model.handlers import (
     KnownStart,
     Recording,
@@ -69,28 +69,29 @@ def smooth(
         return look_ahead(linearize(program, data, path, **given))
 
     given: dict[str, Any] = {"known_start": known_start, "observation_weight": observation_weight, "kernels": kernels}
-    given["angles"] = angles_on_a_circle(program, data, path.states[0, :1])
-    if passes == 1:
-        return look(path)
-    accepted = path = ReferencePath(path.states, torch.where(data.transitions[..., None], path.noise, 0.0))
-    penalty = torch.zeros_like(path.states, dtype=torch.float64)
-    most = torch.full((len(data),), torch.inf, dtype=torch.float64, device=path.states.device)
-    for index in range(passes):
-        ahead = look(path)
-        density, defect = _merit(ahead)
-        worse = torch.isfinite(most) & ~(_cost(density, defect, penalty) <= most)  # or not a number
-        accepted = _either(worse, accepted, path)
-        if index == passes - 1:
-            break
-        halfway = ReferencePath((accepted.states + path.states) / 2, (accepted.noise + path.noise) / 2)
-        moved = _either(worse, halfway, means_as_path(ahead, data))
-        change = torch.nan_to_num((moved.noise - path.noise).abs(), nan=0.0).max()  # of those that have not blown up
-        penalty = torch.where(worse[:, None], penalty, _penalty(ahead, moved))
-        most = torch.where(worse, most, _cost(density, defect, penalty) + MAX_INCREASE)
-        path = moved
-        if not bool(change > tolerance):
-            break
-    return look(accepted) if bool(worse.any()) else ahead
+    with unchanged(program):
+        given["angles"] = angles_on_a_circle(program, data, path.states[0, :1])
+        if passes == 1:
+            return look(path)
+        accepted = path = ReferencePath(path.states, torch.where(data.transitions[..., None], path.noise, 0.0))
+        penalty = torch.zeros_like(path.states, dtype=torch.float64)
+        most = torch.full((len(data),), torch.inf, dtype=torch.float64, device=path.states.device)
+        for index in range(passes):
+            ahead = look(path)
+            density, defect = _merit(ahead)
+            worse = torch.isfinite(most) & ~(_cost(density, defect, penalty) <= most)  # or not a number
+            accepted = _either(worse, accepted, path)
+            if index == passes - 1:
+                break
+            halfway = ReferencePath((accepted.states + path.states) / 2, (accepted.noise + path.noise) / 2)
+            moved = _either(worse, halfway, means_as_path(ahead, data))
+            change = torch.nan_to_num((moved.noise - path.noise).abs(), nan=0.0).max()  # of what has not blown up
+            penalty = torch.where(worse[:, None], penalty, _penalty(ahead, moved))
+            most = torch.where(worse, most, _cost(density, defect, penalty) + MAX_INCREASE)
+            path = moved
+            if not bool(change > tolerance):
+                break
+        return look(accepted) if bool(worse.any()) else ahead
 
 
 def _merit(ahead: Lookahead) -> tuple[Tensor, Tensor]:

@@ -7,6 +7,7 @@ import hashlib
 import itertools
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple, Protocol, TypeVar
 from weakref import WeakKeyDictionary
 
@@ -22,7 +23,7 @@ from steady_ppl.kernels.tape import first_names, where
 from steady_ppl.utils.text import one_line
 
 TRACES = 32  # of one method of programs of one class; each takes some hundredths of a second
-COMPARED_EVERY = 4  # of a program's runs on all rows; the first two are compared as well
+COMPARED_EVERY = 16  # of a program's runs on all rows; the first two are compared as well
 KERNELS = 256  # that are kept in memory
 FEW = 1000  # numbers of a tensor that are looked at one by one
 ROWS_WORTH_COMPILING = 1000  # of all trajectories together
@@ -31,12 +32,13 @@ DIFFERENT = "its kernel and its own lines come to different numbers"
 NO_SLOPES = "some of its slopes are no numbers"
 SETTING = bool | int | float | str | tuple | list | dict | np.ndarray | Tensor
 OF_MODULES = vars(nn.Module()).keys() - {"training"}  # attributes in which torch keeps parameters, buffers and hooks
-Compiled = TypeVar("Compiled")
+Value = TypeVar("Value")
 Array = np.ndarray
 Examples = dict[str, Tensor]  # of the arguments of a function
 _COMPILED: WeakKeyDictionary[type[nn.Module], dict[Any, Any]] = WeakKeyDictionary()
 _NAMES: WeakKeyDictionary[type[nn.Module], list[tuple[int, list[str]]]] = WeakKeyDictionary()
 _RUNS: WeakKeyDictionary[nn.Module, Counter[Method]] = WeakKeyDictionary()
+_READ: WeakKeyDictionary[nn.Module, dict[Any, Any]] = WeakKeyDictionary()  # of programs that are `unchanged` for now
 
 
 class Kernel:
@@ -156,7 +158,7 @@ class Method:
     @torch.no_grad()
     def parameters(self, program: nn.Module) -> Array:
         """What the kernel takes of a program's parameters, as they are now."""
-        return self._taken(self.tape.run(_tensors(program))).numpy()
+        return _read(program, self, lambda: self._taken(self.tape.run(_tensors(program))).numpy())
 
     def _taken(self, values: Sequence[Tensor]) -> Tensor:
         parts = [values[place].detach().to(torch.float32).flatten() for place in self.graph.parameters]
@@ -214,7 +216,7 @@ def _kernel(graph: ScalarGraph, inputs: tuple[str, ...], columns: dict[str, int]
     return _KERNELS[key]
 
 
-def compiled(program: nn.Module, name: str, build: Callable[[], Compiled]) -> Compiled | str:
+def compiled(program: nn.Module, name: str, build: Callable[[], Value]) -> Value | str:
     """What was compiled under a name for programs like this one, built once; or why there is none."""
     known = _COMPILED.setdefault(type(program), {})
     key = (name, signature(program))
@@ -251,8 +253,34 @@ def _members(value: Any) -> Iterable[Any]:
     return value.values() if isinstance(value, dict) else value if isinstance(value, tuple | list) else (value,)
 
 
+@contextmanager
+def unchanged(program: nn.Module) -> Iterator[None]:
+    """What kernels take of a program is read once: nothing of it changes meanwhile."""
+    outer = program in _READ
+    _READ.setdefault(program, {})
+    try:
+        yield
+    finally:
+        if not outer:
+            del _READ[program]
+
+
+def _read(program: nn.Module, what: Any, read: Callable[[], Value]) -> Value:
+    known = _READ.get(program)
+    if known is None:
+        return read()
+    if what not in known:
+        known[what] = read()
+    found: Value = known[what]
+    return found
+
+
 def signature(program: nn.Module) -> tuple[Any, ...]:
     """What a trace takes as given: the shapes of a program's tensors, which of them are one, and its settings."""
+    return _read(program, signature, lambda: _signature(program))
+
+
+def _signature(program: nn.Module) -> tuple[Any, ...]:
     settings = [
         (at, name, _content(value))
         for at, module in program.named_modules()

@@ -10,7 +10,7 @@ import torch
 from examples import drives, example
 
 from steady_ppl.discovery.candidates import gain_of_fits
-from steady_ppl.discovery.refits import first_refit, refit_near, refit_with
+from steady_ppl.discovery.refits import first_refit, fit_near, judged_fits, refit_with
 from steady_ppl.effects import chosen_variant
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood.maximize import maximise, widen_noise
@@ -127,7 +127,7 @@ def test_a_fit_at_another_knee_is_the_one_from_nothing():
     assert base.unwidened is None
     knees = [chosen_variant(program, "thrust_saturation", knee=knee) for knee in (0.5, 0.65)]
     direct = [refit_with(base, knee, 0.5) for knee in knees]
-    near = refit_near(base, direct[0], [knees[1]])
+    near = judged_fits(fit_near(base, direct[0], [knees[1]]))
     assert gain_of_fits(base, near) == pytest.approx(gain_of_fits(base, direct[1]), abs=0.2)
     # fits rest within .02 nats of their maxima, .2 standard deviations: of two fits on two folds .4 nats, three of them
     assert float((near.held_out - direct[1].held_out).sum()) == pytest.approx(0.0, abs=1.2)
