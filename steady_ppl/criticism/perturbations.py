@@ -8,7 +8,7 @@ tests physical effects by name.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,11 +17,13 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
-from steady_ppl.gaussian.predict import errors, on_a_circle
+from steady_ppl.gaussian.predict import errors, mean_step, mean_steps, on_a_circle
+from steady_ppl.kernels.jit import Slopes, slopes_on_all_rows
+from steady_ppl.likelihood.parameters import Element, elements, on_both_sides
+from steady_ppl.likelihood.scores import measured, of_actuators
 from steady_ppl.model.actuation import lagged
-from steady_ppl.model.handlers import AtMean, running
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, advance, row_controls
+from steady_ppl.model.substeps import acting_controls, row_controls
 from steady_ppl.utils.angles import wrap, wrap_angles
 
 LAG = 0.3  # s
@@ -79,32 +81,45 @@ class _Scores:
 
     def of_parameters(self) -> Named:
         """The program's own parameters, where they move the mean."""
-        program, data = self.program, self.data
-        scalars = [(name, value, i) for name, value in program.named_parameters() for i in range(value.numel())]
-        if len(scalars) > MAX_PARAMETERS:
+        if sum(value.numel() for value in self.program.parameters()) > MAX_PARAMETERS:
             return
-
-        def run() -> tuple[Tensor, Tensor]:
-            measured = errors(program, self.path.states, data.measurements, data.observed)
-            return self._moved(acting_controls(program, data)), -measured.double()
-
-        for name, value, index in scalars:
-            flat = value.data.view(-1)
-            before = flat[index].clone()
-            size = 0.01 * max(1.0, abs(float(before)))
-            try:
-                flat[index] = before + size
-                moved, measured = run()
-                flat[index] = before - size
-                moved_less, measured_less = run()
-            finally:
-                flat[index] = before
-            push = wrap_angles(moved - moved_less, self.linear.angles) / (2 * size)
-            shift = torch.where(data.observed, measured - measured_less, 0.0) / (2 * size)
-            score = self.push(push) + self.shift(shift)
+        parts = elements(self.program, frozen=True)
+        if not parts:
+            return
+        for part, score in zip(parts, (self._pushed_by(parts) + self._shifted_by(parts)).unbind(-1), strict=True):
             if bool((score != 0).any()):
-                word = name.removesuffix("_unconstrained")
-                yield word if value.numel() == 1 else f"{word}[{index}]", score
+                yield part.name, score
+
+    def _pushed_by(self, parts: Sequence[Element]) -> Tensor:
+        """Scores of what learnable numbers change of the mean steps, `(B, P)`."""
+        program, data = self.program, self.data
+        given = {"state": self.states, "control": self.controls[:-1], "time": data.elapsed[:-1], "step": data.steps}
+        slopes = slopes_on_all_rows(program, "mean step", mean_step(program), given, parts)
+        scores, left = torch.zeros(len(data), len(parts)).double(), list(range(len(parts)))
+        if isinstance(slopes, Slopes):
+            arrival = torch.where(data.transitions[..., None], self.arrival, 0.0)
+            scores, left = slopes.weighted(arrival), of_actuators(program, data, parts)
+        for index in left:
+            up, down = on_both_sides(parts[index], lambda: self._moved(acting_controls(program, data)))
+            scores[:, index] = self.push(wrap_angles(up - down, self.linear.angles) / (2 * parts[index].step))
+        return scores
+
+    def _shifted_by(self, parts: Sequence[Element]) -> Tensor:
+        """The same of what the program measures."""
+        program, data, states = self.program, self.data, self.path.states
+
+        def reading(state: Tensor) -> Tensor:
+            return measured(program, state).reading
+
+        slopes = slopes_on_all_rows(program, "reading", reading, {"state": states}, parts)
+        if isinstance(slopes, Slopes):
+            return slopes.weighted(torch.where(data.observed, self.reading, 0.0))
+        scores = []
+        for part in parts:
+            sides = on_both_sides(part, lambda: errors(program, states, data.measurements, data.observed).double())
+            shift = torch.where(data.observed, sides[1] - sides[0], 0.0)
+            scores.append(self.shift(shift / (2 * part.step)))
+        return torch.stack(scores, -1)
 
     def of_sensors(self) -> Named:
         """Offset, scale and delay of every measurement, and of all in one unit together."""
@@ -131,13 +146,14 @@ class _Scores:
         for index, (name, answer) in enumerate(zip(self.program.control_names, self.answers, strict=True)):
             if answer is None:
                 continue
+            along = torch.where(self.data.transitions, (answer * self.arrival).sum(-1), 0.0)
             for word, shape in self._other_than(self.commands[:-1, :, index]).items():
-                push = answer * shape.unsqueeze(-1)
-                together.setdefault(word, []).append(push)
-                yield f"{word} {name}", self.push(push)
-        for word, pushes in together.items():
-            if len(pushes) > 1 and word not in ALONE:
-                yield f"{word} all controls", self.push(torch.stack(pushes).sum(0))
+                score = (shape * along).sum(0)
+                together.setdefault(word, []).append(score)
+                yield f"{word} {name}", score
+        for word, scores in together.items():
+            if len(scores) > 1 and word not in ALONE:
+                yield f"{word} all controls", torch.stack(scores).sum(0)
 
     def _other_than(self, command: Tensor) -> dict[str, Tensor]:
         """How what acts may differ from a command `(T, B)`, in words."""
@@ -217,6 +233,4 @@ class _Scores:
 
     def _moved(self, controls: Tensor) -> Tensor:
         """The program's mean step from every row, `(T, B, D)`."""
-        with running(*self.states.shape[:-1]), AtMean():
-            moved = advance(self.program, self.states, controls[:-1], self.data.elapsed[:-1], self.data.steps)
-        return moved.double()
+        return mean_steps(self.program, self.states, controls[:-1], self.data.elapsed[:-1], self.data.steps).double()

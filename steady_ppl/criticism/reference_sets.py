@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,13 +21,14 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.kalman import Tracked, track
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, predict, simulate_again
-from steady_ppl.gaussian.smoother import smooth
+from steady_ppl.gaussian.smoother import REST_TOLERANCE, means_as_path, smooth
 from steady_ppl.model.program import Program
 
 MIN_SETS = 20  # sets
-MAX_ROWS_OF_BLOCK = 500_000  # of all drives of a block
+MAX_ROWS_OF_BLOCK = 100_000  # of all drives of a block: larger arrays are slower to come by than to fill
 LINEARISATIONS = 4
-"""Linearisations: beside a landmark the truth is far from the mode, where the measured drives' paths lie."""
+"""Linearisations of drives that need them: beside a landmark the truth is far from the mode, where the measured drives'
+paths lie."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +72,7 @@ def _block(
     """None where every set blew up."""
     sets = len(starts)
     again, truth = simulate_again(program, data, starts, channels)
-    near = smooth(program, again, truth, known_start=known_start, passes=LINEARISATIONS).linearization.path
-    copies = track(program, again, near, known_start=known_start, passes=1)
+    near, copies = _tracked(program, again, truth, known_start)
     whole = torch.isfinite(copies.log_likelihood).view(sets, -1).all(1)
     if not bool(whole.all()):
         if not bool(whole.any()):
@@ -87,6 +88,24 @@ def _block(
         residuals(program, again, copies, simulated[1], sets),
         directions(program, again, copies),
     )
+
+
+def _tracked(
+    program: Program, data: Trajectories, truth: ReferencePath, known_start: bool
+) -> tuple[ReferencePath, Tracked]:
+    """Paths near the posterior's modes, and the drives along them. Drives whose path is still on its way after a single
+    step from the truth take more."""
+    given: dict[str, Any] = {"known_start": known_start}
+    near = means_as_path(smooth(program, data, truth, passes=1, **given), data)
+    tracked = track(program, data, near, passes=1, **given)
+    far = ~((tracked.noise - near.noise).abs().amax((0, 2)) <= REST_TOLERANCE)
+    if bool(far.any()):
+        index = far.nonzero().flatten()
+        begin = ReferencePath(truth.states[:, index], truth.noise[:, index])
+        path = smooth(program, data.subset(index), begin, passes=LINEARISATIONS, **given).linearization.path
+        near.states[:, index], near.noise[:, index] = path.states, path.noise
+        tracked = track(program, data, near, passes=1, **given)
+    return near, tracked
 
 
 def _joined(blocks: Sequence[SimulatedSets]) -> SimulatedSets:

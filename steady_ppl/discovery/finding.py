@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy import stats
+from scipy import special
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
@@ -74,7 +74,7 @@ def _finding(search: Search, found: Found) -> Finding:
         places = variance_of_places(found.without, found.candidate)
         scale = values if effect.null != 0 else 1.0  # of its logarithm
         spread = np.sqrt(spread**2 + places.numpy() / scale**2)
-    by = stats.norm.isf((1 - INTERVAL) / 2)
+    by = -special.ndtri((1 - INTERVAL) / 2)
     if effect.null != 0:  # positive, learned as its logarithm
         interval = [(v * math.exp(-by * s), v * math.exp(by * s)) for v, s in zip(values, spread, strict=True)]
         spread = values * spread
@@ -118,7 +118,7 @@ def _confidence(search: Search, found: Found, alike: Sequence[Candidate]) -> flo
 
 def _departure(search: Search, tested: Tested) -> Finding:
     factor, sd = 1 + float(tested.coefficient[0]), float(tested.sd[0])
-    by = stats.norm.isf((1 - INTERVAL) / 2) * sd / factor
+    by = -special.ndtri((1 - INTERVAL) / 2) * sd / factor
     return Finding(
         variant=tested.variant,
         kind="noise",
@@ -138,7 +138,7 @@ def shape_of(search: Search, program: Program) -> Shape | None:
         return None
     variant = curve.variant
     heights = curve.refit.coefficient(variant)
-    width = float(stats.norm.isf((1 - INTERVAL) / 2 / len(heights))) * math.sqrt(curve.refit.first_share)
+    width = float(-special.ndtri((1 - INTERVAL) / 2 / len(heights))) * math.sqrt(curve.refit.first_share)
     channel = variant.at.partition("~")[0]
     variable = variant.options.get("variable", "reading")
     about = program.measurement_names[0] if channel == "all" else channel

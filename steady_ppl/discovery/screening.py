@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy import optimize, stats
+from scipy import optimize, special
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
@@ -168,8 +168,8 @@ def _limit(tested: Tested, critical: float) -> np.ndarray:
         return nothing
     size = len(tested.coefficient)
     level = -math.expm1(math.log1p(-critical) / tested.effective)
-    threshold = stats.chi2.isf(level, size)
-    needed = optimize.brentq(lambda away: stats.ncx2.sf(threshold, size, away) - POWER, 1e-6, 1e4)
+    threshold = special.chdtri(size, level)
+    needed = optimize.brentq(lambda away: 1 - special.chndtr(threshold, size, away) - POWER, 1e-6, 1e4)
     return math.sqrt(needed) * tested.alone
 
 
@@ -182,7 +182,7 @@ def _test(column: Column, place: slice, projected: Tensor, left: Tensor, before:
         return None
     steps = torch.linalg.solve(own, scores.T).T
     statistics = (scores * steps).sum(-1).numpy()
-    p_values = stats.chi2.sf(statistics, column.size)
+    p_values = special.chdtrc(column.size, statistics)
     sd, alone = torch.linalg.inv(own).diagonal().sqrt().numpy(), own.diagonal().rsqrt().numpy()
     coefficient = steps[0].numpy()
     return _Test(
@@ -202,7 +202,7 @@ def _test_of_curve(column: Column, place: slice, scores: Tensor, own: Tensor) ->
     scale, freedom = float(weights.square().sum() / weights.sum()), float(weights.sum() ** 2 / weights.square().sum())
     statistics = squares.sum(-1).numpy()
     posterior = torch.linalg.inv(own + torch.linalg.inv(covariance))
-    p_values = stats.chi2.sf(statistics / scale, freedom)
+    p_values = special.chdtrc(freedom, statistics / scale)
     sd = posterior.diagonal().sqrt().numpy()
     tested = Tested(
         column,
@@ -223,7 +223,7 @@ def _departed(departure: Departure, information: Tensor, scores: Tensor) -> tupl
     step = torch.linalg.solve(information + ridge, departure.slope)  # a vanished noise has no information
     sd = float((departure.slope @ step).sqrt())
     z = torch.cat([torch.tensor([departure.away]).double(), scores[1:] @ step]).numpy() / sd
-    p_values = 2 * stats.norm.sf(np.abs(z))
+    p_values = 2 * special.ndtr(-np.abs(z))
     sds = np.array([sd * (math.sqrt(departure.share) * departure.factor)])
     coefficient = np.array([departure.factor - 1])
     column = Column(departure.variant)

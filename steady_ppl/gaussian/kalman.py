@@ -133,20 +133,19 @@ def filter_and_smooth(linear: Linearization) -> Tracked:
 @njit(cache=True, error_model="numpy")
 def forward(given: LinearArrays, filtered: Moments, updates: Updates) -> None:
     """Kalman (1960), a measurement component at a time. Fills `filtered` and `updates`."""
-    rows, trajectories, dimension = filtered.means.shape
-    mean, moved, covariance = np.zeros(dimension), np.zeros(dimension), np.zeros((dimension, dimension))
-    for b in range(trajectories):
-        mean[:] = given.start_offset[b]
-        set_product(covariance, given.start_noise[b], given.start_noise[b].T)
-        for t in range(rows):
-            if t > 0:
-                moved[:] = given.offset[t - 1, b]
-                add_times(moved, given.state[t - 1, b], mean)
-                mean[:] = moved
-                propagate(covariance, covariance, given.state[t - 1, b], given.noise[t - 1, b])
+    rows, trajectories, _ = filtered.means.shape
+    for t in range(rows):  # outside, as the arrays lie in memory
+        for b in range(trajectories):
+            mean, covariance = filtered.means[t, b], filtered.covariances[t, b]
+            if t == 0:
+                mean[:] = given.start_offset[b]
+                set_product(covariance, given.start_noise[b], given.start_noise[b].T)
+            else:
+                mean[:] = given.offset[t - 1, b]
+                add_times(mean, given.state[t - 1, b], filtered.means[t - 1, b])
+                before = filtered.covariances[t - 1, b]
+                propagate(covariance, before, given.state[t - 1, b], given.noise[t - 1, b])
             _update(given, updates, t, b, mean, covariance)
-            filtered.means[t, b] = mean
-            filtered.covariances[t, b] = covariance
 
 
 @njit(cache=True, error_model="numpy")
@@ -181,10 +180,12 @@ def backward(
     De Jong (1989): what is left of later innovations, carried back. Gᵀ arrival is the posterior mean of the noise.
     """
     rows, trajectories, components, dimension = given.measurement.shape
-    later, moved = np.zeros(dimension), np.zeros(dimension)
-    for b in range(trajectories):
-        later[:] = 0.0
-        for t in range(rows - 1, -1, -1):
+    for t in range(rows - 1, -1, -1):
+        for b in range(trajectories):
+            later = arrival[t, b]
+            later[:] = 0.0
+            if t < rows - 1:
+                set_times(later, given.state[t, b].T, arrival[t + 1, b])
             smoothed[t, b] = filtered.means[t, b]
             add_times(smoothed[t, b], filtered.covariances[t, b], later)
             for k in range(components - 1, -1, -1):
@@ -195,10 +196,6 @@ def backward(
                 for i in range(dimension):
                     later[i] += by_state[i] * score
                 reading[t, b, k] = score
-            arrival[t, b] = later
-            if t > 0:
-                set_times(moved, given.state[t - 1, b].T, later)
-                later[:] = moved
 
 
 @njit(cache=True, error_model="numpy")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
 from steady_ppl.gaussian.linearize import ReferencePath
+from steady_ppl.kernels.jit import on_all_rows
 from steady_ppl.model.handlers import AtMean, Observing, Recording, as_vector, residual, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance
@@ -76,17 +77,38 @@ def states_ahead(program: Program, data: Trajectories, tracked: Tracked, most: i
     for ahead in range(1, min(most, len(steps)) + 1):
         rows = slice(ahead - 1, len(steps))
         state = state[: len(steps) - ahead + 1]
-        with running(*state.shape[:-1]), AtMean():
-            state = advance(program, state, controls[rows], elapsed[rows], steps[rows])
+        state = mean_steps(program, state, controls[rows], elapsed[rows], steps[rows])
         yield ahead, state
 
 
+def mean_steps(program: Program, states: Tensor, controls: Tensor, elapsed: Tensor, steps: Tensor) -> Tensor:
+    """Where rows end without noise, `(rows, B, D)`; the controls are the acting ones."""
+    given = {"state": states, "control": controls, "time": elapsed, "step": steps}
+    found = on_all_rows(program, "mean step", mean_step(program), given)
+    return found[0] if isinstance(found, tuple) else mean_step(program)(**given)
+
+
+def mean_step(program: Program) -> Callable[..., Tensor]:
+    """A program's step without noise, of state, acting control, time and step."""
+
+    def moved(state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
+        with running(*state.shape[:-1]), AtMean():
+            return advance(program, state, control, time, step)
+
+    return moved
+
+
 def errors(program: Program, states: Tensor, measurements: Tensor, observed: Tensor) -> Tensor:
-    """Measured less what the program measures in these states, `(..., K)`, on the circle for angles."""
-    with running(*states.shape[:-1]), Recording() as seen, Observing(measurements, observed):
-        program.observe(states)
-    parts = [as_vector(residual(fn, seen.observed[site]), fn.event_dim) for site, fn in seen.distributions.items()]
-    return torch.cat(parts, -1)
+    """Measured less what the program measures in these states, `(rows, B, K)`, on the circle for angles."""
+
+    def apart(state: Tensor, measurement: Tensor, observed: Tensor) -> Tensor:
+        with running(*state.shape[:-1]), Recording() as seen, Observing(measurement, observed):
+            program.observe(state)
+        parts = [as_vector(residual(fn, seen.observed[site]), fn.event_dim) for site, fn in seen.distributions.items()]
+        return torch.cat(parts, -1)
+
+    found = on_all_rows(program, "errors", apart, {"state": states, "measurement": measurements, "observed": observed})
+    return found[0] if isinstance(found, tuple) else apart(states, measurements, observed)
 
 
 @torch.no_grad()

@@ -385,6 +385,11 @@ class Slopes(NamedTuple):
     values: Tensor
     by_number: Tensor
 
+    def weighted(self, weights: Tensor) -> Tensor:
+        """The sum over rows and components of weights `(rows, B, V)` times slopes, `(B, P)` in double precision."""
+        by_slope = (weights.movedim(-1, 0)[self.components].double() * self.values.double()).sum(1)
+        return by_slope.t() @ self.by_number
+
 
 def slopes_on_all_rows(
     program: nn.Module,

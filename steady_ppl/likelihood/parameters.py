@@ -33,8 +33,8 @@ class Element:
         self.parameter.data.view(-1)[self.index] += by
 
 
-def elements(program: Program) -> list[Element]:
-    """Every learnable number of a program.
+def elements(program: Program, *, frozen: bool = False) -> list[Element]:
+    """Every learnable number of a program, and of its parameters that are `frozen` as well.
 
     Raises:
         UsageError: there are more than can be screened one by one.
@@ -46,7 +46,7 @@ def elements(program: Program) -> list[Element]:
     }
     found = []
     for name, parameter in program.named_parameters():
-        if not parameter.requires_grad:
+        if not (parameter.requires_grad or frozen):
             continue
         name = name.removesuffix("_unconstrained")
         for index, value in enumerate(parameter.detach().flatten().tolist()):

@@ -340,7 +340,7 @@ def _of_channels(program: Program, data: Trajectories, at: Smoothed, parts: list
     if isinstance(slopes, Slopes):
         rows, count = at.channels.mean.shape[0], at.channels.mean.shape[-1]
         scores = at.channels.of_slopes(slopes, (-slopes.function[:rows, :, count:]).exp())
-        left = _of_actuators(program, data, parts)
+        left = of_actuators(program, data, parts)
     if left:
         _, spread = channel_moments(program, data, points[:1])
     for index in left:
@@ -362,14 +362,14 @@ def _of_ends(program: Program, data: Trajectories, at: Smoothed, parts: list[Ele
     slopes = slopes_on_all_rows(program, "ends", ends, given, parts)
     scores, left = at.states.new_zeros((len(data), len(parts))).double(), list(range(len(parts)))
     if isinstance(slopes, Slopes):
-        scores, left = arriving.of_slopes(slopes), _of_actuators(program, data, parts)
+        scores, left = arriving.of_slopes(slopes), of_actuators(program, data, parts)
     for index in left:
         up, down = on_both_sides(parts[index], lambda: arriving.ends(program, data))
         scores[:, index] = arriving.score(up - down) / (2 * parts[index].step)
     return scores
 
 
-def _of_actuators(program: Program, data: Trajectories, parts: list[Element]) -> list[int]:
+def of_actuators(program: Program, data: Trajectories, parts: Sequence[Element]) -> list[int]:
     """Which learnable numbers change the acting controls: a kernel is given these and knows no slopes of theirs."""
     if type(program).actuators is Program.actuators:
         return []
