@@ -17,7 +17,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
-from steady_ppl.gaussian.predict import errors, mean_step, mean_steps, on_a_circle
+from steady_ppl.gaussian.predict import mean_step, mean_steps, on_a_circle, row_errors
 from steady_ppl.kernels.jit import Slopes, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import Element, elements, on_both_sides
 from steady_ppl.likelihood.scores import measured, of_actuators
@@ -91,7 +91,7 @@ class _Scores:
                 yield part.name, score
 
     def _pushed_by(self, parts: Sequence[Element]) -> Tensor:
-        """Scores of what learnable numbers change of the mean steps, `(B, P)`."""
+        """Scores of what numbers change of the mean steps, `(B, P)`."""
         program, data = self.program, self.data
         given = {"state": self.states, "control": self.controls[:-1], "time": data.elapsed[:-1], "step": data.steps}
         slopes = slopes_on_all_rows(program, "mean step", mean_step(program), given, parts)
@@ -116,7 +116,7 @@ class _Scores:
             return slopes.weighted(torch.where(data.observed, self.reading, 0.0))
         scores = []
         for part in parts:
-            sides = on_both_sides(part, lambda: errors(program, states, data.measurements, data.observed).double())
+            sides = on_both_sides(part, lambda: row_errors(program, states, data.measurements, data.observed).double())
             shift = torch.where(data.observed, sides[1] - sides[0], 0.0)
             scores.append(self.shift(shift / (2 * part.step)))
         return torch.stack(scores, -1)

@@ -6,8 +6,9 @@ drives': three hundred drives and a hundred sets at once would take fourteen gig
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,9 +24,13 @@ from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, predict, simulate_again
 from steady_ppl.gaussian.smoother import REST_TOLERANCE, means_as_path, smooth
 from steady_ppl.model.program import Program
+from steady_ppl.utils.angles import wrap_angles
+from steady_ppl.utils.cores import Result, side_by_side
+from steady_ppl.utils.random import seeded
 
 MIN_SETS = 20  # sets
-MAX_ROWS_OF_BLOCK = 100_000  # of all drives of a block: larger arrays are slower to come by than to fill
+MAX_ROWS_OF_BLOCK = 100_000  # of all drives of a block: the memory of larger arrays takes longer to get than to fill
+ROUNDING = 1e-5  # of a state, in single precision
 LINEARISATIONS = 4
 """Linearisations of drives that need them: beside a landmark the truth is far from the mode, where the measured drives'
 paths lie."""
@@ -39,6 +44,36 @@ class SimulatedSets:
     floor: dict[int, np.ndarray]  # horizon → RMSE of each component in each set, (M, K)
     residuals: Residuals
     directions: list[Direction]  # with the scores of all M · B drives
+
+    def as_result(self) -> Result:
+        """The same as tensors and what JSON can hold."""
+        arrays = {f"floor {horizon}": value for horizon, value in self.floor.items()}
+        arrays |= {f"variable {name}": value for name, value in self.residuals.variables.items()}
+        arrays |= {"values": self.residuals.values, "there": self.residuals.there}
+        tensors = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
+        tensors |= {f"scores {index}": one.scores for index, one in enumerate(self.directions)}
+        words = [[one.kind, one.name] for one in self.directions]
+        names, variables = list(self.residuals.names), list(self.residuals.variables)
+        said = {"sets": self.sets, "names": names, "variables": variables, "directions": words}
+        return tensors, said | {"horizons": list(self.floor)}
+
+    @classmethod
+    def of_result(cls, tensors: Mapping[str, Tensor], said: Mapping[str, Any]) -> SimulatedSets:
+        """What `as_result` returned."""
+
+        def array(name: str) -> np.ndarray:
+            return tensors[name].numpy()
+
+        variables = {name: array(f"variable {name}") for name in said["variables"]}
+        return cls(
+            said["sets"],
+            {horizon: array(f"floor {horizon}") for horizon in said["horizons"]},
+            Residuals(said["names"], array("values"), array("there"), variables),
+            [
+                Direction(kind, name, tensors[f"scores {index}"])
+                for index, (kind, name) in enumerate(said["directions"])
+            ],
+        )
 
 
 @torch.no_grad()
@@ -56,9 +91,15 @@ def simulate_sets(
     Raises:
         FilterError: too many sets blew up.
     """
-    at_once = max(1, MAX_ROWS_OF_BLOCK // data.time.numel())
-    blocks = [_block(program, data, block, channels, horizons, known_start) for block in starts.split(at_once)]
-    found = [one for one in blocks if one is not None]
+    at_once, seed = max(1, MAX_ROWS_OF_BLOCK // data.time.numel()), int(torch.randint(2**31, ()))
+
+    def simulate(number: int, block: Tensor) -> Result:
+        with seeded(seed + number, "block"):
+            made = _block(program, data, block, channels, horizons, known_start)
+        return ({}, {}) if made is None else made.as_result()
+
+    jobs = [partial(simulate, number, block) for number, block in enumerate(starts.split(at_once))]
+    found = [SimulatedSets.of_result(*result) for result in side_by_side(jobs) if result[0]]
     lost = len(starts) - sum(one.sets for one in found)
     if len(starts) - lost < MIN_SETS:
         what = f"{lost} of {len(starts)} simulated sets blew up"
@@ -98,7 +139,7 @@ def _tracked(
     given: dict[str, Any] = {"known_start": known_start}
     near = means_as_path(smooth(program, data, truth, passes=1, **given), data)
     tracked = track(program, data, near, passes=1, **given)
-    far = ~((tracked.noise - near.noise).abs().amax((0, 2)) <= REST_TOLERANCE)
+    far = ~((tracked.noise - near.noise).abs().amax((0, 2)) <= REST_TOLERANCE) | _starts_elsewhere(tracked, near)
     if bool(far.any()):
         index = far.nonzero().flatten()
         begin = ReferencePath(truth.states[:, index], truth.noise[:, index])
@@ -106,6 +147,14 @@ def _tracked(
         near.states[:, index], near.noise[:, index] = path.states, path.noise
         tracked = track(program, data, near, passes=1, **given)
     return near, tracked
+
+
+def _starts_elsewhere(tracked: Tracked, near: ReferencePath) -> Tensor:
+    """Whether drives' first states are others than the path's, in standard deviations, `(B,)`."""
+    begin = near.states[0].double()
+    away = wrap_angles(tracked.smoothed[0] - begin, tracked.linearization.angles).abs()
+    sd = tracked.covariances[0].diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+    return ~(away <= REST_TOLERANCE * sd + ROUNDING * (1 + begin.abs())).all(-1)
 
 
 def _joined(blocks: Sequence[SimulatedSets]) -> SimulatedSets:

@@ -42,12 +42,13 @@ class Residuals:
     raw: Array | None = None  # of the first set, those with a unit in it, (T, B, ·)
 
     @cached_property
-    def present(self) -> list[tuple[Array, Array]]:
+    def present(self) -> list[tuple[Any, Array]]:
         """Where each residual is, counted through all sets, intervals and drives, and its values there."""
-        found = []
+        found: list[tuple[Any, Array]] = []
         for residual in range(len(self.names)):
-            at = np.flatnonzero(self.there[..., residual])
-            found.append((at, self.values[..., residual].ravel()[at]))
+            there, values = self.there[..., residual], self.values[..., residual].ravel()
+            at = slice(None) if there.all() else np.flatnonzero(there)
+            found.append((at, values[at]))
         return found
 
     @staticmethod

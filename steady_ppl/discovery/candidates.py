@@ -60,7 +60,7 @@ class Candidate:
     refit: Refit | str  # the program with it, or why there is none
     gain: Tensor  # held-out log p(y) above that of the program without, nats, (B,)
     alone: Tensor  # the same of the programs fitted to one fold alone, which is all there is of those given up
-    behind: Candidate | None = None  # the best in its round, where one fold showed that this one is behind
+    behind: Candidate | None = None  # what one fold was enough to show that this one is behind, if so
 
     @property
     def variant(self) -> Variant:
@@ -238,26 +238,29 @@ def at_its_best_place(now: Refit, candidate: Candidate) -> Candidate:
     begun = candidate.refit if candidate.is_judged else refit_with(now, at, candidate.refit.coefficient(at))
     if isinstance(begun, str):
         return candidate
-    fit: Fits = begun
+    fits: list[tuple[Variant, Fits]] = [(at, begun)]  # each likelier than the one before
 
     def try_all(variants: Iterable[Variant]) -> None:
-        nonlocal at, fit
         for variant in variants:
-            other = fit_near(now, fit, [variant])
-            if isinstance(other, Fits) and gain_of_fits(now, other) > gain_of_fits(now, fit) + MIN_GAIN_OF_PLACE:
-                at, fit = variant, other
+            best = fits[-1][1]
+            other = fit_near(now, best, [variant])
+            if isinstance(other, Fits) and gain_of_fits(now, other) > gain_of_fits(now, best) + MIN_GAIN_OF_PLACE:
+                fits.append((variant, other))
 
     try_all(variant for variant in grid if variant.label != candidate.variant.label)
     for share in (0.5, 0.25):
         for _ in range(PASSES):
-            before = at
+            before = len(fits)
             for name in at.profiled:
-                try_all(_beside(at, grid, name, share))
-            if at is before:
+                try_all(_beside(fits[-1][0], grid, name, share))
+            if len(fits) == before:
                 break
-    refit = begun if fit is begun else judged_fits(fit)
-    there = judged(now, replace(tested, column=replace(tested.column, variant=at)), refit)
-    return there if there.total > candidate.total else candidate
+    for variant, best in reversed(fits):
+        refit = begun if best is begun else judged_fits(best)
+        if isinstance(refit, Refit):
+            there = judged(now, replace(tested, column=replace(tested.column, variant=variant)), refit)
+            return there if there.total > candidate.total else candidate
+    return candidate
 
 
 def variance_of_places(now: Refit, candidate: Candidate) -> Tensor:

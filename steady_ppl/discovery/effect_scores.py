@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 
 import torch
 from torch import Tensor
@@ -29,6 +29,7 @@ from steady_ppl.likelihood.scores import (
 from steady_ppl.model.interventions import by_channel
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, row_controls
+from steady_ppl.utils.cores import Result, side_by_side
 from steady_ppl.utils.random import seeded
 
 PART = 400  # trajectories at a time
@@ -251,14 +252,16 @@ def simulate_scores(
     program, data, sets = problem.program, problem.data, len(starts)
     with seeded(seed, "bootstrap"):
         drives, path = simulate_again(program, data, starts, len(program.channels))
-    scores, likely = [], []
-    for first in range(0, len(drives), PART):
-        index = torch.arange(first, min(first + PART, len(drives)))
+
+    def score(index: Tensor) -> Result:
         part = replace(problem, data=drives.subset(index))
         ahead = part.smooth(ReferencePath(path.states[:, index], path.noise[:, index]), passes=2)
-        scores.append(scores_along(part, ahead, parts, columns))
-        likely.append(ahead.log_likelihood)
-    found = Simulated(torch.cat(scores).unflatten(0, (sets, len(data))), torch.cat(likely).view(sets, len(data)))
+        return {"scores": scores_along(part, ahead, parts, columns), "likely": ahead.log_likelihood}, {}
+
+    jobs = [partial(score, index) for index in torch.arange(len(drives)).split(PART)]
+    parts_found = [tensors for tensors, _ in side_by_side(jobs)]
+    scores, likely = (torch.cat([one[name] for one in parts_found]) for name in ("scores", "likely"))
+    found = Simulated(scores.unflatten(0, (sets, len(data))), likely.view(sets, len(data)))
     whole = torch.isfinite(found.scores).all(-1).all(-1) & torch.isfinite(found.log_likelihood).all(-1)
     if int(whole.sum()) < LEAST_LEFT * sets:
         raise FilterError(

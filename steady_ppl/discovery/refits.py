@@ -51,7 +51,7 @@ class Threshold:
 
     drives: float = -math.inf
     held_out: float = -math.inf
-    hopeless: bool = False  # whether a fit is given up on its way where it will not reach that of its drives
+    stops_early: bool = False  # whether a fit ends on its way where it will not reach that of its drives, which decides
 
 
 ALWAYS = Threshold()
@@ -73,7 +73,7 @@ class Fits:
         return self.programs[0]
 
     def mean_coefficient(self, variant: Variant) -> Tensor:
-        """An effect's coefficient: nearly that of a fit to all drives together."""
+        """An effect's coefficient in these fits, whose noise is each fold's own."""
         return self.mean([coefficient(program, _there(program, variant)).detach().clone() for program in self.programs])
 
     def mean(self, values: Sequence[Tensor]) -> Tensor:
@@ -296,7 +296,7 @@ def _refit(
         fold = _wide_fold(begun, program)
         share = len(fold.drives) / len(folds[0].drives)
         guess = None if information is None else share * information
-        if threshold.hopeless and not fitted:
+        if threshold.stops_early and not fitted:
             floor = max(floor, threshold.drives)
         anew = None if unwidened is None else _fitted_anew(fold.fitting(as_declared(unwidened, program)), floor)
         if anew is not None:
@@ -312,7 +312,7 @@ def _refit(
         held_out.append(judged.log_likelihood)
         judged_folds.append(replace(fold, path=maximum.path, held_out_path=judged.path))
         own, others = float(maximum.log_likelihood.sum()), float(judged.log_likelihood.sum())
-        if own < threshold.drives and others < threshold.held_out:
+        if own < threshold.drives and (threshold.stops_early or others < threshold.held_out):
             break
     judges, alone = Judges(fitted, found), torch.cat(held_out)
     if len(fitted) == len(folds) and fitting == BY_LIKELIHOOD:

@@ -182,7 +182,7 @@ def _test(column: Column, place: slice, projected: Tensor, left: Tensor, before:
         return None
     steps = torch.linalg.solve(own, scores.T).T
     statistics = (scores * steps).sum(-1).numpy()
-    p_values = special.chdtrc(column.size, statistics)
+    p_values = special.chdtrc(column.size, statistics.clip(min=0))  # by rounding some are negative
     sd, alone = torch.linalg.inv(own).diagonal().sqrt().numpy(), own.diagonal().rsqrt().numpy()
     coefficient = steps[0].numpy()
     return _Test(

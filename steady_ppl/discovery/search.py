@@ -225,7 +225,7 @@ def _rounds(found: Search, settings: Settings) -> Search:
                     found.diverged = [label for label in labels(found.final) if label not in labels(final)]
                     found.found, found.final = before, final
         begin()
-        if len(found.rounds) > 1 and not found.rounds[1].quiet:
+        if len(found.rounds) > 1 and not found.rounds[1].quiet and not found.curves:
             found.curves = _curves(found)
     return found
 
@@ -276,13 +276,13 @@ def _threshold(candidates: Sequence[Candidate]) -> Threshold:
 
 
 def _curves(search: Search) -> list[Candidate]:
-    """Fits of the curves that the first tests point at, to the program as it stands; those that are behind all named
-    effects together on the first fold are given up."""
+    """Fits of the curves that the first tests point at, to the program as it stands. One is given up where it stays
+    `MAX_NATS_BEHIND` behind all named effects together on the first fold."""
     base, screening = search.base, search.rounds[0].screening
     named, threshold = None, ALWAYS
     if search.found:
         named = judged(base, search.found[0].candidate.tested, search.final)
-        threshold = replace(_threshold([named]), hopeless=True)
+        threshold = replace(_threshold([named]), stops_early=True)
 
     def multiplies(tested: Tested) -> bool:
         return bool(tested.variant.options.get("times"))
@@ -333,16 +333,17 @@ def prune(search: Search) -> None:
 
 
 def _without(search: Search, found: Found) -> Refit | str:
-    """The program with the other effects, fitted one after the other and from where the fit of all ended: the likelier,
-    lest a fit that has stopped early make an effect look needed."""
+    """The program with the other effects. Of a fit of one after the other and one from where the fit of all ended it is
+    the likelier: a fit that has stopped early makes an effect look needed."""
     others = [other.candidate for other in search.found if other is not found]
-    was_so = set(labels(found.without)) == {other.variant.label for other in others}
+    was_so = set(labels(found.without)) - set(labels(search.base)) == {other.variant.label for other in others}
     afresh = found.without if was_so else _with_all(search.base, others)
     near = fit_near(search.base, search.final, [other.variant for other in others])
     if isinstance(afresh, str) or isinstance(near, str):
         return afresh if isinstance(near, str) else judged_fits(near)
     most = max(_objective(search.final), _objective(afresh)) + MIN_NATS_OF_RUNAWAY  # more: it has run away
-    return judged_fits(near) if _objective(afresh) + SAME < _objective(near) < most else afresh
+    likelier = judged_fits(near) if _objective(afresh) + SAME < _objective(near) < most else afresh
+    return afresh if isinstance(likelier, str) else likelier
 
 
 def _objective(fits: Fits) -> float:

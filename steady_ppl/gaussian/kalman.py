@@ -183,9 +183,10 @@ def backward(
     for t in range(rows - 1, -1, -1):
         for b in range(trajectories):
             later = arrival[t, b]
-            later[:] = 0.0
             if t < rows - 1:
                 set_times(later, given.state[t, b].T, arrival[t + 1, b])
+            else:
+                later[:] = 0.0
             smoothed[t, b] = filtered.means[t, b]
             add_times(smoothed[t, b], filtered.covariances[t, b], later)
             for k in range(components - 1, -1, -1):

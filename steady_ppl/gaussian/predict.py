@@ -65,7 +65,7 @@ def predict(
             wanted = bands is None or horizon in bands
             variance = tracked.variances_ahead(horizon) if wanted else torch.full(seen.shape, torch.nan).double()
             observed = data.observed[horizon:] & seen
-            error = errors(program, state, data.measurements[horizon:], observed).double()
+            error = row_errors(program, state, data.measurements[horizon:], observed).double()
             found[horizon] = Prediction(torch.where(observed, error, 0.0), variance, observed)
     return found
 
@@ -99,16 +99,18 @@ def mean_step(program: Program) -> Callable[..., Tensor]:
 
 
 def errors(program: Program, states: Tensor, measurements: Tensor, observed: Tensor) -> Tensor:
-    """Measured less what the program measures in these states, `(rows, B, K)`, on the circle for angles."""
+    """Measured less what the program measures in these states, `(..., K)`, on the circle for angles."""
+    with running(*states.shape[:-1]), Recording() as seen, Observing(measurements, observed):
+        program.observe(states)
+    parts = [as_vector(residual(fn, seen.observed[site]), fn.event_dim) for site, fn in seen.distributions.items()]
+    return torch.cat(parts, -1)
 
-    def apart(state: Tensor, measurement: Tensor, observed: Tensor) -> Tensor:
-        with running(*state.shape[:-1]), Recording() as seen, Observing(measurement, observed):
-            program.observe(state)
-        parts = [as_vector(residual(fn, seen.observed[site]), fn.event_dim) for site, fn in seen.distributions.items()]
-        return torch.cat(parts, -1)
 
-    found = on_all_rows(program, "errors", apart, {"state": states, "measurement": measurements, "observed": observed})
-    return found[0] if isinstance(found, tuple) else apart(states, measurements, observed)
+def row_errors(program: Program, states: Tensor, measurements: Tensor, observed: Tensor) -> Tensor:
+    """`errors` of states `(rows, B, D)`, by a kernel where there is one."""
+    given = {"state": states, "measurement": measurements, "observed": observed}
+    found = on_all_rows(program, "errors", lambda *values: errors(program, *values), given)
+    return found[0] if isinstance(found, tuple) else errors(program, *given.values())
 
 
 @torch.no_grad()

@@ -10,7 +10,7 @@ Hall, Hall and Hausman 1974) unless it is known, and learns on the way (Broyden,
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -38,6 +38,7 @@ SHARE_AGAINST_SCORE = 1 / 3
 """Of that, for a number whose own score points the other way: noise or a friction that is driven to nothing early has
 no score there, and a fit cannot return."""
 FEWER = 0.8  # share of fits that take one step more, by which the time left is told
+SURE = 0.1  # nats that another step may gain where a fit has converged
 MAX_DECREASE = 0.3  # nats by which an objective may fall: paths are at rest but for the tolerance
 MAX_ROUGHNESS = 1.5  # mean square deviation, in the program's own, from which noise is widened before a fit
 OUTLIER_SD, SEARCHES = 6.0, 3  # standard deviations by which an outlier is less likely, and searches for its path
@@ -70,7 +71,7 @@ class Maximum:
     @property
     def converged(self) -> bool:
         """Whether a step would gain less than a tenth of a nat."""
-        return self.decrement is None or self.decrement < 0.1
+        return self.decrement is None or self.decrement < SURE
 
 
 def maximise(
@@ -94,7 +95,7 @@ def maximise(
         information: `(P, P)` of the learnable numbers, where it is known.
         steps: scoring steps at most.
         precision: stop when another step would gain less, nats.
-        hopeless: give up after a few steps where log p(y) would not reach this were it to go on rising as in the last.
+        hopeless: give up after six steps where log p(y) would not reach this were it to rise on as it has lately.
 
     Raises:
         FilterError: the program cannot be smoothed at its initial parameters.
@@ -174,7 +175,8 @@ def climb(
         reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
     is_given = information is not None
     information = _regularised(_of_drives(here) if information is None else information)
-    taken, decrement, risen, passes = 0, 0.0, 0.0, PASSES
+    taken, decrement, passes = 0, 0.0, PASSES
+    rises = deque[float](maxlen=3)  # of the objective by the last steps
     with stages(*(("", FEWER**step) for step in range(steps + 1))) as begin:
         for taken in range(steps + 1):
             begin()
@@ -187,11 +189,13 @@ def climb(
                     "the likeliest parameters cannot be found: the drives do not tell them apart (singular)"
                 )
             decrement = 0.5 * float(here.gradient @ move)
-            if taken == 0 and is_given and decrement < precision:  # by what was known elsewhere: seen here as well?
-                information = _regularised(_of_drives(here))
-                move, _ = torch.linalg.solve_ex(information, here.gradient)
-                decrement = 0.5 * float(here.gradient @ move)
-            behind = taken >= 6 and here.log_likelihood + (steps - taken) * risen < hopeless
+            if is_given and decrement < precision:  # by what was known elsewhere: seen here as well?
+                is_given, own = False, _regularised(_of_drives(here))
+                seen, _ = torch.linalg.solve_ex(own, here.gradient)
+                more = 0.5 * float(here.gradient @ seen)
+                if taken == 0 or (more > SURE and len(here.scores) >= 2 * len(own)):  # few drives know too little
+                    information, move, decrement = own, seen, more
+            behind = taken >= 6 and here.log_likelihood + (steps - taken) * max(rises) < hopeless
             if decrement < precision or taken == steps or behind:
                 break
             move = move * min(1.0, 1 / max(1e-9, float((move.abs() / reach).max())))
@@ -200,13 +204,15 @@ def climb(
             share, there = _searched(terms, here, move, passes)
             if there is not None:
                 information = _updated(information, share * move, here.gradient - there.gradient)
-                risen, here = max(0.0, there.log_likelihood - here.log_likelihood), there
+                rises.append(there.objective - here.objective)
+                here = there
             elif passes == STALLED_PASSES:
                 break
             else:
                 passes = STALLED_PASSES
                 here = _linearised(_along(terms, here), passes)
                 information = _regularised(_of_drives(here))
+                rises.append(math.inf)  # along other paths
     return [
         Maximum(
             log_likelihood=at.ahead.log_likelihood,

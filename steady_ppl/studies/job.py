@@ -29,6 +29,7 @@ from steady_ppl.runs.recipes import find_recipe, require_settings, trains
 from steady_ppl.smc.simulate import simulate
 from steady_ppl.studies.fingerprints import PARTS, TABLES, JobFiles, is_program
 from steady_ppl.studies.plan import HELD_OUT, IN_LIMITS, Job
+from steady_ppl.utils.cores import one_core
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import one_line
 from steady_ppl.utils.threads import one_thread
@@ -46,7 +47,7 @@ def run(job: Job) -> dict[str, Any]:
         most memory that this process took: on Linux during the job, else until its end), `packages` with their
         versions and the figures.
     """
-    with _one_at_a_time, one_thread():
+    with _one_at_a_time, one_thread(), one_core():
         began = time.perf_counter()
         _forget_peak()
         try:

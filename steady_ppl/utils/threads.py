@@ -3,7 +3,7 @@
 The engine's tensors are small. Torch's threads wait for one another by spinning, so that on a busy machine two threads
 took 20 to 55 times the CPU time of one, in filters of 20,000 to 500 particles a drive. On quiet cores two threads
 brought a filter of 100,000 particles in plain torch from 3.5 s to 2.5 s, its kernels nothing, and smaller filters lost.
-Where there are cores to use, processes take them, one thread each (`steady study`).
+Where there are cores to use, processes take them, one thread each (`utils.cores`, `steady study`).
 """
 
 from __future__ import annotations

@@ -5,11 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from examples import drives, example
 from oracles import assert_mean
+from scipy import stats
 
 import steady_ppl.criticism.reference_sets as simulated
 from steady_ppl import FilterError
+from steady_ppl.criticism.perturbations import directions
+from steady_ppl.criticism.residual_maps import _adjusted
+from steady_ppl.gaussian.predict import simulate_again
+from steady_ppl.gaussian.smoother import smooth
+from steady_ppl.kernels import jit
 from steady_ppl.model.program import for_program
+from steady_ppl.utils import cores
+from steady_ppl.utils.cores import one_core
 from steady_ppl.utils.random import seeded
 
 
@@ -63,3 +72,52 @@ def test_too_few_that_did_not_blow_up_is_an_error(cart, even, starts, monkeypatc
     starts[:21] = torch.inf
     with pytest.raises(FilterError, match="21 of 40 simulated sets blew up"):
         made(cart, data, starts, known_start=False)
+
+
+def test_sets_do_not_depend_on_how_many_cores_there_are(cart, even, starts, monkeypatch):
+    data = for_program(cart, even)
+    monkeypatch.setattr(simulated, "MAX_ROWS_OF_BLOCK", 7 * data.time.numel())
+    monkeypatch.setattr(cores, "_cores", lambda: 3)
+    several = arrays(made(cart, data, starts))
+    with one_core():
+        for name, value in arrays(made(cart, data, starts)).items():
+            assert np.array_equal(value, several[name], equal_nan=True), name
+
+
+@pytest.mark.parametrize("known_start", [True, False])
+def test_paths_are_those_of_more_linearisations(known_start):
+    """Of drives of two lengths, one of which passes a landmark by some centimetres."""
+    program = example("hovercraft.py:HovercraftTruth", torch.float32)
+    program.landmarks = (*program.landmarks[:3], (0.7, 1.1))
+    data = drives(program, 6, 41)
+    data.lengths[2] = 23
+    with seeded(1, "again"):
+        again, truth = simulate_again(program, data, data.known_start.expand(4, -1, -1), 3)
+    _, tracked = simulated._tracked(program, again, truth, known_start)
+    rested = smooth(program, again, truth, known_start=known_start, passes=simulated.LINEARISATIONS)
+    means, noise = rested.means()
+    inside = again.transitions[..., None]
+    torch.testing.assert_close(tracked.noise * inside, noise * inside, rtol=0, atol=3 * simulated.REST_TOLERANCE)
+    apart = (tracked.smoothed - means).abs().amax(-1)[again.rows]
+    assert float(apart.max()) < 0.05
+
+
+def test_scores_of_parameters_by_kernels_are_those_by_differences(monkeypatch):
+    program = example("hovercraft.py:HovercraftTruth", torch.float32)
+    data = drives(program, 5, 41)
+    with seeded(1, "again"):
+        again, truth = simulate_again(program, data, data.known_start.expand(2, -1, -1), 3)
+    _, tracked = simulated._tracked(program, again, truth, known_start=True)
+    found = []
+    for rows in (1, 10**9):
+        monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", rows)
+        found.append({one.name: one.scores for one in directions(program, again, tracked)})
+    assert found[0].keys() == found[1].keys() and {"mass", "inertia", "drag[2]"} <= found[0].keys()
+    for name, scores in found[0].items():
+        size = float(found[1][name].abs().max())
+        torch.testing.assert_close(scores, found[1][name], rtol=0.01, atol=0.01 * size, msg=name)
+
+
+def test_adjusted_p_values_are_scipys():
+    p_values = np.random.default_rng(0).uniform(0, 1, 300).round(2) ** 2
+    np.testing.assert_allclose(_adjusted(p_values), stats.false_discovery_control(p_values), rtol=1e-12)

@@ -10,9 +10,18 @@ import torch
 from examples import example
 from scipy import stats
 
-from steady_ppl.discovery.curves import between, by_height, height, knots_of, variables
+from steady_ppl.discovery.curves import (
+    HEIGHT_SD,
+    _effect,
+    between,
+    by_height,
+    height,
+    knots_of,
+    prior_covariance,
+    variables,
+)
 from steady_ppl.discovery.effect_scores import Column, Simulated
-from steady_ppl.discovery.screening import ALPHA, _critical, screen
+from steady_ppl.discovery.screening import ALPHA, _critical, _test, screen
 from steady_ppl.effects import chosen_variant
 
 DRIVES, PARAMETERS = 16, 3
@@ -135,3 +144,20 @@ def test_a_single_tests_level_and_the_familys_say_the_same(sets):
     for observed in (*np.sort(family), critical, *np.nextafter(np.sort(family)[:12], 0.0)):
         whole = (1 + int((family <= observed).sum())) / (1 + sets)
         assert (whole <= ALPHA) == (observed <= critical)
+
+
+def test_a_statistic_that_rounding_made_negative_says_nothing():
+    column = next(column for column in columns() if column.size == 2)
+    scores, information = torch.tensor([[1.0, -1.0], [0.1, 0.2]]).double(), torch.ones(2, 2).double()
+    information[0, 1] = information[1, 0] = 1 + 1e-6  # two columns that are nearly one
+    found = _test(column, slice(0, 2), scores, information, information.diagonal())
+    assert found.tested.statistic < 0 and found.p_values[0] == 1.0
+
+
+def test_the_prior_of_a_curve_is_a_normal_with_its_covariance():
+    effect = _effect("push", "x", [-2.0, 0.0, 1.0, 4.0], 0.3, "m/s²", False)
+    covariance = prior_covariance(effect)
+    heights = torch.tensor([0.1, -0.4, 0.2, 0.7])
+    whole = torch.distributions.MultivariateNormal(torch.zeros(4).double(), covariance)
+    assert float(effect.prior.log_prob(heights)) == pytest.approx(float(whole.log_prob(heights.double())), abs=1e-3)
+    assert covariance.diagonal().sqrt().tolist() == pytest.approx([HEIGHT_SD * 0.3] * 4, rel=1e-3)

@@ -143,3 +143,35 @@ def test_a_curve_is_straight_between_its_knots(circular: bool):
     found = height(values, knots, circular, heights)
     torch.testing.assert_close(found[:-1], expected)
     assert bool(found[-1].isnan())
+
+
+def test_a_program_is_read_once_while_it_is_unchanged_and_anew_after_it():
+    program = example("hovercraft")
+    plain = jit.signature(program)
+
+    def read_and_fail():
+        with jit.unchanged(program):
+            with jit.unchanged(program):
+                known = jit.signature(program)
+            program.landmarks = ((0.0, 0.0),)
+            assert jit.signature(program) is known
+            assert known == plain
+            raise RuntimeError("in between")
+
+    with pytest.raises(RuntimeError, match="in between"):
+        read_and_fail()
+    assert jit.signature(program) != plain
+
+
+def test_weighted_slopes_are_the_derivatives_of_weighted_sums():
+    program = example("hovercraft.py:HovercraftTruth", torch.float32)
+    data = drives(program, 4, 30)
+    given, parts = arguments(program, data), elements(program)
+    slopes = slopes_on_all_rows(program, "ends", ends(program), given, parts)
+    assert isinstance(slopes, Slopes)
+    weights = torch.randn(*slopes.function.shape, generator=torch.Generator().manual_seed(1)).double()
+    for part, found in zip(parts, slopes.weighted(weights).unbind(-1), strict=True):
+        with torch.no_grad():
+            up, down = on_both_sides(part, lambda: (weights * ends(program)(*given.values())).sum((0, -1)))
+        by = (up - down) / (2 * part.step)
+        torch.testing.assert_close(found, by, rtol=0.02, atol=0.02 * float(by.abs().max()) + 1e-4)

@@ -131,3 +131,28 @@ def test_a_fit_at_another_knee_is_the_one_from_nothing():
     assert gain_of_fits(base, near) == pytest.approx(gain_of_fits(base, direct[1]), abs=0.2)
     # fits rest within .02 nats of their maxima, .2 standard deviations: of two fits on two folds .4 nats, three of them
     assert float((near.held_out - direct[1].held_out).sum()) == pytest.approx(0.0, abs=1.2)
+
+
+def test_a_fit_that_cannot_reach_what_it_must_ends_after_six_steps_and_one_that_rises_goes_on(cart):
+    _, data, maximum = cart
+    best = float(maximum.log_likelihood.sum())
+
+    def steps(hopeless):
+        far = example("linear_gaussian")
+        for part, by in zip(elements(far), (1.0, -1.0, 0.7, -0.5), strict=True):
+            part.move(by)
+        return maximise(far, data, known_start=True, hopeless=hopeless)
+
+    whole = steps(-float("inf"))
+    assert whole.converged and whole.steps > 8
+    assert steps(best - 10).steps == whole.steps
+    assert steps(best + 1e6).steps == 6
+
+
+def test_a_fit_that_begins_with_too_much_information_does_not_end_at_once(cart):
+    _, data, maximum = cart
+    far = example("linear_gaussian")
+    for part, by in zip(elements(far), (0.2, -0.2, 0.1, -0.1), strict=True):
+        part.move(by)
+    again = maximise(far, data, known_start=True, information=1e4 * maximum.information, steps=60)
+    assert again.objective == pytest.approx(maximum.objective, abs=0.1)

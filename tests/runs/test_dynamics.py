@@ -140,6 +140,10 @@ def test_what_is_measured_on_average() -> None:
     angle = torch.atan2(landmarks[:, 1] + 2.0, landmarks[:, 0] - 1.0) - 0.4
     assert torch.allclose(model.measure(STATE), torch.atan2(angle.sin(), angle.cos()))
     assert model.measure(STATE.expand(4, 3, 6)).shape == (4, 3, 4)
+    single = STATE.float().expand(50, 40, 6).clone().requires_grad_()
+    seen = dynamics()[1].float().measure(single)
+    (slope,) = torch.autograd.grad(seen.sum(), single)
+    assert torch.allclose(seen.double(), model.measure(STATE), atol=1e-5) and float(slope.abs().max()) > 0
 
 
 @pytest.mark.parametrize(

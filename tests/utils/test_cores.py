@@ -1,0 +1,91 @@
+"""Jobs side by side in forked processes: the same results as one after another, whatever becomes of a process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import pytest
+import torch
+
+from steady_ppl.errors import FilterError
+from steady_ppl.utils import cores
+from steady_ppl.utils.cores import one_core, side_by_side
+
+
+@pytest.fixture(autouse=True)
+def three_cores(monkeypatch):
+    if cores._cores() == 1 and not hasattr(os, "sched_getaffinity"):
+        pytest.skip("no safe fork on this system")
+    monkeypatch.setattr(cores, "_cores", lambda: 3)
+
+
+def jobs_of(count, run=lambda index: None):
+    def job(index):
+        run(index)
+        return {"squares": torch.arange(index + 1.0).square()}, {"pid": os.getpid(), "at": [index, "é"]}
+
+    return [lambda index=index: job(index) for index in range(count)]
+
+
+def test_results_come_in_the_order_of_jobs_from_several_processes():
+    found = side_by_side(jobs_of(7))
+    assert [values["at"] for _, values in found] == [[index, "é"] for index in range(7)]
+    for index, (tensors, _) in enumerate(found):
+        torch.testing.assert_close(tensors["squares"], torch.arange(index + 1.0).square(), rtol=0, atol=0)
+    assert len({values["pid"] for _, values in found}) == 3 and found[0][1]["pid"] == os.getpid()
+
+
+def test_one_core_and_one_job_take_no_other_process():
+    with one_core():
+        assert {values["pid"] for _, values in side_by_side(jobs_of(4))} == {os.getpid()}
+    assert side_by_side(jobs_of(1))[0][1]["pid"] == os.getpid()
+    assert side_by_side([]) == []
+
+
+def test_jobs_within_jobs_stay_in_their_process():
+    def outer():
+        return {}, {"pids": sorted({values["pid"] for _, values in side_by_side(jobs_of(4))})}
+
+    inner = [values["pids"] for _, values in side_by_side([outer, outer, outer])]
+    assert [len(pids) for pids in inner[1:]] == [1, 1]
+
+
+def test_what_a_job_raises_elsewhere_is_raised_here():
+    def fail(index):
+        if index == 1:
+            raise FilterError("trajectory 3 blew up")
+
+    with pytest.raises(FilterError, match="trajectory 3 blew up"):
+        side_by_side(jobs_of(4, fail))
+
+
+def test_jobs_of_a_process_that_is_killed_are_run_here():
+    mine = os.getpid()
+
+    def die(index):
+        if index == 1 and os.getpid() != mine:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    found = side_by_side(jobs_of(6, die))
+    assert [values["at"][0] for _, values in found] == list(range(6))
+    assert found[1][1]["pid"] == mine and found[4][1]["pid"] == mine and found[2][1]["pid"] != mine
+
+
+def test_an_error_here_ends_the_other_processes(tmp_path):
+    mine = os.getpid()
+
+    def wait(index):
+        if os.getpid() != mine:
+            (tmp_path / str(os.getpid())).touch()
+            time.sleep(60)
+        while len(list(tmp_path.iterdir())) < 2:
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        side_by_side(jobs_of(3, wait))
+    for file in tmp_path.iterdir():
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(file.name), 0)
