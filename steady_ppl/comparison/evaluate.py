@@ -24,10 +24,10 @@ from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.planar_vehicle import UnknownMap
 from steady_ppl.model.program import Program, for_program, names
 from steady_ppl.runs.fit import Fit
+from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import aligned
-from steady_ppl.utils.threads import one_thread
 
 
 @one_thread()

@@ -31,8 +31,8 @@ from steady_ppl.gaussian.predict import named_horizons
 from steady_ppl.model.program import Program
 from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit
+from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
-from steady_ppl.utils.threads import one_thread
 
 COASTING = "constant velocity"
 FAR_OFF = 2.0  # nats of a drive's log p(y) between a particle filter and the linearised program

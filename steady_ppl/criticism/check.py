@@ -32,9 +32,9 @@ from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit
+from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
-from steady_ppl.utils.threads import one_thread
 
 SECONDS = (1.0, 3.0)
 MAX_RESIDUAL_SD = 4.0

@@ -29,10 +29,10 @@ from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit, program_source, versions
 from steady_ppl.runs.folder import JOURNAL, require_same, run_folder, write_record
 from steady_ppl.runs.recipes import fingerprint
+from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.journal import journal
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
-from steady_ppl.utils.threads import one_thread
 
 FITTED_FURTHER = 10.0  # nats that fitting a run further may gain before it is said
 FEWEST_DRIVES, FEWEST_SETS = 5, 50

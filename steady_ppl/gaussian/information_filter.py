@@ -23,6 +23,7 @@ from numba import njit
 from torch import Tensor
 
 from steady_ppl.gaussian.lanes import (
+    Array,
     add_dot,
     add_gram,
     add_outer,
@@ -32,7 +33,6 @@ from steady_ppl.gaussian.lanes import (
     set_scaled,
 )
 from steady_ppl.gaussian.linearize import LinearArrays, Linearization
-from steady_ppl.gaussian.matrices import Array
 
 
 class Potential(NamedTuple):

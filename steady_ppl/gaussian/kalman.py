@@ -5,7 +5,8 @@ The scores are the derivatives of log p(y) by a push on the state of any row and
 shifts. They are no estimates: the smoother has believed the program, so that a missing effect appears in them a tenth
 of its size.
 
-The recursions are compiled, on numpy arrays in double precision; rows or intervals first, trajectories second. The
+The recursions are compiled, on numpy arrays in double precision; rows or intervals first, trajectories second. Products
+of small matrices are written out: NumPy's own call BLAS, which at six rows takes longer than the product. The
 notation is that of `linearize`: δ' = F δ + offset + G ε, and a measurement's residual r̄ − H δ with the given precision,
 zero where it is missing.
 """
@@ -21,8 +22,8 @@ from numba import njit
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.gaussian.lanes import Array, array
 from steady_ppl.gaussian.linearize import LinearArrays, Linearization, ReferencePath, linearize
-from steady_ppl.gaussian.matrices import Array, add_times, array, propagate, set_product, set_times
 from steady_ppl.model.program import Program
 
 
@@ -226,3 +227,53 @@ def spread_ahead(given: LinearArrays, covariances: Array, horizon: int, variance
                 for i in range(dimension):
                     for j in range(dimension):
                         variance[k] += along[k, i] * covariances[t, b, i, j] * along[k, j]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def add_product(out: Array, left: Array, right: Array, sign: float = 1.0) -> None:
+    """out += sign · left right, of matrices."""
+    for i in range(out.shape[0]):
+        for k in range(left.shape[1]):
+            weight = sign * left[i, k]
+            for j in range(out.shape[1]):
+                out[i, j] += weight * right[k, j]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def set_product(out: Array, left: Array, right: Array) -> None:
+    """out = left right, of matrices."""
+    out[:] = 0.0
+    add_product(out, left, right)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def add_times(out: Array, matrix: Array, vector: Array, sign: float = 1.0) -> None:
+    """out += sign · matrix vector."""
+    for i in range(out.shape[0]):
+        entry = out[i]
+        for k in range(matrix.shape[1]):
+            entry += sign * matrix[i, k] * vector[k]
+        out[i] = entry
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def set_times(out: Array, matrix: Array, vector: Array) -> None:
+    """out = matrix vector."""
+    out[:] = 0.0
+    add_times(out, matrix, vector)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def propagate(out: Array, covariance: Array, moved: Array, spread: Array) -> None:
+    """out = moved covariance movedᵀ + spread spreadᵀ, symmetric to the bit; `out` may be the covariance itself."""
+    half = np.zeros_like(covariance)
+    add_product(half, moved, covariance)
+    for i in range(out.shape[0]):
+        for j in range(i + 1):
+            entry = 0.0
+            for k in range(moved.shape[1]):
+                entry += half[i, k] * moved[j, k]
+            for c in range(spread.shape[1]):
+                entry += spread[i, c] * spread[j, c]
+            out[i, j] = entry
+            out[j, i] = entry

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from llvmlite import ir
 from numba import njit, types
@@ -16,10 +17,14 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from torch import Tensor
 
-from steady_ppl.gaussian.matrices import Array
-
+Array = np.ndarray[Any, np.dtype[np.float64]]
 LANES = 8
 _intrinsic: Any = intrinsic  # whose annotations count the typing context among the arguments of a call
+
+
+def array(tensor: Tensor) -> Array:
+    """A C-contiguous array; of a contiguous tensor in the host's memory it is that memory."""
+    return tensor.contiguous().numpy(force=True)
 
 
 def lanes_for(trajectories: int) -> int:

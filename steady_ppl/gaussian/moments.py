@@ -11,9 +11,8 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import Lookahead, Steering
-from steady_ppl.gaussian.lanes import add_outer, add_product, out_of_lanes
+from steady_ppl.gaussian.lanes import Array, add_outer, add_product, out_of_lanes
 from steady_ppl.gaussian.linearize import LinearArrays
-from steady_ppl.gaussian.matrices import Array
 
 
 class Moments(NamedTuple):

@@ -17,7 +17,7 @@ from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.model.handlers import broadcast_event, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.validate import step_size
-from steady_ppl.utils.threads import one_thread
+from steady_ppl.utils.cores import one_thread
 
 DAMPING = 1e-2  # of the first step, relative to the curvature
 AT_ONCE = 50_000  # rows of all places and drives

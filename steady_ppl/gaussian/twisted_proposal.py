@@ -18,8 +18,8 @@ from numba import njit
 from torch import Tensor
 
 from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
-from steady_ppl.gaussian.matrices import Array
-from steady_ppl.smc.proposal import Proposal
+from steady_ppl.gaussian.lanes import Array
+from steady_ppl.smc.filter import Proposal
 from steady_ppl.smc.resampling import by_component
 from steady_ppl.utils.angles import wrap
 

@@ -18,9 +18,8 @@ from steady_ppl.model.handlers import ByColumn, Recording, masked, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, sample_row
 from steady_ppl.model.validate import step_size
-from steady_ppl.smc.filter import STEPS_WORTH_COMPILING, particle_filter
+from steady_ppl.smc.filter import STEPS_WORTH_COMPILING, Proposal, particle_filter
 from steady_ppl.smc.genealogy import Paths, event_dims
-from steady_ppl.smc.proposal import Proposal
 from steady_ppl.utils.angles import wrap_angles
 
 HUNDREDS = 100  # of E steps are in a training

@@ -22,7 +22,7 @@ from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.smc.filter import particle_filter
 from steady_ppl.smc.genealogy import Filtered
-from steady_ppl.utils.threads import one_thread
+from steady_ppl.utils.cores import one_thread
 
 
 @one_thread()

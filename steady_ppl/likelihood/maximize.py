@@ -27,9 +27,9 @@ from steady_ppl.likelihood.parameters import Element, elements, on_both_sides, s
 from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import parameter_scores, smoothed, widens
 from steady_ppl.model.program import Program
+from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.journal import Piece, piece
 from steady_ppl.utils.progress import stages
-from steady_ppl.utils.threads import one_thread
 
 PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
 STALLED_PASSES = 30  # linearisations a step once no share of a step was accepted: some path swings about its mode

@@ -27,9 +27,9 @@ from steady_ppl.likelihood.maximize import MAX_MOVE, PASSES, TOLERANCE, log_prio
 from steady_ppl.likelihood.parameters import Element, elements, on_both_sides, set_values, values_of
 from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import Program
+from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
-from steady_ppl.utils.threads import one_thread
 
 if TYPE_CHECKING:
     import arviz

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import reduce
 from typing import Any, Self, cast
 
+import numpy as np
 import pyro
 import pyro.distributions as dist
 import torch
@@ -18,7 +19,6 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.errors import ProgramError
-from steady_ppl.utils.shapes import broadcast_shapes
 
 
 class ByColumn(Messenger):
@@ -297,3 +297,21 @@ def with_moments(fn: Any, loc: Tensor, scale: Tensor) -> Any:
 def broadcast_event(value: Tensor, left: torch.Size, event_dim: int) -> Tensor:
     """Expand a site's value to the batch shape `left`."""
     return value.expand(*left, *value.shape[value.dim() - event_dim :])
+
+
+def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
+    """The shape that all of these go together to. `torch.broadcast_shapes` loads sympy, half a second.
+
+    Raises:
+        RuntimeError: they do not go together.
+
+    Example:
+        >>> broadcast_shapes((3, 1), (2,))
+        torch.Size([3, 2])
+    """
+    if not all(type(length) is int for shape in shapes for length in shape):  # what traces and exports pass on
+        return torch.broadcast_shapes(*shapes)
+    try:
+        return torch.Size(np.broadcast_shapes(*map(tuple, shapes)))
+    except ValueError as error:
+        raise RuntimeError(str(error)) from None

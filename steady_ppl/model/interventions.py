@@ -21,13 +21,13 @@ from steady_ppl.model.handlers import (
     Recording,
     as_event,
     as_vector,
+    broadcast_shapes,
     normal_moments,
     unwrapped,
     with_moments,
 )
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import row_ends
-from steady_ppl.utils.shapes import broadcast_shapes
 
 Change = Callable[[Any, slice], Any]
 

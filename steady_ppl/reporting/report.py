@@ -13,8 +13,8 @@ from steady_ppl.errors import SteadyError, UsageError
 from steady_ppl.reporting.drives import chosen, given, maps, of_run
 from steady_ppl.reporting.html import Report
 from steady_ppl.runs.fit import Fit
+from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
-from steady_ppl.utils.threads import one_thread
 
 
 @one_thread()

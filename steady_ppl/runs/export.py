@@ -9,10 +9,9 @@ from torch import Tensor, nn
 
 from steady_ppl.errors import UsageError
 from steady_ppl.gaussian.predict import errors
-from steady_ppl.model.handlers import AtMean, running
+from steady_ppl.model.handlers import AtMean, broadcast_shapes, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting, advance
-from steady_ppl.utils.shapes import broadcast_shapes
 
 PROBED, PUSHES = 200, (1e-3, 1.0, -1e3)  # rows and sizes of a command that is looked for in what acts later
 

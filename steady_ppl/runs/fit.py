@@ -23,10 +23,10 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import is_count
 from steady_ppl.runs.folder import FINISHED, PARAMETERS, POSTERIOR, RECORD, read_record, run_folder, write_record
 from steady_ppl.training.loop import Trained
+from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.files import whole_file
 from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.tensor_files import read_tensors, write_tensors
-from steady_ppl.utils.threads import one_thread
 
 if TYPE_CHECKING:
     import arviz

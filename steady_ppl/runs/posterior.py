@@ -23,10 +23,10 @@ from steady_ppl.model.handlers import as_vector
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.smc.simulate import measure
 from steady_ppl.utils.angles import draws_on_one_turn, paths_on_one_turn
+from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.files import whole_file
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
-from steady_ppl.utils.threads import one_thread
 
 if TYPE_CHECKING:
     import arviz

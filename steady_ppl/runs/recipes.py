@@ -21,8 +21,8 @@ from steady_ppl.runs.diagnostics import diagnose_fit, diagnose_units
 from steady_ppl.runs.fit import Fit, program_source, sha256, versions
 from steady_ppl.runs.folder import CHECKPOINT, read_record, require_same, run_folder, write_record
 from steady_ppl.runs.workbench import workbench
+from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.tensor_files import read_tensors
-from steady_ppl.utils.threads import one_thread
 
 Recipe = Callable[..., Fit]
 KINDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a word", "None": "none"}

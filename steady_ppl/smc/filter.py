@@ -25,12 +25,36 @@ from steady_ppl.model.stability import divergence
 from steady_ppl.model.substeps import advance, channel_values
 from steady_ppl.smc.backends import Stepping, stepping_for
 from steady_ppl.smc.genealogy import Filtered, event_dims
-from steady_ppl.smc.proposal import Proposal
 from steady_ppl.smc.resampling import Resampler, effective_sample_size, normalise, systematic, take
-from steady_ppl.utils.threads import one_thread
+from steady_ppl.utils.cores import one_thread
 
 STEPS_WORTH_COMPILING = 1_000_000  # steps of particles, which take the program's own lines a second
 OnFrame = Callable[[int, Tensor, Tensor, Tensor], None]
+
+
+class Proposal:
+    """The program's own noise: the bootstrap filter (Gordon, Salmond and Smith 1993).
+
+    A subclass draws the noise itself. Its log ratios enter the weights, and it may resample at every row.
+
+    Attributes:
+        looks_ahead: whether weights know of later measurements, at measured rows and at others.
+    """
+
+    looks_ahead = False
+
+    def start(self, particles: int) -> tuple[Tensor | None, Tensor | float]:
+        """The standard normal noise of `initial`, `(N, B, C)`, and its log density less that of the proposal, `(N, B)`;
+        None lets the program draw."""
+        return None, 0.0
+
+    def step(self, row: int, state: Tensor) -> tuple[Tensor | None, Tensor | float]:
+        """The same for the `transition` after a row, from the states that it moves, `(N, B, D)`, already resampled."""
+        return None, 0.0
+
+    def log_future(self, row: int, state: Tensor) -> Tensor:
+        """What is thought of all measurements after a row, `(N, B)` in double precision."""
+        return state.new_zeros(state.shape[:-1], dtype=torch.float64)
 
 
 class FilterState(NamedTuple):

@@ -15,10 +15,10 @@ from steady_ppl.model.program import Program, for_program
 from steady_ppl.model.stability import counts_rows, is_step
 from steady_ppl.model.substeps import MAX_SUBSTEPS, acting_controls, with_substeps
 from steady_ppl.smc.filter import roll_out
+from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import one_line
-from steady_ppl.utils.threads import one_thread
 
 
 @one_thread()

@@ -25,8 +25,8 @@ from steady_ppl.runs.fit import packages
 from steady_ppl.studies import job as work
 from steady_ppl.studies.fingerprints import JobFiles
 from steady_ppl.studies.plan import Job
+from steady_ppl.utils.cores import ONE_THREAD
 from steady_ppl.utils.text import one_line, shown
-from steady_ppl.utils.threads import ONE_THREAD
 
 Row = dict[str, Any]
 Say = Callable[[str], None]

@@ -29,10 +29,9 @@ from steady_ppl.runs.recipes import find_recipe, require_settings, trains
 from steady_ppl.smc.simulate import simulate
 from steady_ppl.studies.fingerprints import PARTS, TABLES, JobFiles, is_program
 from steady_ppl.studies.plan import HELD_OUT, IN_LIMITS, Job
-from steady_ppl.utils.cores import one_core
+from steady_ppl.utils.cores import one_core, one_thread
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import one_line
-from steady_ppl.utils.threads import one_thread
 
 ERRORS = ("forward", "forward_mean", "state_estimation")
 CHANGED = "its program, recipe or table is not what it was when the study was begun: the same command tries it again"

@@ -24,9 +24,9 @@ from steady_ppl.model.joint import Joint
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.smc.filter import STEPS_WORTH_COMPILING
 from steady_ppl.training.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import tell
-from steady_ppl.utils.threads import one_thread
 
 SEVERAL = 10  # validations are in a training
 SETTLED = 1.0  # nats a drive by which held-out log p(y) may rise at the end of a training that has converged

@@ -16,8 +16,7 @@ from steady_ppl import DataError, FilterError, ProgramError, particle_filter, ro
 from steady_ppl.model.handlers import AtMean, Replaying
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import sample_row
-from steady_ppl.smc.filter import ParticleFilter
-from steady_ppl.smc.proposal import Proposal
+from steady_ppl.smc.filter import ParticleFilter, Proposal
 from steady_ppl.smc.resampling import multinomial, stratified, systematic, take
 
 PROGRAMS = ("linear_gaussian", "hovercraft", "hovercraft:HovercraftTruth", "truck", "pendulum")

@@ -12,7 +12,7 @@ import torch
 from small import TRUTH
 
 import steady_ppl as st
-from steady_ppl.utils.threads import ONE_THREAD, one_thread
+from steady_ppl.utils.cores import ONE_THREAD, one_thread
 
 
 @pytest.fixture(autouse=True)

@@ -8,7 +8,7 @@ import sys
 import pytest
 import torch
 
-from steady_ppl.utils.shapes import broadcast_shapes
+from steady_ppl.model.handlers import broadcast_shapes
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,7 @@ def test_shapes_that_do_not_go_together_are_the_same_error() -> None:
 
 def test_no_sympy_is_loaded_for_it() -> None:
     code = (
-        "import sys; from steady_ppl.utils.shapes import broadcast_shapes\n"
+        "import sys; from steady_ppl.model.handlers import broadcast_shapes\n"
         "broadcast_shapes((3, 1), (2,)); print('sympy' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
