@@ -37,7 +37,6 @@ import steady_ppl
 from steady_ppl import Program, discover, load_program
 from steady_ppl.discovery.result import Discovery
 from steady_ppl.effects import chosen_variant, find
-from steady_ppl.utils.cores import one_core
 
 FOLDER = Path(__file__).parent
 MODELS, RESULTS = FOLDER.parent / "models", FOLDER / "results"
@@ -143,7 +142,6 @@ def chosen_groups(only: Sequence[str] | None) -> list[Group]:
 # --- a job ------------------------------------------------------------------------------------------------------------
 
 
-@one_core()
 def judged(name: str, group: str, index: int, planted: Planted | None = None) -> Record:
     """Return the record of a job: what `discover` says of 16 + 16 drives.
 

@@ -27,13 +27,11 @@ from steady_ppl.discovery.discover import discover
 from steady_ppl.discovery.refits import Refit, refit_with
 from steady_ppl.discovery.result import Discovery, ranked
 from steady_ppl.effects import chosen_variant, parsed
-from steady_ppl.utils.cores import one_core
 
 RESULTS = Path(__file__).parent / "results" / "discovery.jsonl"
 RIVAL_SETS, BRUTE_SETS = 140, 40
 
 
-@one_core()
 def judged(chosen: BenchmarkSet) -> dict[str, Any]:
     """A set's record."""
     torch.set_num_threads(1)

@@ -23,7 +23,6 @@ from resumable import Record, digest, run
 import steady_ppl as st
 from steady_ppl.effects import chosen_variant
 from steady_ppl.runs.recipes import find_recipe
-from steady_ppl.utils.cores import one_core
 
 FOLDER = Path(__file__).parent
 BOAT = FOLDER.parent / "models" / "gps_boat.py"
@@ -31,7 +30,6 @@ TYPICAL = {"yaw_linear_drag": 0.6, "side_slip": 1.0, "quadratic_drag": 0.15}
 SPREAD = (1 / 3, 1.5)
 
 
-@one_core()
 def one(seed: int) -> Record:
     """A set's record."""
     torch.set_num_threads(1)

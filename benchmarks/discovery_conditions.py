@@ -21,7 +21,6 @@ from discovery_scores import made_by, share, uniformity
 
 from steady_ppl import Program, Trajectories, seeded, simulate
 from steady_ppl.discovery.discover import discover
-from steady_ppl.utils.cores import one_core
 
 RESULTS = Path(__file__).parent / "results" / "discovery-conditions.jsonl"
 EFFECTS = ("", "quadratic_drag=0.04", "actuator_lag=0.15", "landmark_bias:bearing_1=0.05", "yaw_bias=0.025")
@@ -50,7 +49,6 @@ class Case:
         return f"{self.condition}, {self.effect or 'clean'}, {self.seed}"
 
 
-@one_core()
 def judged(case: Case) -> dict[str, Any]:
     """A case's record."""
     torch.set_num_threads(1)

@@ -259,7 +259,7 @@ def at_its_best_place(now: Refit, candidate: Candidate) -> Candidate:
         refit = begun if best is begun else judged_fits(best)
         if isinstance(refit, Refit):
             there = judged(now, replace(tested, column=replace(tested.column, variant=variant)), refit)
-            return there if there.total > candidate.total else candidate
+            return there if there.total > candidate.total or not candidate.is_judged else candidate
     return candidate
 
 

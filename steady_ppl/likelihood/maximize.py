@@ -176,7 +176,7 @@ def climb(
     is_given = information is not None
     information = _regularised(_of_drives(here) if information is None else information)
     taken, decrement, passes = 0, 0.0, PASSES
-    rises = deque[float](maxlen=3)  # of the objective by the last steps
+    rises = deque[float](maxlen=3)  # of log p(y) by the last steps
     with stages(*(("", FEWER**step) for step in range(steps + 1))) as begin:
         for taken in range(steps + 1):
             begin()
@@ -195,7 +195,7 @@ def climb(
                 more = 0.5 * float(here.gradient @ seen)
                 if taken == 0 or (more > SURE and len(here.scores) >= 2 * len(own)):  # few drives know too little
                     information, move, decrement = own, seen, more
-            behind = taken >= 6 and here.log_likelihood + (steps - taken) * max(rises) < hopeless
+            behind = taken >= 6 and here.log_likelihood + (steps - taken) * max(0.0, *rises) < hopeless
             if decrement < precision or taken == steps or behind:
                 break
             move = move * min(1.0, 1 / max(1e-9, float((move.abs() / reach).max())))
@@ -204,7 +204,7 @@ def climb(
             share, there = _searched(terms, here, move, passes)
             if there is not None:
                 information = _updated(information, share * move, here.gradient - there.gradient)
-                rises.append(there.objective - here.objective)
+                rises.append(there.log_likelihood - here.log_likelihood)
                 here = there
             elif passes == STALLED_PASSES:
                 break

@@ -5,22 +5,24 @@ took 20 to 55 times the CPU time of one, in filters of 20,000 to 500 particles a
 brought a filter of 100,000 particles in plain torch from 3.5 s to 2.5 s, its kernels nothing, and smaller filters lost.
 
 Coarse jobs run side by side, in processes that are forked: they have what this one has, so that nothing is sent to
-them, and their results come back as safetensors. On other systems than Linux, or where CUDA is in use, no fork is safe,
-and jobs run one after another. This module loads no torch, which reads `ONE_THREAD` as it loads.
+them, and their results come back as safetensors. On other systems than Linux, off the main thread, or where CUDA is in
+use, no fork is safe, and jobs run one after another. This module loads no torch, which reads `ONE_THREAD` as it loads.
 """
 
 from __future__ import annotations
 
 import ctypes
 import json
+import multiprocessing
 import os
+import select
 import signal
 import sys
-import tempfile
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from typing import IO, TYPE_CHECKING, Any
 
@@ -30,7 +32,10 @@ if TYPE_CHECKING:
 Result = tuple[Mapping[str, "Tensor"], Mapping[str, Any]]  # tensors, and what JSON can hold
 Job = Callable[[], Result]
 MOST = 8  # processes at once: each has memory of its own
+MIN_PATIENCE, MAX_SLOWER = 10.0, 5.0  # seconds, and times its own share's, that this process waits for another
 DIE_WITH_PARENT = 1  # of Linux's prctl
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+END = b"whole"
 POOLS = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")
 ONE_THREAD = dict.fromkeys([*(f"{name}_NUM_THREADS" for name in POOLS), "VECLIB_MAXIMUM_THREADS"], "1")
 """Environment of a process whose libraries have one thread each; they read it as they load."""
@@ -78,54 +83,80 @@ def one_core() -> Iterator[None]:
 def side_by_side(jobs: Sequence[Job]) -> list[Result]:
     """What jobs return, in their order. They draw no random numbers, print nothing and change nothing that is shared.
 
-    Jobs whose process fails are run here, where their errors are raised as any other.
+    Jobs whose process fails, hangs or cannot be had are run here, where their errors are raised as any other.
     """
-    processes = max(1, min(_most.get(), _cores(), len(jobs)))
-    shares = [range(first, len(jobs), processes) for first in range(processes)]
-    with ExitStack() as ends:
+    with one_thread(), ExitStack() as ends:  # of two threads one would be missing after a fork
+        processes = max(1, min(_most.get(), _cores(), len(jobs)))
+        shares = [range(first, len(jobs), processes) for first in range(processes)]
         children = []
         for share in shares[1:]:
-            children.append(_Child(jobs, share, ends.enter_context(tempfile.TemporaryFile())))
+            children.append(_Child(jobs, share))
             ends.callback(children[-1].end)
+            children[-1].begin()
+        began = time.monotonic()
         found = {index: jobs[index]() for index in shares[0]}
+        patience = MIN_PATIENCE + MAX_SLOWER * (time.monotonic() - began)
         for child in children:
-            found.update(child.results())
-    return [found[index] if index in found else jobs[index]() for index in range(len(jobs))]
+            found.update(child.results(patience))
+        return [found[index] if index in found else jobs[index]() for index in range(len(jobs))]
 
 
 class _Child:
-    """A forked process that runs a share of the jobs."""
+    """A forked process that runs a share of the jobs, and the memory in which it leaves their results."""
 
-    def __init__(self, jobs: Sequence[Job], share: Sequence[int], file: IO[bytes]) -> None:
-        self.share, self.file = share, file
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # there are other threads, which the child has not
-            self.pid = os.fork()
-        if self.pid == 0:
-            self._run(jobs)
+    def __init__(self, jobs: Sequence[Job], share: Sequence[int]) -> None:
+        self.jobs, self.share = jobs, share
+        self.pid, self.handle = 0, -1  # a handle stays that of the process when its number is another's
+        self.file: IO[bytes] | None = None
 
-    def _run(self, jobs: Sequence[Job]) -> None:
+    def begin(self) -> None:
+        """Fork; without a process where the system has none to give."""
+        with suppress(OSError), _no_signals():
+            self.file = os.fdopen(os.memfd_create("results"), "w+b")
+            parent = os.getpid()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DeprecationWarning)  # there are other threads, which the child has not
+                self.pid = os.fork()
+            if self.pid == 0:
+                self._run(parent)
+            self.handle = os.pidfd_open(self.pid)
+
+    def _run(self, parent: int) -> None:
         """In the child, which ends here."""
         status = 1
         try:
             from steady_ppl.utils.tensor_files import packed
 
             ctypes.CDLL(None).prctl(DIE_WITH_PARENT, signal.SIGKILL)
-            _most.set(1)
-            for index in self.share:
-                tensors, values = jobs[index]()
-                content = packed(tensors, {"values": json.dumps(values)})
-                self.file.write(len(content).to_bytes(8, "little") + content)
-            self.file.flush()
-            status = 0
+            signal.set_wakeup_fd(-1)
+            for ending in SIGNALS:
+                signal.signal(ending, signal.SIG_DFL)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+            if self.file is not None and os.getppid() == parent:
+                _most.set(1)
+                for index in self.share:
+                    tensors, values = self.jobs[index]()
+                    content = packed(tensors, {"values": json.dumps(values)})
+                    self.file.write(len(content).to_bytes(8, "little") + content)
+                self.file.write(END)
+                self.file.flush()
+                status = 0
         finally:
             os._exit(status)
 
-    def results(self) -> dict[int, Result]:
-        """By the jobs' numbers, when it has ended; nothing if it failed."""
+    def results(self, patience: float) -> dict[int, Result]:
+        """By the jobs' numbers, when it has ended; nothing if it failed, or does not end within so many seconds."""
         from steady_ppl.utils.tensor_files import unpacked
 
-        if self._wait() != 0:
+        if self.file is None or self.handle < 0:
+            return {}
+        ended = select.poll()
+        ended.register(self.handle, select.POLLIN)
+        if not ended.poll(1000 * patience):
+            return {}
+        size = self.file.seek(0, os.SEEK_END)
+        self.file.seek(max(0, size - len(END)))
+        if self.file.read() != END:
             return {}
         self.file.seek(0)
         found: dict[int, Result] = {}
@@ -136,19 +167,37 @@ class _Child:
 
     def end(self) -> None:
         """Stop it if it still runs."""
-        if self.pid:
+        if self.handle >= 0:
+            with suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self.handle, signal.SIGKILL)
+            os.close(self.handle)
+        elif self.pid:
             os.kill(self.pid, signal.SIGKILL)
-            self._wait()
+        if self.pid:
+            with suppress(ChildProcessError):  # whoever else waits for processes had it
+                os.waitpid(self.pid, 0)
+        if self.file is not None:
+            self.file.close()
 
-    def _wait(self) -> int:
-        pid, self.pid = self.pid, 0
-        return os.waitpid(pid, 0)[1]
+
+@contextmanager
+def _no_signals() -> Iterator[None]:
+    """Keep signals until the block has ended: an interrupt in a child would unwind its parent's stack."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _cores() -> int:
-    """Of this process, one where forks are not safe."""
+    """That this process may use, one where forks are not safe: another thread may hold a lock that a child would wait
+    for, and a process of a pool has its core."""
     import torch
+    from joblib.externals.loky import cpu_count
 
-    if sys.platform != "linux" or torch.cuda.is_initialized():
+    if sys.platform != "linux" or not hasattr(os, "pidfd_open") or torch.cuda.is_initialized():
         return 1
-    return len(os.sched_getaffinity(0))
+    if threading.current_thread() is not threading.main_thread() or multiprocessing.parent_process() is not None:
+        return 1
+    return int(cpu_count())

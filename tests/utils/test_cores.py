@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
+import threading
 import time
 
 import pytest
@@ -16,7 +18,7 @@ from steady_ppl.utils.cores import one_core, side_by_side
 
 @pytest.fixture(autouse=True)
 def three_cores(monkeypatch):
-    if cores._cores() == 1 and not hasattr(os, "sched_getaffinity"):
+    if sys.platform != "linux" or not hasattr(os, "pidfd_open"):
         pytest.skip("no safe fork on this system")
     monkeypatch.setattr(cores, "_cores", lambda: 3)
 
@@ -89,3 +91,46 @@ def test_an_error_here_ends_the_other_processes(tmp_path):
     for file in tmp_path.iterdir():
         with pytest.raises(ProcessLookupError):
             os.kill(int(file.name), 0)
+
+
+def test_a_process_that_hangs_is_not_waited_for(monkeypatch):
+    mine, held = os.getpid(), threading.Lock()
+    monkeypatch.setattr(cores, "MIN_PATIENCE", 0.2)
+
+    def wait(index):
+        if os.getpid() != mine:
+            with held:
+                time.sleep(60)
+
+    with held:
+        found = side_by_side(jobs_of(4, wait))
+    assert {values["pid"] for _, values in found} == {mine}
+
+
+def test_where_no_process_or_memory_is_to_be_had_jobs_run_here(monkeypatch):
+    def refuse(*_):
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    for call in ("fork", "memfd_create", "pidfd_open"):
+        with monkeypatch.context() as patched:
+            patched.setattr(os, call, refuse)
+            assert {values["pid"] for _, values in side_by_side(jobs_of(5))} == {os.getpid()}
+
+
+def test_processes_that_someone_else_has_waited_for_are_as_good(monkeypatch):
+    before = signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    try:
+        found = side_by_side(jobs_of(6))
+    finally:
+        signal.signal(signal.SIGCHLD, before)
+    assert len({values["pid"] for _, values in found}) == 3
+
+
+def test_threads_and_processes_of_pools_take_no_other(monkeypatch):
+    monkeypatch.undo()
+    found = []
+    thread = threading.Thread(target=lambda: found.append(cores._cores()))
+    thread.start()
+    thread.join()
+    monkeypatch.setattr("multiprocessing.parent_process", lambda: "a pool")
+    assert [*found, cores._cores()] == [1, 1]
