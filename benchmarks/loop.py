@@ -1,15 +1,16 @@
 """Seconds and peak memory of each step of the loop, with empty caches of kernels and warm, and beside another engine.
 
     python benchmarks/loop.py [--sizes 16x101 64x301 300x101] [--cases boat truck mrclam] [--steps fit check …]
-        [--warm 3] [--against FOLDER] [--beside N] [--results [FILE]]
+        [--warm 3] [--against FOLDER] [--beside N] [--profile FOLDER] [--results [FILE]]
 
 Drives of `HovercraftTruth` are given to `models/hovercraft.py`, which lacks two effects: so many to fit, as many to
-choose by, 32 to prove, of so many rows. Every run is a process of its own with one thread. A step's caches of machine
-code are empty at first ("cold"), and full in the runs after it ("warm", the median). Of a command the whole process is
-timed, its imports with it; of `maximise` and `refit` only the call, before which `refit` has fitted the program as it
-is. Peak memory is the process's.
+choose by, 32 to prove, of so many rows. Every run is a process of its own, as a person's shell starts it: no variable
+says how many threads it may take. A step's caches of machine code are empty at first ("cold"), and full in the runs
+after it ("warm", the median). Of a command the whole process is timed, its imports with it; of `maximise` and `refit`
+only the call, before which `refit` has fitted the program as it is. Peak memory is the process's.
 
 `--against` runs the same steps with the engine of another checkout, in turns, with the same tables and programs.
+`--profile` runs every command once more and writes where its time goes, for `python -m pstats`.
 `--beside` keeps other cores busy. Records are kept, and what is there is left out, with `--results` alone.
 """
 
@@ -34,15 +35,15 @@ from resumable import Record, digest, run
 
 RESULTS = ROOT / "benchmarks" / "results" / "loop.jsonl"
 MEBI = 2**20 if sys.platform == "darwin" else 2**10  # units of `ru_maxrss` in a MiB
-POOLS = ("OMP", "OPENBLAS", "MKL", "NUMBA")
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"
 
 
 def environment(engine: Path, caches: Path) -> dict[str, str]:
-    """Of a process with one thread that imports the engine of this checkout and keeps machine code in a folder."""
-    threads = {f"{name}_NUM_THREADS": "1" for name in POOLS}
+    """Of a process that imports the engine of this checkout, keeps machine code in a folder and is told no threads."""
+    own = {name: value for name, value in os.environ.items() if name not in THREADS}
     kept = {"STEADY_KERNEL_CACHE": str(caches / "kernels"), "NUMBA_CACHE_DIR": str(caches / "numba")}
-    return {**os.environ, **threads, **kept, "PYTHONPATH": str(engine), "MPLBACKEND": "Agg"}
+    return {**own, **kept, "PYTHONPATH": str(engine), "MPLBACKEND": "Agg"}
 
 
 def measured(words: Sequence[str], folder: Path, environ: Mapping[str, str]) -> Record:
@@ -70,7 +71,16 @@ def measured(words: Sequence[str], folder: Path, environ: Mapping[str, str]) -> 
     return whole | {"said": " ".join(said.split())[:160]}
 
 
-def work(name: str, case: Case, engines: dict[str, Path], desk: Path, warm: int, seed: int, beside: int) -> Record:
+def work(
+    name: str,
+    case: Case,
+    engines: dict[str, Path],
+    desk: Path,
+    warm: int,
+    seed: int,
+    beside: int,
+    profile: Path | None = None,
+) -> Record:
     """The record of a step: a cold run and warm ones of every engine, in turns."""
     step, place = STEPS[name], desk / case.name
     spare = desk / "caches"  # of what is not timed
@@ -93,6 +103,9 @@ def work(name: str, case: Case, engines: dict[str, Path], desk: Path, warm: int,
                 if engine == "new":
                     raise
                 runs[engine] = f"{error}"
+    if profile is not None and not step.source:
+        told = ["-m", "cProfile", "-o", str(profile / f"{case.name}-{name}.prof"), *words_of(step, case, seed)]
+        measured(told, place / "new", environment(ROOT, desk / f"{case.name} {name} new"))
     commits = {engine: commit(folder) for engine, folder in engines.items()}
     return {"step": name, "commits": commits, "seeds": [*DRIVES, seed], "beside": beside, "runs": runs}
 
@@ -182,6 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the commands")
     parser.add_argument("--against", type=Path, help="another checkout")
     parser.add_argument("--beside", type=int, default=0, help="busy loops")
+    parser.add_argument("--profile", type=Path, help="an existing folder for a profile of each command")
     parser.add_argument("--shared", type=Path, default=ROOT.parent / "shared", help="where the data of cases are")
     parser.add_argument("--results", type=Path, nargs="?", const=RESULTS, help="keep the records, and the table (.md)")
     chosen = parser.parse_args(arguments)
@@ -193,7 +207,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for folder in engines.values():
         _make_ready(folder)
     with tempfile.TemporaryDirectory() as room, busy(chosen.beside):
-        rest = (engines, Path(room), chosen.warm, chosen.seed, chosen.beside)
+        profile = chosen.profile and chosen.profile.resolve()
+        rest = (engines, Path(room), chosen.warm, chosen.seed, chosen.beside, profile)
         jobs: dict[str, tuple[Any, ...]] = {
             f"{case.name} {step}": (step, case, *rest)
             for case in wanted

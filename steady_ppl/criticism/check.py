@@ -29,6 +29,7 @@ from steady_ppl.gaussian.kalman import track
 from steady_ppl.gaussian.linearize import why_not_linear
 from steady_ppl.gaussian.predict import named_horizons, predict
 from steady_ppl.gaussian.smoother import find_and_smooth
+from steady_ppl.kernels.rows import in_plain_torch, without_kernels
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit
@@ -69,7 +70,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     parts = (("finding paths", 1), ("comparing time steps", 1), ("simulating drives", 2), ("judging", 2))
     with stages(*parts) as begin:
         begin()
-        with seeded(seed, "check"):
+        with seeded(seed, "check"), without_kernels() as why:
             ahead = find_and_smooth(program, run, known_start=fit.known_start)
             real = track(program, run, ahead.linearization.path, known_start=fit.known_start, passes=1)
             _, drawn, _ = ahead.draws(simulations)
@@ -90,6 +91,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         controls = {name: acting[..., i].double().numpy(force=True) for i, name in enumerate(program.control_names)}
         misfit = judge(ours, theirs, time, controls, _pairs(program, ours), dispersion)
     notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
+    notes += in_plain_torch(why)
     notes += run.uneven_steps + diagnose_units(program, run)
     notes += [f"refitted to these drives, {step.note}"] if step.note else []
     notes += [step.uncompared] if step.uncompared else []

@@ -18,7 +18,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
 from steady_ppl.gaussian.predict import mean_step, mean_steps, on_a_circle, row_errors
-from steady_ppl.kernels.jit import Slopes, slopes_on_all_rows
+from steady_ppl.kernels.rows import Slopes, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import Element, elements, on_both_sides
 from steady_ppl.likelihood.scores import measured, of_actuators
 from steady_ppl.model.actuation import lagged

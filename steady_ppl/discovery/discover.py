@@ -22,6 +22,7 @@ from steady_ppl.discovery.result import Discovery
 from steady_ppl.discovery.search import MAX_EFFECTS, Found, Search, Settings, search
 from steady_ppl.effects import of_name, record, restore, written_class
 from steady_ppl.errors import DataError, UsageError
+from steady_ppl.kernels.rows import in_plain_torch, without_kernels
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import Program
@@ -112,7 +113,7 @@ def discover(
     require(problem, choosing.data, simulations)
     with stages(("", 8), ("comparing before and after", 1), ("looking for a better next drive", 1)) as begin:
         begin()
-        with seeded(seed, "search"):
+        with seeded(seed, "search"), without_kernels() as why:
             chosen = Settings(declared, simulations, seed=seed, withheld=withheld)
             found = search(problem, choosing.data, chosen)
         begin()
@@ -125,6 +126,7 @@ def discover(
         begin()
         unclear = _unclear(found, effects)
         proposed = next_run(unclear, seed) if unclear else None
+    notes += in_plain_torch(why)
     if unclear and proposed is None:
         alike = " from ".join(candidate.variant.name for candidate in unclear.alike[:2])
         notes.append(f"no way of driving that was tried tells {alike} better than these drives do")

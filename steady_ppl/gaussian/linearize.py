@@ -19,7 +19,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError
 from steady_ppl.gaussian.lanes import Array, array
-from steady_ppl.kernels.jit import on_all_rows
+from steady_ppl.kernels.rows import on_all_rows
 from steady_ppl.model.handlers import (
     AtMean,
     Observing,

@@ -12,7 +12,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.kernels.jit import on_all_rows
+from steady_ppl.kernels.rows import on_all_rows
 from steady_ppl.model.handlers import AtMean, Observing, Recording, as_vector, residual, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance

@@ -17,7 +17,8 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
 from steady_ppl.gaussian.linearize import ReferencePath, angles_on_a_circle, linearize
-from steady_ppl.kernels.jit import on_all_rows, unchanged
+from steady_ppl.kernels.jit import unchanged
+from steady_ppl.kernels.rows import on_all_rows
 from steady_ppl.model.handlers import (
     KnownStart,
     Recording,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import itertools
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -23,13 +23,10 @@ from steady_ppl.kernels.tape import first_names, where
 from steady_ppl.utils.text import one_line
 
 TRACES = 32  # of one method of programs of one class; each takes some hundredths of a second
-COMPARED_EVERY = 16  # of a program's runs on all rows; the first two are compared as well
 KERNELS = 256  # that are kept in memory
 FEW = 1000  # numbers of a tensor that are looked at one by one
-ROWS_WORTH_COMPILING = 1000  # of all trajectories together
 KEEPS_CHANGING = "its settings or tensors change from run to run"
 DIFFERENT = "its kernel and its own lines come to different numbers"
-NO_SLOPES = "some of its slopes are no numbers"
 SETTING = bool | int | float | str | tuple | list | dict | np.ndarray | Tensor
 OF_MODULES = vars(nn.Module()).keys() - {"training"}  # attributes in which torch keeps parameters, buffers and hooks
 Value = TypeVar("Value")
@@ -37,7 +34,6 @@ Array = np.ndarray
 Examples = dict[str, Tensor]  # of the arguments of a function
 _COMPILED: WeakKeyDictionary[type[nn.Module], dict[Any, Any]] = WeakKeyDictionary()
 _NAMES: WeakKeyDictionary[type[nn.Module], list[tuple[int, list[str]]]] = WeakKeyDictionary()
-_RUNS: WeakKeyDictionary[nn.Module, Counter[Method]] = WeakKeyDictionary()
 _READ: WeakKeyDictionary[nn.Module, dict[Any, Any]] = WeakKeyDictionary()  # of programs that are `unchanged` for now
 
 
@@ -338,125 +334,3 @@ def close(mine: Tensor, theirs: Tensor) -> bool:
     scale = torch.where(torch.isfinite(theirs), theirs, 0.0).abs().flatten(0, -2).amax(0)
     same = ((mine - theirs).abs() <= 1e-4 * (theirs.abs() + scale) + 1e-7) | (mine == theirs)
     return float((same | (mine.isnan() & theirs.isnan())).float().mean()) > 0.98
-
-
-def on_all_rows(
-    program: nn.Module,
-    name: str,
-    function: Callable[..., Tensor],
-    arguments: dict[str, Tensor],
-    along: Sequence[str] = (),
-    kernels: bool | None = None,
-) -> tuple[Tensor, list[Tensor]] | str | None:
-    """A function's value and its Jacobians.
-
-    Args:
-        program: what the function belongs to.
-        name: of the function, by which its kernel is kept.
-        function: of one row of one trajectory or of many; it returns `(..., V)`.
-        arguments: its arguments in order, each `(rows, B)` or `(rows, B, ·)`.
-        along: those in which to differentiate, the first ones.
-        kernels: whether a kernel is worth compiling; None: if there are `ROWS_WORTH_COMPILING`.
-
-    Returns:
-        The value `(rows, B, V)` and the Jacobians `(rows, B, V, ·)`; why there is no kernel; None where it is not
-        worth one.
-    """
-    found = _computed(program, f"{name} on all rows", function, arguments, kernels, along=along)
-    if not isinstance(found, tuple):
-        return found
-    method, values, rest = found
-    widths = [arguments[at].shape[-1] for at in along]
-    return values, list(rest.unflatten(-1, (method.values, sum(widths))).split(widths, -1)) if along else []
-
-
-class Slopes(NamedTuple):
-    """What a function's components change by with the parameters that a kernel takes, where that is not zero.
-
-    Attributes:
-        function: its own values, `(rows, B, V)`.
-        components: of the function, one for each slope, `(N,)`.
-        values: the slopes, `(N, rows, B)`.
-        by_number: what the kernel's parameter of each slope changes by with each learnable number, `(N, P)`.
-    """
-
-    function: Tensor
-    components: Tensor
-    values: Tensor
-    by_number: Tensor
-
-    def weighted(self, weights: Tensor) -> Tensor:
-        """The sum over rows and components of weights `(rows, B, V)` times slopes, `(B, P)` in double precision."""
-        by_slope = (weights.movedim(-1, 0)[self.components].double() * self.values.double()).sum(1)
-        return by_slope.t() @ self.by_number
-
-
-def slopes_on_all_rows(
-    program: nn.Module,
-    name: str,
-    function: Callable[..., Tensor],
-    arguments: dict[str, Tensor],
-    numbers: Sequence[Number],
-    kernels: bool | None = None,
-) -> Slopes | str | None:
-    """A function's slopes in a program's learnable numbers; otherwise as `on_all_rows`."""
-    found = _computed(program, f"{name} by parameters", function, arguments, kernels, by_parameters=True)
-    if not isinstance(found, tuple):
-        return found
-    method, values, rest = found
-    if not bool(torch.isfinite(rest.sum())):  # a root of zero, say, over which differences step
-        return NO_SLOPES
-    components, parameters = torch.tensor(method.slopes, dtype=torch.int64).view(-1, 2).unbind(-1)
-    return Slopes(values, components, rest.movedim(-1, 0), method.by_number(program, numbers)[parameters])
-
-
-def _computed(
-    program: nn.Module,
-    name: str,
-    function: Callable[..., Tensor],
-    arguments: dict[str, Tensor],
-    kernels: bool | None,
-    **derivatives: Any,
-) -> tuple[Method, Tensor, Tensor] | str | None:
-    """The kernel, the function's value and the derivatives `(rows, B, ·)`."""
-    first = next(iter(arguments.values()))
-    rows, trajectories = first.shape[:2]
-    if kernels is None:
-        kernels = rows * trajectories >= ROWS_WORTH_COMPILING
-    if not kernels:
-        return None
-    if rows * trajectories < LANES:
-        return f"fewer than {LANES} rows"
-    if first.device.type != "cpu" or first.dtype != torch.float32:
-        return f"{str(first.dtype).removeprefix('torch.')} on {first.device.type}"
-    examples = {at: value[:1, :1].unsqueeze(0).clone() for at, value in arguments.items()}
-
-    def build() -> Method:
-        return Method(program, lambda *values: (function(*values),), examples, {}, **derivatives)
-
-    method = compiled(program, name, build)
-    if isinstance(method, str):
-        return method
-    found = _run(method, program, arguments, rows, trajectories)
-    values, rest = found[..., : method.values], found[..., method.values :]
-    runs = _RUNS.setdefault(program, Counter())
-    runs[method] += 1
-    if runs[method] <= 2 or runs[method] % COMPARED_EVERY == 0:
-        plain = function(*(_a_few(value) for value in arguments.values()))
-        if not close(_a_few(values), plain):
-            return discard(program, name)
-    return method, values, rest
-
-
-def _a_few(values: Tensor) -> Tensor:
-    """Some sixteen of all rows, `(1, ·, ·)`."""
-    return values.flatten(0, 1)[None, :: max(1, values.shape[0] * values.shape[1] // LANES)]
-
-
-def _run(method: Method, program: nn.Module, arguments: dict[str, Tensor], rows: int, trajectories: int) -> Tensor:
-    """Everything that the kernel computes, `(rows, B, ·)`."""
-    cells = rows * trajectories
-    inputs = [value.float().reshape(cells, 1, -1).permute(2, 1, 0).contiguous().numpy() for value in arguments.values()]
-    out = torch.empty(len(method.graph.outputs), 1, cells)
-    method.kernel(method.parameters(program), np.zeros((1, 0), np.float32), inputs, None, out.numpy())
-    return out.squeeze(1).t().reshape(rows, trajectories, -1)

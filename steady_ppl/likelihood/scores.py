@@ -30,7 +30,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.moments import posterior_moments
 from steady_ppl.kernels.graph import NotCompilable
-from steady_ppl.kernels.jit import Slopes, slopes_on_all_rows
+from steady_ppl.kernels.rows import Slopes, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import Element, moved, on_both_sides
 from steady_ppl.model.handlers import (
     AtMean,

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 Result = tuple[Mapping[str, "Tensor"], Mapping[str, Any]]  # tensors, and what JSON can hold
 Job = Callable[[], Result]
-MOST = 8  # processes at once: each has memory of its own
+MAX_PROCESSES = 8  # at once: each has memory of its own
 MIN_PATIENCE, MAX_SLOWER = 10.0, 5.0  # seconds, and times its own share's, that this process waits for another
 DIE_WITH_PARENT = 1  # of Linux's prctl
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -42,7 +42,7 @@ ONE_THREAD = dict.fromkeys([*(f"{name}_NUM_THREADS" for name in POOLS), "VECLIB_
 
 _lock = threading.Lock()
 _inside, _given = 0, 1  # how many blocks are on one thread, and how many threads there were before the first
-_most: ContextVar[int] = ContextVar("how many processes the block may take", default=MOST)
+_most: ContextVar[int] = ContextVar("how many processes the block may take", default=MAX_PROCESSES)
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from steady_ppl.criticism.perturbations import directions
 from steady_ppl.criticism.residual_maps import _adjusted
 from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.gaussian.smoother import smooth
-from steady_ppl.kernels import jit
+from steady_ppl.kernels import rows as rows_by_kernels
 from steady_ppl.model.program import for_program
 from steady_ppl.utils import cores
 from steady_ppl.utils.cores import one_core
@@ -110,7 +110,7 @@ def test_scores_of_parameters_by_kernels_are_those_by_differences(monkeypatch):
     _, tracked = simulated._tracked(program, again, truth, known_start=True)
     found = []
     for rows in (1, 10**9):
-        monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", rows)
+        monkeypatch.setattr(rows_by_kernels, "ROWS_WORTH_COMPILING", rows)
         found.append({one.name: one.scores for one in directions(program, again, tracked)})
     assert found[0].keys() == found[1].keys() and {"mass", "inertia", "drag[2]"} <= found[0].keys()
     for name, scores in found[0].items():

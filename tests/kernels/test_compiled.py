@@ -24,7 +24,7 @@ from steady_ppl.gaussian.linearize import ReferencePath, linearize
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.guides import linearized
-from steady_ppl.kernels import jit
+from steady_ppl.kernels import jit, rows as rows_by_kernels
 from steady_ppl.smc.backends import CompiledStepping, Stepping, stepping_for
 
 HovercraftTruth = type(example("hovercraft:HovercraftTruth"))
@@ -86,7 +86,7 @@ def test_a_kernels_jacobians_are_those_of_torch(name, monkeypatch):
     torch.manual_seed(1)
     states, noise = 2 * torch.randn(9, 3, len(program.states)), torch.randn(8, 3, len(program.channels))
     by_torch = linearize(program, data, ReferencePath(states, noise))
-    monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", 1)
+    monkeypatch.setattr(rows_by_kernels, "ROWS_WORTH_COMPILING", 1)
     by_kernel = linearize(program, data, ReferencePath(states, noise))
     assert by_kernel.in_plain_torch is None and jit._COMPILED[type(program)]
     for part in ("offset", "state", "noise", "residual", "measurement", "precision", "log_scale"):
@@ -94,7 +94,7 @@ def test_a_kernels_jacobians_are_those_of_torch(name, monkeypatch):
 
 
 def test_a_program_has_kernels_for_the_filter_and_for_its_jacobians(monkeypatch):
-    monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", 1)
+    monkeypatch.setattr(rows_by_kernels, "ROWS_WORTH_COMPILING", 1)
     program = single("hovercraft")
     data = drives(program, 2, 9)
     path = ReferencePath(torch.randn(9, 2, 6), torch.randn(8, 2, 3))
@@ -117,7 +117,7 @@ def test_jacobians_that_cannot_be_compiled_come_from_torch_and_the_guide_says_wh
 
 
 def test_jacobians_that_have_fallen_behind_their_program_are_found_out(monkeypatch):
-    monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", 1)
+    monkeypatch.setattr(rows_by_kernels, "ROWS_WORTH_COMPILING", 1)
     program = Stale()
     data = drives(example("hovercraft", torch.float32), 2, 31)
     path = ReferencePath(torch.randn(31, 2, 6), torch.randn(30, 2, 3))

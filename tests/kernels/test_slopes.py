@@ -12,8 +12,8 @@ from examples import drives, example
 from steady_ppl import seeded
 from steady_ppl.discovery.curves import height
 from steady_ppl.gaussian.linearize import ReferencePath, linearize
-from steady_ppl.kernels import jit
-from steady_ppl.kernels.jit import Slopes, slopes_on_all_rows
+from steady_ppl.kernels import jit, rows as rows_by_kernels
+from steady_ppl.kernels.rows import Slopes, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import elements, on_both_sides
 from steady_ppl.model.handlers import Standardised, running
 from steady_ppl.model.substeps import acting_controls, advance, with_substeps
@@ -23,7 +23,7 @@ PROGRAMS = ["hovercraft.py:HovercraftTruth", "truck", "pendulum", "linear_gaussi
 
 @pytest.fixture(autouse=True)
 def compile_everything(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", 1)
+    monkeypatch.setattr(rows_by_kernels, "ROWS_WORTH_COMPILING", 1)
 
 
 def ends(program):

@@ -17,8 +17,8 @@ from pyro.distributions import constraints
 from pyro.nn import PyroModule, PyroParam
 from torch import Tensor, nn
 
-from steady_ppl.kernels import jit
-from steady_ppl.kernels.jit import Slopes, on_all_rows, slopes_on_all_rows
+from steady_ppl.kernels import jit, rows as rows_by_kernels
+from steady_ppl.kernels.rows import Slopes, in_plain_torch, on_all_rows, slopes_on_all_rows, without_kernels
 from steady_ppl.kernels.tape import Tape
 
 STATES = torch.linspace(-2.0, 2.0, 90).view(10, 3, 3)
@@ -27,7 +27,7 @@ Lines = Callable[[Any, Tensor], Tensor]
 
 @pytest.fixture(autouse=True)
 def _compile_everything(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", 1)
+    monkeypatch.setattr(rows_by_kernels, "ROWS_WORTH_COMPILING", 1)
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def test_slopes_that_are_no_numbers_are_left_to_torch() -> None:
         return (state - which.gain).norm(dim=-1, keepdim=True)
 
     still = {"state": which.gain.detach().expand(10, 3, 3)}
-    assert slopes_on_all_rows(which, "lines", lines, still, [Number(which.gain)]) == jit.NO_SLOPES
+    assert slopes_on_all_rows(which, "lines", lines, still, [Number(which.gain)]) == rows_by_kernels.NO_SLOPES
 
 
 def test_a_kernel_is_compared_when_a_program_first_runs_with_it() -> None:
@@ -235,3 +235,19 @@ def test_parameters_between_other_bounds_have_a_kernel_each() -> None:
 
     for bounds in (constraints.unit_interval, constraints.interval(0.0, 2.0), constraints.unit_interval):
         assert_own(Bounded(bounds), lambda one, state: state * one.share)
+
+
+def test_why_there_is_no_kernel_is_noted_once_a_function():
+    class Sorting(nn.Module):
+        pass
+
+    program, given = Sorting(), {"state": torch.randn(4, 5, 3)}
+    with without_kernels() as why:
+        for _ in range(2):
+            assert isinstance(on_all_rows(program, "sorted", lambda state: state.sort(-1).values, given), str)
+        with without_kernels() as inner:
+            on_all_rows(program, "sorted twice", lambda state: state.sort(-1).values, given)
+    assert list(why) == ["sorted"] and list(inner) == ["sorted twice"]
+    (note,) = in_plain_torch({"one": "a", "two": "b", "three": "a"})
+    assert note == "computed in plain torch, without compiled kernels: one, three: a; two: b"
+    assert in_plain_torch({}) == []

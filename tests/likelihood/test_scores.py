@@ -13,7 +13,7 @@ from steady_ppl.discovery.curves import curves
 from steady_ppl.discovery.effect_scores import Column, Scoring
 from steady_ppl.effects import attach, chosen_variant, parsed
 from steady_ppl.gaussian.smoother import find_path, means_as_path, smooth
-from steady_ppl.kernels import jit
+from steady_ppl.kernels import rows as rows_by_kernels
 from steady_ppl.likelihood.parameters import elements, moved
 from steady_ppl.likelihood.scores import Smoothed, parameter_scores, smoothed, typical_spreads
 from steady_ppl.model.substeps import with_substeps
@@ -94,7 +94,7 @@ def test_kernels_and_torch_find_the_same_scores_of_an_actuator(effect, substeps,
     data = drives(program, 3, 12)
     at, _ = at_rest(program, data)
     plain = parameter_scores(program, data, at, elements(program))
-    monkeypatch.setattr(jit, "ROWS_WORTH_COMPILING", 1)
+    monkeypatch.setattr(rows_by_kernels, "ROWS_WORTH_COMPILING", 1)
     found = parameter_scores(program, data, at, elements(program))
     torch.testing.assert_close(found, plain, rtol=1e-2, atol=1e-2 * float(plain.abs().max()))
 

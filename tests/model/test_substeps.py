@@ -31,7 +31,7 @@ from steady_ppl import (
 )
 from steady_ppl.gaussian.linearize import linearize
 from steady_ppl.gaussian.smoother import find_path, smooth
-from steady_ppl.kernels.jit import on_all_rows
+from steady_ppl.kernels.rows import on_all_rows
 from steady_ppl.model.handlers import AtMean, Recording, Standardised, running
 from steady_ppl.model.substeps import (
     advance,

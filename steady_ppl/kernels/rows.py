@@ -1,0 +1,170 @@
+"""Functions of a program on all rows of all trajectories, by kernels: values, Jacobians, slopes in its parameters."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from steady_ppl.kernels.codegen import LANES
+from steady_ppl.kernels.jit import Method, Number, close, compiled, discard
+
+COMPARED_EVERY = 16  # of a program's runs on all rows; the first two are compared as well
+ROWS_WORTH_COMPILING = 1000  # of all trajectories together
+NO_SLOPES = "some of its slopes are no numbers"
+_RUNS: WeakKeyDictionary[nn.Module, Counter[Method]] = WeakKeyDictionary()
+_WHY: ContextVar[dict[str, str] | None] = ContextVar("why functions had no kernel, by their names", default=None)
+
+
+@contextmanager
+def without_kernels() -> Iterator[dict[str, str]]:
+    """Why functions of the block had no kernel where there were rows enough for one, by the functions' names."""
+    found: dict[str, str] = {}
+    token = _WHY.set(found)
+    try:
+        yield found
+    finally:
+        _WHY.reset(token)
+
+
+def in_plain_torch(why: Mapping[str, str]) -> list[str]:
+    """What `without_kernels` gave, as a note for who waits for the result."""
+    names = {reason: [name for name in why if why[name] == reason] for reason in why.values()}
+    parts = [f"{', '.join(names[reason])}: {reason}" for reason in names]
+    return [f"computed in plain torch, without compiled kernels: {'; '.join(parts)}"] if parts else []
+
+
+def on_all_rows(
+    program: nn.Module,
+    name: str,
+    function: Callable[..., Tensor],
+    arguments: dict[str, Tensor],
+    along: Sequence[str] = (),
+    kernels: bool | None = None,
+) -> tuple[Tensor, list[Tensor]] | str | None:
+    """A function's value and its Jacobians.
+
+    Args:
+        program: what the function belongs to.
+        name: of the function, by which its kernel is kept.
+        function: of one row of one trajectory or of many; it returns `(..., V)`.
+        arguments: its arguments in order, each `(rows, B)` or `(rows, B, ·)`.
+        along: those in which to differentiate, the first ones.
+        kernels: whether a kernel is worth compiling; None: if there are `ROWS_WORTH_COMPILING`.
+
+    Returns:
+        The value `(rows, B, V)` and the Jacobians `(rows, B, V, ·)`; why there is no kernel; None where it is not
+        worth one.
+    """
+    found = _computed(program, f"{name} on all rows", function, arguments, kernels, along=along)
+    if not isinstance(found, tuple):
+        return found
+    method, values, rest = found
+    widths = [arguments[at].shape[-1] for at in along]
+    return values, list(rest.unflatten(-1, (method.values, sum(widths))).split(widths, -1)) if along else []
+
+
+class Slopes(NamedTuple):
+    """What a function's components change by with the parameters that a kernel takes, where that is not zero.
+
+    Attributes:
+        function: its own values, `(rows, B, V)`.
+        components: of the function, one for each slope, `(N,)`.
+        values: the slopes, `(N, rows, B)`.
+        by_number: what the kernel's parameter of each slope changes by with each learnable number, `(N, P)`.
+    """
+
+    function: Tensor
+    components: Tensor
+    values: Tensor
+    by_number: Tensor
+
+    def weighted(self, weights: Tensor) -> Tensor:
+        """The sum over rows and components of weights `(rows, B, V)` times slopes, `(B, P)` in double precision."""
+        by_slope = (weights.movedim(-1, 0)[self.components].double() * self.values.double()).sum(1)
+        return by_slope.t() @ self.by_number
+
+
+def slopes_on_all_rows(
+    program: nn.Module,
+    name: str,
+    function: Callable[..., Tensor],
+    arguments: dict[str, Tensor],
+    numbers: Sequence[Number],
+    kernels: bool | None = None,
+) -> Slopes | str | None:
+    """A function's slopes in a program's learnable numbers; otherwise as `on_all_rows`."""
+    found = _computed(program, f"{name} by parameters", function, arguments, kernels, by_parameters=True)
+    if not isinstance(found, tuple):
+        return found
+    method, values, rest = found
+    if not bool(torch.isfinite(rest.sum())):  # a root of zero, say, over which differences step
+        return _noted(name, NO_SLOPES)
+    components, parameters = torch.tensor(method.slopes, dtype=torch.int64).view(-1, 2).unbind(-1)
+    return Slopes(values, components, rest.movedim(-1, 0), method.by_number(program, numbers)[parameters])
+
+
+def _computed(
+    program: nn.Module,
+    name: str,
+    function: Callable[..., Tensor],
+    arguments: dict[str, Tensor],
+    kernels: bool | None,
+    **derivatives: Any,
+) -> tuple[Method, Tensor, Tensor] | str | None:
+    """The kernel, the function's value and the derivatives `(rows, B, ·)`."""
+    first = next(iter(arguments.values()))
+    rows, trajectories = first.shape[:2]
+    if kernels is None:
+        kernels = rows * trajectories >= ROWS_WORTH_COMPILING
+    if not kernels:
+        return None
+    if rows * trajectories < LANES:
+        return f"fewer than {LANES} rows"
+    if first.device.type != "cpu" or first.dtype != torch.float32:
+        return f"{str(first.dtype).removeprefix('torch.')} on {first.device.type}"
+    examples = {at: value[:1, :1].unsqueeze(0).clone() for at, value in arguments.items()}
+
+    def build() -> Method:
+        return Method(program, lambda *values: (function(*values),), examples, {}, **derivatives)
+
+    method = compiled(program, name, build)
+    if isinstance(method, str):
+        return _noted(name, method)
+    found = _run(method, program, arguments, rows, trajectories)
+    values, rest = found[..., : method.values], found[..., method.values :]
+    runs = _RUNS.setdefault(program, Counter())
+    runs[method] += 1
+    if runs[method] <= 2 or runs[method] % COMPARED_EVERY == 0:
+        plain = function(*(_a_few(value) for value in arguments.values()))
+        if not close(_a_few(values), plain):
+            return _noted(name, discard(program, name))
+    return method, values, rest
+
+
+def _noted(name: str, reason: str) -> str:
+    found = _WHY.get()
+    if found is not None:
+        found[name.partition(" on all rows")[0].partition(" by parameters")[0]] = reason
+    return reason
+
+
+def _a_few(values: Tensor) -> Tensor:
+    """Some sixteen of all rows, `(1, ·, ·)`."""
+    return values.flatten(0, 1)[None, :: max(1, values.shape[0] * values.shape[1] // LANES)]
+
+
+def _run(method: Method, program: nn.Module, arguments: dict[str, Tensor], rows: int, trajectories: int) -> Tensor:
+    """Everything that the kernel computes, `(rows, B, ·)`."""
+    cells = rows * trajectories
+    inputs = [value.float().reshape(cells, 1, -1).permute(2, 1, 0).contiguous().numpy() for value in arguments.values()]
+    out = torch.empty(len(method.graph.outputs), 1, cells)
+    method.kernel(method.parameters(program), np.zeros((1, 0), np.float32), inputs, None, out.numpy())
+    return out.squeeze(1).t().reshape(rows, trajectories, -1)
