@@ -74,7 +74,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Finding:
+class SignificantCell:
     """A cell whose average lies outside the simulated band."""
 
     cell: Cell
@@ -89,7 +89,7 @@ class Misfit:
     cells: list[Cell]
     z: Array  # one a cell
     p_values: Array  # one a cell
-    significant: list[Finding]  # at a false-discovery rate of 5 %, strongest first
+    significant: list[SignificantCell]  # at a false-discovery rate of 5 %, strongest first
     p_value: float  # of the hypothesis that there is nothing, by Simes' test, calibrated on the simulated sets
     simulated: Array  # the same of each simulated set, (M,)
     dispersion: Array  # mean square of each residual over that of the simulated ones, (R,); NaN where there are none
@@ -132,7 +132,7 @@ def judge(
     simes = np.array([_simes(row) for row in p_values])
     level = min(ALPHA, float(np.quantile(simes[1:], ALPHA, method="lower")))  # the tails of t are a model, too
     chosen = np.flatnonzero(_adjusted(p_values[0]) <= level)
-    findings = [Finding(cells[i], float(z[0, i]), float(p_values[0, i])) for i in chosen]
+    findings = [SignificantCell(cells[i], float(z[0, i]), float(p_values[0, i])) for i in chosen]
     return Misfit(
         cells=cells,
         z=z[0],

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from steady_ppl.criticism.attribution import Attribution
 from steady_ppl.criticism.baselines import ABOUT, Reference
-from steady_ppl.criticism.residual_maps import Cell, Finding, Misfit, Residuals
+from steady_ppl.criticism.residual_maps import Cell, Misfit, Residuals, SignificantCell
 from steady_ppl.criticism.step_size import StepCheck
 from steady_ppl.data.frozen_sensors import Stretch
 from steady_ppl.data.trajectories import Trajectories
@@ -243,7 +243,7 @@ def subject(found: Check, residual: int) -> str:
     return name if residual < len(found.program.measurement_names) else f"{name} acceleration"
 
 
-def sentence(found: Check, finding: Finding) -> str:
+def sentence(found: Check, finding: SignificantCell) -> str:
     """A finding in words."""
     cell = finding.cell
     name, more, where = subject(found, cell.residual), finding.z > 0, place(found, cell)

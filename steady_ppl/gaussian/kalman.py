@@ -27,7 +27,7 @@ from steady_ppl.gaussian.linearize import LinearArrays, Linearization, Reference
 from steady_ppl.model.program import Program
 
 
-class Moments(NamedTuple):
+class FilteredMoments(NamedTuple):
     """The states given the measurements up to each row: `(T + 1, B, D)` and `(T + 1, B, D, D)`."""
 
     means: Array
@@ -103,7 +103,7 @@ def track(
 def filter_and_smooth(linear: Linearization) -> Tracked:
     """Run the recursions along a linearization."""
     rows, drives, components, dimension = linear.measurement.shape
-    filtered = Moments(np.empty((rows, drives, dimension)), np.empty((rows, drives, dimension, dimension)))
+    filtered = FilteredMoments(np.empty((rows, drives, dimension)), np.empty((rows, drives, dimension, dimension)))
     updates = Updates(
         innovation=np.empty((rows, drives, components)),
         variance=np.empty((rows, drives, components)),
@@ -132,7 +132,7 @@ def filter_and_smooth(linear: Linearization) -> Tracked:
 
 
 @njit(cache=True, error_model="numpy")
-def forward(given: LinearArrays, filtered: Moments, updates: Updates) -> None:
+def forward(given: LinearArrays, filtered: FilteredMoments, updates: Updates) -> None:
     """Kalman (1960), a measurement component at a time. Fills `filtered` and `updates`."""
     rows, trajectories, _ = filtered.means.shape
     for t in range(rows):  # outside, as the arrays lie in memory
@@ -174,7 +174,7 @@ def _update(given: LinearArrays, updates: Updates, t: int, b: int, mean: Array, 
 
 @njit(cache=True, error_model="numpy")
 def backward(
-    given: LinearArrays, filtered: Moments, updates: Updates, arrival: Array, reading: Array, smoothed: Array
+    given: LinearArrays, filtered: FilteredMoments, updates: Updates, arrival: Array, reading: Array, smoothed: Array
 ) -> None:
     """Fill the scores of log p(y), `arrival` and `reading`, and the posterior means `smoothed`; see `Tracked`.
 
@@ -230,7 +230,7 @@ def spread_ahead(given: LinearArrays, covariances: Array, horizon: int, variance
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def add_product(out: Array, left: Array, right: Array, sign: float = 1.0) -> None:
+def add_matrix_product(out: Array, left: Array, right: Array, sign: float = 1.0) -> None:
     """out += sign · left right, of matrices."""
     for i in range(out.shape[0]):
         for k in range(left.shape[1]):
@@ -243,7 +243,7 @@ def add_product(out: Array, left: Array, right: Array, sign: float = 1.0) -> Non
 def set_product(out: Array, left: Array, right: Array) -> None:
     """out = left right, of matrices."""
     out[:] = 0.0
-    add_product(out, left, right)
+    add_matrix_product(out, left, right)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -267,7 +267,7 @@ def set_times(out: Array, matrix: Array, vector: Array) -> None:
 def propagate(out: Array, covariance: Array, moved: Array, spread: Array) -> None:
     """out = moved covariance movedᵀ + spread spreadᵀ, symmetric to the bit; `out` may be the covariance itself."""
     half = np.zeros_like(covariance)
-    add_product(half, moved, covariance)
+    add_matrix_product(half, moved, covariance)
     for i in range(out.shape[0]):
         for j in range(i + 1):
             entry = 0.0

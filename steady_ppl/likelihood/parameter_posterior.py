@@ -115,7 +115,7 @@ def parameter_posterior(
 
 
 @dataclass(frozen=True)
-class Shape:
+class NormalShape:
     """A Student t in the space in which parameters are learned."""
 
     centre: Tensor  # (P,)
@@ -135,17 +135,17 @@ class Shape:
         return tail - torch.linalg.slogdet(self.root)[1]
 
 
-def about_maximum(problem: Problem, path: ReferencePath) -> Shape:
+def about_maximum(problem: Problem, path: ReferencePath) -> NormalShape:
     """By the curvature where the program is; what the data do not tell is open by as much as a fit moves it at once."""
     parts = elements(problem.program)
     reach = torch.tensor([MAX_MOVE * part.step for part in parts], dtype=torch.float64)
     curvature, directions = torch.linalg.eigh(reach * observed_information(problem, path, parts) * reach[:, None])
-    return Shape(values_of(parts), reach[:, None] * directions * curvature.clamp(min=1.0).rsqrt())
+    return NormalShape(values_of(parts), reach[:, None] * directions * curvature.clamp(min=1.0).rsqrt())
 
 
-def adapt(program: Program, shape: Shape, judge: LogLikelihood, count: int) -> tuple[Tensor, Tensor]:
+def adapt(program: Program, shape: NormalShape, judge: LogLikelihood, count: int) -> tuple[Tensor, Tensor]:
     """Values of all rounds, `(K, P)`, and their log weights, `(K,)`."""
-    shapes: list[Shape] = []
+    shapes: list[NormalShape] = []
     values, judged = shape.centre.new_empty(0, len(shape.centre)), shape.centre.new_empty(0)
     log_weights = judged
     with stages(*(("", share) for share in ROUNDS)) as begin:
@@ -160,7 +160,7 @@ def adapt(program: Program, shape: Shape, judge: LogLikelihood, count: int) -> t
     return values, log_weights
 
 
-def _shaped(shape: Shape, values: Tensor, log_weights: Tensor) -> Shape:
+def _shaped(shape: NormalShape, values: Tensor, log_weights: Tensor) -> NormalShape:
     """The moments of weighed values; weights are tempered until enough of the values count."""
     enough = min(ENOUGH * values.shape[1], int(torch.isfinite(log_weights).sum()) / 2)
     power = 1.0
@@ -171,7 +171,7 @@ def _shaped(shape: Shape, values: Tensor, log_weights: Tensor) -> Shape:
     covariance = apart.T @ (weights[:, None] * apart)
     spread = covariance.diagonal().sqrt()
     root, failed = torch.linalg.cholesky_ex(covariance + torch.diag(1e-6 * spread.square()))
-    return Shape(centre, root) if not failed else shape
+    return NormalShape(centre, root) if not failed else shape
 
 
 def observed_information(problem: Problem, path: ReferencePath, parts: list[Element]) -> Tensor:

@@ -46,7 +46,7 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance, channel_scales, sample_channels
 from steady_ppl.utils.angles import wrap_angles
 
-Moments = tuple[Tensor, Tensor]
+MeanAndSpread = tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Deviations:
     def around(self, index: int) -> Tensor:
         """The points of one component, `(3, rows, B, D)`."""
         count = self.mean.shape[-1]
-        return by_component(self.points[[0, 1 + index, 1 + count + index]])
+        return component_major(self.points[[0, 1 + index, 1 + count + index]])
 
     def of_spread(self, slope: Tensor) -> Tensor:
         """Score of a change of the log standard deviations by `slope`, `(rows, B, C)`; `(B,)`."""
@@ -182,8 +182,8 @@ def arrivals(ahead: Lookahead, data: Trajectories) -> Arrivals:
     return Arrivals(
         mean=per * (information - (precision @ away).squeeze(-1)),
         scale=scale,
-        states=by_component(torch.cat([begin.unsqueeze(0), begin + by_state, begin - by_state]).to(kind)),
-        noise=by_component(torch.cat([noise.unsqueeze(0), noise + by_noise, noise - by_noise]).to(kind)),
+        states=component_major(torch.cat([begin.unsqueeze(0), begin + by_state, begin - by_state]).to(kind)),
+        noise=component_major(torch.cat([noise.unsqueeze(0), noise + by_noise, noise - by_noise]).to(kind)),
         angles=linear.angles,
         present=data.transitions,
     )
@@ -196,29 +196,33 @@ def smoothed(ahead: Lookahead, data: Trajectories) -> Smoothed:
     lag = torch.from_numpy(found.lag).movedim(0, -1).to(precision.device)
     inside = data.transitions.unsqueeze(-1).expand_as(lag)
     return Smoothed(
-        states=by_component(found.states.to(kind)),
+        states=component_major(found.states.to(kind)),
         channels=Deviations(**found.channels.tensors(precision.device), present=inside),
         lag=torch.where(inside, lag, 0.0),
         measurements=Deviations(**found.measurements.tensors(precision.device), present=precision > 0),
-        sharpness=by_component(precision.sqrt().to(kind)),
+        sharpness=component_major(precision.sqrt().to(kind)),
         ahead=ahead,
     )
 
 
-def by_component(values: Tensor) -> Tensor:
+def component_major(values: Tensor) -> Tensor:
     """The same, laid out component by component, as the programs take them apart."""
     return values.movedim(-1, 0).contiguous().movedim(0, -1)
 
 
 @torch.no_grad()
-def channel_moments(program: Program, data: Trajectories, states: Tensor, controls: Tensor | None = None) -> Moments:
+def channel_moments(
+    program: Program, data: Trajectories, states: Tensor, controls: Tensor | None = None
+) -> MeanAndSpread:
     """Means and standard deviations of rows' channels at states `(P, T, B, D)`, each `(P, T, B, C)`; `controls` are the
     acting ones, `(T + 1, B, U)` or `(P, T + 1, B, U)`, or as `acting` gives them."""
     controls = acting_controls(program, data) if controls is None else controls
     return _moments_of_channels(program, states, controls[..., :-1, :, :], data.elapsed[:-1], data.steps)
 
 
-def _moments_of_channels(program: Program, states: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Moments:
+def _moments_of_channels(
+    program: Program, states: Tensor, control: Tensor, time: Tensor, step: Tensor
+) -> MeanAndSpread:
     seen = Recording()
     with running(*states.shape[:-1]), seen, AtMean():
         sample_channels(program, states, control, time, step)
@@ -311,7 +315,7 @@ def measured(program: Program, states: Tensor) -> Measured:
     return Measured(seen.distributions)
 
 
-def typical_spreads(program: Program, data: Trajectories, at: Smoothed) -> Moments:
+def typical_spreads(program: Program, data: Trajectories, at: Smoothed) -> MeanAndSpread:
     """Root mean square standard deviations of the channels, `(C,)`, and of the measurements, `(K,)`."""
     spread = substep_spreads(program, data, at.channels.points[:1])
     sharp = measured(program, at.measurements.points[:1]).spread

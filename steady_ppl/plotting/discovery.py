@@ -35,7 +35,7 @@ SMALL = 8  # points, of letters
 TICKS = 400  # of the rug
 
 
-class Row(NamedTuple):
+class GainRow(NamedTuple):
     """A line of a panel: a value with an interval, in the panel's unit, and what is written beside it."""
 
     label: str
@@ -161,13 +161,13 @@ def _groups(found: Discovery) -> list[Group]:
     return [alone, *groups]
 
 
-def _of_group(group: Group, seed: int) -> list[Row]:
+def _of_group(group: Group, seed: int) -> list[GainRow]:
     """A line for the heading, which has no label, and one for each candidate."""
-    rows = [Row("", 0.0, None, OTHER, group.heading)] if group.heading else []
+    rows = [GainRow("", 0.0, None, OTHER, group.heading)] if group.heading else []
     for candidate in group.candidates:
         label = _label(candidate.variant)
         color = CHOSEN if label in group.chosen else ALIKE if label in group.alike else OTHER
-        rows.append(Row(label, candidate.total, gain_interval(candidate, seed), color))
+        rows.append(GainRow(label, candidate.total, gain_interval(candidate, seed), color))
     return rows
 
 
@@ -182,7 +182,7 @@ def _remaining(found: Discovery) -> list[Tested]:
     return [t for t in alive if math.isfinite(t.variant.effect.null) and (t.detection_limit > 0).all()]
 
 
-def _of_finding(found: Discovery, finding: Finding) -> list[Row]:
+def _of_finding(found: Discovery, finding: Finding) -> list[GainRow]:
     variant, absent = finding.variant, finding.variant.effect.null
     tests_of = (one.screening.tests.tested for one in found.search.rounds)
     first = next((t for tested in tests_of for t in tested if t.variant.name == variant.name), None)
@@ -192,17 +192,17 @@ def _of_finding(found: Discovery, finding: Finding) -> list[Row]:
     return _in_limits(variant, values, ends, limit_of(found, first), CHOSEN)
 
 
-def _of_test(tested: Tested) -> list[Row]:
+def _of_test(tested: Tested) -> list[GainRow]:
     half = 1.645 * tested.sd
     ends = np.stack([tested.coefficient - half, tested.coefficient + half], -1)
     return _in_limits(tested.variant, tested.coefficient, ends, tested.detection_limit, OTHER)
 
 
-def _in_limits(variant: Variant, values: np.ndarray, ends: np.ndarray, limits: np.ndarray, color: str) -> list[Row]:
+def _in_limits(variant: Variant, values: np.ndarray, ends: np.ndarray, limits: np.ndarray, color: str) -> list[GainRow]:
     """A line for each component: its value and interval `(k, 2)` over its detection limit."""
     parts = variant.effect.components
     return [
-        Row(
+        GainRow(
             f"{_label(variant)} {parts[i]}" if parts else _label(variant),
             value / limit,
             (low / limit, high / limit),
@@ -225,7 +225,7 @@ def _label(variant: Variant) -> str:
     return f"{to}: a curve of {of}" if tilde else variant.label
 
 
-def _point(axes: Axes, row: Row, place: float, hollow: bool = False) -> None:
+def _point(axes: Axes, row: GainRow, place: float, hollow: bool = False) -> None:
     if row.interval is not None:
         axes.plot(row.interval, (place, place), "-", color=row.color, lw=1.6)
     axes.plot(row.value, place, "o", color=row.color, ms=5, mfc="none" if hollow else row.color)
