@@ -27,6 +27,7 @@ from steady_ppl.comparison.scores import (
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import named_horizons
 from steady_ppl.model.program import Program
 from steady_ppl.runs.diagnostics import diagnose_units
@@ -48,6 +49,7 @@ def prove(
     reference: str | None = None,
     truth: str | None = None,
     with_constant_velocity: bool = True,
+    paths: Mapping[str, ReferencePath] | None = None,
     seed: int = 0,
 ) -> Proof:
     """Compare programs on drives: log p(y), open-loop errors, coverage, noise scales.
@@ -66,6 +68,7 @@ def prove(
         reference: the row that the others are compared with, the first when not given.
         truth: the row whose program made the drives; its own simulated drives give the noise floor.
         with_constant_velocity: add a row of the reference without any acceleration but noise.
+        paths: name → path near the posterior means of the drives, where one is known; others are searched for.
         seed: of the search for paths, the simulation and the resampling.
 
     Raises:
@@ -88,7 +91,8 @@ def prove(
         for name, program in programs.items():
             begin()
             same = next((other for other in judged if programs[other] is program), None)
-            judged[name] = judged[same] if same else judge_program(name, program, data, known_start, seed)
+            path = (paths or {}).get(name)
+            judged[name] = judged[same] if same else judge_program(name, program, data, known_start, seed, path)
         begin()
         before, true = judged[reference], judged.get(truth or "")
         coasting = keeping_velocity(before) if with_constant_velocity else None

@@ -138,8 +138,10 @@ class Judged:
     where it was not run."""
 
 
-def judge_program(name: str, program: Program, data: Trajectories, known_start: bool, seed: int) -> Judged:
-    """Find the paths from the measurements alone, predict, and compare.
+def judge_program(
+    name: str, program: Program, data: Trajectories, known_start: bool, seed: int, path: ReferencePath | None = None
+) -> Judged:
+    """Find the paths from the measurements alone, unless one is given; predict, and compare.
 
     Raises:
         UsageError: the program cannot be linearised.
@@ -155,7 +157,7 @@ def judge_program(name: str, program: Program, data: Trajectories, known_start: 
         )
     try:
         with seeded(seed, "prove"):
-            ahead = unseen.find_and_smooth()
+            ahead = unseen.find_and_smooth(path)
     except FilterError as error:
         raise FilterError(f"{name}: {error}", trajectory=error.trajectory, time=error.time) from error
     judged = judge(problem, ahead)

@@ -100,6 +100,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     return Check(
         program=program,
         data=run,
+        path=ahead.linearization.path,
         horizons=horizons,
         predictions=predictions,
         floor=made.floor,

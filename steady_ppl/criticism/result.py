@@ -16,6 +16,7 @@ from steady_ppl.criticism.residual_maps import Cell, Misfit, Residuals, Signific
 from steady_ppl.criticism.step_size import StepCheck
 from steady_ppl.data.frozen_sensors import Stretch
 from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction
 from steady_ppl.model.program import Program
 from steady_ppl.utils.late import Displayed
@@ -45,6 +46,7 @@ class Check(Displayed):
     Attributes:
         program: that was judged.
         data: the drives, as the program reads them.
+        path: near their posterior means.
         horizons: name → how many rows ahead, "one step" first.
         predictions: horizon → measured less predicted.
         floor: horizon → RMSE of each component in each simulated set, `(M, K)`: what the noise alone would leave.
@@ -61,6 +63,7 @@ class Check(Displayed):
 
     program: Program
     data: Trajectories
+    path: ReferencePath
     horizons: dict[str, int]
     predictions: dict[int, Prediction]
     floor: dict[int, np.ndarray]

@@ -146,14 +146,15 @@ def find_and_smooth(
     known_start: bool = False,
     observation_weight: float = 1.0,
     may_fail: bool = False,
+    path: ReferencePath | None = None,
 ) -> Lookahead:
-    """Find paths from the measurements alone and look ahead along them.
+    """Find paths from the measurements alone, unless some are given, and look ahead along them.
 
     Raises:
         FilterError: the bootstrap filter of the search broke down, or the linearised program unless it `may_fail`.
     """
-    path = find_path(program, data, known_start=known_start, observation_weight=observation_weight)
-    ahead = smooth(program, data, path, known_start=known_start, observation_weight=observation_weight)
+    near = path or find_path(program, data, known_start=known_start, observation_weight=observation_weight)
+    ahead = smooth(program, data, near, known_start=known_start, observation_weight=observation_weight)
     if not may_fail:
         require_found(ahead, program, data)
     return ahead

@@ -59,9 +59,10 @@ class Problem:
         """A path near the posterior's best mode; see `gaussian.smoother`."""
         return find_path(self.program, self.data, known_start=self.known_start)
 
-    def find_and_smooth(self) -> Lookahead:
-        """The lookahead along a path that is found from the measurements alone; see `gaussian.smoother`."""
-        return find_and_smooth(self.program, self.data, known_start=self.known_start)
+    def find_and_smooth(self, path: ReferencePath | None = None) -> Lookahead:
+        """The lookahead along a path near this one, else one that is found from the measurements alone; see
+        `gaussian.smoother`."""
+        return find_and_smooth(self.program, self.data, known_start=self.known_start, path=path)
 
     def smooth(self, path: ReferencePath, **settings: Any) -> Lookahead:
         """The lookahead along the posterior's mode near a path; see `gaussian.smoother`."""

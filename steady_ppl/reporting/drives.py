@@ -192,7 +192,9 @@ def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: 
     data = found.data.subset(shown.drives)
     posterior = drawn_states(fit.program, data, draws=draws, known_start=fit.known_start, seed=seed)["posterior"]
     states = found.program.state_names
-    quantiles = np.stack([posterior[name].quantile(QUANTILES, ("chain", "draw")).values for name in states], -1)
+    quantiles = np.stack(
+        [posterior[name].quantile(QUANTILES, ("chain", "draw"), skipna=False).values for name in states], -1
+    )
     quantiles = quantiles.swapaxes(1, 2)  # (3, rows, B, D)
     all_of_them = Shown(list(range(len(data))), shown.every, len(data))
     low, middle, high = map(all_of_them.of, quantiles)

@@ -8,6 +8,7 @@ from typing import Any
 from steady_ppl.comparison.prove import prove, unfinished
 from steady_ppl.comparison.result import Proof
 from steady_ppl.criticism.check import check
+from steady_ppl.criticism.result import Check
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import SteadyError, UsageError
 from steady_ppl.reporting.drives import chosen, given, maps, of_run
@@ -69,7 +70,7 @@ def report(
             there = of_run(checks[label], fit, data, shown, draws=draws, seed=seed)
             drawn.append({"label": label, **there, **maps(checks[label])})
         begin()
-        proof = _proof(runs, data, seed)
+        proof = _proof(runs, checks, data, seed)
     drives = given(next(iter(checks.values())), shown) | {"runs": drawn}
     return Report(
         title=title,
@@ -84,10 +85,10 @@ def report(
     )
 
 
-def _proof(runs: Mapping[str, Fit], data: Trajectories, seed: int) -> Proof | str:
+def _proof(runs: Mapping[str, Fit], checks: Mapping[str, Check], data: Trajectories, seed: int) -> Proof | str:
     if len(runs) < 2:
         return "There is one run only: name the run before and the one after to compare them."
     try:
-        return prove(runs, data, seed=seed)
+        return prove(runs, data, paths={label: one.path for label, one in checks.items()}, seed=seed)
     except SteadyError as error:
         return f"The runs cannot be compared: {error}."
