@@ -36,6 +36,7 @@ ALLOWED = {
         "joblib",
     ): "hands jobs to its own processes, or to a cluster that is named",
     ("steady_ppl/cli/learn.py", "joblib"): "counts the cores",
+    ("steady_ppl/utils/cores.py", "joblib"): "counts the cores",
     ("benchmarks/vmapped.py", "runpy.run_path"): "runs the script that the person names",
     ("benchmarks/report_page.py", "urllib"): "asks the browser that it started on this machine",
 }
