@@ -99,6 +99,7 @@ def test_clean_drives_give_none_and_say_what_could_have_been_seen(clean):
     assert clean.figures["before"] == clean.figures["after"]
 
 
+@pytest.mark.slow
 def test_a_fault_of_the_sensor_is_not_blamed_on_the_dynamics():
     found = discovered("landmark_bias:1=0.07")
     assert found.verdict == "sensor" and found.findings[0].alike == ["landmark_bias:bearing_1"]

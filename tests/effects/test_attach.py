@@ -107,7 +107,12 @@ def test_a_class_lists_its_effects(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("effect", "rate"), [("actuator_delay:turn", 0.2), ("lever_arm", 0.1), ("measurement_noise", 1.0)]
+    ("effect", "rate"),
+    [
+        pytest.param("actuator_delay:turn", 0.2, marks=pytest.mark.slow),
+        ("lever_arm", 0.1),
+        ("measurement_noise", 1.0),
+    ],
 )
 def test_a_coefficient_moves_in_steps_of_its_typical_size(effect: str, rate: float) -> None:
     program = example("truck").with_effect(effect, 0.5)

@@ -20,12 +20,9 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = [*sorted(DOCS.glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 RUN = (
-    "own-data",
-    pytest.param("own-program", marks=pytest.mark.slow),
     "own-effect",
-    "own-sensor",
     "own-recipe",
-    "control",
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("own-data", "own-program", "own-sensor", "control")),
 )
 
 

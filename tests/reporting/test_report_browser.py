@@ -109,6 +109,7 @@ def test_a_link_that_was_followed_can_be_followed_again(page):
     assert first == again == "before, drive 4, 1.0 to 2.0 s" and chosen_by_hand == "before, drive 2, all seconds"
 
 
+@pytest.mark.slow
 def test_addresses_that_are_nonsense_show_what_is_nearest(page):
     for anchor, shown in (
         ("#run=99&drive=99&from=500&to=600", "after, drive 6, all seconds"),
@@ -133,6 +134,7 @@ def test_the_keyboard_meets_no_tools_and_every_picture_has_a_name(page):
     assert (tools, unnamed) == ("0", "0") and int(pictures) == 9
 
 
+@pytest.mark.slow
 def test_paper_is_as_wide_as_what_is_drawn_on_it(page, tmp_path):
     script = """
     window.dispatchEvent(new Event("beforeprint"));

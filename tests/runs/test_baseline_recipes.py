@@ -47,7 +47,8 @@ def learned(name: str, program, train, valid=None, **options):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name.startswith("svi") else ()) for name in RECIPES]
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name.startswith(("svi", "fit-tv")) else ()) for name in RECIPES],
 )
 def test_each_beats_hand(name: str) -> None:
     """A vehicle believed to be twice as heavy as it is: its mass is found, and held-out drives are likelier."""

@@ -83,6 +83,7 @@ def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(t
     assert (tmp_path / "marks" / "7").stat().st_size == begun[7] + 1
 
 
+@pytest.mark.slow
 def test_a_deadly_job_takes_nothing_with_it_and_is_tried_after_the_others(tmp_path: Path):
     (tmp_path / "mine.py").write_text(RECIPE.format())
     (tmp_path / "marks").mkdir()
@@ -109,6 +110,7 @@ def test_workers_that_die_before_they_begin_end_a_study(tmp_path: Path, monkeypa
         run_study(read_plan(written(tmp_path)), tmp_path / "out", Local(2))
 
 
+@pytest.mark.slow
 def test_one_worker_that_dies_before_it_begins_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     mark = tmp_path / "died"
 
@@ -125,6 +127,7 @@ def test_one_worker_that_dies_before_it_begins_is_replaced(tmp_path: Path, monke
     assert [row["outcome"] for row in found] == ["done"] * 6 and said == []
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_while_it_has_nothing_to_do_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     made: list[executors._Process] = []
 
@@ -160,6 +163,7 @@ def fit(program, table, valid=None, *, known_start=False, mark="", seed=0):
 """
 
 
+@pytest.mark.slow
 def test_a_worker_that_has_grown_is_replaced_without_a_word(tmp_path: Path, recwarn: pytest.WarningsRecorder):
     (tmp_path / "mine.py").write_text(GROWING.format())
     (tmp_path / "workers").mkdir()
