@@ -84,8 +84,9 @@ def states_ahead(program: Program, data: Trajectories, tracked: Tracked, most: i
 def mean_steps(program: Program, states: Tensor, controls: Tensor, elapsed: Tensor, steps: Tensor) -> Tensor:
     """Where rows end without noise, `(rows, B, D)`; the controls are the acting ones."""
     given = {"state": states, "control": controls, "time": elapsed, "step": steps}
-    found = on_all_rows(program, "mean step", mean_step(program), given)
-    return found[0] if isinstance(found, tuple) else mean_step(program)(**given)
+    step = mean_step(program)
+    found = on_all_rows(program, "mean step", step, given)
+    return found[0] if isinstance(found, tuple) else step(**given)
 
 
 def mean_step(program: Program) -> Callable[..., Tensor]:

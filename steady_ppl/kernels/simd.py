@@ -129,6 +129,7 @@ def polynomial(x: Lanes, *coefficients: float) -> Lanes:
 
 
 def absolute(x: Lanes) -> Lanes:
+    """|x|."""
     return x.call("fabs")
 
 
@@ -145,6 +146,7 @@ def _turned(x: Lanes, quarters: int) -> Lanes:
 
 
 def exp(x: Lanes) -> Lanes:
+    """eˣ."""
     low, high = x < -87.33654, x > 88.72283
     clipped = low.where(-87.33654, high.where(88.72283, x))
     n = (clipped * (1 / math.log(2)) + 0.5).call("floor")
@@ -161,6 +163,7 @@ def exp(x: Lanes) -> Lanes:
 
 
 def log(x: Lanes) -> Lanes:
+    """The natural logarithm; not a number below zero."""
     bits = x.converted("bitcast", INTEGER)
     mantissa = bits.on_integers("and_", 0x007FFFFF).on_integers("or_", 0x3F000000)
     mantissa = mantissa.converted("bitcast", FLOAT)  # in [0.5, 1)
@@ -181,6 +184,7 @@ def log(x: Lanes) -> Lanes:
 
 
 def log1p(x: Lanes) -> Lanes:
+    """log(1 + x), exact near zero."""
     u = x + 1.0
     logarithm = log(u)
     finite = (u > 0.0).logical("and_", u < math.inf)
@@ -188,12 +192,14 @@ def log1p(x: Lanes) -> Lanes:
 
 
 def sigmoid(x: Lanes) -> Lanes:
+    """1 / (1 + e⁻ˣ)."""
     e = exp(-absolute(x))
     share = 1.0 / (e + 1.0)
     return (x < 0.0).where(e * share, share)
 
 
 def tanh(x: Lanes) -> Lanes:
+    """The hyperbolic tangent."""
     size, s = absolute(x), x * x
     small = polynomial(s, -5.70498872745e-3, 2.06390887954e-2, -5.37397155531e-2, 1.33314422036e-1, -3.33332819422e-1)
     large = 1.0 - 2.0 / (exp(size + size) + 1.0)
@@ -201,6 +207,7 @@ def tanh(x: Lanes) -> Lanes:
 
 
 def atan2(y: Lanes, x: Lanes) -> Lanes:
+    """The angle of (x, y) against the first axis, in (−π, π]."""
     y, x = y.pair(x)
     a, b = absolute(y), absolute(x)
     steep = a > b
@@ -217,14 +224,17 @@ def atan2(y: Lanes, x: Lanes) -> Lanes:
 
 
 def maximum(x: Lanes, y: Lanes) -> Lanes:
+    """The larger of two; not a number where either is none."""
     return (x > y).where(x, x.compare("!=", x).where(x, y))
 
 
 def minimum(x: Lanes, y: Lanes) -> Lanes:
+    """The smaller of two; not a number where either is none."""
     return (x < y).where(x, x.compare("!=", x).where(x, y))
 
 
 def expm1(x: Lanes) -> Lanes:
+    """eˣ − 1, exact near zero."""
     half = tanh(x * 0.5)
     return (absolute(x) < 0.5).where(half * 2.0 / (1.0 - half), exp(x) - 1.0)
 
