@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import nullcontext
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -72,6 +74,7 @@ class Stepping:
 
 
 FILTER = "filter"  # the name of what is compiled for it
+BLOCK = 2**22  # bytes of memory for rows' results, asked for at a time
 
 
 def stepping_for(plain: Stepping, state: Tensor) -> tuple[Stepping, str | None]:
@@ -137,6 +140,7 @@ class CompiledStepping(Stepping):
         self.moving, self.observing = methods.transition.parameters(program), methods.observe.parameters(program)
         moved = (plain.controls[:-1], data.elapsed[:-1, :, None], data.steps[..., None])
         self.moved = torch.cat(moved, -1).float().contiguous().numpy()
+        self._rows: list[Tensor] = []
         weight = torch.as_tensor(self.observation_weight, dtype=torch.float32).expand(data.time.shape).unsqueeze(-1)
         self.measured = torch.cat((data.measurements, data.observed.to(weight), weight), -1).contiguous().numpy()
 
@@ -146,7 +150,7 @@ class CompiledStepping(Stepping):
         methods = self.methods
         particles, trajectories = state.shape[:2]
         drawn = torch.randn(methods.channels, trajectories, particles) if noise is None else by_component(noise)
-        out = torch.empty(methods.results, trajectories, particles)
+        out = self._row(methods.results, trajectories, particles)
         came_from = None if ancestors is None else ancestors.t().contiguous().numpy()
         inputs = [by_component(state).numpy(), drawn.numpy()]
         methods.transition.kernel(self.moving, self.moved[row], inputs, came_from, out.numpy())
@@ -157,6 +161,17 @@ class CompiledStepping(Stepping):
             for site, value in zip(methods.sizes, values.split(list(methods.sizes.values())), strict=True)
         }
         return moved.permute(2, 1, 0), noises
+
+    def _row(self, *shape: int) -> Tensor:
+        """Memory for a row's results, out of a block of several rows by numpy.
+
+        A filter keeps its history. Rows of their own by torch go back to the system, and its fresh pages take a third
+        of the filter's time; these blocks are used again.
+        """
+        if not self._rows or self._rows[-1].shape != shape:
+            rows = max(1, min(len(self.moved), BLOCK // (4 * math.prod(shape))))
+            self._rows = list(torch.from_numpy(np.empty((rows, *shape), np.float32)))
+        return self._rows.pop()
 
     def log_density(self, row: int, state: Tensor) -> Tensor:
         out = torch.empty(1, state.shape[1], state.shape[0])

@@ -202,7 +202,7 @@ class ParticleFilter:
             future = self._within(row, self.proposal.log_future(row, state.states))
         expected = log_weights if future is None else log_weights + future
         broken = expected.isnan()  # a particle that blew up explains no measurement
-        log_weights = log_weights.masked_fill(broken, -math.inf)
+        log_weights.masked_fill_(broken, -math.inf)
         weights, evidence = normalise(expected.masked_fill_(broken, -math.inf))
         sizes = effective_sample_size(weights)
         return _Weighed(log_weights - evidence, weights, future, evidence, sizes, broken.sum(0, dtype=torch.float64))

@@ -65,23 +65,26 @@ def systematic(weights: Tensor, draws: int, uniform: Tensor | None = None) -> Te
 def _systematic(weights: np.ndarray, uniform: np.ndarray, chosen: np.ndarray) -> None:
     trajectories, particles = weights.shape
     draws = chosen.shape[1]
+    first = np.empty(draws + 1, np.int64)  # the particle whose offspring begin at a draw; 0 within offspring
     for b in range(trajectories):
+        first[:] = 0
         total = 0.0
         for i in range(particles):
             total += weights[b, i]
         cumulative, born = 0.0, 0
         for i in range(particles):
+            first[born] = i  # the next particle takes the place where this one has no offspring: no branch
             cumulative += weights[b, i]
             share = cumulative / total
-            until = (
-                math.ceil(share * draws - uniform[b]) if share < 1 else draws
-            )  # all, also for u within rounding of 1
-            while born < until:
-                chosen[b, born] = i
-                born += 1
-        while born < draws:  # where a weight is not a number: the filter says so at its end
-            chosen[b, born] = particles - 1
-            born += 1
+            # all, also for u within rounding of 1
+            until = math.ceil(share * draws - uniform[b]) if share < 1 else draws
+            born = max(born, until)
+        if born < draws:  # where a weight is not a number: the filter says so at its end
+            first[born] = particles - 1
+        parent = 0
+        for j in range(draws):
+            parent = max(parent, first[j])
+            chosen[b, j] = parent
 
 
 def systematic_in_parallel(weights: Tensor, draws: int, uniform: Tensor) -> Tensor:

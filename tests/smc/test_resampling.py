@@ -125,6 +125,29 @@ def test_one_after_the_other_and_in_parallel_the_same_are_drawn(values, draws, u
     assert torch.equal(systematic(w, draws, u), systematic_in_parallel(w.t(), draws, u).t())
 
 
+@given(weights, draws, uniforms)
+@settings(deadline=None, derandomize=True)
+def test_systematic_draws_are_counted_up_to_the_ceilings_of_cumulative_weights(values, draws, uniform):
+    w, total = normalised(values)[:, 0].tolist(), 0.0
+    for weight in w:
+        total += weight
+    cumulative, expected = 0.0, list[int]()
+    for particle, weight in enumerate(w):
+        cumulative += weight
+        share = cumulative / total
+        until = math.ceil(share * draws - uniform) if share < 1 else draws
+        expected += [particle] * (until - len(expected))
+    index = systematic(normalised(values), draws, torch.tensor([uniform], dtype=torch.float64))
+    assert index[:, 0].tolist() == expected
+
+
+def test_weights_that_are_no_numbers_give_indices_within_range():
+    for broken in (math.nan, math.inf):
+        weights = torch.tensor([[0.5], [broken], [0.5]], dtype=torch.float64)
+        index = systematic(weights, 5)
+        assert index.min() >= 0 and index.max() <= 2
+
+
 def test_each_trajectory_has_its_own_weights_and_uniform():
     both = torch.cat([normalised([0.7, 0.2, 0.1]), normalised([0.1, 0.1, 0.8])], 1)
     uniform = torch.tensor([0.1, 0.9], dtype=torch.float64)
