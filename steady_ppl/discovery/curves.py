@@ -12,13 +12,16 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pyro.distributions as dist
 import torch
+from numba import njit
 from pyro.distributions.transforms import LowerCholeskyAffine
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects import Effect, Variant
+from steady_ppl.gaussian.lanes import Array
 from steady_ppl.gaussian.predict import on_a_circle
 from steady_ppl.model.interventions import channel_means
 from steady_ppl.model.program import Program, names, units
@@ -114,16 +117,6 @@ def knots_of(values: Tensor, circular: bool) -> tuple[float, ...] | None:
     return tuple(low + (high - low) * k / (KNOTS - 1) for k in range(KNOTS))
 
 
-def between(values: Tensor, knots: Sequence[float], circular: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """The knots before and behind some values, and how far values are from the one to the other, each `(...)`; beyond
-    the outermost knots a curve is constant."""
-    count = len(knots)
-    place = (values - knots[0]) / (knots[1] - knots[0])
-    place = torch.remainder(place, count) if circular else place.clamp(0, count - 1)
-    before = place.detach().nan_to_num().floor().clamp(0, count - 1 if circular else count - 2).long()
-    return before, (before + 1) % count, place - before
-
-
 def height(values: Tensor, knots: Sequence[float], circular: bool, c: Tensor) -> Tensor:
     """The curve of heights `c` `(K,)` at some values, `(...)`: each knot has a hat that ends at the next ones."""
     count = len(knots)
@@ -137,13 +130,33 @@ def height(values: Tensor, knots: Sequence[float], circular: bool, c: Tensor) ->
 
 def by_height(values: Tensor, weights: Tensor, knots: Sequence[float], circular: bool) -> Tensor:
     """The derivative in the heights of the sum of a curve's values times `weights`, `(..., B)`; `(B, K)`."""
-    before, behind, share = between(values, knots, circular)
     drives, count = values.shape[-1], len(knots)
-    drive = count * torch.arange(drives)
-    found = weights.new_zeros(drives * count, dtype=torch.float64)
-    for knot, part in ((before, 1 - share), (behind, share)):
-        found += torch.bincount((drive + knot).flatten(), (weights * part).flatten().double(), drives * count)
-    return found.view(drives, count)
+    found = np.zeros((2, drives, count))
+    at, by = (part.reshape(-1, drives).numpy() for part in (values, weights.expand_as(values)))
+    grid = np.array([knots[0], knots[1] - knots[0]], at.dtype)
+    _add_by_height(at, by, grid, np.arange(count + 1).astype(at.dtype), circular, found)
+    return torch.from_numpy(found[0] + found[1])
+
+
+@njit(cache=True, error_model="numpy")
+def _add_by_height(values: Array, weights: Array, grid: Array, places: Array, circular: bool, found: Array) -> None:
+    """Add the weights of `values` `(M, B)` to the knots before and behind them, `(2, B, K)`; beyond the outermost knots
+    a curve is constant. In the values' precision: `grid`, the first knot and the distance of two, and `places`, 0 … K.
+    """
+    before, behind = found[0], found[1]
+    count = before.shape[1]
+    last = count - 1 if circular else count - 2
+    for m in range(len(values)):
+        for b in range(values.shape[1]):
+            place = (values[m, b] - grid[0]) / grid[1]
+            if circular:
+                place %= places[count]
+            else:
+                place = min(max(place, places[0]), places[count - 1])
+            knot = min(int(place), last) if place == place else 0
+            share = place - places[knot]
+            before[b, knot] += weights[m, b] * (places[1] - share)
+            behind[b, (knot + 1) % count] += weights[m, b] * share
 
 
 def over_state(

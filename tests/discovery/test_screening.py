@@ -13,7 +13,6 @@ from scipy import stats
 from steady_ppl.discovery.curves import (
     HEIGHT_SD,
     _effect,
-    between,
     by_height,
     height,
     knots_of,
@@ -111,8 +110,9 @@ def test_heights_have_the_slopes_that_autograd_finds():
 
 
 def test_a_place_that_is_not_a_number_has_none():
-    _, _, share = between(torch.tensor([torch.nan, 0.5]), (0.0, 1.0), False)
-    assert torch.isnan(share).tolist() == [True, False]
+    for circular in (False, True):
+        slopes = by_height(torch.tensor([[torch.nan, 0.5]]), torch.ones(1, 2), (0.0, 1.0), circular)
+        assert torch.isnan(slopes).any(-1).tolist() == [True, False]
 
 
 def test_curves_may_depend_on_everything_that_a_program_declares():
