@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -40,12 +40,6 @@ class Paths:
     noise: dict[str, Tensor]
     event_dims: dict[str, int]
     in_plain_torch: str | None = None
-
-    def of(self, trajectories: Sequence[int]) -> Paths:
-        """The paths of some trajectories."""
-        index = list(trajectories)
-        start, noise = ({site: value[:, :, index] for site, value in part.items()} for part in (self.start, self.noise))
-        return replace(self, states=self.states[:, :, index], start=start, noise=noise)
 
     def channels(self, program: Program, data: Trajectories) -> dict[str, Any]:
         """Each channel's distribution along the paths of `data`, given the noise of those before it."""
