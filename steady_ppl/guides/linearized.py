@@ -86,16 +86,11 @@ class LinearizedGuide(PathGuide):
         """Remember paths found from the measurements alone, where they are likelier than what is known already."""
         if not trajectories:
             return
-        part = data.subset(trajectories)
+        part, start, weight = data.subset(trajectories), self.known_start, self.tempering(progress)
         for label in part.labels:
             self.memory[f"searched/{label}"] = torch.tensor(progress, dtype=torch.float64)
-        weight = self.tempering(progress)
         ahead = find_and_smooth(
-            self.program,
-            part,
-            known_start=self.known_start,
-            observation_weight=weight,
-            may_fail=known is not None,
+            self.program, part, known_start=start, observation_weight=weight, may_fail=known is not None
         )
         found = resting_path(ahead, part)
         better = ahead.log_likelihood > (-torch.inf if known is None else known[trajectories])  # not where it is a nan
@@ -104,11 +99,10 @@ class LinearizedGuide(PathGuide):
             self.remember(ReferencePath(found.states[:, kept], found.noise[:, kept]), part.subset(kept))
 
     def _smooth(self, data: Trajectories, progress: float) -> Lookahead:
-        path = ReferencePath(self._recall("states", data), self._recall("noise", data))
         return smooth(
             self.program,
             data,
-            path,
+            ReferencePath(self._recall("states", data), self._recall("noise", data)),
             known_start=self.known_start,
             observation_weight=self.tempering(progress),
             passes=self.passes,
@@ -128,9 +122,9 @@ class LinearizedGuide(PathGuide):
             self.memory[f"states/{label}"] = path.states[:, i]
             self.memory[f"noise/{label}"] = path.noise[:, i]
 
-    def _figures(self, ahead: Lookahead) -> dict[str, float]:
-        """Log p(y) of the linearised program, at this step's observation weight; and what happened to its paths."""
-        figures = {"log_evidence": float(ahead.log_likelihood.mean())}
+    def _figures(self, ahead: Lookahead, progress: float) -> dict[str, float]:
+        """This step's observation weight, log p(y) of the linearised program at it, and what happened to its paths."""
+        figures = {"observation_weight": self.tempering(progress), "log_evidence": float(ahead.log_likelihood.mean())}
         return figures | {name: float(count) for name, count in self.counts.items() if count}
 
 
@@ -147,14 +141,13 @@ class GaussianGuide(LinearizedGuide):
         Raises:
             FilterError: the linearised program blew up.
         """
-        weight = self.tempering(progress)
         ahead = self.look_ahead(data, progress)
         require_found(ahead, self.program, data)
         kernels = data.time.numel() >= WORTH_COMPILING
         paths = smoother_paths(self.program, data, ahead, self.draws, known_start=self.known_start, kernels=kernels)
         self.in_plain_torch = self.in_plain_torch or paths.in_plain_torch
         self.keep(paths, data)
-        return {"observation_weight": weight} | self._figures(ahead)
+        return self._figures(ahead, progress)
 
 
 class LookaheadGuide(LinearizedGuide, FilteringGuide):
@@ -162,9 +155,9 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
 
     Args:
         particles: N, for each trajectory.
-        tempering, known_start, passes, search_again: of `LinearizedGuide`.
         resample_below: share of N under which the effective sample size triggers resampling.
         untwisted, tempered: see `Twist`.
+        more: of `LinearizedGuide`.
     """
 
     def __init__(
@@ -173,22 +166,12 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
         *,
         particles: int = 100,
         draws: int = 100,
-        tempering: Tempering | None = None,
-        known_start: bool = False,
-        passes: int = 1,
-        search_again: float = 0.2,
         resample_below: float = 0.5,
         untwisted: float = 0.01,
         tempered: float = 1.0,
+        **more: Any,
     ) -> None:
-        super().__init__(
-            program,
-            draws=draws,
-            tempering=tempering,
-            known_start=known_start,
-            passes=passes,
-            search_again=search_again,
-        )
+        super().__init__(program, draws=draws, **more)
         require(particles >= 1, "particles", particles, "at least 1")
         self.particles, self.resample_below = particles, resample_below
         self.untwisted, self.tempered = untwisted, tempered
@@ -199,10 +182,10 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
         Raises:
             FilterError: the filter broke down.
         """
-        weight = self.tempering(progress)
         ahead = self.look_ahead(data, progress)
-        health = self._filter(data, weight, Twist(ahead, untwisted=self.untwisted, tempered=self.tempered))
-        return {"observation_weight": weight} | self._figures(ahead) | health
+        twist = Twist(ahead, untwisted=self.untwisted, tempered=self.tempered)
+        health = self._filter(data, self.tempering(progress), twist)
+        return self._figures(ahead, progress) | health
 
 
 class SmootherGuide(VariationalGuide):
