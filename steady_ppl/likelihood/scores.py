@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import pyro.distributions as dist
@@ -45,8 +45,6 @@ from steady_ppl.model.handlers import (
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance, channel_scales, sample_channels
 from steady_ppl.utils.angles import wrap_angles
-
-MeanAndSpread = tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True)
@@ -213,7 +211,7 @@ def component_major(values: Tensor) -> Tensor:
 @torch.no_grad()
 def channel_moments(
     program: Program, data: Trajectories, states: Tensor, controls: Tensor | None = None
-) -> MeanAndSpread:
+) -> tuple[Tensor, Tensor]:
     """Means and standard deviations of rows' channels at states `(P, T, B, D)`, each `(P, T, B, C)`; `controls` are the
     acting ones, `(T + 1, B, U)` or `(P, T + 1, B, U)`, or as `acting` gives them."""
     controls = acting_controls(program, data) if controls is None else controls
@@ -222,7 +220,7 @@ def channel_moments(
 
 def _moments_of_channels(
     program: Program, states: Tensor, control: Tensor, time: Tensor, step: Tensor
-) -> MeanAndSpread:
+) -> tuple[Tensor, Tensor]:
     seen = Recording()
     with running(*states.shape[:-1]), seen, AtMean():
         sample_channels(program, states, control, time, step)
@@ -279,20 +277,10 @@ class Measured:
         """What is measured on average, `(..., K)`, on the circle where a measurement lives there."""
         return self._of_sites(lambda _, fn: -residual(fn, torch.zeros_like(fn.mean)))
 
-    def same(self, other: Measured) -> bool:
-        """Whether `other` measures the same, with the same scales and tails."""
-        alike = (self.spread == other.spread) & (self.freedom == other.freedom)
-        return bool((self.shift(other) == 0).all()) and bool(alike.all())
-
     @property
     def spread(self) -> Tensor:
         """Scales, `(..., K)`."""
         return self._of_sites(lambda _, fn: unwrapped(fn).scale)
-
-    @property
-    def heavy_tailed(self) -> bool:
-        """Whether some site is a Student t."""
-        return any(isinstance(unwrapped(fn), dist.StudentT) for fn in self.distributions.values())
 
     @property
     def freedom(self) -> Tensor:
@@ -305,6 +293,16 @@ class Measured:
 
         return self._of_sites(of_site)
 
+    @property
+    def heavy_tailed(self) -> bool:
+        """Whether some site is a Student t."""
+        return any(isinstance(unwrapped(fn), dist.StudentT) for fn in self.distributions.values())
+
+    def same(self, other: Measured) -> bool:
+        """Whether `other` measures the same, with the same scales and tails."""
+        alike = (self.spread == other.spread) & (self.freedom == other.freedom)
+        return bool((self.shift(other) == 0).all()) and bool(alike.all())
+
 
 @torch.no_grad()
 def measured(program: Program, states: Tensor) -> Measured:
@@ -315,7 +313,7 @@ def measured(program: Program, states: Tensor) -> Measured:
     return Measured(seen.distributions)
 
 
-def typical_spreads(program: Program, data: Trajectories, at: Smoothed) -> MeanAndSpread:
+def typical_spreads(program: Program, data: Trajectories, at: Smoothed) -> tuple[Tensor, Tensor]:
     """Root mean square standard deviations of the channels, `(C,)`, and of the measurements, `(K,)`."""
     spread = substep_spreads(program, data, at.channels.points[:1])
     sharp = measured(program, at.measurements.points[:1]).spread
@@ -358,12 +356,8 @@ def _of_channels(program: Program, data: Trajectories, at: Smoothed, parts: list
 def _of_ends(program: Program, data: Trajectories, at: Smoothed, parts: list[Element]) -> Tensor:
     """The parameters' part in where rows end, `(B, P)`."""
     arriving = arrivals(at.ahead, data)
-
-    def ends(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-        return _row_ends(program, state, noise, control, time, step)
-
     given = _by_row(program, data, state=arriving.states, noise=arriving.noise)
-    slopes = slopes_on_all_rows(program, "ends", ends, given, parts)
+    slopes = slopes_on_all_rows(program, "ends", partial(_row_ends, program), given, parts)
     scores, left = at.states.new_zeros((len(data), len(parts))).double(), list(range(len(parts)))
     if isinstance(slopes, Slopes):
         scores, left = arriving.of_slopes(slopes), of_actuators(program, data, parts)
