@@ -47,15 +47,15 @@ class PathGuide:
         self.in_plain_torch: str | None = None
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
-        """The E step: draw new paths for `data` at `progress` (0 to 1); returns figures for the log."""
+        """The E step: draw new paths for `data` at `progress` (0 to 1); returns figures for the log.
+
+        Raises:
+            FilterError: the filter or the linearised program broke down, or a path is not finite.
+        """
         raise NotImplementedError
 
     def keep(self, paths: Paths, data: Trajectories) -> None:
-        """Store paths of `data`, their padding filled.
-
-        Raises:
-            FilterError: a state is not finite.
-        """
+        """Store paths of `data`, their padding filled; a state that is not finite is a `FilterError`."""
         self.paths = paths.within(data)
         broken = ~torch.isfinite(self.paths.states).all(-1).all(0) & data.rows
         if bool(broken.any()):
@@ -131,11 +131,7 @@ class SMCGuide(FilteringGuide):
         self.known_start, self.resample_below = known_start, resample_below
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
-        """Run the filter and keep `draws` paths.
-
-        Raises:
-            FilterError: the filter broke down, or a path is not finite.
-        """
+        """Run the filter and keep `draws` paths."""
         weight = self.tempering(progress)
         return {"observation_weight": weight} | self._filter(data, weight)
 

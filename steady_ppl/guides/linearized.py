@@ -58,11 +58,7 @@ class LinearizedGuide(PathGuide):
 
     def look_ahead(self, data: Trajectories, progress: float) -> Lookahead:
         """Linearise along the remembered paths; search for those that are not there, again for those that are lost, and
-        now and then for all: what was found while the program knew little can be a wrong place that it never leaves.
-
-        Raises:
-            FilterError: a path cannot be found.
-        """
+        now and then for all: what was found while the program knew little can be a wrong place that it never leaves."""
         self._search(data, [i for i, label in enumerate(data.labels) if f"states/{label}" not in self.memory], progress)
         ahead = self._smooth(data, progress)
         lost = (~torch.isfinite(ahead.log_likelihood)).nonzero().flatten().tolist()
@@ -136,11 +132,7 @@ class GaussianGuide(LinearizedGuide):
     """
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
-        """Linearise, smooth and keep `draws` independent paths.
-
-        Raises:
-            FilterError: the linearised program blew up.
-        """
+        """Linearise, smooth and keep `draws` independent paths."""
         ahead = self.look_ahead(data, progress)
         require_found(ahead, self.program, data)
         kernels = data.time.numel() >= WORTH_COMPILING
@@ -177,11 +169,7 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
         self.untwisted, self.tempered = untwisted, tempered
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
-        """Run the filter and keep `draws` paths.
-
-        Raises:
-            FilterError: the filter broke down.
-        """
+        """Run the filter and keep `draws` paths."""
         ahead = self.look_ahead(data, progress)
         twist = Twist(ahead, untwisted=self.untwisted, tempered=self.tempered)
         health = self._filter(data, self.tempering(progress), twist)

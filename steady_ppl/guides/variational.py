@@ -45,6 +45,7 @@ class VariationalGuide(nn.Module):
     """
 
     centred = False
+    program: Program
 
     def __init__(
         self,
@@ -58,15 +59,10 @@ class VariationalGuide(nn.Module):
         super().__init__()
         require(draws >= 1, "draws", draws, "at least 1")
         require(0 < rate < math.inf, "the guide's rate", rate, "above 0")
-        self._program = (program,)  # in a tuple it is no submodule: its parameters are not the guide's
+        self.__dict__["program"] = program  # no submodule: its parameters are not the guide's
         self.draws, self.known_start, self.rate = draws, known_start, rate
         self.annealing = annealing or Constant()
         self.kl_weight = 1.0
-
-    @property
-    def program(self) -> Program:
-        """The state-space model."""
-        return self._program[0]
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
         """Look the KL weight up; nothing is drawn outside the gradient."""
@@ -100,9 +96,8 @@ class VariationalGuide(nn.Module):
 
     def roll_out(self, data: Trajectories) -> tuple[Paths, Tensor, Tensor]:
         """Paths of `data`; log-densities of start and noise as `start` and `step` give them, each summed, `(M,)`."""
-        trajectories = len(data)
         later, at_start = self.begin(data), data.controls.new_zeros(self.draws)
-        left, moving = torch.Size((self.draws, 1, trajectories)), Recording()
+        left, moving = torch.Size((self.draws, 1, len(data))), Recording()
         certain: Messenger
         if self.known_start:
             certain = KnownStart(data.known_start)
