@@ -346,10 +346,10 @@ def _of_channels(program: Program, data: Trajectories, at: Smoothed, parts: list
     if left:
         _, spread = channel_moments(program, data, points[:1])
     for index in left:
-        part = parts[index]
-        up, down = on_both_sides(part, lambda: channel_moments(program, data, points))
-        of_mean = at.channels.of_mean((up[0] - down[0]) / (2 * part.step * spread))
-        scores[:, index] = of_mean + at.channels.of_spread((up[1][0] / down[1][0]).log() / (2 * part.step))
+        width = 2 * parts[index].step
+        up, down = on_both_sides(parts[index], lambda: channel_moments(program, data, points))
+        of_mean = at.channels.of_mean((up[0] - down[0]) / (width * spread))
+        scores[:, index] = of_mean + at.channels.of_spread((up[1][0] / down[1][0]).log() / width)
     return scores
 
 
@@ -388,18 +388,17 @@ def _of_measurements(program: Program, at: Smoothed, parts: list[Element]) -> Te
     slopes = slopes_on_all_rows(program, "readings", readings, {"state": points.flatten(0, 1)}, parts)
     if isinstance(slopes, Slopes):
         return found.of_slopes(slopes, at.sharpness)
-    columns = []
-    for part in parts:
-        score = at.states.new_zeros(points.shape[2])
-        few_up, few_down = on_both_sides(part, lambda: measured(program, points[:1]))
-        if not few_up.same(few_down):
-            width, here = 2 * part.step, measured(program, points)
-            up, down = on_both_sides(part, lambda: measured(program, points))
-            score = score + found.of_mean((here.shift(up) - here.shift(down)) * at.sharpness / width)
-            score = score + found.of_spread((up.spread[0] / down.spread[0]).log() / width)
-            score = score + (_of_tails(here, up, at) - _of_tails(here, down, at)) / width
-        columns.append(score)
-    return torch.stack(columns, -1).double()
+    scores = at.states.new_zeros((points.shape[2], len(parts))).double()
+    for index, part in enumerate(parts):
+        up, down = on_both_sides(part, lambda: measured(program, points[:1]))
+        if up.same(down):
+            continue
+        width, here = 2 * part.step, measured(program, points)
+        up, down = on_both_sides(part, lambda: measured(program, points))
+        of_mean = found.of_mean((here.shift(up) - here.shift(down)) * at.sharpness / width)
+        of_spread = found.of_spread((up.spread[0] / down.spread[0]).log() / width)
+        scores[:, index] = of_mean + of_spread + (_of_tails(here, up, at) - _of_tails(here, down, at)) / width
+    return scores
 
 
 def _by_row(program: Program, data: Trajectories, **along: Tensor) -> dict[str, Tensor]:

@@ -63,17 +63,12 @@ class FilterState(NamedTuple):
     states: Tensor  # (N, B, D)
     log_weights: Tensor  # (N, B) double; their exponentials sum to one until a proposal's ratio enters
     roots: Tensor  # (N, B), the first row's particle that each descends from
-    evidence: tuple[Tensor, ...] = ()  # log p(y_t | y_0 … y_{t-1}) of earlier rows, (B,); looking ahead they telescope
-
-    @property
-    def log_likelihood(self) -> Tensor:
-        """The estimate of log p(y) so far, `(B,)`."""
-        return torch.stack(self.evidence).sum(0) if self.evidence else torch.zeros_like(self.log_weights[0])
 
 
 class Step(NamedTuple):
     """What a filter did at a row."""
 
+    evidence: Tensor  # (B,), log p(y_t | y_0 … y_{t-1}), whose sum is log p(y); looking ahead, these telescope
     effective_sizes: Tensor  # (B,) ESS once the row is weighed; N where nothing was weighed
     blown_up: Tensor  # (B,) how many weights were not numbers; they count as zero
     ancestors: Tensor | None  # (N, B), the particles that move on; None: each
@@ -165,8 +160,8 @@ class ParticleFilter:
         if row < self.last:
             states, log_weights, noise = self._move(row, states, log_weights, ancestors)
         return (
-            FilterState(states, log_weights, roots, (*state.evidence, weighed.evidence)),
-            Step(weighed.effective_sizes, weighed.blown_up, ancestors, noise),
+            FilterState(states, log_weights, roots),
+            Step(weighed.evidence, weighed.effective_sizes, weighed.blown_up, ancestors, noise),
         )
 
     def _weigh(self, state: FilterState, row: int) -> _Weighed:
@@ -269,13 +264,13 @@ def particle_filter(
             history.append(state.states)
         state, step = along.step(state, row)
         steps.append(step if keep_history else step._replace(ancestors=None, noise={}))
-    blown_up = torch.stack([step.blown_up for step in steps])
-    _raise_if_broken(program, torch.stack(state.evidence), blown_up, data)
+    evidence, sizes, blown_up = (torch.stack(values) for values in zip(*(step[:3] for step in steps), strict=True))
+    _raise_if_broken(program, evidence, blown_up, data)
     start, left, dims = along.start, along.left, event_dims(along.start)
     return Filtered(
-        log_likelihood=state.log_likelihood,
+        log_likelihood=evidence.sum(0),
         log_weights=state.log_weights,
-        effective_sizes=torch.stack([step.effective_sizes for step in steps]),
+        effective_sizes=sizes,
         roots=torch.zeros_like(state.log_weights).scatter_(0, state.roots, 1.0).sum(0),
         blown_up=blown_up.sum(0),
         states=history,
