@@ -190,19 +190,16 @@ class AutoRollout(VariationalGuide):
             raise UsageError(
                 "an automatic guide has parameters for each of its drives: it takes no others and no batch"
             )
-        values, ratios = list[dict[str, Tensor]](), list[Tensor]()
-        for _ in range(self.draws):
-            with pyro.settings.context(module_local_params=True), poutine.block():
-                trace = poutine.trace(self.auto).get_trace(data)
-            drawn: dict[str, Any] = {name: trace.nodes[name]["value"] for name in self._shapes(data)}
-            values.append(drawn)
-            normal = [dist.Normal(0.0, 1.0).log_prob(value).sum() for value in drawn.values()]
-            ratios.append(trace.log_prob_sum() - torch.stack(normal).sum())
-        self.now = {name: torch.stack([drawn[name] for drawn in values]) for name in values[0]}
+        names, normal = list(self._shapes(data)), dist.Normal(0.0, 1.0)
+        with pyro.settings.context(module_local_params=True), poutine.block():
+            traces = [poutine.trace(self.auto).get_trace(data) for _ in range(self.draws)]
+        drawn: list[list[Any]] = [[trace.nodes[name]["value"] for name in names] for trace in traces]
+        priors = [torch.stack([normal.log_prob(value).sum() for value in one]).sum() for one in drawn]
+        self.now = {name: torch.stack(values) for name, values in zip(names, zip(*drawn, strict=True), strict=True)}
         padded = data.controls.new_zeros(self.draws, *data.transitions.shape, self.sizes[1])
         padded[:, data.transitions] = self.now["noise"]
         self.now["noise"] = padded
-        return torch.stack(ratios)
+        return torch.stack([trace.log_prob_sum() - prior for trace, prior in zip(traces, priors, strict=True)])
 
     def start(self) -> tuple[Tensor, Tensor]:
         noise = self.now["start"]

@@ -203,17 +203,10 @@ def _of_test(tested: Tested) -> list[GainRow]:
 
 def _in_limits(variant: Variant, values: np.ndarray, ends: np.ndarray, limits: np.ndarray, color: str) -> list[GainRow]:
     """A line for each component: its value and interval `(k, 2)` over its detection limit."""
-    parts = variant.effect.components
-    return [
-        GainRow(
-            f"{_label(variant)} {parts[i]}" if parts else _label(variant),
-            value / limit,
-            (low / limit, high / limit),
-            color,
-            _with_unit(limit, variant),
-        )
-        for i, (value, (low, high), limit) in enumerate(zip(values, ends, limits, strict=True))
-    ]
+    label = _label(variant)
+    labels = [f"{label} {part}" for part in variant.effect.components] or [label] * len(values)
+    rows = zip(labels, values / limits, ends / limits[:, None], limits, strict=True)
+    return [GainRow(name, value, (low, high), color, _with_unit(at, variant)) for name, value, (low, high), at in rows]
 
 
 def _with_unit(limit: float, variant: Variant) -> str:

@@ -36,12 +36,9 @@ class Proposal:
     """The program's own noise: the bootstrap filter (Gordon, Salmond and Smith 1993).
 
     A subclass draws the noise itself. Its log ratios enter the weights, and it may resample at every row.
-
-    Attributes:
-        looks_ahead: whether weights know of later measurements, at measured rows and at others.
     """
 
-    looks_ahead = False
+    looks_ahead = False  # whether weights know of later measurements, at measured rows and at others
 
     def start(self, particles: int) -> tuple[Tensor | None, Tensor | float]:
         """The standard normal noise of `initial`, `(N, B, C)`, and its log density less that of the proposal, `(N, B)`;

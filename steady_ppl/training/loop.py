@@ -173,13 +173,12 @@ def train(
     elif checkpoint is not None:
         write_checkpoint(checkpoint, state, optimizer)
     batch, interrupted = optimization.batch or len(data), False
+    patience = optimization.patience * optimization.validate_every
     shows_bar = progress and sys.stderr.isatty()
     bar = tqdm(total=optimization.steps, initial=state.step, disable=not shows_bar, file=sys.stderr, unit="step")
     with bar, pyro.settings.context(module_local_params=True), pyro.validation_enabled(False):
         try:
-            while state.step < optimization.steps and (
-                state.step - state.kept_step < optimization.patience * optimization.validate_every
-            ):
+            while state.step < optimization.steps and state.step - state.kept_step < patience:
                 with seeded(seed, "step", state.step):
                     part = data if batch >= len(data) else data.subset(torch.randperm(len(data))[:batch])
                     figures = guide.refresh(part, state.step / optimization.steps)
