@@ -69,7 +69,8 @@ def choose_filter(
 def neglected(
     program: Program, data: Trajectories, *, known_start: bool, particles: int = 200, ahead: Lookahead | None = None
 ) -> Tensor:
-    """What the linearised program neglects: log p(y) by the filter that looks ahead, less the linearised program's.
+    """What the linearised program neglects: log p(y) by the filter that looks ahead, less the linearised program's,
+    `(B,)` nats, with the filter's Monte-Carlo error.
 
     Near zero the Gaussian guide draws from the posterior, as far as its path is near the right mode: the filter is
     steered along the same path and cannot tell.
@@ -80,9 +81,6 @@ def neglected(
         known_start: the first state is certain.
         particles: of the filter, for each trajectory.
         ahead: of these drives; found from the measurements when None.
-
-    Returns:
-        `(B,)` nats, with the filter's Monte-Carlo error.
     """
     ahead = ahead or Problem(program, data, known_start).find_and_smooth()
     filtered = particle_filter(

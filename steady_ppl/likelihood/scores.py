@@ -90,12 +90,8 @@ class Deviations:
         return self.mean.square() + self.variance - 1
 
     def of_slopes(self, slopes: Slopes, sharpness: Tensor) -> Tensor:
-        """Scores of learnable numbers, `(B, P)`.
-
-        Args:
-            slopes: of the means and, after them, of the log standard deviations, at `points` row by row.
-            sharpness: 1 / the standard deviations, `(rows, B, C)`.
-        """
+        """Scores of learnable numbers, `(B, P)`, from the slopes of the means and, after them, of the log standard
+        deviations, at `points` row by row; `sharpness` is 1 / the standard deviations, `(rows, B, C)`."""
         count, rows = self.mean.shape[-1], self.mean.shape[0]
         of_means = slopes.components < count
         at, values = slopes.components[of_means], slopes.values[of_means].unflatten(1, (-1, rows))

@@ -177,12 +177,10 @@ def observation_noise(fit: Fit, *, axes: Axes | None = None, label: str = "as th
     Raises:
         UsageError: the fit was not trained, or nothing was tempered.
     """
-    if fit.trained is not None and any("kl_weight" in entry for entry in fit.trained.history):
-        steps, weights = _logged(fit, "kl_weight", "")
-        factors = [math.sqrt(weight) for weight in weights]
-    else:
-        steps, weights = _logged(fit, "observation_weight", "its observations were not tempered")
-        factors = [1 / math.sqrt(weight) for weight in weights]
+    annealed = fit.trained is not None and any("kl_weight" in entry for entry in fit.trained.history)
+    figure = "kl_weight" if annealed else "observation_weight"
+    steps, weights = _logged(fit, figure, "its observations were not tempered")
+    factors = [math.sqrt(weight) if annealed else 1 / math.sqrt(weight) for weight in weights]
     axes = _over_steps(axes, "observation noise / the program's")
     axes.plot(steps, factors, "o-", ms=3, label=label)
     axes.axhline(1, color="black", lw=0.6)

@@ -219,7 +219,7 @@ def particle_filter(
     kernels: bool | None = None,
     on_frame: OnFrame | None = None,
 ) -> Filtered:
-    """Run the program as a particle filter on every trajectory at once.
+    """Run the program as a particle filter on every trajectory at once; with `keep_history` its genealogy is returned.
 
     Args:
         program: the state-space model.
@@ -235,9 +235,6 @@ def particle_filter(
         kernels: run compiled methods where they can serve; None: if there is enough to do, see `STEPS_WORTH_COMPILING`.
         on_frame: called at every row with (row, states `(N, B, D)`, log-weights before, log-weights after), `(N, B)`;
             not when looking ahead.
-
-    Returns:
-        The estimate of log p(y) and, with `keep_history`, the genealogy.
 
     Raises:
         FilterError: every weight is zero; names trajectory and time.

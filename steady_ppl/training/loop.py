@@ -351,14 +351,12 @@ class Validation:
 
 
 def as_good(candidate: Sequence[float], best: Sequence[float]) -> bool:
-    """Whether held-out log p(y) is no worse than the best, up to one standard error of the paired difference.
+    """Whether held-out log p(y), of each drive or empty, is no worse than the best, up to one standard error of the
+    paired difference (the rule of Breiman et al. 1984, towards the later instead of the smaller model).
 
     Log p(y) at 1 Hz hardly feels how wide the process noise is; its differences late in a training are smaller than
     what the choice of held-out drives moves. Among equals the later parameters have seen more of the full observation
-    weight (the one-standard-error rule of Breiman et al. 1984, towards the later instead of the smaller model).
-
-    Args:
-        candidate, best: log p(y) of each held-out trajectory; empty when nothing is held out.
+    weight.
     """
     if not candidate or not best:
         return True
