@@ -158,7 +158,7 @@ def climb(
     for term in terms:
         reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
     is_given = information is not None
-    information = _regularised(_of_drives(here) if information is None else information)
+    information = _of_drives(here) if information is None else _regularised(information)
     taken, decrement, passes = 0, 0.0, PASSES
     rises = deque[float](maxlen=3)  # of log p(y) by the last steps
     with stages(*(("", FEWER**step) for step in range(steps + 1))) as begin:
@@ -166,7 +166,7 @@ def climb(
             begin()
             move, singular = torch.linalg.solve_ex(information, here.gradient)
             if not singular and not float(here.gradient @ move) >= 0:  # it has ceased to be positive
-                information = _regularised(_of_drives(here))
+                information = _of_drives(here)
                 move, singular = torch.linalg.solve_ex(information, here.gradient)
             if singular:
                 raise FilterError(
@@ -174,7 +174,7 @@ def climb(
                 )
             decrement = 0.5 * float(here.gradient @ move)
             if is_given and decrement < precision:  # by what was known elsewhere: seen here as well?
-                is_given, own = False, _regularised(_of_drives(here))
+                is_given, own = False, _of_drives(here)
                 seen, _ = torch.linalg.solve_ex(own, here.gradient)
                 more = 0.5 * float(here.gradient @ seen)
                 if taken == 0 or (more > SURE and len(here.scores) >= 2 * len(own)):  # few drives know too little
@@ -195,7 +195,7 @@ def climb(
             else:
                 passes = STALLED_PASSES
                 here = _linearised([at.term for at in here.terms], passes)
-                information = _regularised(_of_drives(here))
+                information = _of_drives(here)
                 rises.append(math.inf)  # along other paths
     return [
         Maximum(
@@ -232,7 +232,7 @@ def _of_drives(here: _Here) -> Tensor:
     """The information by the cross products of the drives' scores."""
     by_drive = here.scores - here.scores.mean(0)
     information = by_drive.T @ by_drive
-    return information + 0.1 * torch.diag(information.diagonal())
+    return _regularised(information + 0.1 * torch.diag(information.diagonal()))
 
 
 def _regularised(information: Tensor) -> Tensor:
