@@ -39,8 +39,11 @@ from .guides.linearized import (
     LookaheadGuide as LookaheadGuide,
     SmootherGuide as SmootherGuide,
 )
-from .guides.network import InferenceNetwork as InferenceNetwork
-from .guides.variational import AutoRollout as AutoRollout, VariationalGuide as VariationalGuide
+from .guides.variational import (
+    AutoRollout as AutoRollout,
+    InferenceNetwork as InferenceNetwork,
+    VariationalGuide as VariationalGuide,
+)
 from .likelihood.evidence import (
     choose_filter as choose_filter,
     log_likelihood as log_likelihood,

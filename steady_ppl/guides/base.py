@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import pyro
 import pyro.distributions as dist
@@ -25,6 +26,7 @@ from steady_ppl.utils.angles import wrap_angles
 HUNDREDS = 100  # of E steps are in a training
 PASSES = 30  # of Gauss and Newton's method
 AT_REST = 1e-9  # of a channel's size and unit, by which noise may still move when it is found
+Tempering = Callable[[float], float]  # a schedule: the observation weight at a share of the training, 0 to 1
 
 
 class PathGuide:
@@ -45,15 +47,15 @@ class PathGuide:
         self.in_plain_torch: str | None = None
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
-        """The E step: draw new paths for `data` at `progress` (0 to 1); returns figures for the log."""
+        """The E step: draw new paths for `data` at `progress` (0 to 1); returns figures for the log.
+
+        Raises:
+            FilterError: the filter or the linearised program broke down, or a path is not finite.
+        """
         raise NotImplementedError
 
     def keep(self, paths: Paths, data: Trajectories) -> None:
-        """Store paths of `data`, their padding filled.
-
-        Raises:
-            FilterError: a state is not finite.
-        """
+        """Store paths of `data`, their padding filled; a state that is not finite is a `FilterError`."""
         self.paths = paths.within(data)
         broken = ~torch.isfinite(self.paths.states).all(-1).all(0) & data.rows
         if bool(broken.any()):
@@ -73,17 +75,12 @@ class PathGuide:
 
 
 class FilteringGuide(PathGuide):
-    """A guide that draws its paths by a particle filter.
-
-    Attributes:
-        particles: N, for each trajectory.
-        resample_below: share of N under which the effective sample size triggers resampling.
-    """
+    """A guide that draws its paths by a particle filter."""
 
     program: Program
     known_start: bool
-    particles: int
-    resample_below: float
+    particles: int  # N, for each trajectory
+    resample_below: float  # share of N under which the effective sample size triggers resampling
 
     def _filter(self, data: Trajectories, weight: float, proposal: Proposal | None = None) -> dict[str, float]:
         """Keep paths of the filter; returns the health of its particles."""
@@ -99,8 +96,8 @@ class FilteringGuide(PathGuide):
         )
         self.in_plain_torch = filtered.in_plain_torch or (proposal and self.in_plain_torch) or None
         self.keep(filtered.paths(self.draws), data)
-        rows = data.observed.any(-1) if proposal is None else data.rows
-        figures = {"ess": float(filtered.effective_sizes[rows].mean()), "roots": float(filtered.roots.mean())}
+        weighed = data.observed.any(-1) if proposal is None else data.rows
+        figures = {"ess": float(filtered.effective_sizes[weighed].mean()), "roots": float(filtered.roots.mean())}
         blown_up = float(filtered.blown_up.sum())
         return figures | {"weights_blown_up": blown_up} if blown_up else figures
 
@@ -134,11 +131,7 @@ class SMCGuide(FilteringGuide):
         self.known_start, self.resample_below = known_start, resample_below
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
-        """Run the filter and keep `draws` paths.
-
-        Raises:
-            FilterError: the filter broke down, or a path is not finite.
-        """
+        """Run the filter and keep `draws` paths."""
         weight = self.tempering(progress)
         return {"observation_weight": weight} | self._filter(data, weight)
 
@@ -179,16 +172,12 @@ def sample_known(paths: Paths, data: Trajectories) -> None:
 
 @torch.no_grad()
 def true_paths(program: Program, data: Trajectories) -> Paths:
-    """The true states with the channel noise that leads from one to the next.
+    """The true states of `data`, all known, with the channel noise that leads from one to the next.
 
     Gauss and Newton's method from zero noise: least squares on the differences that a unit of each channel makes; one
     pass is exact where the next state is affine in the noise. What noise cannot explain (a position that does not
     follow from the velocity) is left over, and the more of that, the more precise the derivatives must be: the program
     runs in double precision. Angles are compared on the circle.
-
-    Args:
-        program: the state-space model.
-        data: as returned by `for_program`, all states known.
 
     Raises:
         DataError: a state is unknown.
@@ -200,11 +189,11 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
     states = torch.where(data.rows[..., None], states, states[:1])
     exact, within = copy.deepcopy(program).double(), data.to(torch.float64)
     before, after = states[:-1].double(), states[1:].double()
-    controls = acting_controls(exact, within)[:-1]
+    over_time = (acting_controls(exact, within)[:-1], within.elapsed[:-1], within.steps)
 
     def run(noise: Tensor) -> tuple[Tensor, Recording]:
         with running(*before.shape[:-1]), Recording() as recording, Taking(noise):
-            return sample_row(exact, before, controls, within.elapsed[:-1], within.steps), recording
+            return sample_row(exact, before, *over_time), recording
 
     channels = torch.eye(step_size(program)).to(before)
     noise = before.new_zeros(*before.shape[:-1], len(channels))
@@ -247,14 +236,6 @@ class Taking(ByColumn):
     def _pyro_sample(self, message: Any) -> None:
         taken = self.values[..., self.take(message["fn"])]
         message["value"] = taken if message["fn"].event_dim else taken[..., 0]
-
-
-class Tempering(Protocol):
-    """A schedule of the observation weight."""
-
-    def __call__(self, progress: float) -> float:
-        """The weight at `progress` through the training, 0 to 1."""
-        ...
 
 
 @dataclass(frozen=True)

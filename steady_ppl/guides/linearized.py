@@ -17,12 +17,12 @@ from steady_ppl.gaussian.smoother import (
     means_as_path,
     require_found,
     resting_path,
-    smooth,
     smoother_paths,
 )
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.guides.base import FilteringGuide, LinearRamp, PathGuide, Tempering
 from steady_ppl.guides.variational import VariationalGuide, log_ratio, times
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.angles import wrap
 
@@ -54,31 +54,31 @@ class LinearizedGuide(PathGuide):
         super().__init__(draws)
         self.program, self.tempering = program, tempering or LinearRamp()
         self.known_start, self.passes, self.search_again = known_start, passes, search_again
-        self.counts: dict[str, int] = {}
 
-    def look_ahead(self, data: Trajectories, progress: float) -> Lookahead:
+    def look_ahead(self, data: Trajectories, progress: float) -> tuple[Lookahead, dict[str, float]]:
         """Linearise along the remembered paths; search for those that are not there, again for those that are lost, and
         now and then for all: what was found while the program knew little can be a wrong place that it never leaves.
 
-        Raises:
-            FilterError: a path cannot be found.
+        With the lookahead come figures: the step's observation weight, log p(y) of the linearised program at it, and
+        how many paths were lost and searches failed.
         """
         self._search(data, [i for i, label in enumerate(data.labels) if f"states/{label}" not in self.memory], progress)
         ahead = self._smooth(data, progress)
         lost = (~torch.isfinite(ahead.log_likelihood)).nonzero().flatten().tolist()
         searched = [float(self.memory[f"searched/{label}"]) for label in data.labels]
         due = [i for i, then in enumerate(searched) if progress - then >= self.search_again and i not in lost]
-        self.counts = {"paths_lost": len(lost)}
+        counts = {"paths_lost": float(len(lost)), "searches_failed": 0.0}
         self._search(data, lost, progress)
         try:
             self._search(data, due, progress, ahead.log_likelihood)
         except FilterError:  # nothing likelier was found than what is known
-            self.counts["searches_failed"] = 1
+            counts["searches_failed"] = 1.0
         if lost or due:
             ahead = self._smooth(data, progress)
         self.remember(means_as_path(ahead, data), data)
         self.in_plain_torch = ahead.linearization.in_plain_torch
-        return ahead
+        figures = {"observation_weight": self.tempering(progress), "log_evidence": float(ahead.log_likelihood.mean())}
+        return ahead, figures | {name: count for name, count in counts.items() if count}
 
     def _search(
         self, data: Trajectories, trajectories: Sequence[int], progress: float, known: Tensor | None = None
@@ -86,16 +86,11 @@ class LinearizedGuide(PathGuide):
         """Remember paths found from the measurements alone, where they are likelier than what is known already."""
         if not trajectories:
             return
-        part = data.subset(trajectories)
+        part, start, weight = data.subset(trajectories), self.known_start, self.tempering(progress)
         for label in part.labels:
             self.memory[f"searched/{label}"] = torch.tensor(progress, dtype=torch.float64)
-        weight = self.tempering(progress)
         ahead = find_and_smooth(
-            self.program,
-            part,
-            known_start=self.known_start,
-            observation_weight=weight,
-            may_fail=known is not None,
+            self.program, part, known_start=start, observation_weight=weight, may_fail=known is not None
         )
         found = resting_path(ahead, part)
         better = ahead.log_likelihood > (-torch.inf if known is None else known[trajectories])  # not where it is a nan
@@ -105,15 +100,9 @@ class LinearizedGuide(PathGuide):
 
     def _smooth(self, data: Trajectories, progress: float) -> Lookahead:
         path = ReferencePath(self._recall("states", data), self._recall("noise", data))
-        return smooth(
-            self.program,
-            data,
-            path,
-            known_start=self.known_start,
-            observation_weight=self.tempering(progress),
-            passes=self.passes,
-            kernels=data.time.numel() >= WORTH_COMPILING,
-        )
+        weight, kernels = self.tempering(progress), data.time.numel() >= WORTH_COMPILING
+        problem = Problem(self.program, data, self.known_start)
+        return problem.smooth(path, observation_weight=weight, passes=self.passes, kernels=kernels)
 
     def _recall(self, kind: str, data: Trajectories) -> Tensor:
         known = [self.memory[f"{kind}/{label}"] for label in data.labels]
@@ -128,11 +117,6 @@ class LinearizedGuide(PathGuide):
             self.memory[f"states/{label}"] = path.states[:, i]
             self.memory[f"noise/{label}"] = path.noise[:, i]
 
-    def _figures(self, ahead: Lookahead) -> dict[str, float]:
-        """Log p(y) of the linearised program, at this step's observation weight; and what happened to its paths."""
-        figures = {"log_evidence": float(ahead.log_likelihood.mean())}
-        return figures | {name: float(count) for name, count in self.counts.items() if count}
-
 
 class GaussianGuide(LinearizedGuide):
     """Draws of the linearised program's posterior as the E step: the iterated extended Kalman smoother.
@@ -142,19 +126,14 @@ class GaussianGuide(LinearizedGuide):
     """
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
-        """Linearise, smooth and keep `draws` independent paths.
-
-        Raises:
-            FilterError: the linearised program blew up.
-        """
-        weight = self.tempering(progress)
-        ahead = self.look_ahead(data, progress)
+        """Linearise, smooth and keep `draws` independent paths."""
+        ahead, figures = self.look_ahead(data, progress)
         require_found(ahead, self.program, data)
         kernels = data.time.numel() >= WORTH_COMPILING
         paths = smoother_paths(self.program, data, ahead, self.draws, known_start=self.known_start, kernels=kernels)
         self.in_plain_torch = self.in_plain_torch or paths.in_plain_torch
         self.keep(paths, data)
-        return {"observation_weight": weight} | self._figures(ahead)
+        return figures
 
 
 class LookaheadGuide(LinearizedGuide, FilteringGuide):
@@ -162,9 +141,9 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
 
     Args:
         particles: N, for each trajectory.
-        tempering, known_start, passes, search_again: of `LinearizedGuide`.
         resample_below: share of N under which the effective sample size triggers resampling.
         untwisted, tempered: see `Twist`.
+        more: of `LinearizedGuide`.
     """
 
     def __init__(
@@ -173,36 +152,21 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
         *,
         particles: int = 100,
         draws: int = 100,
-        tempering: Tempering | None = None,
-        known_start: bool = False,
-        passes: int = 1,
-        search_again: float = 0.2,
         resample_below: float = 0.5,
         untwisted: float = 0.01,
         tempered: float = 1.0,
+        **more: Any,
     ) -> None:
-        super().__init__(
-            program,
-            draws=draws,
-            tempering=tempering,
-            known_start=known_start,
-            passes=passes,
-            search_again=search_again,
-        )
+        super().__init__(program, draws=draws, **more)
         require(particles >= 1, "particles", particles, "at least 1")
         self.particles, self.resample_below = particles, resample_below
         self.untwisted, self.tempered = untwisted, tempered
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
-        """Run the filter and keep `draws` paths.
-
-        Raises:
-            FilterError: the filter broke down.
-        """
-        weight = self.tempering(progress)
-        ahead = self.look_ahead(data, progress)
-        health = self._filter(data, weight, Twist(ahead, untwisted=self.untwisted, tempered=self.tempered))
-        return {"observation_weight": weight} | self._figures(ahead) | health
+        """Run the filter and keep `draws` paths."""
+        ahead, figures = self.look_ahead(data, progress)
+        twist = Twist(ahead, untwisted=self.untwisted, tempered=self.tempered)
+        return figures | self._filter(data, self.tempering(progress), twist)
 
 
 class SmootherGuide(VariationalGuide):

@@ -33,20 +33,11 @@ def run_filter(
     particles: int,
     known_start: bool,
     look_ahead: bool = False,
-    keep_history: bool = True,
-    kernels: bool | None = None,
+    **settings: Any,
 ) -> Filtered:
-    """The particle filter at observation weight 1, bootstrap or looking ahead."""
+    """The particle filter, bootstrap or looking ahead; more settings and the errors are those of `particle_filter`."""
     proposal = Twist(Problem(program, data, known_start).find_and_smooth()) if look_ahead else None
-    return particle_filter(
-        program,
-        data,
-        particles=particles,
-        known_start=known_start,
-        proposal=proposal,
-        keep_history=keep_history,
-        kernels=kernels,
-    )
+    return particle_filter(program, data, particles=particles, known_start=known_start, proposal=proposal, **settings)
 
 
 @dataclass(frozen=True)
@@ -78,7 +69,8 @@ def choose_filter(
 def neglected(
     program: Program, data: Trajectories, *, known_start: bool, particles: int = 200, ahead: Lookahead | None = None
 ) -> Tensor:
-    """What the linearised program neglects: log p(y) by the filter that looks ahead, less the linearised program's.
+    """What the linearised program neglects: log p(y) by the filter that looks ahead, less the linearised program's,
+    `(B,)` nats, with the filter's Monte-Carlo error.
 
     Near zero the Gaussian guide draws from the posterior, as far as its path is near the right mode: the filter is
     steered along the same path and cannot tell.
@@ -89,9 +81,6 @@ def neglected(
         known_start: the first state is certain.
         particles: of the filter, for each trajectory.
         ahead: of these drives; found from the measurements when None.
-
-    Returns:
-        `(B,)` nats, with the filter's Monte-Carlo error.
     """
     ahead = ahead or Problem(program, data, known_start).find_and_smooth()
     filtered = particle_filter(
@@ -102,13 +91,10 @@ def neglected(
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a filter says of given drives, without their states.
-
-    Where hardly a particle was left the estimate hangs on a few: it scatters, and is mostly too low.
-    """
+    """What a filter says of given drives, without their states."""
 
     log_likelihood: Tensor  # (B,), estimated
-    scarce: Tensor  # (B,) share of measured rows after which hardly a particle was left, see `Filtered.scarce`
+    scarce: Tensor  # (B,) as `Filtered.scarce`; where it is large the estimate scatters, and is mostly too low
 
 
 def evidence(
@@ -144,17 +130,10 @@ def evidence(
             "let it begin at a measured row",
             trajectory=label,
         )
+    settings: Any = {"known_start": known_start, "look_ahead": look_ahead, "kernels": kernels}
     values, scarce = [], []
     for part in in_parts(thinned, particles, look_ahead=look_ahead):
-        filtered = run_filter(
-            program,
-            part,
-            particles=particles,
-            known_start=known_start,
-            look_ahead=look_ahead,
-            keep_history=False,
-            kernels=kernels,
-        )
+        filtered = run_filter(program, part, particles=particles, keep_history=False, **settings)
         values.append(filtered.log_likelihood)
         scarce.append(filtered.scarce(part))
     return Evidence(torch.cat(values), torch.cat(scarce))
@@ -168,18 +147,10 @@ def log_likelihood(program: Program, data: Trajectories, **settings: Any) -> Ten
 
 @one_thread()
 def smoothed_states(program: Program, data: Trajectories, *, known_start: bool) -> Tensor:
-    """Posterior means of the states given all measurements.
+    """Posterior means of the states given all measurements, `(T + 1, B, D)`, of `data` as `for_program` returns them.
 
     By the iterated smoother, angles on its path's turn; where the program's noise is not normal, from the surviving
-    lineages of a bootstrap filter.
-
-    Args:
-        program: the state-space model.
-        data: as returned by `for_program`.
-        known_start: start at the true first state.
-
-    Returns:
-        `(T + 1, B, D)`.
+    lineages of a bootstrap filter. With a `known_start` the first state is the true one.
     """
     problem = Problem(program, data, known_start)
     if problem.why_not_linear() is None:

@@ -46,27 +46,16 @@ OUTLIER_SD, SEARCHES = 6.0, 3  # standard deviations by which an outlier is less
 
 @dataclass(frozen=True)
 class Maximum:
-    """A program at its maximum.
+    """A program at its maximum."""
 
-    Attributes:
-        log_likelihood: `(B,)` log p(y) of the linearised program.
-        objective: their sum and the log prior.
-        path: the posterior means of the drives, along which it is linearised.
-        names: of the learnable numbers.
-        information: `(P, P)` in the unconstrained space.
-        steps: scoring steps taken.
-        decrement: what another step would still gain, nats; None where nobody has looked.
-        gained: objective above that at the parameters from which it began, nats.
-    """
-
-    log_likelihood: Tensor
-    objective: float
-    path: ReferencePath
-    names: tuple[str, ...]
-    information: Tensor
-    steps: int
-    decrement: float | None
-    gained: float
+    log_likelihood: Tensor  # (B,), log p(y) of the linearised program
+    objective: float  # their sum and the log prior
+    path: ReferencePath  # the posterior means of the drives, along which it is linearised
+    names: tuple[str, ...]  # of the learnable numbers
+    information: Tensor  # (P, P) in the unconstrained space
+    steps: int  # scoring steps taken
+    decrement: float | None  # what another step would still gain, nats; None where nobody has looked
+    gained: float  # objective above that at the parameters from which it began, nats
 
     @property
     def converged(self) -> bool:
@@ -80,10 +69,7 @@ def maximise(
     path: ReferencePath | None = None,
     *,
     known_start: bool = False,
-    information: Tensor | None = None,
-    steps: int = 25,
-    precision: float = 0.02,
-    hopeless: float = -math.inf,
+    **settings: Any,
 ) -> Maximum:
     """Move a program's parameters, in place, to where log p(y) of the linearised program plus the log prior is largest.
 
@@ -92,15 +78,13 @@ def maximise(
         data: as returned by `for_program`.
         path: of the drives, near their posterior means; found from the measurements when None.
         known_start: the first state is certain.
-        information: `(P, P)` of the learnable numbers, where it is known.
-        steps: scoring steps at most.
-        precision: stop when another step would gain less, nats.
-        hopeless: give up after six steps where log p(y) would not reach this were it to rise on as it has lately.
+        settings: `information`, `(P, P)` of the learnable numbers, where it is known; `steps`, scoring steps at most;
+            `precision`, stop when another step would gain less, nats; `hopeless`, give up after six steps where log
+            p(y) would not reach this were it to rise on as it has lately. Their defaults are those of `climb`.
 
     Raises:
         FilterError: the program cannot be smoothed at its initial parameters.
     """
-    settings = {"information": information, "steps": steps, "precision": precision, "hopeless": hopeless}
     return maximum_of(Problem(program, data, known_start), path, **settings)
 
 
@@ -167,14 +151,14 @@ def climb(
         FilterError: the programs cannot be smoothed where they begin, or the drives do not tell their numbers apart.
     """
     here = _linearised(terms)
-    for term, at in zip(terms, here.terms, strict=True):
-        require_found(at.ahead, term.problem.program, term.problem.data)
+    for at in here.terms:
+        require_found(at.ahead, at.term.problem.program, at.term.problem.data)
     began = [at.objective for at in here.terms]
-    reach = torch.zeros(_size(terms), dtype=torch.float64)
+    reach = torch.zeros_like(here.gradient)
     for term in terms:
         reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
     is_given = information is not None
-    information = _regularised(_of_drives(here) if information is None else information)
+    information = _of_drives(here) if information is None else _regularised(information)
     taken, decrement, passes = 0, 0.0, PASSES
     rises = deque[float](maxlen=3)  # of log p(y) by the last steps
     with stages(*(("", FEWER**step) for step in range(steps + 1))) as begin:
@@ -182,7 +166,7 @@ def climb(
             begin()
             move, singular = torch.linalg.solve_ex(information, here.gradient)
             if not singular and not float(here.gradient @ move) >= 0:  # it has ceased to be positive
-                information = _regularised(_of_drives(here))
+                information = _of_drives(here)
                 move, singular = torch.linalg.solve_ex(information, here.gradient)
             if singular:
                 raise FilterError(
@@ -190,7 +174,7 @@ def climb(
                 )
             decrement = 0.5 * float(here.gradient @ move)
             if is_given and decrement < precision:  # by what was known elsewhere: seen here as well?
-                is_given, own = False, _regularised(_of_drives(here))
+                is_given, own = False, _of_drives(here)
                 seen, _ = torch.linalg.solve_ex(own, here.gradient)
                 more = 0.5 * float(here.gradient @ seen)
                 if taken == 0 or (more > SURE and len(here.scores) >= 2 * len(own)):  # few drives know too little
@@ -201,7 +185,7 @@ def climb(
             move = move * min(1.0, 1 / max(1e-9, float((move.abs() / reach).max())))
             against = move * here.gradient < 0
             move = torch.where(against, move.clamp(-SHARE_AGAINST_SCORE * reach, SHARE_AGAINST_SCORE * reach), move)
-            share, there = _searched(terms, here, move, passes)
+            share, there = _searched(here, move, passes)
             if there is not None:
                 information = _updated(information, share * move, here.gradient - there.gradient)
                 rises.append(there.log_likelihood - here.log_likelihood)
@@ -210,36 +194,32 @@ def climb(
                 break
             else:
                 passes = STALLED_PASSES
-                here = _linearised(_along(terms, here), passes)
-                information = _regularised(_of_drives(here))
+                here = _linearised([at.term for at in here.terms], passes)
+                information = _of_drives(here)
                 rises.append(math.inf)  # along other paths
     return [
         Maximum(
             log_likelihood=at.ahead.log_likelihood,
             objective=at.objective,
-            path=at.path,
-            names=tuple(part.name for part in term.parts),
-            information=information[term.columns][:, term.columns],
+            path=at.term.path,
+            names=tuple(part.name for part in at.term.parts),
+            information=information[at.term.columns][:, at.term.columns],
             steps=taken,
             decrement=decrement,
             gained=at.objective - before,
         )
-        for term, at, before in zip(terms, here.terms, began, strict=True)
+        for at, before in zip(here.terms, began, strict=True)
     ]
 
 
-def _size(terms: Sequence[Term]) -> int:
-    """How many numbers an objective has."""
-    return len({column for term in terms for column in term.columns})
-
-
-def _searched(terms: Sequence[Term], here: _Here, move: Tensor, passes: int) -> tuple[float, _Here | None]:
+def _searched(here: _Here, move: Tensor, passes: int) -> tuple[float, _Here | None]:
     """The share of a move that does not fall, and where it leads; None where none does and nothing is moved."""
-    share, before = 1.0 if bool(torch.isfinite(move).all()) else 0.0, [values_of(term.parts) for term in terms]
+    share, terms = 1.0 if bool(torch.isfinite(move).all()) else 0.0, [at.term for at in here.terms]
+    before = [values_of(term.parts) for term in terms]
     while share > 0.01:
         for term, values in zip(terms, before, strict=True):
             set_values(term.parts, values + share * move[term.columns])
-        there = _tried(_along(terms, here), passes, here.objective - MAX_DECREASE)
+        there = _tried(terms, passes, here.objective - MAX_DECREASE)
         if there is not None:
             return share, there
         share /= 3
@@ -252,7 +232,7 @@ def _of_drives(here: _Here) -> Tensor:
     """The information by the cross products of the drives' scores."""
     by_drive = here.scores - here.scores.mean(0)
     information = by_drive.T @ by_drive
-    return information + 0.1 * torch.diag(information.diagonal())
+    return _regularised(information + 0.1 * torch.diag(information.diagonal()))
 
 
 def _regularised(information: Tensor) -> Tensor:
@@ -261,8 +241,9 @@ def _regularised(information: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class _TermHere:
+    term: Term  # along the path that its drives have here
+    shares: dict[str, float]  # in the log prior of parameters, which other terms may have in common with it
     ahead: Lookahead
-    path: ReferencePath
     objective: float
 
 
@@ -281,12 +262,8 @@ class _Here:
         return sum(float(term.ahead.log_likelihood.sum()) for term in self.terms)
 
 
-def _along(terms: Sequence[Term], here: _Here) -> list[Term]:
-    return [replace(term, path=there.path) for term, there in zip(terms, here.terms, strict=True)]
-
-
 def _linearised(terms: Sequence[Term], passes: int = PASSES) -> _Here:
-    return _scored(terms, _valued(terms, passes))
+    return _scored(_valued(terms, passes))
 
 
 def _tried(terms: Sequence[Term], passes: int, least: float) -> _Here | None:
@@ -296,29 +273,33 @@ def _tried(terms: Sequence[Term], passes: int, least: float) -> _Here | None:
         finite = all(bool(torch.isfinite(term.ahead.log_likelihood).all()) for term in found)
         if not finite or not sum(term.objective for term in found) >= least:
             return None
-        here = _scored(terms, found)
+        here = _scored(found)
     except FilterError:
         return None
     return here if bool(torch.isfinite(here.gradient).all()) else None
 
 
 def _valued(terms: Sequence[Term], passes: int) -> list[_TermHere]:
-    found = []
-    for term, shares in zip(terms, _shares(terms), strict=True):
+    found, owners = [], Counter(column for term in terms for column in term.columns)
+    for term in terms:
+        names = [part.name.split("[")[0] for part in term.parts]
+        shares = {name: 1 / owners[column] for name, column in zip(names, term.columns, strict=True)}
         ahead = term.problem.smooth(term.path, passes=passes, tolerance=TOLERANCE)
         objective = float(ahead.log_likelihood.sum()) + log_prior(term.problem.program, shares)
-        found.append(_TermHere(ahead, resting_path(ahead, term.problem.data), objective))
+        there = replace(term, path=resting_path(ahead, term.problem.data))
+        found.append(_TermHere(there, shares, ahead, objective))
     return found
 
 
-def _scored(terms: Sequence[Term], found: list[_TermHere]) -> _Here:
-    gradient, by_drive = torch.zeros(_size(terms), dtype=torch.float64), []
-    for term, at, shares in zip(terms, found, _shares(terms), strict=True):
-        program, data = term.problem.program, term.problem.data
-        own = parameter_scores(program, data, smoothed(at.ahead, data), term.parts)
-        gradient[term.columns] += own.sum(0) + _slope_of_prior(program, term.parts, shares)
+def _scored(found: list[_TermHere]) -> _Here:
+    columns, by_drive = {column for at in found for column in at.term.columns}, []
+    gradient = torch.zeros(len(columns), dtype=torch.float64)
+    for at in found:
+        program, data = at.term.problem.program, at.term.problem.data
+        own = parameter_scores(program, data, smoothed(at.ahead, data), at.term.parts)
+        gradient[at.term.columns] += own.sum(0) + _slope_of_prior(program, at.term.parts, at.shares)
         wide = own.new_zeros((len(own), len(gradient)))
-        wide[:, term.columns] = own
+        wide[:, at.term.columns] = own
         by_drive.append(wide)
     return _Here(found, torch.cat(by_drive), gradient)
 
@@ -330,15 +311,6 @@ def posterior_score(problem: Problem, path: ReferencePath) -> Tensor:
         FilterError: the program diverges there.
     """
     return _linearised([Term.alone(problem, path)], STALLED_PASSES).gradient
-
-
-def _shares(terms: Sequence[Term]) -> list[dict[str, float]]:
-    """Each program's share in the log prior of its parameters, which others may have in common with it."""
-    owners = Counter(column for term in terms for column in term.columns)
-    return [
-        {part.name.split("[")[0]: 1 / owners[column] for part, column in zip(term.parts, term.columns, strict=True)}
-        for term in terms
-    ]
 
 
 def _slope_of_prior(program: Program, parts: list[Element], shares: dict[str, float]) -> Tensor:
@@ -363,8 +335,7 @@ def log_prior(program: Program, shares: Mapping[str, float] | None = None) -> fl
 def _updated(information: Tensor, step: Tensor, fall: Tensor) -> Tensor:
     """The BFGS update with `fall` of the score along `step`, damped where no positive curvature is seen (Powell)."""
     through = information @ step
-    expected = float(step @ through)
-    seen = float(step @ fall)
+    expected, seen = float(step @ through), float(step @ fall)
     if seen < 0.2 * expected:
         share = 0.8 * expected / (expected - seen)
         fall = share * fall + (1 - share) * through

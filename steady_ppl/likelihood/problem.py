@@ -17,22 +17,15 @@ from steady_ppl.model.program import Program, for_program
 
 @dataclass(frozen=True)
 class Problem:
-    """A state-space model and drives, with or without their exact start.
-
-    Public functions take the three one by one and build this once.
-
-    Attributes:
-        program: the state-space model.
-        data: as returned by `for_program`.
-        known_start: the first states are certain.
+    """A state-space model and drives, with or without their exact start; public functions take the three one by one.
 
     Raises:
         DataError: a known start, and some first state is not given.
     """
 
     program: Program
-    data: Trajectories
-    known_start: bool = False
+    data: Trajectories  # as returned by `for_program`
+    known_start: bool = False  # the first states are certain
 
     def __post_init__(self) -> None:
         if self.known_start:

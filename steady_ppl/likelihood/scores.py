@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import pyro.distributions as dist
@@ -45,8 +45,6 @@ from steady_ppl.model.handlers import (
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance, channel_scales, sample_channels
 from steady_ppl.utils.angles import wrap_angles
-
-MeanAndSpread = tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True)
@@ -92,12 +90,8 @@ class Deviations:
         return self.mean.square() + self.variance - 1
 
     def of_slopes(self, slopes: Slopes, sharpness: Tensor) -> Tensor:
-        """Scores of learnable numbers, `(B, P)`.
-
-        Args:
-            slopes: of the means and, after them, of the log standard deviations, at `points` row by row.
-            sharpness: 1 / the standard deviations, `(rows, B, C)`.
-        """
+        """Scores of learnable numbers, `(B, P)`, from the slopes of the means and, after them, of the log standard
+        deviations, at `points` row by row; `sharpness` is 1 / the standard deviations, `(rows, B, C)`."""
         count, rows = self.mean.shape[-1], self.mean.shape[0]
         of_means = slopes.components < count
         at, values = slopes.components[of_means], slopes.values[of_means].unflatten(1, (-1, rows))
@@ -213,7 +207,7 @@ def component_major(values: Tensor) -> Tensor:
 @torch.no_grad()
 def channel_moments(
     program: Program, data: Trajectories, states: Tensor, controls: Tensor | None = None
-) -> MeanAndSpread:
+) -> tuple[Tensor, Tensor]:
     """Means and standard deviations of rows' channels at states `(P, T, B, D)`, each `(P, T, B, C)`; `controls` are the
     acting ones, `(T + 1, B, U)` or `(P, T + 1, B, U)`, or as `acting` gives them."""
     controls = acting_controls(program, data) if controls is None else controls
@@ -222,7 +216,7 @@ def channel_moments(
 
 def _moments_of_channels(
     program: Program, states: Tensor, control: Tensor, time: Tensor, step: Tensor
-) -> MeanAndSpread:
+) -> tuple[Tensor, Tensor]:
     seen = Recording()
     with running(*states.shape[:-1]), seen, AtMean():
         sample_channels(program, states, control, time, step)
@@ -279,20 +273,10 @@ class Measured:
         """What is measured on average, `(..., K)`, on the circle where a measurement lives there."""
         return self._of_sites(lambda _, fn: -residual(fn, torch.zeros_like(fn.mean)))
 
-    def same(self, other: Measured) -> bool:
-        """Whether `other` measures the same, with the same scales and tails."""
-        alike = (self.spread == other.spread) & (self.freedom == other.freedom)
-        return bool((self.shift(other) == 0).all()) and bool(alike.all())
-
     @property
     def spread(self) -> Tensor:
         """Scales, `(..., K)`."""
         return self._of_sites(lambda _, fn: unwrapped(fn).scale)
-
-    @property
-    def heavy_tailed(self) -> bool:
-        """Whether some site is a Student t."""
-        return any(isinstance(unwrapped(fn), dist.StudentT) for fn in self.distributions.values())
 
     @property
     def freedom(self) -> Tensor:
@@ -305,6 +289,16 @@ class Measured:
 
         return self._of_sites(of_site)
 
+    @property
+    def heavy_tailed(self) -> bool:
+        """Whether some site is a Student t."""
+        return any(isinstance(unwrapped(fn), dist.StudentT) for fn in self.distributions.values())
+
+    def same(self, other: Measured) -> bool:
+        """Whether `other` measures the same, with the same scales and tails."""
+        alike = (self.spread == other.spread) & (self.freedom == other.freedom)
+        return bool((self.shift(other) == 0).all()) and bool(alike.all())
+
 
 @torch.no_grad()
 def measured(program: Program, states: Tensor) -> Measured:
@@ -315,7 +309,7 @@ def measured(program: Program, states: Tensor) -> Measured:
     return Measured(seen.distributions)
 
 
-def typical_spreads(program: Program, data: Trajectories, at: Smoothed) -> MeanAndSpread:
+def typical_spreads(program: Program, data: Trajectories, at: Smoothed) -> tuple[Tensor, Tensor]:
     """Root mean square standard deviations of the channels, `(C,)`, and of the measurements, `(K,)`."""
     spread = substep_spreads(program, data, at.channels.points[:1])
     sharp = measured(program, at.measurements.points[:1]).spread
@@ -348,22 +342,18 @@ def _of_channels(program: Program, data: Trajectories, at: Smoothed, parts: list
     if left:
         _, spread = channel_moments(program, data, points[:1])
     for index in left:
-        part = parts[index]
-        up, down = on_both_sides(part, lambda: channel_moments(program, data, points))
-        of_mean = at.channels.of_mean((up[0] - down[0]) / (2 * part.step * spread))
-        scores[:, index] = of_mean + at.channels.of_spread((up[1][0] / down[1][0]).log() / (2 * part.step))
+        width = 2 * parts[index].step
+        up, down = on_both_sides(parts[index], lambda: channel_moments(program, data, points))
+        of_mean = at.channels.of_mean((up[0] - down[0]) / (width * spread))
+        scores[:, index] = of_mean + at.channels.of_spread((up[1][0] / down[1][0]).log() / width)
     return scores
 
 
 def _of_ends(program: Program, data: Trajectories, at: Smoothed, parts: list[Element]) -> Tensor:
     """The parameters' part in where rows end, `(B, P)`."""
     arriving = arrivals(at.ahead, data)
-
-    def ends(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-        return _row_ends(program, state, noise, control, time, step)
-
     given = _by_row(program, data, state=arriving.states, noise=arriving.noise)
-    slopes = slopes_on_all_rows(program, "ends", ends, given, parts)
+    slopes = slopes_on_all_rows(program, "ends", partial(_row_ends, program), given, parts)
     scores, left = at.states.new_zeros((len(data), len(parts))).double(), list(range(len(parts)))
     if isinstance(slopes, Slopes):
         scores, left = arriving.of_slopes(slopes), of_actuators(program, data, parts)
@@ -394,18 +384,17 @@ def _of_measurements(program: Program, at: Smoothed, parts: list[Element]) -> Te
     slopes = slopes_on_all_rows(program, "readings", readings, {"state": points.flatten(0, 1)}, parts)
     if isinstance(slopes, Slopes):
         return found.of_slopes(slopes, at.sharpness)
-    columns = []
-    for part in parts:
-        score = at.states.new_zeros(points.shape[2])
-        few_up, few_down = on_both_sides(part, lambda: measured(program, points[:1]))
-        if not few_up.same(few_down):
-            width, here = 2 * part.step, measured(program, points)
-            up, down = on_both_sides(part, lambda: measured(program, points))
-            score = score + found.of_mean((here.shift(up) - here.shift(down)) * at.sharpness / width)
-            score = score + found.of_spread((up.spread[0] / down.spread[0]).log() / width)
-            score = score + (_of_tails(here, up, at) - _of_tails(here, down, at)) / width
-        columns.append(score)
-    return torch.stack(columns, -1).double()
+    scores = at.states.new_zeros((points.shape[2], len(parts))).double()
+    for index, part in enumerate(parts):
+        up, down = on_both_sides(part, lambda: measured(program, points[:1]))
+        if up.same(down):
+            continue
+        width, here = 2 * part.step, measured(program, points)
+        up, down = on_both_sides(part, lambda: measured(program, points))
+        of_mean = found.of_mean((here.shift(up) - here.shift(down)) * at.sharpness / width)
+        of_spread = found.of_spread((up.spread[0] / down.spread[0]).log() / width)
+        scores[:, index] = of_mean + of_spread + (_of_tails(here, up, at) - _of_tails(here, down, at)) / width
+    return scores
 
 
 def _by_row(program: Program, data: Trajectories, **along: Tensor) -> dict[str, Tensor]:

@@ -67,7 +67,10 @@ def discovery_picture(found: Discovery) -> Figure:
         gains(found, above)
         open_loop_picture(found.proof, axes=below)
         titled(below, "predictions of the validation drives", below.get_xlabel())
-        (curve_panel if found.shape else coefficients)(found, right.subplots())
+        if found.shape:
+            unknown_effect(found, axes=right.subplots())
+        else:
+            coefficients(found, right.subplots())
     else:
         left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
         tests(found, left)
@@ -200,17 +203,10 @@ def _of_test(tested: Tested) -> list[GainRow]:
 
 def _in_limits(variant: Variant, values: np.ndarray, ends: np.ndarray, limits: np.ndarray, color: str) -> list[GainRow]:
     """A line for each component: its value and interval `(k, 2)` over its detection limit."""
-    parts = variant.effect.components
-    return [
-        GainRow(
-            f"{_label(variant)} {parts[i]}" if parts else _label(variant),
-            value / limit,
-            (low / limit, high / limit),
-            color,
-            _with_unit(limit, variant),
-        )
-        for i, (value, (low, high), limit) in enumerate(zip(values, ends, limits, strict=True))
-    ]
+    label = _label(variant)
+    labels = [f"{label} {part}" for part in variant.effect.components] or [label] * len(values)
+    rows = zip(labels, values / limits, ends / limits[:, None], limits, strict=True)
+    return [GainRow(name, value, (low, high), color, _with_unit(at, variant)) for name, value, (low, high), at in rows]
 
 
 def _with_unit(limit: float, variant: Variant) -> str:
@@ -231,10 +227,19 @@ def _point(axes: Axes, row: GainRow, place: float, hollow: bool = False) -> None
     axes.plot(row.value, place, "o", color=row.color, ms=5, mfc="none" if hollow else row.color)
 
 
-def curve_panel(found: Discovery, axes: Axes) -> Axes:
-    """The curve with its band, where the drives were, and greyed where they were not."""
+def unknown_effect(found: Discovery, *, axes: Axes | None = None) -> Axes:
+    """The curve that explains the drives where no effect of the catalogue does, with its band; grey where no drive was.
+
+    Raises:
+        UsageError: the verdict is another one: there is no curve.
+    """
     shape, chosen = found.shape, found.search.curve
-    assert shape is not None and chosen is not None and isinstance(chosen.refit, Refit)
+    if shape is None:
+        raise UsageError(f"there is no curve to draw: the verdict is {found.verdict}")
+    assert chosen is not None and isinstance(chosen.refit, Refit)
+    import matplotlib.pyplot as plt
+
+    axes = axes if axes is not None else plt.subplots(figsize=(6, 4), layout="constrained")[1]
     points, heights, band = (np.array(values) for values in (shape.points, shape.curve, shape.band))
     program = found.before.program
     values = np.concatenate([_visited(program, chosen.variant, fold) for fold in chosen.refit.folds])
@@ -280,16 +285,3 @@ def _visited(program: Program, variant: Variant, fold: Fold) -> np.ndarray:
     mean = channel_means(program, program.transition, *given, data.steps / program.substeps)
     values = variables(program, *given, mean)[variant.options["variable"]]
     return values.expand(data.transitions.shape)[data.transitions].double().numpy(force=True)
-
-
-def unknown_effect(found: Discovery, *, axes: Axes | None = None) -> Axes:
-    """The curve that explains the drives where no effect of the catalogue does, with its band.
-
-    Raises:
-        UsageError: the verdict is another one: there is no curve.
-    """
-    if found.shape is None:
-        raise UsageError(f"there is no curve to draw: the verdict is {found.verdict}")
-    import matplotlib.pyplot as plt
-
-    return curve_panel(found, axes if axes is not None else plt.subplots(figsize=(6, 4), layout="constrained")[1])

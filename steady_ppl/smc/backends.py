@@ -22,36 +22,22 @@ from steady_ppl.smc.resampling import by_component, take
 
 
 class Stepping:
-    """The program's own lines, through Pyro.
-
-    Args:
-        program: the state-space model.
-        data: as returned by `for_program`.
-        observation_weight: tempers the observations' log-density; `(B,)` for one a trajectory.
-
-    Attributes:
-        event_dims: event dimension of each site of `transition`, known after the first.
-    """
+    """The program's own lines, through Pyro; its arguments are those of `smc.filter.particle_filter`."""
 
     def __init__(self, program: Program, data: Trajectories, observation_weight: float | Tensor) -> None:
         self.program, self.data, self.observation_weight = program, data, observation_weight
         self.steps, self.elapsed, self.controls = data.steps, data.elapsed, acting_controls(program, data)
-        self.event_dims: dict[str, int] = {}
+        self.event_dims: dict[str, int] = {}  # of each site of `transition`, known after the first
 
     def transition(
         self, row: int, state: Tensor, ancestors: Tensor | None, noise: Tensor | None
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Move on by one interval.
+        """Move states `(N, B, D)` on from a row: the next ones, and each site's values `(N, B, ...)`, which with
+        several substeps are in standard deviations (see `substeps.channel_values`).
 
         Args:
-            row: the interval's first row.
-            state: `(N, B, D)`.
-            ancestors: `(N, B)`, which of these move on; None: each.
+            ancestors: `(N, B)`, which of the states move on; None: each.
             noise: `(N, B, C)`, in standard deviations of the channels; None: drawn by the program.
-
-        Returns:
-            The next states `(N, B, D)` and each site's values `(N, B, ...)`; with several substeps these are in
-            standard deviations, see `substeps.channel_values`.
         """
         if ancestors is not None:
             state = take(state, ancestors)
@@ -106,10 +92,8 @@ class _Methods:
             advance(program, first, *inputs.values())
         self.event_dims = event_dims(seen)
         self.sizes = {site: value.numel() for site, value in seen.values.items()}
-        self.channels, self.width = sum(self.sizes.values()), state.shape[-1]
-        self.held = program.substeps > 1
-        values = 0 if self.held else self.channels
-        self.results = self.width + values
+        self.channels, self.width, self.held = sum(self.sizes.values()), state.shape[-1], program.substeps > 1
+        self.results = self.width + (0 if self.held else self.channels)
 
         def transition(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Any:
             with running(*one), Recording() as recording, Standardised(noise):

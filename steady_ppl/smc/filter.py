@@ -36,12 +36,9 @@ class Proposal:
     """The program's own noise: the bootstrap filter (Gordon, Salmond and Smith 1993).
 
     A subclass draws the noise itself. Its log ratios enter the weights, and it may resample at every row.
-
-    Attributes:
-        looks_ahead: whether weights know of later measurements, at measured rows and at others.
     """
 
-    looks_ahead = False
+    looks_ahead = False  # whether weights know of later measurements, at measured rows and at others
 
     def start(self, particles: int) -> tuple[Tensor | None, Tensor | float]:
         """The standard normal noise of `initial`, `(N, B, C)`, and its log density less that of the proposal, `(N, B)`;
@@ -58,47 +55,28 @@ class Proposal:
 
 
 class FilterState(NamedTuple):
-    """The particles that have come to a row, whose measurements they have yet to meet; at the end, the last row's.
+    """The particles that have come to a row, whose measurements they have yet to meet; at the end, the last row's."""
 
-    Attributes:
-        states: `(N, B, D)`.
-        log_weights: `(N, B)` in double precision. Their exponentials sum to one, unless a proposal's ratio has entered.
-        roots: `(N, B)`, the first row's particle that each descends from.
-        evidence: log p(y_t | y_0 … y_{t-1}) of every row before, `(B,)` each; with a lookahead these telescope.
-    """
-
-    states: Tensor
-    log_weights: Tensor
-    roots: Tensor
-    evidence: tuple[Tensor, ...] = ()
-
-    @property
-    def log_likelihood(self) -> Tensor:
-        """The estimate of log p(y) so far, `(B,)`."""
-        return torch.stack(self.evidence).sum(0) if self.evidence else torch.zeros_like(self.log_weights[0])
+    states: Tensor  # (N, B, D)
+    log_weights: Tensor  # (N, B) double; their exponentials sum to one until a proposal's ratio enters
+    roots: Tensor  # (N, B), the first row's particle that each descends from
 
 
 class Step(NamedTuple):
-    """What a filter did at a row.
+    """What a filter did at a row."""
 
-    Attributes:
-        effective_sizes: `(B,)` ESS once the row is weighed; N where nothing was weighed.
-        blown_up: `(B,)` how many weights were not numbers; they count as zero.
-        ancestors: `(N, B)`, the particles that move on; None: each.
-        noise: value of each site of `transition` from this row, `(N, B, ...)`; empty at the last row.
-    """
-
-    effective_sizes: Tensor
-    blown_up: Tensor
-    ancestors: Tensor | None
-    noise: dict[str, Tensor]
+    evidence: Tensor  # (B,), log p(y_t | y_0 … y_{t-1}), whose sum is log p(y); looking ahead, these telescope
+    effective_sizes: Tensor  # (B,) ESS once the row is weighed; N where nothing was weighed
+    blown_up: Tensor  # (B,) how many weights were not numbers; they count as zero
+    ancestors: Tensor | None  # (N, B), the particles that move on; None: each
+    noise: dict[str, Tensor]  # value of each site of `transition` from this row, (N, B, ...); empty at the last row
 
 
 class _Weighed(NamedTuple):
-    """Particles with a row's measurements in their weights: `weights` `(N, B)` sum to one and know of the `future`."""
+    """Particles with a row's measurements in their weights."""
 
     log_weights: Tensor
-    weights: Tensor
+    weights: Tensor  # (N, B), sum to one and know of the `future`
     future: Tensor | None
     evidence: Tensor
     effective_sizes: Tensor
@@ -109,16 +87,11 @@ class ParticleFilter:
     """A particle filter that goes through a table row by row: `init`, then a `step` a row, under `torch.no_grad()`.
 
     Its arguments are those of `particle_filter`.
-
-    Attributes:
-        start: the sites of `initial`, known after `init`.
-        stepping: how the program's methods run, known after `init`.
-        in_plain_torch: why no kernels serve; None where they do or were not asked for.
     """
 
-    start: Recording
-    stepping: Stepping
-    in_plain_torch: str | None = None
+    start: Recording  # the sites of `initial`, known after `init`
+    stepping: Stepping  # how the program's methods run, known after `init`
+    in_plain_torch: str | None = None  # why no kernels serve; None where they do or were not asked for
 
     def __init__(
         self,
@@ -144,8 +117,7 @@ class ParticleFilter:
         self.bootstrap = type(self.proposal) is Proposal
         self.kernels = particles * data.time.numel() >= STEPS_WORTH_COMPILING if kernels is None else kernels
         self.last, self.left = len(data.time) - 1, torch.Size((particles, 1, len(data)))
-        self.inside = data.rows
-        self.ended = (~self.inside).any(1).tolist()  # rows past a trajectory's end
+        self.inside, self.ended = data.rows, (~data.rows).any(1).tolist()  # rows past a trajectory's end
         self.observed = data.observed.any(-1).any(-1).tolist()
 
     def init(self) -> FilterState:
@@ -154,7 +126,7 @@ class ParticleFilter:
         Raises:
             ProgramError: a known start, and `initial` returns another state than the one that it samples.
         """
-        program, data, trajectories = self.program, self.data, self.left[-1]
+        program, data = self.program, self.data
         noise, log_ratio = (None, 0.0) if self.known_start else self.proposal.start(self.particles)
         drawing = KnownStart(data.known_start) if self.known_start else _given(noise)
         with running(*self.left), Recording() as self.start, drawing:
@@ -167,30 +139,26 @@ class ParticleFilter:
         self.stepping = Stepping(program, data, self.observation_weight)
         if self.kernels and self.last > 0:
             self.stepping, self.in_plain_torch = stepping_for(self.stepping, states)
-        even = states.new_full((trajectories, self.particles), -math.log(self.particles), dtype=torch.float64).t()
-        self._unmoved = torch.arange(self.particles, device=states.device).expand(trajectories, -1).t()
-        self._none, self._all = even.new_zeros(trajectories), even.new_full((trajectories,), float(self.particles))
+        size = (len(data), self.particles)
+        even = states.new_full(size, -math.log(self.particles), dtype=torch.float64).t()
+        self._unmoved = torch.arange(self.particles, device=states.device).expand(size).t()
+        self._none, self._all = even.new_zeros(len(data)), even.new_full(size[:1], float(self.particles))
         return FilterState(states=states, log_weights=even + log_ratio, roots=self._unmoved)
 
     def step(self, state: FilterState, row: int) -> tuple[FilterState, Step]:
-        """Weigh the particles at a row, resample those trajectories that need it, and move on to the next row.
-
-        Args:
-            state: of this row.
-            row: in 0 … T; after the last one nothing moves.
-        """
+        """Weigh the particles at a row 0 … T, resample those trajectories that need it, and move on to the next row."""
         weighed = self._weigh(state, row)
-        log_weights, roots, ancestors = weighed.log_weights, state.roots, None
+        states, log_weights, roots = state.states, weighed.log_weights, state.roots
+        ancestors, noise = None, dict[str, Tensor]()
         if row < self.last:
             log_weights, roots, ancestors = self._resample(weighed, roots)
         if self.on_frame is not None:
-            self.on_frame(row, state.states, state.log_weights, weighed.log_weights)
-        states, noise = state.states, dict[str, Tensor]()
+            self.on_frame(row, states, state.log_weights, weighed.log_weights)
         if row < self.last:
             states, log_weights, noise = self._move(row, states, log_weights, ancestors)
         return (
-            FilterState(states, log_weights, roots, (*state.evidence, weighed.evidence)),
-            Step(weighed.effective_sizes, weighed.blown_up, ancestors, noise),
+            FilterState(states, log_weights, roots),
+            Step(weighed.evidence, weighed.effective_sizes, weighed.blown_up, ancestors, noise),
         )
 
     def _weigh(self, state: FilterState, row: int) -> _Weighed:
@@ -251,7 +219,7 @@ def particle_filter(
     kernels: bool | None = None,
     on_frame: OnFrame | None = None,
 ) -> Filtered:
-    """Run the program as a particle filter on every trajectory at once.
+    """Run the program as a particle filter on every trajectory at once; with `keep_history` its genealogy is returned.
 
     Args:
         program: the state-space model.
@@ -267,9 +235,6 @@ def particle_filter(
         kernels: run compiled methods where they can serve; None: if there is enough to do, see `STEPS_WORTH_COMPILING`.
         on_frame: called at every row with (row, states `(N, B, D)`, log-weights before, log-weights after), `(N, B)`;
             not when looking ahead.
-
-    Returns:
-        The estimate of log p(y) and, with `keep_history`, the genealogy.
 
     Raises:
         FilterError: every weight is zero; names trajectory and time.
@@ -293,13 +258,13 @@ def particle_filter(
             history.append(state.states)
         state, step = along.step(state, row)
         steps.append(step if keep_history else step._replace(ancestors=None, noise={}))
-    blown_up = torch.stack([step.blown_up for step in steps])
-    _raise_if_broken(program, torch.stack(state.evidence), blown_up, data)
+    evidence, sizes, blown_up = (torch.stack(values) for values in zip(*(step[:3] for step in steps), strict=True))
+    _raise_if_broken(program, evidence, blown_up, data)
     start, left, dims = along.start, along.left, event_dims(along.start)
     return Filtered(
-        log_likelihood=state.log_likelihood,
+        log_likelihood=evidence.sum(0),
         log_weights=state.log_weights,
-        effective_sizes=torch.stack([step.effective_sizes for step in steps]),
+        effective_sizes=sizes,
         roots=torch.zeros_like(state.log_weights).scatter_(0, state.roots, 1.0).sum(0),
         blown_up=blown_up.sum(0),
         states=history,

@@ -7,12 +7,15 @@ on average. Systematic resampling takes one uniform a trajectory, stratified one
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from collections.abc import Callable
 
 import numpy as np
 import torch
 from numba import njit
 from torch import Tensor
+
+Resampler = Callable[[Tensor, int], Tensor]
+"""Of normalised weights `(N, B)` and a number of draws: indices `(draws, B)` in 0 … N − 1, in ascending order."""
 
 
 def normalise(log_weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -29,34 +32,20 @@ def effective_sample_size(weights: Tensor) -> Tensor:
     return weights.square().sum(0).reciprocal()
 
 
-class Resampler(Protocol):
-    """Draws particles in proportion to their weights."""
-
-    def __call__(self, weights: Tensor, draws: int, /) -> Tensor:
-        """Indices `(draws, B)` in 0 … N − 1, in ascending order, by normalised weights `(N, B)`."""
-
-
 def systematic(weights: Tensor, draws: int, uniform: Tensor | None = None) -> Tensor:
     """Systematic resampling in O(N): particle i is drawn floor or ceiling of `draws · w_i` times.
 
     The number of offspring up to particle i is ⌈draws · (w_1 + … + w_i) − u⌉, one u a trajectory
     (Kitagawa 1996; Chopin and Papaspiliopoulos 2020, section 9.6). Sums are taken in double precision.
 
-    Args:
-        weights: `(N, B)`, normalised.
-        draws: how many to draw for each trajectory.
-        uniform: `(B,)` in [0, 1); drawn when not given.
-
-    Returns:
-        `(draws, B)` indices in 0 … N − 1, in ascending order.
+    `uniform` is `(B,)` in [0, 1), and drawn when not given. See `Resampler` for the other shapes.
     """
-    trajectories, device = weights.shape[1], weights.device
     if uniform is None:
-        uniform = torch.rand(trajectories, dtype=torch.float64, device=device)
+        uniform = torch.rand(weights.shape[1], dtype=torch.float64, device=weights.device)
     by_trajectory = weights.t().to(torch.float64)
-    if device.type != "cpu":
+    if weights.device.type != "cpu":
         return systematic_in_parallel(by_trajectory, draws, uniform).t()
-    chosen = torch.empty(trajectories, draws, dtype=torch.int64)
+    chosen = torch.empty(weights.shape[1], draws, dtype=torch.int64)
     _systematic(by_trajectory.contiguous().numpy(), uniform.contiguous().numpy(), chosen.numpy())
     return chosen.t()
 
@@ -75,8 +64,7 @@ def _systematic(weights: np.ndarray, uniform: np.ndarray, chosen: np.ndarray) ->
         for i in range(particles):
             first[born] = i  # the next particle takes the place where this one has no offspring: no branch
             cumulative += weights[b, i]
-            share = cumulative / total
-            # all, also for u within rounding of 1
+            share = cumulative / total  # where it is one all are born, also for u within rounding of one
             until = math.ceil(share * draws - uniform[b]) if share < 1 else draws
             born = max(born, until)
         if born < draws:  # where a weight is not a number: the filter says so at its end
@@ -133,15 +121,7 @@ def _shares(weights: Tensor) -> Tensor:
 
 
 def take(values: Tensor, index: Tensor) -> Tensor:
-    """The particles `index` of each trajectory.
-
-    Args:
-        values: `(N, B)` or `(N, B, ...)`.
-        index: `(M, B)` in 0 … N − 1.
-
-    Returns:
-        `(M, B)` or `(M, B, ...)`, laid out component by component.
-    """
+    """The particles `index`, `(M, B)`, of each trajectory's `values`, `(N, B, ...)`, stored component by component."""
     components = values.flatten(2).permute(2, 1, 0) if values.dim() > 2 else values.t().unsqueeze(0)
     taken = components.gather(2, index.t().expand(len(components), -1, -1))
     return taken.permute(2, 1, 0).reshape(*index.shape, *values.shape[2:])

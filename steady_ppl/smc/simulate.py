@@ -48,15 +48,15 @@ def simulate(
     """
     with seeded(seed, "simulate"):
         if like is None:
-            rows, count = round(program.duration / program.step) + 1, trajectories or 1
-            time = (torch.arange(rows, dtype=torch.float64) * program.step)[:, None].repeat(1, count)
-            measurements = time.new_zeros((rows, count, len(program.measurements)))
+            rows, drives = round(program.duration / program.step) + 1, trajectories or 1
+            time = (torch.arange(rows, dtype=torch.float64) * program.step)[:, None].repeat(1, drives)
+            measurements = time.new_zeros((rows, drives, len(program.measurements)))
             like = Trajectories(
                 time=time,
                 controls=_example_controls(program, time),
                 measurements=measurements,
                 observed=torch.ones_like(measurements, dtype=torch.bool),
-                lengths=torch.full((count,), rows),
+                lengths=torch.full((drives,), rows),
                 control_names=program.control_names,
                 measurement_names=program.measurement_names,
                 state_names=program.state_names,
@@ -66,8 +66,7 @@ def simulate(
         rows, drives = run.time.shape
         with running(1, drives):
             start = broadcast_event(program.initial(), torch.Size((1, drives)), 1)
-        states = [start]
-        over_time = (acting_controls(program, run)[:-1], run.elapsed[:-1], run.steps)
+        states, over_time = [start], (acting_controls(program, run)[:-1], run.elapsed[:-1], run.steps)
         with stages(*[("", 1)] * (rows - 1)) as begin:
             for state in roll_out(program, start, *(values.unsqueeze(1) for values in over_time)):
                 begin()

@@ -23,27 +23,16 @@ NUMBERS = {"step": WHOLE, "history": [{"step": NUMBER}], "kept_step": WHOLE, "be
 
 @dataclass
 class Checkpoint:
-    """The state of a training run besides its optimiser.
+    """The state of a training run besides its optimiser."""
 
-    Attributes:
-        step: E steps done.
-        history: one entry a validation.
-        parameters: the live parameters of program and guide.
-        averaged: the running mean of the program's parameters.
-        kept: the averaged parameters that would be returned now, empty before the first validation.
-        kept_step: the step that they are from.
-        best_held_out: the best held-out log p(y) so far, one a trajectory.
-        memory: what the guide begins its next E step from.
-    """
-
-    step: int
-    history: list[dict[str, float]]
-    parameters: Mapping[str, Tensor]
-    averaged: dict[str, Tensor]
-    kept: dict[str, Tensor]
-    kept_step: int = 0
-    best_held_out: list[float] = field(default_factory=list)
-    memory: dict[str, Tensor] = field(default_factory=dict)
+    parameters: Mapping[str, Tensor]  # the live ones of program and guide
+    averaged: dict[str, Tensor]  # the running mean of the program's
+    memory: dict[str, Tensor]  # what the guide begins its next E step from
+    step: int = 0  # E steps done
+    history: list[dict[str, float]] = field(default_factory=list)  # one entry a validation
+    kept: dict[str, Tensor] = field(default_factory=dict)  # averaged ones to return; empty before the first validation
+    kept_step: int = 0  # that they are from
+    best_held_out: list[float] = field(default_factory=list)  # log p(y), one a trajectory
 
 
 def write_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimizer) -> None:
@@ -62,7 +51,7 @@ def read_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimi
         RunError: the file is missing, damaged, or of another program.
     """
     tensors, text = read_tensors(path)
-    groups: dict[str, dict[str, Tensor]] = {group: {} for group in (*GROUPS, "optimizer")}
+    groups = {group: dict[str, Tensor]() for group in (*GROUPS, "optimizer")}
     for key, value in tensors.items():
         group, _, name = key.partition("/")
         if group not in groups:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -40,11 +40,9 @@ class Guide(Protocol):
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
         """The E step, outside the gradient; returns figures for the log."""
-        ...
 
     def __call__(self, data: Trajectories) -> None:
         """Sample the sites of `Joint`."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -162,30 +160,25 @@ def train(
     joint = Joint(program, known_start=known_start)
     elbo = Trace_ELBO(num_particles=guide.draws, vectorize_particles=guide.draws > 1, max_plate_nesting=2)
     parameters: dict[str, Tensor] = dict(program.named_parameters())
-    optimizer = torch.optim.AdamW(_groups(program, guide, optimization), betas=optimization.betas)
+    own = dict(guide.named_parameters(prefix="guide")) if isinstance(guide, nn.Module) else {}
+    optimizer = torch.optim.AdamW(_groups(program, guide, own.values(), optimization), betas=optimization.betas)
     full_rates = [group["lr"] for group in optimizer.param_groups]
     state = Checkpoint(
-        step=0,
-        history=[],
-        parameters={**parameters, **_guide_parameters(guide)},
+        parameters=parameters | own,
         averaged={name: value.detach().clone() for name, value in parameters.items()},
-        kept={},
         memory=getattr(guide, "memory", {}),
     )
     if resume and checkpoint is not None:
         read_checkpoint(checkpoint, state, optimizer)
     elif checkpoint is not None:
         write_checkpoint(checkpoint, state, optimizer)
-    batch = optimization.batch or len(data)
+    batch, interrupted = optimization.batch or len(data), False
+    patience = optimization.patience * optimization.validate_every
     shows_bar = progress and sys.stderr.isatty()
     bar = tqdm(total=optimization.steps, initial=state.step, disable=not shows_bar, file=sys.stderr, unit="step")
-    figures: dict[str, float] = {}
-    interrupted = False
     with bar, pyro.settings.context(module_local_params=True), pyro.validation_enabled(False):
         try:
-            while state.step < optimization.steps and (
-                state.step - state.kept_step < optimization.patience * optimization.validate_every
-            ):
+            while state.step < optimization.steps and state.step - state.kept_step < patience:
                 with seeded(seed, "step", state.step):
                     part = data if batch >= len(data) else data.subset(torch.randperm(len(data))[:batch])
                     figures = guide.refresh(part, state.step / optimization.steps)
@@ -273,14 +266,8 @@ def _copy(values: Mapping[str, Tensor], parameters: Mapping[str, Tensor]) -> Non
         parameters[name].copy_(value)
 
 
-def _guide_parameters(guide: Guide) -> dict[str, nn.Parameter]:
-    if not isinstance(guide, nn.Module):
-        return {}
-    return {f"guide.{name}": value for name, value in guide.named_parameters()}
-
-
-def _groups(program: Program, guide: Guide, optimization: Optimization) -> list[dict[str, Any]]:
-    """One parameter group each, with the program's own relative rates and decays."""
+def _groups(program: Program, guide: Guide, own: Iterable[Tensor], optimization: Optimization) -> list[dict[str, Any]]:
+    """One parameter group each, with the program's own relative rates and decays; those of the guide are its `own`."""
 
     def relative(table: Any, name: str) -> float:
         return next((factor for start, factor in table.items() if name.startswith(start)), 1.0)
@@ -292,7 +279,6 @@ def _groups(program: Program, guide: Guide, optimization: Optimization) -> list[
         rate = optimization.learning_rate * relative(program.rates, name)
         groups.append({"params": [value], "lr": rate, "weight_decay": decay})
     rate = optimization.learning_rate * getattr(guide, "rate", 1.0)
-    own = _guide_parameters(guide).values()
     return [*groups, *({"params": [value], "lr": rate, "weight_decay": 0.0} for value in own)]
 
 
@@ -350,12 +336,10 @@ class Validation:
             return cls(None, known_start=known_start)
         data = for_program(program, table)
         reason = why_not_linear(program, data, known_start=known_start)
-        usual = 100 if reason is None else 2000
-        count = usual if particles is None else particles
+        ahead = reason is None
+        count = (100 if ahead else 2000) if particles is None else particles
         require(count >= 1, "validation_particles", count, "at least 1")
-        if reason is not None:
-            return cls(data, count, known_start, reason=reason)
-        return cls(data, count, known_start, every=1, look_ahead=True)
+        return cls(data, count, known_start, every=1 if ahead else 10, look_ahead=ahead, reason=reason)
 
     def __call__(self, program: Program, seed: int) -> list[float]:
         """Log p(y) of each held-out trajectory."""
@@ -367,14 +351,12 @@ class Validation:
 
 
 def as_good(candidate: Sequence[float], best: Sequence[float]) -> bool:
-    """Whether held-out log p(y) is no worse than the best, up to one standard error of the paired difference.
+    """Whether held-out log p(y), of each drive or empty, is no worse than the best, up to one standard error of the
+    paired difference (the rule of Breiman et al. 1984, towards the later instead of the smaller model).
 
     Log p(y) at 1 Hz hardly feels how wide the process noise is; its differences late in a training are smaller than
     what the choice of held-out drives moves. Among equals the later parameters have seen more of the full observation
-    weight (the one-standard-error rule of Breiman et al. 1984, towards the later instead of the smaller model).
-
-    Args:
-        candidate, best: log p(y) of each held-out trajectory; empty when nothing is held out.
+    weight.
     """
     if not candidate or not best:
         return True

@@ -30,7 +30,7 @@ from steady_ppl.plotting import (
     posterior_velocities,
 )
 from steady_ppl.plotting.check import innovations
-from steady_ppl.plotting.posterior import forecast_band
+from steady_ppl.plotting.fit import forecast_band
 
 
 @pytest.fixture(scope="module")

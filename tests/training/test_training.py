@@ -460,7 +460,7 @@ def test_steady_learns_the_maximum_likelihood_estimate_of_the_cart():
 
 def test_a_checkpoint_of_other_validation_drives_is_refused():
     with pytest.raises(RunError, match=r"it knows 2 held-out log p\(y\), and there are 1"):
-        _judge(Checkpoint(4, [], {}, {}, {}, best_held_out=[1.0, 2.0]), [1.5], {})
+        _judge(Checkpoint({}, {}, {}, step=4, best_held_out=[1.0, 2.0]), [1.5], {})
 
 
 def test_gradients_are_scaled_down_to_their_norm(data, monkeypatch):
