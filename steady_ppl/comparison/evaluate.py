@@ -314,9 +314,8 @@ def measurement_errors(program: Program, data: Trajectories, *, particles: int, 
 
 def _totals(problem: Problem, particles: int, horizons: dict[str, int]) -> dict[str, tuple[float, float]]:
     """Error → its sum over measured cells, and how many they are."""
-    program, data = problem.program, problem.data
-    squares, covered, count = 0.0, 0.0, 0.0
-    draws: list[Tensor] = []
+    program, data, known_start = problem.program, problem.data, problem.known_start
+    squares, covered, count, draws = 0.0, 0.0, 0.0, list[Tensor]()
 
     def on_frame(row: int, states: Tensor, before: Tensor, after: Tensor) -> None:
         nonlocal squares, covered, count
@@ -332,9 +331,7 @@ def _totals(problem: Problem, particles: int, horizons: dict[str, int]) -> dict[
         covered += float(((below > 0.05) & (below < 0.95))[observed].sum())
         count += float(observed.sum())
 
-    particle_filter(
-        program, data, particles=particles, known_start=problem.known_start, keep_history=False, on_frame=on_frame
-    )
+    particle_filter(program, data, particles=particles, known_start=known_start, keep_history=False, on_frame=on_frame)
     totals = {"one_step": (squares, count), "coverage_90": (covered, count)}
     filtered = torch.stack(draws, 1)
     for name, horizon in horizons.items():
