@@ -13,7 +13,6 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -39,8 +38,9 @@ class Tested:
     """A candidate's test: of its best column where it has several."""
 
     column: Column
+    place: slice  # of its numbers among those of all columns
     statistic: float  # the Lagrange multiplier; of a curve, with its prior
-    p_value: float  # of this candidate alone
+    p_values: np.ndarray  # of this candidate alone, on the drives and then on every simulated set, (1 + S,)
     coefficient: np.ndarray  # one scoring step from zero, (k,)
     sd: np.ndarray  # its standard deviation, (k,)
     detection_limit: np.ndarray  # found with 95 % power at the family-wise level, each number alone, (k,)
@@ -51,6 +51,11 @@ class Tested:
     departure: bool = False  # whether it says that a fitted σ is not the declared: there is nothing left to fit then
 
     @property
+    def p_value(self) -> float:
+        """Of this candidate alone, on the drives."""
+        return float(self.p_values[0])
+
+    @property
     def variant(self) -> Variant:
         """The effect."""
         return self.column.variant
@@ -59,6 +64,10 @@ class Tested:
     def is_curve(self) -> bool:
         """Whether it is no named effect."""
         return self.column.is_curve
+
+    def rank(self) -> tuple[float, float]:
+        """Small where much is found, also where p-values are too small to be told apart."""
+        return self.p_value, -self.statistic
 
 
 @dataclass(frozen=True)
@@ -103,7 +112,7 @@ def screen(
     groups = defaultdict[str, list[int]](list)
     for index, column in enumerate(columns):
         groups[CURVE if column.is_curve else column.variant.name].append(index)
-    tests, curves = list[_Test](), list[Tested]()
+    tests, curves = list[Tested](), list[Tested]()
     for members in groups.values():
         found = [_test(columns[i], places[i], projected, left, before) for i in members]
         alive = [test for test in found if test is not None]
@@ -112,13 +121,13 @@ def screen(
         else:
             why = CONTAINED if any(bool((before[places[i]] > 0).any()) for i in members) else UNEXCITED
             tests.append(_untestable(columns[members[0]], places[members[0]], why, len(scores)))
-        curves += [_best_of([test]).tested for test in alive if test.tested.is_curve]
+        curves += [_best_of([test]) for test in alive if test.is_curve]
     tests += [_departed(departure, information[own, own], scores[:, own]) for departure in departures]
-    tests.sort(key=_Test.rank)
+    tests.sort(key=Tested.rank)
     family = np.stack([test.p_values for test in tests]).min(0)
     critical = _critical(family[1:])
     return Screened(
-        tested=[replace(test.tested, detection_limit=_limit(test.tested, critical)) for test in tests],
+        tested=[replace(test, detection_limit=_limit(test, critical)) for test in tests],
         curves=sorted(curves, key=lambda test: -test.evidence),
         p_value=(1 + float((family[1:] <= family[0]).sum())) / len(family),
         critical=critical,
@@ -134,32 +143,19 @@ def _critical(simulated: np.ndarray) -> float:
     return float(np.nextafter(np.sort(simulated)[max(0, allowed)], 0.0))
 
 
-class _Test(NamedTuple):
-    """The test of one column, its place among all, and its p-values in every set, the drives' first."""
-
-    tested: Tested
-    place: slice
-    p_values: np.ndarray
-
-    def rank(self) -> tuple[float, float]:
-        """Small where much is found, also where p-values are too small to be told apart."""
-        return self.tested.p_value, -self.tested.statistic
-
-
-def _best_of(tests: list[_Test]) -> _Test:
+def _best_of(tests: list[Tested]) -> Tested:
     """The test of the best of several columns, corrected for how many independent tests they are like."""
-    best, effective = min(tests, key=_Test.rank), 1.0
-    smallest = np.stack([test.p_values for test in tests]).min(0)
+    effective, smallest = 1.0, np.stack([test.p_values for test in tests]).min(0)
     if len(tests) > 1:
         median = float(np.clip(np.median(smallest[1:]), 1e-6, 0.5))
         effective = max(1.0, math.log(0.5) / math.log1p(-median))
     together = -np.expm1(effective * np.log1p(-np.minimum(smallest, 1 - 1e-12)))
-    return _Test(replace(best.tested, p_value=float(together[0]), effective=effective), best.place, together)
+    return replace(min(tests, key=Tested.rank), p_values=together, effective=effective)
 
 
-def _untestable(column: Column, place: slice, why: str, sets: int) -> _Test:
+def _untestable(column: Column, place: slice, why: str, sets: int) -> Tested:
     nothing, endless = np.zeros(column.size), np.full(column.size, math.inf)
-    return _Test(Tested(column, 0.0, 1.0, nothing, endless, endless, untestable=why), place, np.ones(sets))
+    return Tested(column, place, 0.0, np.ones(sets), nothing, endless, endless, untestable=why)
 
 
 def _limit(tested: Tested, critical: float) -> np.ndarray:
@@ -173,7 +169,7 @@ def _limit(tested: Tested, critical: float) -> np.ndarray:
     return math.sqrt(needed) * tested.alone
 
 
-def _test(column: Column, place: slice, projected: Tensor, left: Tensor, before: Tensor) -> _Test | None:
+def _test(column: Column, place: slice, projected: Tensor, left: Tensor, before: Tensor) -> Tested | None:
     own, scores = left[place, place], projected[:, place]
     if column.is_curve:
         return _test_of_curve(column, place, scores, own) if bool((own.diagonal() > 0).any()) else None
@@ -184,13 +180,10 @@ def _test(column: Column, place: slice, projected: Tensor, left: Tensor, before:
     statistics = (scores * steps).sum(-1).numpy()
     p_values = special.chdtrc(column.size, statistics.clip(min=0))  # by rounding some are negative
     sd, alone = torch.linalg.inv(own).diagonal().sqrt().numpy(), own.diagonal().rsqrt().numpy()
-    coefficient = steps[0].numpy()
-    return _Test(
-        Tested(column, float(statistics[0]), float(p_values[0]), coefficient, sd, sd, alone=alone), place, p_values
-    )
+    return Tested(column, place, float(statistics[0]), p_values, steps[0].numpy(), sd, sd, alone=alone)
 
 
-def _test_of_curve(column: Column, place: slice, scores: Tensor, own: Tensor) -> _Test:
+def _test_of_curve(column: Column, place: slice, scores: Tensor, own: Tensor) -> Tested:
     """A score test against the prior (Liu, Lin and Ghosh 2007): a weighted sum of χ² of one degree of freedom, matched
     by a scaled χ² of the same mean and variance (Satterthwaite)."""
     covariance = prior_covariance(column.variant.effect)
@@ -202,22 +195,21 @@ def _test_of_curve(column: Column, place: slice, scores: Tensor, own: Tensor) ->
     scale, freedom = float(weights.square().sum() / weights.sum()), float(weights.sum() ** 2 / weights.square().sum())
     statistics = squares.sum(-1).numpy()
     posterior = torch.linalg.inv(own + torch.linalg.inv(covariance))
-    p_values = special.chdtrc(freedom, statistics / scale)
     sd = posterior.diagonal().sqrt().numpy()
-    tested = Tested(
+    return Tested(
         column,
+        place,
         float(statistics[0]),
-        float(p_values[0]),
+        special.chdtrc(freedom, statistics / scale),
         coefficient=(posterior @ scores[0]).numpy(),
         sd=sd,
         detection_limit=sd,
         evidence=0.5 * float(statistics[0]) - 0.5 * float(torch.log1p(values).sum()),
         alone=own.diagonal().rsqrt().numpy(),
     )
-    return _Test(tested, place, p_values)
 
 
-def _departed(departure: Departure, information: Tensor, scores: Tensor) -> _Test:
+def _departed(departure: Departure, information: Tensor, scores: Tensor) -> Tested:
     """A Wald test of the fitted noise against the declared."""
     ridge = 1e-10 * float(information.diagonal().max()) * torch.eye(len(information)).double()
     step = torch.linalg.solve(information + ridge, departure.slope)  # a vanished noise has no information
@@ -225,9 +217,8 @@ def _departed(departure: Departure, information: Tensor, scores: Tensor) -> _Tes
     z = torch.cat([torch.tensor([departure.away]).double(), scores[1:] @ step]).numpy() / sd
     p_values = 2 * special.ndtr(-np.abs(z))
     sds = np.array([sd * (math.sqrt(departure.share) * departure.factor)])
-    column, change = Column(departure.variant), np.array([departure.factor - 1])
-    tested = Tested(column, float(z[0] ** 2), float(p_values[0]), change, sds, sds, alone=sds, departure=True)
-    return _Test(tested, slice(0, 0), p_values)
+    column, nowhere, change = Column(departure.variant), slice(0, 0), np.array([departure.factor - 1])
+    return Tested(column, nowhere, float(z[0] ** 2), p_values, change, sds, sds, alone=sds, departure=True)
 
 
 def _alike(left: Tensor, places: Sequence[slice]) -> Tensor:
