@@ -19,7 +19,7 @@ from models.paper import (
     PaperTruck,
 )
 from steady_ppl import Fit, Trajectories, for_program, log_likelihood, seeded
-from steady_ppl.comparison.metrics import state_estimation
+from steady_ppl.comparison.evaluate import state_estimation
 from steady_ppl.errors import FilterError
 
 Settings = dict[str, Any]

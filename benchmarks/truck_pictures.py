@@ -23,7 +23,7 @@ from matplotlib.axes import Axes
 from truck_programs import learnt
 
 from steady_ppl import Program, Trajectories, for_program, roll_out
-from steady_ppl.comparison.metrics import forward_mean
+from steady_ppl.comparison.evaluate import forward_mean
 from steady_ppl.model.handlers import AtMean
 from steady_ppl.model.substeps import acting_controls
 

@@ -1,4 +1,1 @@
-"""Whether runs are better than another, and by how much: errors, scores and paired intervals on unused drives.
-
-Nothing here fits a program or draws a picture.
-"""
+"""Whether runs are better than another, and by how much: errors, scores and paired intervals on unused drives."""

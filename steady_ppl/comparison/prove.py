@@ -54,11 +54,10 @@ def prove(
 ) -> Proof:
     """Compare programs on drives: log p(y), open-loop errors, coverage, noise scales.
 
-    log p(y) is that of the linearised program, per trajectory; beside it stands what a particle filter of 200 particles
-    adds to it, which is near zero where it can be trusted. Errors are root mean squares of measured less predicted,
-    1, 3 and 10 s ahead of every row's filtered state, without noise and with the recorded controls, over the components
-    that share a unit; in state space where the x. columns are known, in the program's error groups. Only measurements
-    that every row predicts count.
+    log p(y) is that of the linearised program, per trajectory; what a particle filter adds to it is near zero where it
+    can be trusted. Errors are root mean squares of measured less predicted, 1, 3 and 10 s ahead of every row's filtered
+    state, without noise and with the recorded controls, over the components that share a unit; and of the program's
+    error groups where the x. columns are known. Only measurements that every row predicts count.
 
     Args:
         rows: name → program, best the one before first and the one after second; further ones such as the oracle's
@@ -83,7 +82,11 @@ def prove(
     """
     programs = {name: row.program if isinstance(row, Fit) else row for name, row in rows.items()}
     notes: list[str] = []
-    known_start = _start_of(rows, notes) if known_start is None else known_start
+    if known_start is None:
+        fitted = [row.known_start for row in rows.values() if isinstance(row, Fit)]
+        known_start = bool(fitted) and all(fitted)
+        if any(fitted) and not known_start:
+            notes.append("some rows were fitted with a known start and some without: all are judged without")
     reference = next(iter(programs), "") if reference is None else reference
     _require(programs, reference, truth, data)
     judged: dict[str, Judged] = {}
@@ -107,17 +110,8 @@ def prove(
     drives = before.problem.data
     horizons = named_horizons(drives, SECONDS)
     notes += drives.uneven_steps + diagnose_units(before.problem.program, drives)
-    notes += _few_starts(drives, horizons, known_start)
-    return Proof(
-        rows=found,
-        reference=reference,
-        horizons=horizons,
-        step=drives.median_step,
-        trajectories=len(data),
-        known_start=known_start,
-        seed=seed,
-        notes=notes + unfinished(rows) + _blown_up(found) + far_off(found, data),
-    )
+    notes += _few_starts(drives, horizons, known_start) + unfinished(rows) + _blown_up(found) + far_off(found, data)
+    return Proof(found, reference, horizons, drives.median_step, len(data), known_start, seed, notes)
 
 
 def _counted(judged: Iterable[Judged]) -> dict[int, Tensor]:
@@ -133,13 +127,6 @@ def unfinished(rows: Mapping[str, Program | Fit]) -> list[str]:
         for name, row in rows.items()
         if isinstance(row, Fit) and row.trained is not None and row.trained.still_rising is not None
     ]
-
-
-def _start_of(rows: Mapping[str, Program | Fit], notes: list[str]) -> bool:
-    fitted = [row.known_start for row in rows.values() if isinstance(row, Fit)]
-    if any(fitted) and not all(fitted):
-        notes.append("some rows were fitted with a known start and some without: all are judged without")
-    return bool(fitted) and all(fitted)
 
 
 def _require(programs: Mapping[str, Program], reference: str, truth: str | None, data: Trajectories) -> None:
@@ -177,10 +164,11 @@ def _few_starts(data: Trajectories, horizons: Mapping[str, int], known_start: bo
 
 
 def _blown_up(rows: Mapping[str, Row]) -> list[str]:
-    worst = {
-        name: [key for key, sums in row.sums.items() if not np.isfinite(sums.total).all()] for name, row in rows.items()
-    }
-    return [f"{name} blows up {min(key.horizon for key in keys)} rows ahead" for name, keys in worst.items() if keys]
+    notes = []
+    for name, row in rows.items():
+        if horizons := [key.horizon for key, sums in row.sums.items() if not np.isfinite(sums.total).all()]:
+            notes.append(f"{name} blows up {min(horizons)} rows ahead")
+    return notes
 
 
 def far_off(rows: Mapping[str, Row], data: Trajectories) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from steady_ppl.comparison.scores import BANDS, COVERAGE, RESAMPLES, Change, Key
 from steady_ppl.effects import attached
 from steady_ppl.model.program import error_groups
 from steady_ppl.utils.late import Displayed
-from steady_ppl.utils.text import aligned
+from steady_ppl.utils.text import aligned, number
 
 WIDTH, NAME = 100, 20
 FLOOR = "noise floor"
@@ -77,23 +78,21 @@ class Proof(Displayed):
         content = self.figures
         rows, horizons = content["rows"], list(content["horizons"])
         far = horizons[1:] or horizons
-        said = (
-            f"{self.trajectories} drives; differences are from {self.reference}, with {COVERAGE:.0%} intervals "
-            "bootstrapped over drives"
-        )
+        drives = f"{self.trajectories} drives; differences are from {self.reference}"
+        said = f"{drives}, with {COVERAGE:.0%} intervals bootstrapped over drives"
         lines = [*textwrap.wrap(content["verdict"], WIDTH), "", said, ""]
         bands = [name for name in BANDS if name in horizons]
         shown = [name if i else f"in 90 % band, {name}" for i, name in enumerate(bands)]
         header = ["", "log p(y) [nats]", "difference [nats]", "by particles", *shown]
-        lines += _table(header, [[row["row"], *_likely(row), *_covered(row, bands)] for row in rows])
+        lines += _table([header, *([row["row"], *_likely(row, bands)] for row in rows)])
         lines += ["", "root mean square error of predictions ahead, and by how much it differs"]
         units_of = {("measurement", of): of for of in rows[0]["measurement"]}
         units_of |= {("state", of): unit for of, unit in content["units"].items()}
         for (kind, of), unit in units_of.items():
             title = of if kind == "state" else "measured"
             header = [f"{title} [{unit}]" if unit else title, *far, *(f"{name}, differs" for name in far)]
-            cells = [[row["row"], *_errors(row[kind][of], row, kind, of, far)] for row in rows if of in row[kind]]
-            lines += [*_table(header, cells), ""] if cells else []
+            cells = [[row["row"], *_errors(row, kind, of, far)] for row in rows if of in row[kind]]
+            lines += [*_table([header, *cells]), ""] if cells else []
         lines += _scales([row for row in rows if row["row"] != FLOOR])
         for note in self.notes:
             lines += textwrap.wrap(f"note: {note}", WIDTH)
@@ -113,11 +112,7 @@ def units_of_states(found: Proof) -> dict[str, str]:
 def _against_reference(found: Proof, name: str) -> dict[str, Any] | None:
     if name in (found.reference, FLOOR):
         return None
-    return _by_key(found, {key: _plain(change) for key, change in changes(found, name).items()})
-
-
-def _plain(change: Change | None) -> dict[str, Any] | None:
-    return None if change is None else dict(vars(change))
+    return _by_key(found, {key: change and dict(vars(change)) for key, change in changes(found, name).items()})
 
 
 def _by_key(found: Proof, values: Mapping[Key, Any]) -> dict[str, Any]:
@@ -135,37 +130,25 @@ def _by_key(found: Proof, values: Mapping[Key, Any]) -> dict[str, Any]:
 
 def changes(found: Proof, name: str) -> dict[Key, Change | None]:
     """A row's figures less the reference's, at the horizons that have names."""
-    ours, theirs = found.rows[name].sums, found.rows[found.reference].sums
-    wanted = {0, *found.horizons.values()}
-    return {
-        key: paired(sums, theirs[key], seed=found.seed)
-        for key, sums in ours.items()
-        if key in theirs and key.horizon in wanted
-    }
-
-
-def judged_row(found: Proof) -> str:
-    """The row that the sentence is about: the last but those that only show what is possible."""
-    others = [name for name in found.rows if name != found.reference and name not in POSSIBLE]
-    return others[-1] if others else next(name for name in found.rows if name != found.reference)
+    theirs, wanted = found.rows[found.reference].sums, {0, *found.horizons.values()}
+    ours = {key: sums for key, sums in found.rows[name].sums.items() if key in theirs and key.horizon in wanted}
+    return {key: paired(sums, theirs[key], seed=found.seed) for key, sums in ours.items()}
 
 
 def verdict(found: Proof) -> str:
-    """One sentence on the last run that is not the reference."""
-    name = judged_row(found)
+    """One sentence on the last row but the reference and, if there are others, those that show what is possible."""
+    others = [name for name in found.rows if name != found.reference]
+    name = next((name for name in reversed(others) if name not in POSSIBLE), others[0])
     changed = changes(found, name)
     likely = changed[Key("log_likelihood", "", 0)]
     horizon = next(h for h in ("3 s", "1 s", "10 s", "one step") if h in found.horizons)
     errors = {key.of: change for key, change in changed.items() if key[::2] == ("measurement", found.horizons[horizon])}
-    parts = []
-    if likely is not None:
-        parts.append(f"log p(y) {with_interval(likely.difference, likely.interval, 1, ' nats a drive')}")
+    parts = [f"log p(y) {with_interval(likely.difference, likely.interval, 1, ' nats a drive')}"] if likely else []
     for of, change in errors.items():
-        differs = _differs(_plain(change))
         where = f" in {of}" if len(errors) > 1 and of else ""
-        if differs:
+        if differs := _differs(vars(change) if change else None):
             parts.append(f"{horizon.replace(' ', '-')} open-loop error{where} {differs}")
-    gained = _sign([likely]), -_sign(list(errors.values()))
+    gained = _sign([likely]), -_sign([*errors.values()])
     alone, between = JUDGED[gained if gained in JUDGED else (sum(gained), sum(gained))]
     added = _added(found.rows[found.reference], found.rows[name])
     said = f"Adding {added} {alone}" if added else f"{name} {between} {found.reference}"
@@ -173,7 +156,7 @@ def verdict(found: Proof) -> str:
 
 
 def _sign(found: Sequence[Change | None]) -> int:
-    signs = {change.sign for change in found if change is not None} - {0}
+    signs = {int(change.interval[0] > 0) - int(change.interval[1] < 0) for change in found if change} - {0}
     return signs.pop() if len(signs) == 1 else 0
 
 
@@ -191,21 +174,16 @@ def with_interval(value: float, interval: Sequence[float], digits: int, unit: st
     return f"{value:+.{digits}f}{unit} [{low}, {high}]".replace("-", "−")
 
 
-def _likely(row: Mapping[str, Any]) -> list[str]:
+def _likely(row: Mapping[str, Any], bands: Sequence[str]) -> list[str]:
     change = (row["against_reference"] or {}).get("log_likelihood")
     said = with_interval(change["difference"], change["interval"], 1) if change else ""
-    left = number(row["neglected"], "+.2f")
-    return [cell.replace("-", "−") for cell in (number(row["log_likelihood"], ".1f"), said, left)]
+    cells = [number(row["log_likelihood"], ".1f"), said, number(row["neglected"], "+.2f")]
+    cells += [number(row["coverage_90"].get(name), ".1%") for name in bands]
+    return [cell.replace("-", "−") for cell in cells]
 
 
-def _covered(row: Mapping[str, Any], bands: Sequence[str]) -> list[str]:
-    return [number(row["coverage_90"].get(name), ".1%") for name in bands]
-
-
-def _errors(
-    errors: Mapping[str, float | None], row: Mapping[str, Any], kind: str, of: str, horizons: Sequence[str]
-) -> list[str]:
-    against = (row["against_reference"] or {}).get(kind, {}).get(of, {})
+def _errors(row: Mapping[str, Any], kind: str, of: str, horizons: Sequence[str]) -> list[str]:
+    errors, against = row[kind][of], (row["against_reference"] or {}).get(kind, {}).get(of, {})
     return [number(errors.get(name), ".3g") for name in horizons] + [_differs(against.get(name)) for name in horizons]
 
 
@@ -229,30 +207,15 @@ def _scales(rows: Sequence[Mapping[str, Any]]) -> list[str]:
                 columns[label] = column
             before = column
     lines = [[row["row"], *(column[i] for column in columns.values())] for i, row in enumerate(rows)]
-    return _table(["noise σ", *columns], lines)
+    return _table([["noise σ", *columns], *lines])
 
 
-def number(value: float | None, form: str) -> str:
-    """A figure as text, a dash where there is none."""
-    return "–" if value is None else f"{value:{form}}"
-
-
-def _table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
-    """Aligned lines; columns that find no room go into a second table below."""
-    cut = [[_cut(line[0]), *line[1:]] for line in (header, *lines)]
-    widths = [max(map(len, column)) for column in zip(*cut, strict=True)]
-    kept, used = [0], widths[0]
-    for column, width in enumerate(widths[1:], 1):
-        if used + 2 + width > WIDTH and len(kept) > 1:
-            rest = [0, *range(column, len(widths))]
-            below = _table([header[i] for i in rest], [[line[i] for i in rest] for line in lines])
-            break
-        kept.append(column)
-        used += 2 + width
-    else:
-        below = []
-    return [*aligned([[line[i] for i in kept] for line in cut]), *(["", *below] if below else [])]
-
-
-def _cut(name: str) -> str:
-    return name if len(name) <= NAME else name[: NAME - 1] + "…"
+def _table(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Aligned rows, the header first; columns that find no room go into a second table below."""
+    cut = [[name if len(name) <= NAME else f"{name[: NAME - 1]}…", *cells] for name, *cells in rows]
+    ends = itertools.accumulate(2 + max(map(len, column)) for column in zip(*cut, strict=True))
+    room = max(2, sum(end - 2 <= WIDTH for end in ends))
+    lines = aligned([row[:room] for row in cut])
+    if room < len(cut[0]):
+        lines += ["", *_table([[row[0], *row[room:]] for row in rows])]
+    return lines

@@ -12,7 +12,7 @@ import torch
 from scipy import special
 from torch import Tensor
 
-from steady_ppl.comparison.metrics import has_truth, squared_errors
+from steady_ppl.comparison.evaluate import has_truth, squared_errors
 from steady_ppl.criticism.baselines import ConstantVelocity, constant_velocity
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, UsageError
@@ -37,12 +37,11 @@ Scales = dict[str, dict[str, float | None]]  # "channels" and "measurements" →
 
 
 class Key(NamedTuple):
-    """Which figure: kind is "log_likelihood", "coverage_90", "measurement" (of a unit) or "state" (of an error group);
-    horizon in rows, 0 for log p(y)."""
+    """Which figure."""
 
-    kind: str
-    of: str
-    horizon: int
+    kind: str  # log_likelihood, coverage_90, measurement or state
+    of: str  # the unit of measurements, the error group of states
+    horizon: int  # rows, 0 for log p(y)
 
 
 @dataclass(frozen=True)
@@ -65,10 +64,6 @@ class Sums:
             mean = (weights @ self.total) / (weights @ self.count)
         return np.sqrt(mean) if self.root else mean
 
-    def among(self, drives: np.ndarray) -> Sums:
-        """Of some drives."""
-        return Sums(self.total[drives], self.count[drives], self.root)
-
 
 @dataclass(frozen=True)
 class Change:
@@ -79,24 +74,17 @@ class Change:
     relative: float | None = None
     relative_interval: list[float] | None = None
 
-    @property
-    def sign(self) -> int:
-        """1 or −1 where the interval lies above or below zero, else 0."""
-        low, high = self.interval
-        return int(low > 0) - int(high < 0)
-
 
 def paired(ours: Sums, theirs: Sums, *, seed: int) -> Change | None:
-    """The difference between two figures of the same drives.
+    """The difference between two figures; None where fewer than 5 drives have them, or where it is not finite.
 
     The interval is between percentiles of the resampled differences, at levels that make it as wide as Student's for
     a mean of few drives (Hesterberg 2015, The American Statistician 69, section 5.3, the expanded percentile interval).
-    None where fewer than 5 drives have such a figure, or where it is not finite.
     """
     both = (ours.count > 0) & (theirs.count > 0)
     if both.sum() < MIN_DRIVES:
         return None
-    ours, theirs = ours.among(both), theirs.among(both)
+    ours, theirs = (replace(sums, total=sums.total[both], count=sums.count[both]) for sums in (ours, theirs))
     drives = int(both.sum())
     drawn = np.random.default_rng([seed, drives]).multinomial(drives, np.full(drives, 1 / drives), RESAMPLES)
     weights = np.concatenate([np.ones((1, drives)), drawn])
@@ -134,27 +122,18 @@ class Judged:
     states: dict[tuple[str, int], tuple[Tensor, Tensor]]
     """Error group and horizon → squared errors `(T + 1 − horizon, B)` and where the truth is known."""
     neglected: Tensor | str | None = None
-    """log p(y) by a particle filter less that of the linearised program, `(B,)` nats; why the filter broke down; None
-    where it was not run."""
+    """log p(y) by a particle filter, if it ran, less the linearised one, `(B,)` nats; or why the filter broke down."""
 
 
 def judge_program(
     name: str, program: Program, data: Trajectories, known_start: bool, seed: int, path: ReferencePath | None = None
 ) -> Judged:
-    """Find the paths from the measurements alone, unless one is given; predict, and compare.
-
-    Raises:
-        UsageError: the program cannot be linearised.
-        FilterError: the linearised program broke down.
-    """
+    """Find the paths from the measurements alone, unless one is given; predict, and compare; errors as of `prove`."""
     problem = Problem(program, for_program(program, data), known_start)
     unseen = problem.without_truth()
-    why = unseen.why_not_linear()
-    if why is not None:
-        raise UsageError(
-            f"{name}: prove needs programs that can be linearised: {why.split(': looking')[0]} "
-            "(`steady evaluate` takes any)"
-        )
+    if (why := unseen.why_not_linear()) is not None:
+        said = f"{name}: prove needs programs that can be linearised: {why.split(': looking')[0]}"
+        raise UsageError(f"{said} (`steady evaluate` takes any)")
     try:
         with seeded(seed, "prove"):
             ahead = unseen.find_and_smooth(path)
@@ -163,10 +142,9 @@ def judge_program(
     judged = judge(problem, ahead)
     try:
         with seeded(seed, "prove by particles"):
-            left = neglected(program, unseen.data, known_start=known_start, ahead=ahead)
+            return replace(judged, neglected=neglected(program, unseen.data, known_start=known_start, ahead=ahead))
     except FilterError as error:
         return replace(judged, neglected=str(error))
-    return replace(judged, neglected=left)
 
 
 def judge(problem: Problem, ahead: Lookahead, kernels: bool | None = None) -> Judged:
@@ -174,11 +152,10 @@ def judge(problem: Problem, ahead: Lookahead, kernels: bool | None = None) -> Ju
     program, data, unseen = problem.program, problem.data, problem.without_truth().data
     tracked = track(program, unseen, ahead.linearization.path, known_start=problem.known_start, kernels=kernels)
     named = named_horizons(data, SECONDS)
-    longest = max(named.values())
+    longest, states = max(named.values()), dict[tuple[str, int], tuple[Tensor, Tensor]]()
     horizons = {round(rows) for rows in np.geomspace(1, longest, DRAWN).tolist()} | set(named.values())
     bands = [named[name] for name in BANDS if name in named]
     predictions = predict(program, unseen, tracked, sorted(horizons), bands=bands)
-    states: dict[tuple[str, int], tuple[Tensor, Tensor]] = {}
     if data.states is not None and has_truth(data):
         for horizon, state in states_ahead(program, unseen, tracked, longest):
             if horizon in horizons:

@@ -20,7 +20,7 @@ from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction
 from steady_ppl.model.program import Program
 from steady_ppl.utils.late import Displayed
-from steady_ppl.utils.text import aligned
+from steady_ppl.utils.text import aligned, number
 
 SHOWN = 8  # findings in the table
 WHO = {
@@ -128,7 +128,7 @@ class Check(Displayed):
         for name, component in content["measurements"].items():
             for horizon, row in component["horizons"].items():
                 keys = ("rmse", "noise_floor", "constant_velocity", "last_measurement")
-                cells = ["–" if row[key] is None else f"{row[key]:.4g}" for key in keys]
+                cells = [number(row[key], ".4g") for key in keys]
                 label = f"{name} [{component['unit']}]" if component["unit"] else name
                 table.append([label, horizon, *cells, f"{row['coverage_90']:.1%}"])
         lines = [content["verdict"], "", *aligned(table, left=(0, 1))]

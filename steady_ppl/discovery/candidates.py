@@ -2,34 +2,25 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations, pairwise
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from steady_ppl.discovery.curves import curves
-from steady_ppl.discovery.effect_scores import Column, Simulated, columns_of, scores_along, simulate_scores
-from steady_ppl.discovery.refits import (
-    ALWAYS,
-    BY_LIKELIHOOD,
-    Fits,
-    Refit,
-    Threshold,
-    fit_near,
-    judged_fits,
-    refit_with,
-)
+from steady_ppl.discovery.effect_scores import Column, columns_of, scores_along, simulate_scores
+from steady_ppl.discovery.refits import ALWAYS, BY_LIKELIHOOD, Fits, Refit, Threshold, fit_near, judged_fits, refit_with
 from steady_ppl.discovery.screening import ALPHA, Screened, Tested, departures, screen
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.errors import FilterError
 from steady_ppl.likelihood.parameters import Element, elements
 from steady_ppl.likelihood.scores import measured, smoothed, typical_spreads
 from steady_ppl.model.program import Program
-from steady_ppl.utils.journal import Piece, piece
+from steady_ppl.utils.journal import piece
 from steady_ppl.utils.random import seeded
 
 LEADERS, ALIKE = 6, 0.85  # how many are refitted at least, and whose columns correlate so much with the first
@@ -74,8 +65,7 @@ class Candidate:
 
     @property
     def total(self) -> float:
-        """Held-out gain of all drives, nats, less `charge`; extrapolated where one fold was enough to see that it is
-        behind."""
+        """Held-out gain of all drives, nats, less `charge`; extrapolated where it was given up after one fold."""
         if self.is_judged or not isinstance(self.refit, Refit):
             return float(self.gain.sum()) - self.charge
         ahead = 0.0
@@ -85,16 +75,14 @@ class Candidate:
 
     @property
     def charge(self) -> int:
-        """Nats for what the drives that judge it have told as well: one for each knee and place, and for each number of
-        the coefficient of a noise that all folds have in common."""
+        """Nats for what the judging drives have told as well: each knee and place, and each number of common noise."""
         common = self.refit.in_common(self.variant) if isinstance(self.refit, Refit) else 0
         return len(self.variant.profiled) + common
 
     def significant(self, critical: float) -> bool:
         """Whether its own test reaches the family's level, or nearly does and its gain leaves no doubt.
 
-        Where the program's own fit has ended beside its best, anything that moves the other parameters gains; the test
-        does not see that.
+        The gain alone says little: beside a fit that ended short of its best, anything gains that moves the parameters.
         """
         if self.total > CLEAR_GAIN:
             return self.tested.p_value <= max(critical, NEAR_ALPHA)
@@ -104,20 +92,15 @@ class Candidate:
     def against_its_sign(self) -> bool:
         """Whether physics gives the coefficient the other sign: then it is a symptom, not an effect."""
         sign = self.variant.effect.sign
-        if not sign or not isinstance(self.refit, Refit):
-            return False
-        return sign * float(self.refit.coefficient(self.variant)) < 0
+        return bool(sign) and isinstance(self.refit, Refit) and sign * float(self.refit.coefficient(self.variant)) < 0
 
 
 @torch.no_grad()
 def screen_program(now: Refit, declared: Program, *, sets: int, seed: int, withheld: Sequence[str] = ()) -> Screening:
     """Test every candidate that a fitted program does not have, on the drives of its first fold.
 
-    Args:
-        now: the fitted program.
-        declared: as it was before it was fitted.
-        sets, seed: simulated sets.
-        withheld: names of effects that are left out of the catalogue.
+    `declared` is the program before it was fitted, `sets` counts the simulated ones, `withheld` names effects to leave
+    out.
     """
     program, fold = now.program, now.folds[0]
     problem, parts = fold.fitting(program), elements(program)
@@ -126,15 +109,10 @@ def screen_program(now: Refit, declared: Program, *, sets: int, seed: int, withh
     ahead = problem.smooth(fold.path, passes=3, tolerance=0.01)
     away = departures(declared, now, parts)
     away = [one for one in away if one.variant.name not in there and one.variant.effect.name not in withheld]
-    skip = there | {departure.variant.name for departure in away}
+    there |= {departure.variant.name for departure in away}
     tailed = bool(torch.isfinite(measured(program, fold.path.states[:1, :1]).freedom).any())  # Student t as it stands
-    variants = [
-        variant
-        for effect in catalogue(program)
-        if effect.name not in withheld and not (tailed and effect.form == "tails")
-        for variant in effect.variants(program, seen)
-        if variant.name not in skip
-    ]
+    effects = [e for e in catalogue(program) if e.name not in withheld and not (tailed and e.form == "tails")]
+    variants = [v for effect in effects for v in effect.variants(program, seen) if v.name not in there]
     spread, sharpness = typical_spreads(program, fold.drives, smoothed(ahead, fold.drives))
     columns = columns_of([*variants, *curves(program, seen, spread, sharpness)])
     observed = scores_along(problem, ahead, parts, columns)
@@ -145,23 +123,18 @@ def screen_program(now: Refit, declared: Program, *, sets: int, seed: int, withh
     if not fold.known_start:
         with seeded(seed, "starts"):
             starts = ahead.draws(sets)[1][:, 0].to(starts)
-
-    def simulate() -> Piece:
-        made = simulate_scores(problem, starts, parts, columns, seed=seed)
-        return {"scores": made.scores, "log_likelihood": made.log_likelihood}, {}
-
-    simulated = Simulated(**piece(simulate)[0])
-    information, first = {"": simulated.information[: len(parts), : len(parts)]}, len(parts)
+    simulated, _ = piece(lambda: ({"scores": simulate_scores(problem, starts, parts, columns, seed=seed)}, {}))
+    tests = screen(observed, simulated["scores"], len(parts), columns, away)
+    information, first = {"": tests.information[: len(parts), : len(parts)]}, len(parts)
     for column in columns:
         index = [*range(len(parts)), *range(first, first + column.size)]
-        information[_key(column)] = simulated.information[index][:, index]
+        information[_key(column)] = tests.information[index][:, index]
         first += column.size
-    return Screening(screen(observed, simulated, len(parts), columns, away), parts, information)
+    return Screening(tests, parts, information)
 
 
 def leaders(screened: Screened, first: bool) -> list[Tested]:
-    """Those to fit: all that are nearly significant in the first round, of the best few in later ones, and the aliases
-    of the first.
+    """Those to fit: all that are nearly significant, of the best few in later rounds, and the aliases of the first.
 
     How far behind a test is says little where much is missing: scores look one step ahead, and a drag of which they see
     a trace may be what holds everything else in its wrong place.
@@ -188,7 +161,7 @@ def fitted(now: Refit, tested: Tested, screening: Screening, threshold: Threshol
     if known is not None and tested.column.probe is None and now.fitting == BY_LIKELIHOOD:
         return fit(absent)  # scoring steps go from there as far as the likelihood rises
     candidate = fit(_start(tested))
-    lost = isinstance(candidate.refit, str) or gain_of_first_fold(now, candidate.refit) < 0
+    lost = isinstance(candidate.refit, str) or gain_of_fits(now, candidate.refit, folds=1) < 0
     return fit(absent) if lost and known is not None and tested.statistic > MIN_STATISTIC_TO_RETRY else candidate
 
 
@@ -202,14 +175,9 @@ def judged(now: Refit, tested: Tested, refit: Refit | str) -> Candidate:
     return Candidate(tested, refit, alone if given_up else refit.held_out - now.held_out, alone)
 
 
-def gain_of_first_fold(now: Fits, refit: Fits) -> float:
-    """Nats of log p(y) by which a fit explains better the drives that it was fitted to."""
-    return float((refit.maxima[0].log_likelihood - now.maxima[0].log_likelihood).sum())
-
-
-def gain_of_fits(now: Fits, refit: Fits) -> float:
-    """The same of the drives of every fold, each by the fit to it."""
-    pairs = zip(refit.maxima, now.maxima, strict=False)
+def gain_of_fits(now: Fits, refit: Fits, folds: int | None = None) -> float:
+    """Nats of log p(y) by which fits, of the first `folds` or all, explain better the drives they were fitted to."""
+    pairs = zip(refit.maxima[:folds], now.maxima, strict=False)
     return float(sum((one.log_likelihood - other.log_likelihood).sum() for one, other in pairs))
 
 
@@ -267,58 +235,44 @@ def variance_of_places(now: Refit, candidate: Candidate) -> Tensor:
     """What the uncertainty of knees, widths and places adds to the variance of a coefficient, `(k,)`.
 
     By the delta method along their profile likelihood, with a prior as wide as their grid. Where the program cannot be
-    fitted on either side of one, its coefficient is taken as uncertain by its own size. `now` is the program without
-    the candidate, which is fitted at its best place.
+    fitted on either side of one, its coefficient is as uncertain as it is large. `now` lacks the effect.
     """
     assert isinstance(candidate.refit, Refit)
     at, grid, near = candidate.variant, _grid(now, candidate), candidate.refit
     here, best = near.mean_coefficient(at).flatten().double(), gain_of_fits(now, near)
 
-    def fitted(variant: Variant) -> tuple[Tensor, float] | None:
-        """How the coefficient changes, and by how much the likelihood falls."""
+    def moved_to(variant: Variant) -> tuple[Tensor, float] | None:
+        """How the coefficient changes there, and by how much the likelihood falls, nats."""
         fits = fit_near(now, near, [variant])
         if isinstance(fits, str):
             return None
         return fits.mean_coefficient(variant).flatten().double() - here, best - gain_of_fits(now, fits)
 
-    variance, ways = torch.zeros_like(here), list[_Way]()
+    variance = torch.zeros_like(here)
+    steps: list[tuple[str, int, Variant, float]] = []  # a number, its sign, where it leads and the likelihood's fall
+    slopes: list[Tensor] = []  # changes of the coefficient by a step up
+    bends, priors = list[float](), list[float]()  # curvatures of the likelihood and of the prior, in steps
     for name in at.profiled:
-        sides = [
-            (sign, v, fit)
-            for sign, v in zip((1, -1), _beside(at, grid, name, NEIGHBOUR_SHARE), strict=True)
-            if (fit := fitted(v))
-        ]
+        beside = zip((1, -1), _beside(at, grid, name, NEIGHBOUR_SHARE), strict=True)
+        sides = [(sign, variant, *found) for sign, variant in beside if (found := moved_to(variant))]
         if not sides:
             variance = variance + here.square()
             continue
-        slope = torch.stack([sign * change for sign, _, (change, _) in sides]).mean(0)
-        bend = sum(2 * fall for *_, (_, fall) in sides) / len(sides)
-        count = len({variant.profiled[name] for variant in grid})
-        sign, variant, (_, fall) = sides[0]
-        ways.append(_Way(name, sign, variant, fall, slope, bend, (2 * NEIGHBOUR_SHARE / max(1, count - 1)) ** 2))
-    if not ways:
+        sign, variant, _, fall = sides[0]
+        steps.append((name, sign, variant, fall))
+        slopes.append(torch.stack([sign * change for sign, _, change, _ in sides]).mean(0))
+        bends.append(sum(2 * fall for *_, fall in sides) / len(sides))
+        priors.append((2 * NEIGHBOUR_SHARE / max(1, len({v.profiled[name] for v in grid}) - 1)) ** 2)
+    if not steps:
         return variance
-    curvature = torch.diag(torch.tensor([way.bend for way in ways], dtype=torch.float64))
-    for (i, one), (j, other) in itertools.combinations(enumerate(ways), 2):
-        both = fitted(replace(one.beside, options={**one.beside.options, other.name: other.beside.options[other.name]}))
+    curvature = torch.diag(torch.tensor(bends, dtype=torch.float64))
+    for (i, (_, sign, there, fall)), (j, (name, other_sign, other, other_fall)) in combinations(enumerate(steps), 2):
+        both = moved_to(replace(there, options={**there.options, name: other.options[name]}))
         if both is not None:
-            curvature[i, j] = curvature[j, i] = one.sign * other.sign * (both[1] - one.fall - other.fall)
+            curvature[i, j] = curvature[j, i] = sign * other_sign * (both[1] - fall - other_fall)
     values, turn = torch.linalg.eigh(curvature)
-    along = torch.stack([way.slope for way in ways], -1) @ turn
-    return variance + (along.square() / (values.clamp(min=0) + min(way.prior for way in ways))).sum(-1)
-
-
-@dataclass(frozen=True)
-class _Way:
-    """A step beside a place, in one of its numbers."""
-
-    name: str  # of the number
-    sign: int  # which way it goes
-    beside: Variant  # where that leads
-    fall: float  # of the likelihood there, nats
-    slope: Tensor  # change of the coefficient by a step up, (k,)
-    bend: float  # curvature of the likelihood in steps
-    prior: float  # precision of a normal as wide as the grid, in steps
+    along = torch.stack(slopes, -1) @ turn
+    return variance + (along.square() / (values.clamp(min=0) + min(priors))).sum(-1)
 
 
 def _grid(now: Refit, candidate: Candidate) -> list[Variant]:
@@ -332,5 +286,5 @@ def _beside(at: Variant, grid: Sequence[Variant], name: str, share: float) -> li
     """The effect on either side of a place: by a share of the grid's spacing, or of the value where there is none."""
     value = at.profiled[name]
     values = sorted({float(variant.profiled[name]) for variant in grid})
-    apart = min((b - a for a, b in itertools.pairwise(values)), default=0.8 * value)
+    apart = min((b - a for a, b in pairwise(values)), default=0.8 * value)
     return [replace(at, options={**at.options, name: value + sign * share * apart}) for sign in (1, -1)]

@@ -37,8 +37,7 @@ ADDITIVE, COMMANDED = "", "what is commanded"  # what a curve is multiplied with
 
 @torch.no_grad()
 def curves(program: Program, data: Trajectories, spread: Tensor, sharpness: Tensor) -> list[Variant]:
-    """All curves that are looked at: every channel over every variable, what is commanded of it over time, every
-    measurement over its own reading.
+    """All curves: every channel over every variable, its command over time, every measurement over its own reading.
 
     `data` has the states along which they are looked at. `spread`, `(C,)`, are standard deviations of the channels,
     `sharpness`, `(K,)`, of the measurements.
@@ -55,13 +54,12 @@ def curves(program: Program, data: Trajectories, spread: Tensor, sharpness: Tens
             continue
         for index, channel in enumerate(program.channel_names):
             for times in (ADDITIVE, COMMANDED) if variable == "time" else (ADDITIVE,):
-                size = 1.0
+                size, unit = 1.0, program.channel_units[index]
                 if times:
                     size = float(mean[channel].expand(data.steps.shape)[data.transitions].square().mean().sqrt())
-                if size > 0 and float(spread[index]) / size > MIN_HEIGHT:
-                    unit = "1" if times else program.channel_units[index]
-                    height = float(spread[index]) / size
-                    effect = _effect("push", variable, knots, height, unit, variable in program.angles)
+                    unit = "1"
+                if size > 0 and (height_sd := float(spread[index]) / size) > MIN_HEIGHT:
+                    effect = _effect("push", variable, knots, height_sd, unit, variable in program.angles)
                     at = f"{channel}~{variable}{f' × {times}' if times else ''}"
                     found.append(effect.variant(at=at, channel=channel, variable=variable, knots=knots, times=times))
     return found + _of_readings(program, data, sharpness)
@@ -104,8 +102,7 @@ def unit_of(program: Program, variable: str) -> str:
 
 
 def knots_of(values: Tensor, circular: bool) -> tuple[float, ...] | None:
-    """Where a curve bends, from the smallest to the largest value but for the outermost hundredths; a whole turn for an
-    angle; None where the variable does not vary, or is never seen."""
+    """Where a curve bends, between the outermost hundredths of values, or over a whole turn; None where none vary."""
     if circular:
         return tuple(-math.pi + 2 * math.pi * k / KNOTS for k in range(KNOTS))
     if not len(values):
@@ -160,19 +157,10 @@ def _add_by_height(values: Array, weights: Array, grid: Array, places: Array, ci
 
 
 def over_state(
-    self: Any,
-    state: Tensor,
-    control: Tensor,
-    time: Tensor,
-    step: Tensor,
-    c: Tensor,
-    mean: Mapping[str, Tensor],
-    channel: Any,
-    variable: Any,
-    knots: Any,
-    times: Any,
+    self: Any, *at: Tensor, c: Tensor, mean: Mapping[str, Tensor], channel: Any, variable: Any, knots: Any, times: Any
 ) -> Any:
     """A curve that adds to a channel."""
+    state, control, time, _ = at
     value = variables(self, state, control, time, mean)[variable]
     return {channel: height(value, knots, variable in self.angles, c) * multiplier(mean, channel, times)}
 
@@ -184,7 +172,14 @@ def over_reading(self: Any, state: Tensor, measured: Tensor, c: Tensor, chosen: 
 
 
 def _effect(form: str, variable: str, knots: Sequence[float], spread: float, unit: str, circular: bool) -> Effect:
-    covariance = HEIGHT_SD**2 * spread**2 * _correlation(knots, circular)
+    at, reach = torch.tensor(knots, dtype=torch.float64), REACH * (knots[-1] - knots[0])
+    apart = (at.unsqueeze(1) - at).abs()
+    if circular:
+        apart, reach = 2 * (apart / 2).sin().abs(), 1.0
+    correlation = torch.exp(-0.5 * (apart / reach) ** 2) + 1e-3 * torch.eye(len(knots)).double()
+    root = torch.linalg.cholesky((HEIGHT_SD**2 * spread**2 * correlation).float())
+    zeros = torch.zeros(len(knots))
+    normal = dist.Normal(zeros, 1.0).to_event(1)  # turned by `root`: `MultivariateNormal` loads sympy, half a second
     return Effect(
         name=NAME,
         form=form,
@@ -196,7 +191,7 @@ def _effect(form: str, variable: str, knots: Sequence[float], spread: float, uni
         typical=tuple(spread for _ in knots),
         limit=HEIGHT_SD * spread,
         components=tuple(f"{knot:.3g}" for knot in knots),
-        prior=_normal(covariance.float()),
+        prior=dist.TransformedDistribution(normal, [LowerCholeskyAffine(zeros, root)]),
     )
 
 
@@ -205,22 +200,6 @@ def prior_covariance(effect: Effect) -> Tensor:
     (along,) = effect.prior.transforms
     root: Tensor = along.scale_tril.double()
     return root @ root.T
-
-
-def _normal(covariance: Tensor) -> Any:
-    """A normal about zero: `MultivariateNormal` loads sympy, half a second."""
-    zeros = torch.zeros(len(covariance))
-    along = LowerCholeskyAffine(zeros, torch.linalg.cholesky(covariance))
-    return dist.TransformedDistribution(dist.Normal(zeros, 1.0).to_event(1), [along])
-
-
-def _correlation(knots: Sequence[float], circular: bool) -> Tensor:
-    at = torch.tensor(knots, dtype=torch.float64)
-    apart = (at.unsqueeze(1) - at).abs()
-    reach = REACH * (knots[-1] - knots[0])
-    if circular:
-        apart, reach = 2 * (apart / 2).sin().abs(), 1.0
-    return torch.exp(-0.5 * (apart / reach) ** 2) + 1e-3 * torch.eye(len(knots)).double()
 
 
 def _of_readings(program: Program, data: Trajectories, sharpness: Tensor) -> list[Variant]:

@@ -12,12 +12,12 @@ from typing import Any
 import torch
 
 from steady_ppl.comparison.prove import far_off, prove
-from steady_ppl.comparison.result import Proof
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories, joined
 from steady_ppl.discovery.candidates import NATS
-from steady_ppl.discovery.finding import Finding, findings, next_run, shape_of
+from steady_ppl.discovery.finding import findings, next_run, shape_of
 from steady_ppl.discovery.fitting import ByDraws
+from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.result import Discovery
 from steady_ppl.discovery.search import MAX_EFFECTS, Found, Search, Settings, search
 from steady_ppl.effects import of_name, record, restore, written_class
@@ -114,48 +114,36 @@ def discover(
     with stages(("", 8), ("comparing before and after", 1), ("looking for a better next drive", 1)) as begin:
         begin()
         with seeded(seed, "search"), without_kernels() as why:
-            chosen = Settings(declared, simulations, seed=seed, withheld=withheld)
-            found = search(problem, choosing.data, chosen)
+            found = search(problem, choosing.data, Settings(declared, simulations, seed=seed, withheld=withheld))
         begin()
         shape = shape_of(found, program)
         effects = [] if shape else findings(found)
         final = found.base if shape or found.rounds[0].quiet else found.final
         settings = {"simulations": simulations, "seed": seed}
         fits = [Fit(refit.mean_program(), "discover", settings, seed, known_start) for refit in (found.base, final)]
-        proof = _proof(found, shape is not None, choosing, seed)
+        better = found.curve.refit if found.curve else found.final
+        assert isinstance(better, Refit)
+        rows = {"before": found.base.judges.programs[0], "after": better.judges.programs[0]}
+        proof = prove(rows, choosing.data, known_start=known_start, with_constant_velocity=False, seed=seed)
         begin()
-        unclear = _unclear(found, effects)
-        proposed = next_run(unclear, seed) if unclear else None
+        unclear = [] if shape else [one for one in found.found if len(one.alike) > 1]
+        largest = max(unclear, key=lambda one: one.candidate.total, default=None)
+        proposed = next_run(largest, seed) if largest else None
     notes += in_plain_torch(why)
-    if unclear and proposed is None:
-        alike = " from ".join(candidate.variant.name for candidate in unclear.alike[:2])
+    if largest and proposed is None:
+        alike = " from ".join(candidate.variant.name for candidate in largest.alike[:2])
         notes.append(f"no way of driving that was tried tells {alike} better than these drives do")
-    return Discovery(
-        search=found,
-        findings=effects,
-        shape=shape,
-        next_run=proposed,
-        proof=proof,
-        before=fits[0],
-        after=fits[1],
-        doubts=_doubts(found, is_fitted),
-        notes=notes + diagnose_units(program, problem.data) + _notes(found) + far_off(proof.rows, choosing.data),
-    )
-
-
-def _unclear(found: Search, effects: Sequence[Finding]) -> Found | None:
-    """The first of what was found whose class has several members."""
-    names = [effect.variant.name for effect in effects if len(effect.alike) > 1]
-    return next((one for name in names for one in found.found if one.candidate.variant.name == name), None)
+    notes += diagnose_units(program, problem.data) + _notes(found) + far_off(proof.rows, choosing.data)
+    return Discovery(found, effects, shape, proposed, proof, fits[0], fits[1], _doubts(found, is_fitted), notes)
 
 
 def _doubts(found: Search, is_fitted: bool) -> list[str]:
     doubts = [] if found.base.converged else [NOT_CONVERGED]
-    gained = found.gained
-    if is_fitted and gained > FITTED_FURTHER:
+    if is_fitted and found.gained > FITTED_FURTHER:
         doubts.append(
-            f"the run had not converged: fitting it further gained {gained:.0f} nats on these drives, before anything "
-            "was added. What follows begins from there; `steady prove` against the run would count them as gains"
+            f"the run had not converged: fitting it further gained {found.gained:.0f} nats on these drives, before "
+            "anything was added. What follows begins from there; `steady prove` against the run would count them as "
+            "gains"
         )
     statistic, count = found.rounds[0].screening.tests.fitted
     if count and statistic > 5 * count + 10:
@@ -172,12 +160,6 @@ def _as_written(program: Program) -> Program:
         return restore(written_class(program)(), record(program)).to(next(program.parameters(), torch.zeros(())).dtype)
 
 
-def _proof(found: Search, is_curve: bool, valid: Problem, seed: int) -> Proof:
-    after: Any = found.curve.refit if is_curve and found.curve else found.final
-    rows = {"before": found.base.judges.programs[0], "after": after.judges.programs[0]}
-    return prove(rows, valid.data, known_start=valid.known_start, with_constant_velocity=False, seed=seed)
-
-
 def _notes(found: Search) -> list[str]:
     notes = []
     if isinstance(found.base.fitting, ByDraws):
@@ -185,12 +167,10 @@ def _notes(found: Search) -> list[str]:
             "the linearised program's log p(y) is off by more than half a nat a drive, or cannot be judged: fits are "
             "gradient steps on draws, judged by particles, and whether they have converged is not tested"
         )
-    constant = unexcited(found.base.program, found.base.folds[0].drives)
-    if constant:
+    if constant := unexcited(found.base.program, found.base.folds[0].drives):
         notes.append(f"{', '.join(constant)} never changes: what it does cannot be told from what happens anyway")
-    for step in (found.step, found.with_found):
-        if step is not None and step.note:
-            notes.append(f"all fits are at a finer step: {step.note}")
+    steps = [found.step, found.with_found] if found.with_found else [found.step]
+    notes += [f"all fits are at a finer step: {step.note}" for step in steps if step.note]
     if found.step.uncompared:
         notes.append(found.step.uncompared)
     if found.curve is not None:
@@ -201,17 +181,14 @@ def _notes(found: Search) -> list[str]:
     if not found.final.converged and found.found:
         notes.append("the fit with what was found has not converged")
     if found.diverged:
-        effects = " and ".join(found.diverged)
-        notes.append(f"{effects}: taken back, with it the program blows up on drives of its own")
+        notes.append(f"{' and '.join(found.diverged)}: taken back, with it the program blows up on drives of its own")
     if len(found.found) == MAX_EFFECTS:
         notes.append(f"the search stops at {MAX_EFFECTS} effects: add them, fit, and discover again from there")
     if not found.is_complete:
         notes.append("something is left that no effect of the catalogue brings: the tests were not quiet at the end")
     notes += [f"{one.candidate.variant.label}: {said}" for one in found.found if (said := _of_one_drive(one))]
-    for candidate in found.rounds[0].candidates:
-        if candidate.against_its_sign and candidate.total > 0:
-            notes.append(f"{candidate.variant.label} would help with a sign that physics rules out: a symptom")
-    return notes
+    symptoms = [one.variant.label for one in found.rounds[0].candidates if one.against_its_sign and one.total > 0]
+    return notes + [f"{label} would help with a sign that physics rules out: a symptom" for label in symptoms]
 
 
 def _of_one_drive(found: Found) -> str:
@@ -241,15 +218,13 @@ def require(problem: Problem, valid: Trajectories, simulations: int) -> None:
         if drives.time.shape[0] < 3 or not bool(drives.observed[1:].any()):
             raise DataError(f"the {name} drives have no measurements after their first rows")
         refuse_long(drives)
-    both = shared(train, valid)
-    if both:
+    if both := shared(train, valid):
         some = ", ".join(both[:3]) + (" …" if len(both) > 3 else "")
         raise UsageError(
             f"{len(both)} of the validation drives are training drives as well ({some}): nothing could be judged "
             "by them"
         )
-    why = problem.why_not_linear()
-    if why is not None:
+    if (why := problem.why_not_linear()) is not None:
         raise UsageError(f"discover needs a program that can be linearised: {why.split(': looking')[0]}")
     constant = unexcited(program, train)
     if constant and len(constant) == len(program.control_names):
@@ -261,21 +236,21 @@ def require(problem: Problem, valid: Trajectories, simulations: int) -> None:
 
 def shared(one: Trajectories, other: Trajectories) -> list[str]:
     """Labels of those of the second drives whose measurements are also among the first."""
-    known = {_measured(one, index) for index in range(len(one))}
-    return [other.labels[index] for index in range(len(other)) if _measured(other, index) in known]
 
+    def measured(data: Trajectories, index: int) -> bytes:
+        rows = int(data.lengths[index])
+        seen = data.observed[:rows, index]
+        return torch.where(seen, data.measurements[:rows, index], 0.0).numpy().tobytes() + seen.numpy().tobytes()
 
-def _measured(data: Trajectories, index: int) -> bytes:
-    rows = int(data.lengths[index])
-    seen = data.observed[:rows, index]
-    return torch.where(seen, data.measurements[:rows, index], 0.0).numpy().tobytes() + seen.numpy().tobytes()
+    known = {measured(one, index) for index in range(len(one))}
+    return [label for index, label in enumerate(other.labels) if measured(other, index) in known]
 
 
 def unexcited(program: Program, data: Trajectories) -> list[str]:
     """Controls that have one value everywhere."""
     controls = data.controls[:-1][data.transitions]
-    same = (controls == controls[:1]).all(0) if len(controls) else torch.ones(data.controls.shape[-1], dtype=torch.bool)
-    return [name for name, constant in zip(program.control_names, same.tolist(), strict=True) if constant]
+    same = (controls == controls[:1]).all(0).tolist()
+    return [name for name, constant in zip(program.control_names, same, strict=True) if constant]
 
 
 @contextmanager
@@ -301,6 +276,9 @@ def kept_search(
         yield
         return
     program = given.program if isinstance(given, Fit) else given
+    parameters = hashlib.sha256()
+    for name, value in program.state_dict().items():
+        parameters.update(name.encode() + value.numpy(force=True).tobytes())
     begun = {
         "program": program_source(program, folder),
         "begun_substeps": program.substeps,
@@ -308,7 +286,7 @@ def kept_search(
         "status": "searching",
         "known_start": options["known_start"],
         "seed": options["seed"],
-        "options": {**options, "parameters": _fingerprint_of(program)},
+        "options": {**options, "parameters": parameters.hexdigest()},
         "option_files": {},
         "table_sha256": fingerprint(train),
         "valid_sha256": fingerprint(valid) if valid is not None else None,
@@ -321,11 +299,3 @@ def kept_search(
             write_record(folder, begun)
         with journal(folder / JOURNAL):
             yield
-
-
-def _fingerprint_of(program: Program) -> str:
-    digest = hashlib.sha256()
-    for name, value in program.state_dict().items():
-        digest.update(name.encode())
-        digest.update(value.numpy(force=True).tobytes())
-    return digest.hexdigest()

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.discovery.curves import by_height, multiplier, over_reading, over_state, variables
+from steady_ppl.discovery.curves import NAME as CURVE, by_height, multiplier, over_reading, over_state, variables
 from steady_ppl.effects import Variant
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
@@ -48,6 +48,11 @@ class Column:
         """How many numbers its coefficient has."""
         return self.variant.effect.size
 
+    @property
+    def is_curve(self) -> bool:
+        """Whether it is no named effect."""
+        return self.variant.effect.name == CURVE
+
 
 def columns_of(variants: Sequence[Variant]) -> list[Column]:
     """One column a variant, or one for each of its probes."""
@@ -61,6 +66,7 @@ class Scoring:
         self.program, self.data, self.at = program, data, at
         self.acting = acting_controls(program, data)
         self.controls = row_controls(program, self.acting)
+        self.rows = (self.controls[:-1], data.elapsed[:-1], data.steps)  # of transitions
         self.means, spread = channel_moments(program, data, at.channels.points, self.acting)
         self.row_spread = spread[0]
         self.substep_spread = substep_spreads(program, data, at.channels.points[:1], self.acting)[0]
@@ -80,19 +86,15 @@ class Scoring:
     def _differences(self, column: Column) -> Iterator[tuple[tuple[Tensor, Tensor], float]]:
         """For each number of the coefficient two coefficients and how far they are apart."""
         variant, like = column.variant, self.substep_spread
-        absent = variant.absent(like)
+        absent, typical = variant.absent(like), variant.typical.to(like)
         if column.probe is not None:
             reach = 1.0 if not torch.isfinite(absent) else abs(column.probe - float(absent))
             yield (torch.as_tensor(column.probe).to(like), absent), reach
             return
-        size = variant.effect.size
-        typical = variant.typical.to(like)
         steps = 0.05 * torch.where(typical == 0, typical.abs().max(), typical.abs())
-        for index in range(size):
-            by = torch.zeros(size).to(like)
-            by[index] = steps[index]
+        for step, by in zip(steps.tolist(), torch.diag(steps), strict=True):
             by = by.reshape(absent.shape)
-            yield (absent + by, absent - by), 2 * float(steps[index])
+            yield (absent + by, absent - by), 2 * step
 
     def _push(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         values = [value for value in c if bool(torch.isfinite(value).all())]
@@ -132,8 +134,7 @@ class Scoring:
     def _variables(self, index: int) -> dict[str, Tensor]:
         """What curves may depend on, at the points of one channel, each `(3, T, B)`."""
         if index not in self._values:
-            given = (self._around(index), self.controls[:-1], self.data.elapsed[:-1])
-            found = variables(self.program, *given, self._means_around(index))
+            found = variables(self.program, self._around(index), *self.rows[:2], self._means_around(index))
             shape = (3, *self.substep_spread.shape[:2])
             self._values[index] = {name: value.expand(shape) for name, value in found.items()}
         return self._values[index]
@@ -145,16 +146,15 @@ class Scoring:
 
     def _pushed(self, variant: Variant, value: Tensor, index: int, few: bool = False) -> dict[str, Tensor]:
         """At the points of one channel; of `few`, of the first drive only."""
-        points, given = self._around(index), (self.controls[:-1], self.data.elapsed[:-1], self.data.steps)
+        points, rows = self._around(index), self.rows
         means = self._means_around(index) if variant.needs_mean else {}
         if few:
-            points, given = points[:1, :, :1], (given[0][:, :1], given[1][:, :1], given[2][:, :1])
+            points, rows = points[:1, :, :1], (rows[0][:, :1], rows[1][:, :1], rows[2][:, :1])
             means = {name: mean[:1, :, :1] for name, mean in means.items()}
-        return variant(self.program, points, *given, c=value, mean=means)
+        return variant(self.program, points, *rows, c=value, mean=means)
 
     def _command(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
-        control, time = self.controls[:-1], self.data.elapsed[:-1]
-        up, down = (variant(self.program, self.at.channels.points, control, time, c=value) for value in c)
+        up, down = (variant(self.program, self.at.channels.points, *self.rows[:2], c=value) for value in c)
         slope = (self.by_control * (up - down).movedim(-1, 0).unsqueeze(-1)).sum(0)
         return self.at.channels.of_mean(slope / (width * self.row_spread))
 
@@ -195,8 +195,7 @@ class Scoring:
         return self.at.measurements.of_mean(down.shift(up) * self.at.sharpness / width)
 
     def _spread(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
-        given = (self.at.states[:-1], self.controls[:-1], self.data.elapsed[:-1], self.data.steps)
-        factors = (variant(self.program, *given, c=value) for value in c)
+        factors = (variant(self.program, self.at.states[:-1], *self.rows, c=value) for value in c)
         up, down = (by_channel(self.program, factor, 1.0, self.substep_spread) for factor in factors)
         return self.at.channels.of_spread((up / down).log() / width)
 
@@ -221,34 +220,18 @@ class Scoring:
         return torch.where(at.present[1:], product * ratio * ratio.new_tensor(chosen), 0.0).sum((0, -1))
 
 
-@dataclass(frozen=True)
-class Simulated:
-    """Scores of simulated sets of drives."""
-
-    scores: Tensor  # (S, B, N), of the parameters first and then of the columns
-    log_likelihood: Tensor  # (S, B)
-
-    @cached_property
-    def information(self) -> Tensor:
-        """Covariance of a set's summed scores, `(N, N)`, from the spread of each drive's among the sets."""
-        apart = self.scores - self.scores.mean(0)
-        return torch.einsum("sbi,sbj->ij", apart, apart) / (len(apart) - 1)
-
-
 def scores_along(problem: Problem, ahead: Lookahead, parts: Sequence[Element], columns: Sequence[Column]) -> Tensor:
     """Scores of parameters and columns, `(B, N)`."""
-    program, data = problem.program, problem.data
-    at = smoothed(ahead, data)
-    scoring = Scoring(program, data, at)
-    return torch.cat([parameter_scores(program, data, at, list(parts)), *(scoring(column) for column in columns)], -1)
+    along = (problem.program, problem.data, smoothed(ahead, problem.data))
+    scoring = Scoring(*along)
+    return torch.cat([parameter_scores(*along, list(parts)), *(scoring(column) for column in columns)], -1)
 
 
 @torch.no_grad()
 def simulate_scores(
     problem: Problem, starts: Tensor, parts: Sequence[Element], columns: Sequence[Column], *, seed: int
-) -> Simulated:
-    """Simulate drives of a fitted program that begin at `starts`, `(S, B, D)`, with the same controls and gaps, and
-    score parts and columns at the same parameters."""
+) -> Tensor:
+    """Scores `(S, B, N)` of drives that a program makes from `starts` `(S, B, D)`, with the same controls and gaps."""
     program, data, sets = problem.program, problem.data, len(starts)
     with seeded(seed, "bootstrap"):
         drives, path = simulate_again(program, data, starts, len(program.channels))
@@ -259,13 +242,13 @@ def simulate_scores(
         return {"scores": scores_along(part, ahead, parts, columns), "likely": ahead.log_likelihood}, {}
 
     jobs = [partial(score, index) for index in torch.arange(len(drives)).split(PART)]
-    parts_found = [tensors for tensors, _ in side_by_side(jobs)]
-    scores, likely = (torch.cat([one[name] for one in parts_found]) for name in ("scores", "likely"))
-    found = Simulated(scores.unflatten(0, (sets, len(data))), likely.view(sets, len(data)))
-    whole = torch.isfinite(found.scores).all(-1).all(-1) & torch.isfinite(found.log_likelihood).all(-1)
+    found = [tensors for tensors, _ in side_by_side(jobs)]
+    scores, likely = (torch.cat([one[name] for one in found]) for name in ("scores", "likely"))
+    scores = scores.unflatten(0, (sets, len(data)))
+    whole = torch.isfinite(scores).all(-1).all(-1) & torch.isfinite(likely.view(sets, len(data))).all(-1)
     if int(whole.sum()) < LEAST_LEFT * sets:
         raise FilterError(
             f"{int((~whole).sum())} of {sets} simulated sets blew up: the fitted program does not even explain "
             "drives of its own"
         )
-    return Simulated(found.scores[whole], found.log_likelihood[whole])
+    return scores[whole]

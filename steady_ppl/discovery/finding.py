@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,17 +14,17 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.candidates import Candidate, variance_of_places
 from steady_ppl.discovery.curves import unit_of
-from steady_ppl.discovery.refits import Refit, wide, wide_drives
+from steady_ppl.discovery.refits import Refit, with_states_of
 from steady_ppl.discovery.screening import Tested
 from steady_ppl.discovery.search import MIN_GAIN_OF_CURVE, Found, Search
 from steady_ppl.effects import Variant, attached
-from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.random import seeded
 
 INTERVAL = 0.9
+HALF_WIDTH = float(-special.ndtri((1 - INTERVAL) / 2))  # standard deviations on either side of it
 RESAMPLES = 2000
 DRIVES = 24  # simulated for each proposal
 TYPES = 3  # of every way of driving
@@ -70,27 +70,26 @@ def _finding(search: Search, found: Found) -> Finding:
     variant, effect = found.candidate.variant, found.candidate.variant.effect
     values = refit.coefficient(variant).flatten().double().numpy()
     spread = _spread(search, variant, len(values))
+    is_positive = effect.null != 0  # and learned as its logarithm
     if variant.profiled:
         places = variance_of_places(found.without, found.candidate)
-        scale = values if effect.null != 0 else 1.0  # of its logarithm
-        spread = np.sqrt(spread**2 + places.numpy() / scale**2)
-    by = -special.ndtri((1 - INTERVAL) / 2)
-    if effect.null != 0:  # positive, learned as its logarithm
-        interval = [(v * math.exp(-by * s), v * math.exp(by * s)) for v, s in zip(values, spread, strict=True)]
-        spread = values * spread
-    else:
-        interval = [(v - by * s, v + by * s) for v, s in zip(values, spread, strict=True)]
-    alike = found.alike
+        spread = np.sqrt(spread**2 + places.numpy() / (values if is_positive else 1.0) ** 2)
+    pairs = [(value, HALF_WIDTH * sd) for value, sd in zip(values.tolist(), spread.tolist(), strict=True)]
     return Finding(
         variant=variant,
         kind=effect.verdict,
-        alike=[candidate.variant.name for candidate in alike],
-        confidence=_confidence(search, found, alike),
+        alike=[candidate.variant.name for candidate in found.alike],
+        confidence=_confidence(search, found),
         coefficient=values.tolist(),
-        sd=spread.tolist(),
-        interval=[(float(low), float(high)) for low, high in interval],
+        sd=(values * spread if is_positive else spread).tolist(),
+        interval=[_around(value, by) if is_positive else (value - by, value + by) for value, by in pairs],
         gain=found.candidate.total,
     )
+
+
+def _around(value: float, by: float) -> tuple[float, float]:
+    """An interval that is symmetric in the logarithm."""
+    return value * math.exp(-by), value * math.exp(by)
 
 
 def _spread(search: Search, variant: Variant, count: int) -> np.ndarray:
@@ -106,29 +105,19 @@ def _spread(search: Search, variant: Variant, count: int) -> np.ndarray:
     return (search.final.first_share * covariance.diagonal()[index]).clamp(min=0).sqrt().numpy()
 
 
-def _confidence(search: Search, found: Found, alike: Sequence[Candidate]) -> float:
-    """Posterior probability of the class; all candidates and none are alike before, a curve is less likely by
-    `MIN_GAIN_OF_CURVE`."""
+def _confidence(search: Search, found: Found) -> float:
+    """Posterior probability of the class; a curve is less likely before than a candidate, or than none."""
     totals = {id(c): c.total for c in found.candidates if isinstance(c.refit, Refit)}
     curve = max((c.total for c in search.curves if isinstance(c.refit, Refit)), default=-math.inf)
     rivals = [0.0, found.candidate.total + curve - search.gain - MIN_GAIN_OF_CURVE]
     whole = np.logaddexp.reduce([*totals.values(), *rivals])
-    return float(np.exp(np.logaddexp.reduce([totals[id(c)] for c in alike]) - whole))
+    return float(np.exp(np.logaddexp.reduce([totals[id(c)] for c in found.alike]) - whole))
 
 
 def _departure(search: Search, tested: Tested) -> Finding:
     factor, sd = 1 + float(tested.coefficient[0]), float(tested.sd[0])
-    by = -special.ndtri((1 - INTERVAL) / 2) * sd / factor
-    return Finding(
-        variant=tested.variant,
-        kind="noise",
-        alike=[tested.variant.name],
-        confidence=None,
-        coefficient=[factor],
-        sd=[sd],
-        interval=[(factor * math.exp(-by), factor * math.exp(by))],
-        gain=None,
-    )
+    interval, name = _around(factor, HALF_WIDTH * sd / factor), tested.variant.name
+    return Finding(tested.variant, "noise", [name], None, [factor], [sd], [interval], None)
 
 
 def shape_of(search: Search, program: Program) -> Shape | None:
@@ -156,7 +145,7 @@ def shape_of(search: Search, program: Program) -> Shape | None:
 
 def gain_interval(candidate: Candidate, seed: int) -> tuple[float, float] | None:
     """95 % bootstrap interval, over drives, of a candidate's held-out gain; None where it was fitted on one fold."""
-    if isinstance(candidate.refit, str) or len(candidate.refit.programs) == 1:
+    if not candidate.is_judged:
         return None
     gain = candidate.gain.double().numpy() - candidate.charge / len(candidate.gain)
     random = np.random.default_rng(seed)
@@ -173,15 +162,13 @@ class NextRun:
     way: str  # how they are made, in words
     controls: dict[str, list[float]]  # control → its values, one a row
     step: float  # s, of a row
-    separation: float
-    """Nats of log p(y) by which one such drive tells the first member of the class from the nearest other."""
+    separation: float  # nats by which one such drive tells the first member of the class from the nearest other
     usual: float  # the same of the drives that there are
 
 
 @torch.no_grad()
 def next_run(found: Found, seed: int) -> NextRun | None:
-    """The best of some ways of driving within the limits of the controls that were driven, None where none separates
-    the class better than the drives that there are.
+    """The best of some ways of driving within the limits that were driven; None where none beats the drives there are.
 
     Each is simulated with the best member of the class; the others are judged by how much less likely they find it.
     """
@@ -216,15 +203,14 @@ def _separation(refits: list[Refit], controls: Tensor, seed: int) -> float:
     starts = fold.path.states[0, :count].unsqueeze(0)
     with seeded(seed, "next run"):
         again, truth = simulate_again(program, drives, starts, len(program.channels))
-    own = _log_likelihood(Problem(program, again, fold.known_start), truth)
-    apart = [float((own - _log_likelihood(Problem(other, again, fold.known_start), truth)).mean()) for other in others]
+
+    def log_likelihood(judge: Program) -> Tensor:
+        problem = Problem(judge, with_states_of(judge, again), fold.known_start)
+        return problem.smooth(with_states_of(judge, truth), passes=4).log_likelihood
+
+    own = log_likelihood(program)
+    apart = [float((own - log_likelihood(other)).mean()) for other in others]
     return min(apart) if all(map(math.isfinite, apart)) else math.nan
-
-
-def _log_likelihood(problem: Problem, path: ReferencePath) -> Tensor:
-    """Of drives and a path of another program."""
-    fitting = replace(problem, data=wide_drives(problem.data, problem.program))
-    return fitting.smooth(wide(path, problem.program), passes=4).log_likelihood
 
 
 def _ways(data: Trajectories, seed: int) -> Iterator[tuple[str, Tensor]]:

@@ -1,9 +1,8 @@
 """How a program is fitted to some drives and judged on others.
 
 By likelihood: scoring steps of the linearised program, fast and exact where it is nearly linear. By draws: gradient
-steps on paths drawn from its posterior by the filter that looks ahead (generalised EM, as the recipe `steady` without
-tempering), which judges as well, for programs whose linearised log p(y) has kinks or is off: acceleration limits that
-bind, noise that goes with the state.
+steps on paths drawn by the filter that looks ahead (generalised EM, as the recipe `steady` without tempering), for
+programs whose linearised log p(y) has kinks or is off: acceleration limits that bind, noise that goes with the state.
 
 Programs fitted to different drives judge with the size of their process noise in common. A few drives tell little of a
 noise that the sensors nearly hide. Fitted to them alone it may vanish, and then other drives punish the program by tens
@@ -31,7 +30,7 @@ from steady_ppl.guides.base import Constant
 from steady_ppl.guides.linearized import LookaheadGuide
 from steady_ppl.likelihood.evidence import neglected
 from steady_ppl.likelihood.maximize import Maximum, Term, climb, kept_maximum, maximum_of
-from steady_ppl.likelihood.parameters import elements, moved, set_values, values_of
+from steady_ppl.likelihood.parameters import Element, elements, moved, set_values, values_of
 from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import channel_moments, substep_spreads
 from steady_ppl.model.program import Program
@@ -58,11 +57,7 @@ class ByLikelihood:
     """Scoring steps of the linearised program's log p(y), which judges as well."""
 
     def fit(self, problem: Problem, path: ReferencePath | None = None, **settings: Any) -> Maximum:
-        """Move a program's parameters, in place, from a path that is found when None; settings are `maximise`'s.
-
-        Raises:
-            FilterError: the program cannot follow the drives.
-        """
+        """Move a program's parameters, in place, from a path that is found when None; see `maximise`."""
         return maximum_of(problem, path, **settings)
 
     def judge(self, problem: Problem, path: ReferencePath) -> Judgement:
@@ -75,8 +70,8 @@ class ByLikelihood:
 class ByDraws:
     """Gradient steps on paths drawn by the filter that looks ahead, which judges as well.
 
-    Draws of the linearised program's posterior would be cheaper, but where limits bind their slopes are not those of
-    log p(y): fits with them end beside its maximum, and whatever moves a fit towards it is then taken for an effect.
+    Draws of the linearised program's posterior are cheaper. But where limits bind their slopes are not those of
+    log p(y): fits end beside its maximum, and whatever moves them towards it is taken for an effect.
     """
 
     steps: int = 60  # E steps, each with a gradient step
@@ -123,8 +118,7 @@ Fitting = ByLikelihood | ByDraws
 
 
 def is_doubtful(problem: Problem, path: ReferencePath) -> bool:
-    """Whether the linearised program's log p(y) is off by more than half a nat a drive, or no particle filter that it
-    leads can follow these drives to say so."""
+    """Whether the linearised log p(y) is off by more than half a nat a drive, or no particle filter can say."""
     ahead = _at_rest(problem, path)
     try:
         return float(_neglected(problem, ahead).abs().mean()) > MAX_LINEARISATION_ERROR
@@ -139,10 +133,9 @@ def _at_rest(problem: Problem, path: ReferencePath) -> Lookahead:
 
 
 def _neglected(problem: Problem, ahead: Lookahead, particles: int = 200) -> Tensor:
+    known = problem.known_start
     with seeded(0, "judge"):
-        return neglected(
-            problem.program, problem.data, known_start=problem.known_start, particles=particles, ahead=ahead
-        )
+        return neglected(problem.program, problem.data, known_start=known, particles=particles, ahead=ahead)
 
 
 @dataclass(frozen=True)
@@ -155,24 +148,23 @@ class Judges:
 
 
 def with_common_noise(problems: Sequence[Problem], maxima: Sequence[Maximum]) -> Judges:
-    """Return copies of programs with their process noise in common.
+    """Return copies of programs with their process noise in common, or the programs where they learn none.
 
     The sum of the folds' log p(y) is maximised in the noise of all and in every program's other numbers, from where
-    their fits ended. Programs without such noise are returned as they are.
-
-    Raises:
-        FilterError: the programs cannot follow their drives with one noise.
+    their fits ended. A FilterError says that programs cannot follow their drives with one noise.
     """
     found = [noise_numbers(one.program, one.data, m.path) for one, m in zip(problems, maxima, strict=True)]
     common = sorted(set().union(*found))
     if not common:
         return Judges([problem.program for problem in problems], list(maxima))
-    names = [part.name for part in elements(problems[0].program)]
     copies = [replace(problem, program=copy.deepcopy(problem.program)) for problem in problems]
-    places = _places(len(names), common, len(copies))
+    parts = [elements(problem.program) for problem in copies]
+    own = [index for index in range(len(parts[0])) if index not in common]
+    place = {index: place for place, index in enumerate([*common, *own])}  # of the numbers of the first program
+    shift = [0 if index in common else len(own) for index in range(len(parts[0]))]  # from program to program
     terms = [
-        Term(problem, maximum.path, elements(problem.program), own)
-        for problem, maximum, own in zip(copies, maxima, places, strict=True)
+        Term(problem, maximum.path, parts[order], [place[index] + order * by for index, by in enumerate(shift)])
+        for order, (problem, maximum) in enumerate(zip(copies, maxima, strict=True))
     ]
     information, starts = _starts(terms, maxima)
     for last, start in enumerate(starts, 1):
@@ -180,12 +172,11 @@ def with_common_noise(problems: Sequence[Problem], maxima: Sequence[Maximum]) ->
             set_values(term.parts, start[term.columns])
         try:
             ended = climb(terms, information=information, steps=STEPS, precision=PRECISION)
+            break
         except FilterError:
             if last == len(starts):
                 raise
-        else:
-            break
-    return Judges([problem.program for problem in copies], ended, tuple(names[index] for index in common))
+    return Judges([problem.program for problem in copies], ended, tuple(parts[0][index].name for index in common))
 
 
 @torch.no_grad()
@@ -196,25 +187,23 @@ def noise_numbers(program: Program, data: Trajectories, path: ReferencePath) -> 
     """
     forms = {variant.parameter: variant.effect.form for variant in attached(program)}
     mean, spread = _moments(program, data, path)
-    found = set()
-    for index, part in enumerate(elements(program)):
+
+    def is_noise(part: Element) -> bool:
         name = part.name.split("[")[0]
         if name in forms:
-            is_noise = forms[name] in FORMS
-        else:
-            with moved(part, MOVED):
-                mean_there, spread_there = _moments(program, data, path)
-            change = (spread_there / spread).log().nan_to_num(0.0, 0.0, 0.0)
-            alike = bool(((change - change.mean(1, keepdim=True)).abs() < LIKE).all())
-            still = bool(((mean_there - mean).abs() <= LIKE * spread).all())
-            is_noise = alike and still and bool((change.abs() > LIKE).any())
-        if is_noise:
-            found.add(index)
-    return found
+            return forms[name] in FORMS
+        with moved(part, MOVED):
+            mean_there, spread_there = _moments(program, data, path)
+        change = (spread_there / spread).log().nan_to_num(0.0, 0.0, 0.0)
+        alike = ((change - change.mean(1, keepdim=True)).abs() < LIKE).all()
+        still = ((mean_there - mean).abs() <= LIKE * spread).all()
+        return bool(alike & still & (change.abs() > LIKE).any())
+
+    return {index for index, part in enumerate(elements(program)) if is_noise(part)}
 
 
 def _moments(program: Program, data: Trajectories, path: ReferencePath) -> tuple[Tensor, Tensor]:
-    """Return means of rows' channels and standard deviations of substeps' along a path, `(1, rows, C)` each."""
+    """Means of rows' channels and standard deviations of substeps' along a path, `(1, rows, C)` each."""
     states = path.states[:-1].unsqueeze(0)
     mean, spread = channel_moments(program, data, states)
     if program.substeps > 1:
@@ -222,22 +211,10 @@ def _moments(program: Program, data: Trajectories, path: ReferencePath) -> tuple
     return mean[:, data.transitions], spread[:, data.transitions]
 
 
-def _places(count: int, common: Sequence[int], programs: int) -> list[list[int]]:
-    """Where each program's numbers are among those of all: first the common ones, then the own ones of each."""
-    own = [index for index in range(count) if index not in common]
-    first = {index: place for place, index in enumerate([*common, *own])}
-    return [
-        [first[index] if index in common else first[index] + order * len(own) for index in range(count)]
-        for order in range(programs)
-    ]
-
-
 def _starts(terms: Sequence[Term], maxima: Sequence[Maximum]) -> tuple[Tensor, list[Tensor]]:
-    """The information of all numbers, and where to begin: at the maximum of the sum were every log p(y) a parabola, and
-    where each program's own numbers are, with the mean of the noise."""
+    """The information of all numbers, and where to begin: at the maximum of the sum of parabolas, and at the means."""
     count = 1 + max(max(term.columns) for term in terms)
-    information, pull = torch.zeros(count, count).double(), torch.zeros(count).double()
-    sums, weights = torch.zeros(count).double(), torch.zeros(count).double()
+    information, (pull, sums, weights) = torch.zeros(count, count).double(), torch.zeros(3, count).double()
     for term, maximum in zip(terms, maxima, strict=True):
         index, values = torch.tensor(term.columns), values_of(term.parts)
         information[index[:, None], index] += maximum.information
@@ -245,6 +222,5 @@ def _starts(terms: Sequence[Term], maxima: Sequence[Maximum]) -> tuple[Tensor, l
         sums[index] += maximum.information.diagonal() * values
         weights[index] += maximum.information.diagonal()
     parabola, singular = torch.linalg.solve_ex(information, pull)
-    means = sums / weights
     has_maximum = not singular and bool(torch.isfinite(parabola).all())
-    return information, [parabola, means] if has_maximum else [means]
+    return information, [*([parabola] if has_maximum else []), sums / weights]

@@ -5,7 +5,9 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -23,6 +25,7 @@ from steady_ppl.model.program import Program
 from steady_ppl.utils.random import seeded
 
 MAX_LOG_NOISE_RATIO = math.log(20.0)  # of noise after a fit and before, beyond which a program explains nothing
+AlongStates = TypeVar("AlongStates", bound=Trajectories | ReferencePath)
 MAX_LOSS = 2.0  # nats below the program without, after which a fit is given up: a candidate at zero is that program
 
 
@@ -43,6 +46,16 @@ class Fold:
     def judging(self, program: Program) -> Problem:
         """A program with the drives to judge."""
         return Problem(program, self.held_out, self.known_start)
+
+    def wide(self, program: Program) -> Fold:
+        """The fold for a program that has further, resting states."""
+        own = (with_states_of(program, self.drives), with_states_of(program, self.path))
+        others = (with_states_of(program, self.held_out), with_states_of(program, self.held_out_path))
+        return Fold(*own, *others, self.known_start)
+
+    def information(self, of_first: Tensor | None, first: Fold) -> Tensor | None:
+        """What these drives tell, by what those of the first fold do."""
+        return None if of_first is None else len(self.drives) / len(first.drives) * of_first
 
 
 @dataclass(frozen=True)
@@ -87,13 +100,9 @@ class Refit(Fits):
     """What was fitted on each fold, and how it explains the drives that were kept from it."""
 
     judges: Judges  # the programs with their process noise in common, if fits by likelihood ended on every fold
-    held_out: Tensor
-    """log p(y) of each drive under the judge fitted without it, but for the noise in common, `(B,)`; of the first fold
-    only where the rest was not worth fitting."""
+    held_out: Tensor  # log p(y) of each drive under the judge not fitted to it, (B,); of one fold where given up
     held_out_alone: Tensor  # the same under the programs that were fitted to one fold alone
-    unwidened: Program | None = None
-    """The program before its fit made its noise many times wider, from whose parameters fits with an effect begin as
-    well; None where it did not."""
+    unwidened: Program | None = None  # before its fit made its noise many times wider: fits begin there as well
 
     def coefficients(self, variant: Variant) -> list[Tensor]:
         """An effect's coefficient on each fold."""
@@ -140,14 +149,15 @@ def first_refit(problem: Problem, valid: Trajectories, *, seed: int, nearer: Pro
         one = fit_by_likelihood(own, train, known_start=known_start)
         other = Problem(copy.deepcopy(own), valid, known_start)
         second = refit_outliers(other, maximum_of(other, other.find_path()))
-    folds = [
-        Fold(train, one.path, valid, second.path, known_start),
-        Fold(valid, second.path, train, one.path, known_start),
-    ]
-    unwidened = copy.deepcopy(program) if _far_wider(own, program, train) else None
-    if unwidened is None and is_doubtful(folds[0].fitting(own), one.path):
-        return first_by_draws(program, [own, other.program], folds, seed)
-    return replace(_refit([own, other.program], folds, [one, second]), unwidened=unwidened)
+    fold = Fold(train, one.path, valid, second.path, known_start)
+    programs, folds = [own, other.program], [fold, Fold(valid, second.path, train, one.path, known_start)]
+    parts = elements(own)
+    grown = values_of(parts) - values_of(elements(program)) > MAX_LOG_NOISE_RATIO
+    is_far_wider = bool((grown & torch.tensor(widens(own, parts, train))).any())
+    unwidened = copy.deepcopy(program) if is_far_wider else None
+    if unwidened is None and is_doubtful(fold.fitting(own), one.path):
+        return first_by_draws(program, programs, folds, seed)
+    return replace(_refit(programs, folds, [one, second]), unwidened=unwidened)
 
 
 @dataclass(frozen=True)
@@ -160,11 +170,7 @@ class Start:
 
 
 def starts_by_draws(given: Program, fitted: Program, fold: Fold) -> list[Start]:
-    """Return the given program and its linearised fit as starts, the likelier first, as far as they follow the drives.
-
-    Raises:
-        FilterError: neither does.
-    """
+    """The given program and its linearised fit as starts, the likelier first, as far as they follow the drives."""
     found, failures = list[Start](), list[FilterError]()
     for program, near in ((given, None), (fitted, fold.path)):
         problem = fold.fitting(program)
@@ -187,12 +193,9 @@ def first_by_draws(given: Program, fitted: list[Program], folds: list[Fold], see
 
     def climbed(begun: list[Start]) -> Refit:
         one, other = (start.path for start in begun)
-        along = [
-            replace(folds[0], path=one, held_out_path=other),
-            replace(folds[1], path=other, held_out_path=one),
-        ]
+        along = [replace(folds[0], path=one, held_out_path=other), replace(folds[1], path=other, held_out_path=one)]
         programs = [copy.deepcopy(start.program) for start in begun]
-        return _refit(programs, along, [None, None], fitting=FIRST_BY_DRAWS)
+        return _refit(programs, along, fitting=FIRST_BY_DRAWS)
 
     try:
         refit = climbed(likelier)
@@ -201,13 +204,6 @@ def first_by_draws(given: Program, fitted: list[Program], folds: list[Fold], see
             raise
         refit = climbed(as_given)
     return replace(refit, fitting=BY_DRAWS)
-
-
-def _far_wider(fitted: Program, program: Program, data: Trajectories) -> bool:
-    """Whether a fit has made some channel's noise several times what it was."""
-    parts = elements(fitted)
-    grown = values_of(parts) - values_of(elements(program)) > MAX_LOG_NOISE_RATIO
-    return bool((grown & torch.tensor(widens(fitted, parts, data))).any())
 
 
 def refit_with(
@@ -220,17 +216,14 @@ def refit_with(
 ) -> Refit | str:
     """The program with an effect whose coefficient begins at `value`, or why it cannot be fitted.
 
-    Args:
-        base: the program without.
-        information: of the first fold's drives, the coefficient last; or a fit that learned all these numbers.
-        threshold: what the first fold must reach for the second to be fitted as well.
+    `information` is that of the first fold's drives, the coefficient last, or a fit that learned all these numbers.
     """
     try:
         programs = [attach(copy.deepcopy(program), variant, value) for program in base.programs]
         least = [float(maximum.log_likelihood.sum()) - MAX_LOSS for maximum in base.maxima]
-        nothing = [None] * len(programs)
         if isinstance(information, Maximum):
             information = _information(information, elements(programs[0]))
+        nothing = [None] * len(programs)
         return _refit(programs, base.folds, nothing, information, least, threshold, base.unwidened, base.fitting)
     except SteadyError as error:
         return str(error)
@@ -250,15 +243,13 @@ def fit_near(base: Fits, near: Fits, variants: Sequence[Variant]) -> Fits | str:
         for program, fitted in zip(programs, near.programs, strict=True):
             own = program.state_dict()
             program.load_state_dict(own | {name: value for name, value in fitted.state_dict().items() if name in own})
-        known = _information(near.maxima[0], elements(programs[0]))
-        folds = [_wide_fold(fold, program) for fold, program in zip(near.folds, programs, strict=True)]
-        maxima = []
-        for program, fold in zip(programs, folds, strict=True):
-            share = len(fold.drives) / len(folds[0].drives)
-            guess = None if known is None else share * known
+        known, maxima, folds = _information(near.maxima[0], elements(programs[0])), list[Maximum](), list[Fold]()
+        for program, before in zip(programs, near.folds, strict=True):
+            fold = before.wide(program)
+            guess = fold.information(known, near.folds[0])
             maxima.append(near.fitting.fit(fold.fitting(program), fold.path, information=guess))
-        ended = [replace(fold, path=maximum.path) for fold, maximum in zip(folds, maxima, strict=True)]
-        return Fits(programs, maxima, ended, near.fitting)
+            folds.append(replace(fold, path=maxima[-1].path))
+        return Fits(programs, maxima, folds, near.fitting)
     except SteadyError as error:
         return str(error)
 
@@ -284,7 +275,7 @@ def as_declared(declared: Program, fitted: Program) -> Program:
 def _refit(
     programs: list[Program],
     folds: list[Fold],
-    maxima: Sequence[Maximum | None],
+    maxima: Sequence[Maximum | None] = (None, None),
     information: Tensor | None = None,
     least: Sequence[float] = (-math.inf, -math.inf),
     threshold: Threshold = ALWAYS,
@@ -292,15 +283,17 @@ def _refit(
     fitting: Fitting = BY_LIKELIHOOD,
 ) -> Refit:
     fitted, found, held_out, judged_folds = list[Program](), list[Maximum](), list[Tensor](), list[Fold]()
-    for program, begun, known, floor in zip(programs, folds, maxima, least, strict=True):
-        fold = _wide_fold(begun, program)
-        share = len(fold.drives) / len(folds[0].drives)
-        guess = None if information is None else share * information
+    for program, before, known, floor in zip(programs, folds, maxima, least, strict=True):
+        fold = before.wide(program)
+        guess = fold.information(information, folds[0])
         if threshold.stops_early and not fitted:
             floor = max(floor, threshold.drives)
-        anew = None if unwidened is None else _fitted_anew(fold.fitting(as_declared(unwidened, program)), floor)
-        if anew is not None:
-            floor = max(floor, float(anew[1].log_likelihood.sum()))
+        anew: tuple[Program, Maximum] | None = None  # by paths that are found anew, as far as it follows the drives
+        if unwidened is not None:
+            again = fold.fitting(as_declared(unwidened, program))
+            with suppress(FilterError):
+                anew = again.program, maximum_of(again, hopeless=floor)
+                floor = max(floor, float(anew[1].log_likelihood.sum()))
         maximum = known or fitting.fit(fold.fitting(program), fold.path, information=guess, hopeless=floor)
         held_out_path = fold.held_out_path
         if anew is not None and anew[1].objective > maximum.objective:
@@ -326,14 +319,6 @@ def _refit(
     return Refit(fitted, found, judged_folds, fitting, judges, torch.cat(held_out), alone, unwidened)
 
 
-def _fitted_anew(problem: Problem, floor: float) -> tuple[Program, Maximum] | None:
-    """A fit whose paths are found anew; None where the program cannot follow the drives."""
-    try:
-        return problem.program, maximum_of(problem, hopeless=floor)
-    except FilterError:
-        return None
-
-
 def _information(maximum: Maximum, parts: Sequence[Element]) -> Tensor | None:
     """Of learnable numbers, as a fit in which they and perhaps others were learned left it; None if some were not."""
     if not {part.name for part in parts} <= set(maximum.names):
@@ -347,28 +332,10 @@ def _there(program: Program, variant: Variant) -> Variant:
     return next(known for known in attached(program) if known.name == variant.name)
 
 
-def _wide_fold(fold: Fold, program: Program) -> Fold:
-    """A fold for a program that has further, resting states."""
-    return Fold(
-        wide_drives(fold.drives, program),
-        wide(fold.path, program),
-        wide_drives(fold.held_out, program),
-        wide(fold.held_out_path, program),
-        fold.known_start,
-    )
-
-
-def wide(path: ReferencePath, program: Program) -> ReferencePath:
-    """A path for a program that has further, resting states, or fewer."""
-    return ReferencePath(_for_states_of(path.states, program), path.noise)
-
-
-def wide_drives(drives: Trajectories, program: Program) -> Trajectories:
-    """Drives for a program that has further, resting states, or fewer."""
-    return drives if drives.states is None else replace(drives, states=_for_states_of(drives.states, program))
-
-
-def _for_states_of(states: Tensor, program: Program) -> Tensor:
-    count = len(program.states)
-    more = max(0, count - states.shape[-1])
-    return torch.cat([states[..., :count], states.new_zeros((*states.shape[:-1], more))], -1)
+def with_states_of(program: Program, along: AlongStates) -> AlongStates:
+    """Drives, or a path, for a program that has further, resting states, or fewer."""
+    states, count = along.states, len(program.states)
+    if states is None:
+        return along
+    resting = states.new_zeros((*states.shape[:-1], max(0, count - states.shape[-1])))
+    return replace(along, states=torch.cat([states[..., :count], resting], -1))

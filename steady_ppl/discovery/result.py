@@ -13,13 +13,12 @@ import numpy as np
 from steady_ppl.comparison.result import Proof
 from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.finding import Finding, NextRun, Shape, gain_interval
-from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.screening import ALPHA, Tested
 from steady_ppl.discovery.search import Search
 from steady_ppl.effects import Variant
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.late import Displayed
-from steady_ppl.utils.text import aligned
+from steady_ppl.utils.text import aligned, number
 
 WIDTH, SHOWN = 100, 12
 IN_WORDS = {
@@ -74,7 +73,8 @@ class Discovery(Displayed):
     def figures(self) -> dict[str, Any]:
         """Everything as a plain dict, ready for JSON; every figure is finite, None where there is none."""
         first = self.findings[0] if self.findings else None
-        rows = {row["row"]: row for row in self.proof.figures["rows"]}
+        kept = ("log_likelihood", "measurement", "coverage_90", "scales")
+        sides = {row["row"]: {key: row[key] for key in kept} for row in self.proof.figures["rows"]}
         return {
             "verdict": self.verdict,
             "sentence": sentence(self),
@@ -88,8 +88,8 @@ class Discovery(Displayed):
             "candidates": [_candidate(self, tested) for tested in ranked(self)],
             "shape": vars(self.shape) if self.shape else None,
             "next_run": vars(self.next_run) if self.next_run else None,
-            "before": _side(rows["before"]),
-            "after": _side(rows["after"]),
+            "before": sides["before"],
+            "after": sides["after"],
             "rounds": [
                 {"p_value": one.screening.tests.p_value, "added": one.chosen.variant.name if one.chosen else None}
                 for one in self.search.rounds
@@ -102,8 +102,8 @@ class Discovery(Displayed):
         }
 
     def __str__(self) -> str:
-        doubts = [line for doubt in self.doubts for line in textwrap.wrap(f"warning: {doubt}", WIDTH)]
-        lines = [*doubts, *textwrap.wrap(sentence(self), WIDTH)]
+        said = [*(f"warning: {doubt}" for doubt in self.doubts), sentence(self)]
+        lines = [line for paragraph in said for line in textwrap.wrap(paragraph, WIDTH)]
         for finding in self.findings:
             lines += ["", f"{finding.variant.name}: {finding.variant.effect.text}", f"  {finding.variant.effect.feels}"]
         if shape := self.shape:
@@ -112,17 +112,13 @@ class Discovery(Displayed):
             lines += [f"{point:10.3g}  {height:10.3g} ± {band:.2g}" for point, height, band in rows]
         lines += ["", *_table(self)]
         if run := self.next_run:
-            said = (
-                f"To tell {' from '.join(run.between[:2])}, drive {run.way}: {run.separation:.1f} nats a drive, "
-                f"against {run.usual:.1f} of drives such as these."
-            )
-            lines += ["", *textwrap.wrap(said, WIDTH)]
-        known: set[str] = set()
+            asked = f"To tell {' from '.join(run.between[:2])}, drive {run.way}: {run.separation:.1f} nats a drive, "
+            lines += ["", *textwrap.wrap(f"{asked}against {run.usual:.1f} of drives such as these.", WIDTH)]
+        notes = self.notes
         if self.verdict != "none":
             lines += ["", "On the validation drives:", str(self.proof)]
-            known = set(self.proof.notes)
-        notes = [line for note in self.notes if note not in known for line in textwrap.wrap(f"note: {note}", WIDTH)]
-        return "\n".join([*lines, *notes])
+            notes = [note for note in notes if note not in self.proof.notes]
+        return "\n".join(lines + [line for note in notes for line in textwrap.wrap(f"note: {note}", WIDTH)])
 
     def __repr__(self) -> str:
         return f"Discovery({sentence(self)!r})"
@@ -130,15 +126,14 @@ class Discovery(Displayed):
 
 def ranked(found: Discovery) -> list[Tested]:
     """The first round's tests: what was found, then those that were fitted by what they gained, then the others."""
-    tests = found.search.rounds[0].screening.tests.tested
     total = {c.variant.name: c.total for c in found.search.rounds[0].candidates}
     chosen = [finding.variant.name for finding in found.findings]
 
-    def place(index: int) -> tuple[int, float, int]:
-        name = tests[index].variant.name
-        return chosen.index(name) if name in chosen else len(chosen), -total.get(name, -math.inf), index
+    def place(tested: Tested) -> tuple[int, float]:
+        name = tested.variant.name
+        return chosen.index(name) if name in chosen else len(chosen), -total.get(name, -math.inf)
 
-    return [tests[i] for i in sorted(range(len(tests)), key=place)]
+    return sorted(found.search.rounds[0].screening.tests.tested, key=place)
 
 
 def _candidate(found: Discovery, tested: Tested) -> dict[str, Any]:
@@ -172,11 +167,9 @@ def _fitted(found: Discovery, tested: Tested) -> Candidate | None:
 
 def limit_of(found: Discovery, tested: Tested) -> np.ndarray:
     """What could have been seen: by the last tests, of the program with what was found, where they have the effect."""
-    name = tested.variant.name
-    last = found.search.rounds[-1].screening.tests.tested
-    return next(
-        (t.detection_limit for t in last if t.variant.name == name and not t.untestable), tested.detection_limit
-    )
+    name, last = tested.variant.name, found.search.rounds[-1].screening.tests.tested
+    limits = [one.detection_limit for one in last if one.variant.name == name and not one.untestable]
+    return limits[0] if limits else tested.detection_limit
 
 
 def _note(tested: Tested, fitted: Candidate | None) -> str | None:
@@ -184,15 +177,15 @@ def _note(tested: Tested, fitted: Candidate | None) -> str | None:
         return tested.untestable
     if tested.departure:
         return "the fitted noise against the declared"
-    if fitted and isinstance(fitted.refit, str):
+    if fitted is None:
+        return None
+    if isinstance(fitted.refit, str):
         return fitted.refit
-    if fitted and fitted.against_its_sign:
+    if fitted.against_its_sign:
         return "its sign is one that physics rules out: a symptom"
-    if fitted and not fitted.is_judged:
+    if not fitted.is_judged:
         return "given up after half of the drives: its gain is extrapolated"
-    if fitted and isinstance(fitted.refit, Refit) and not fitted.refit.converged:
-        return "its fit has not converged"
-    return None
+    return None if fitted.refit.converged else "its fit has not converged"
 
 
 def _finding(finding: Finding) -> dict[str, Any]:
@@ -212,20 +205,13 @@ def _finding(finding: Finding) -> dict[str, Any]:
     }
 
 
-def _side(row: dict[str, Any]) -> dict[str, Any]:
-    return {key: row[key] for key in ("log_likelihood", "measurement", "coverage_90", "scales")}
-
-
 def sentence(found: Discovery) -> str:
     """The verdict in one sentence, after a first one on the time step where that is too coarse."""
-    step, with_found = found.search.step, found.search.with_found
-    said = [step.sentence] if step.sentence else []
-    if with_found is not None and with_found.sentence:
-        said.append(f"with what was found below, {with_found.sentence}")
-    if not said:
-        return _verdict(found)
-    first = "; ".join(said)
-    return f"{first[0].upper()}{first[1:]}. All that follows is at that step. {_verdict(found)}"
+    step, with_found = found.search.step.sentence, found.search.with_found
+    later = f"with what was found below, {with_found.sentence}" if with_found and with_found.sentence else ""
+    first = "; ".join(filter(None, (step, later)))
+    said = f"{first[0].upper()}{first[1:]}. All that follows is at that step. " if first else ""
+    return said + _verdict(found)
 
 
 def _verdict(found: Discovery) -> str:
@@ -249,7 +235,10 @@ def _verdict(found: Discovery) -> str:
 
 def _said(finding: Finding, is_complete: bool) -> str:
     """A finding with how sure it is, or what it brings where the probabilities leave out what else there may be."""
-    said = f"{finding.variant.label} = {with_interval(finding)}"
+    unit = "" if finding.variant.unit in ("", "1") else f" {finding.variant.unit}"
+    pairs = zip(finding.coefficient, finding.interval, strict=True)
+    numbers = ", ".join(f"{value:.3g} [{low:.3g}, {high:.3g}]" for value, (low, high) in pairs)
+    said = f"{finding.variant.label} = {numbers}{unit}"
     if len(finding.alike) > 1:
         said += f", which these drives cannot tell from {' or '.join(finding.alike[1:])}"
     if finding.confidence is None:
@@ -258,13 +247,6 @@ def _said(finding: Finding, is_complete: bool) -> str:
         return f"{said} ({finding.gain:+.0f} nats held out)"
     sure = ">99 %" if finding.confidence > 0.99 else f"{100 * finding.confidence:.0f} %"
     return f"{said} (confidence {sure})"
-
-
-def with_interval(finding: Finding) -> str:
-    """A coefficient with its 90 % interval and unit."""
-    unit = "" if finding.variant.unit in ("", "1") else f" {finding.variant.unit}"
-    pairs = zip(finding.coefficient, finding.interval, strict=True)
-    return ", ".join(f"{value:.3g} [{low:.3g}, {high:.3g}]" for value, (low, high) in pairs) + unit
 
 
 def _table(found: Discovery) -> list[str]:
@@ -291,26 +273,22 @@ def _limits(found: Discovery, tested: Sequence[Tested]) -> list[str]:
 
 def _line(found: Discovery, tested: Tested) -> list[str]:
     one = _candidate(found, tested)
-    name = f"curve {tested.variant.at}" if tested.is_curve else tested.variant.name
     gain = "" if one["heldout_gain"] is None else f"{one['heldout_gain']:+.1f}"
     statistic, p_value = ("–", "–") if tested.untestable else (f"{one['statistic']:.1f}", f"{one['p_value']:.1g}")
+    test = [one["kind"], statistic, p_value, gain]
     if tested.is_curve:
-        return [name, one["kind"], statistic, p_value, gain, "", "", "", ""]
-    numbers = [_short(one[key]) for key in ("coefficient", "sd", "detection_limit")]
-    return [name, one["kind"], statistic, p_value, gain, *numbers, one["unit"]]
+        return [f"curve {tested.variant.at}", *test, "", "", "", ""]
+    return [one["effect"], *test, *(_short(one[key]) for key in ("coefficient", "sd", "detection_limit")), one["unit"]]
 
 
-def _short(value: Any) -> str:
-    if value is None:
-        return "–"
-    return ", ".join(f"{v:.2g}" for v in value) if isinstance(value, list) else f"{value:.3g}"
+def _short(value: float | list[float] | None) -> str:
+    return ", ".join(f"{v:.2g}" for v in value) if isinstance(value, list) else number(value, ".3g")
 
 
 def _numbers(values: np.ndarray) -> float | list[float] | None:
     if not np.isfinite(values).all():
         return None
-    found = [float(value) for value in values]
-    return found[0] if len(found) == 1 else found
+    return float(values[0]) if len(values) == 1 else [float(value) for value in values]
 
 
 def _options(variant: Variant) -> dict[str, Any]:

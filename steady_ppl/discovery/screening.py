@@ -9,18 +9,18 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import partial
 
 import numpy as np
 import torch
 from scipy import optimize, special
 from torch import Tensor
 
-from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.curves import NAME as CURVE, prior_covariance
-from steady_ppl.discovery.effect_scores import Column, Simulated
+from steady_ppl.discovery.effect_scores import Column
 from steady_ppl.discovery.refits import Fold, Refit, as_declared
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.likelihood.parameters import Element, on_both_sides
@@ -38,8 +38,9 @@ class Tested:
     """A candidate's test: of its best column where it has several."""
 
     column: Column
+    place: slice  # of its numbers among those of all columns
     statistic: float  # the Lagrange multiplier; of a curve, with its prior
-    p_value: float  # of this candidate alone
+    p_values: np.ndarray  # of this candidate alone, on the drives and then on every simulated set, (1 + S,)
     coefficient: np.ndarray  # one scoring step from zero, (k,)
     sd: np.ndarray  # its standard deviation, (k,)
     detection_limit: np.ndarray  # found with 95 % power at the family-wise level, each number alone, (k,)
@@ -50,6 +51,11 @@ class Tested:
     departure: bool = False  # whether it says that a fitted σ is not the declared: there is nothing left to fit then
 
     @property
+    def p_value(self) -> float:
+        """Of this candidate alone, on the drives."""
+        return float(self.p_values[0])
+
+    @property
     def variant(self) -> Variant:
         """The effect."""
         return self.column.variant
@@ -57,7 +63,11 @@ class Tested:
     @property
     def is_curve(self) -> bool:
         """Whether it is no named effect."""
-        return self.variant.effect.name == CURVE
+        return self.column.is_curve
+
+    def rank(self) -> tuple[float, float]:
+        """Small where much is found, also where p-values are too small to be told apart."""
+        return self.p_value, -self.statistic
 
 
 @dataclass(frozen=True)
@@ -68,25 +78,25 @@ class Screened:
     curves: list[Tested]  # every curve's test, the largest evidence first
     p_value: float  # family-wise, of the smallest
     critical: float  # the single p-value below which the family-wise level is kept
-    fitted: tuple[float, int]
-    """The Lagrange multiplier of the fitted parameters themselves, large where the fit has not converged, and how many
-    they are."""
+    fitted: tuple[float, int]  # Lagrange multiplier of the fitted parameters, large at a bound; how many they are
     alike: Tensor  # candidate × candidate, the largest canonical correlation of their projected columns
+    information: Tensor  # covariance of a set's summed scores, of the parameters and then of the columns, (N, N)
 
 
 def screen(
-    observed: Tensor, simulated: Simulated, fitted: int, columns: Sequence[Column], departures: Sequence[Departure] = ()
+    observed: Tensor, simulated: Tensor, fitted: int, columns: Sequence[Column], departures: Sequence[Departure] = ()
 ) -> Screened:
     """Test every candidate.
 
     Args:
         observed: scores of the drives, `(B, N)`: of the `fitted` parameters first and then of the columns, in order.
-        simulated: the same of simulated sets.
+        simulated: the same of simulated sets, `(S, B, N)`.
         departures: of the fitted noise from the declared.
     """
-    sums = simulated.scores.sum(1)
+    sums = simulated.sum(1)
     bias = sums.mean(0)
-    information = simulated.information
+    apart = simulated - simulated.mean(0)  # of each drive among the sets
+    information = torch.einsum("sbi,sbj->ij", apart, apart) / (len(apart) - 1)
     scores = torch.cat([(observed.sum(0) - bias).unsqueeze(0), sums - bias])
     own, rest = slice(0, fitted), slice(fitted, None)
     inverse = torch.linalg.pinv(information[own, own], hermitian=True)  # `lstsq` rounds differently from run to run
@@ -99,33 +109,31 @@ def screen(
     ends = [*itertools.accumulate(column.size for column in columns)]
     places = [slice(end - column.size, end) for column, end in zip(columns, ends, strict=True)]
 
-    found, chosen, curves = [], [], []
-    for members in _groups(columns):
-        tests = [_test(columns[i], places[i], projected, left, before) for i in members]
-        alive = [test for test in tests if test is not None]
+    groups = defaultdict[str, list[int]](list)
+    for index, column in enumerate(columns):
+        groups[CURVE if column.is_curve else column.variant.name].append(index)
+    tests, curves = list[Tested](), list[Tested]()
+    for members in groups.values():
+        found = [_test(columns[i], places[i], projected, left, before) for i in members]
+        alive = [test for test in found if test is not None]
         if alive:
-            found.append(_best_of(alive))
-            chosen.append(min(alive, key=_Test.rank).place)
+            tests.append(_best_of(alive))
         else:
-            excited = any(bool((before[places[i]] > 0).any()) for i in members)
-            found.append((_untestable(columns[members[0]], CONTAINED if excited else UNEXCITED), np.ones(len(scores))))
-            chosen.append(places[members[0]])
-        curves += [_best_of([test])[0] for test in alive if test.tested.is_curve]
-    for departure in departures:
-        found.append(_departed(departure, information[own, own], scores[:, own]))
-        chosen.append(slice(0, 0))
-    family = np.stack([p_values for _, p_values in found]).min(0)
+            why = CONTAINED if any(bool((before[places[i]] > 0).any()) for i in members) else UNEXCITED
+            tests.append(_untestable(columns[members[0]], places[members[0]], why, len(scores)))
+        curves += [_best_of([test]) for test in alive if test.is_curve]
+    tests += [_departed(departure, information[own, own], scores[:, own]) for departure in departures]
+    tests.sort(key=Tested.rank)
+    family = np.stack([test.p_values for test in tests]).min(0)
     critical = _critical(family[1:])
-    tested = [replace(t, detection_limit=_limit(t, critical)) for t, _ in found]
-    own_step = inverse @ scores[0, own]
-    order = sorted(range(len(tested)), key=lambda i: (tested[i].p_value, -tested[i].statistic))
     return Screened(
-        tested=[tested[i] for i in order],
+        tested=[replace(test, detection_limit=_limit(test, critical)) for test in tests],
         curves=sorted(curves, key=lambda test: -test.evidence),
         p_value=(1 + float((family[1:] <= family[0]).sum())) / len(family),
         critical=critical,
-        fitted=(float(scores[0, own] @ own_step), fitted),
-        alike=_alike(left, [chosen[i] for i in order]),
+        fitted=(float(scores[0, own] @ (inverse @ scores[0, own])), fitted),
+        alike=_alike(left, [test.place for test in tests]),
+        information=information,
     )
 
 
@@ -135,47 +143,35 @@ def _critical(simulated: np.ndarray) -> float:
     return float(np.nextafter(np.sort(simulated)[max(0, allowed)], 0.0))
 
 
-class _Test(NamedTuple):
-    """The test of one column, its place among all, and its p-values in every set, the drives' first."""
-
-    tested: Tested
-    place: slice
-    p_values: np.ndarray
-
-    def rank(self) -> tuple[float, float]:
-        """Small where much is found, also where p-values are too small to be told apart."""
-        return self.tested.p_value, -self.tested.statistic
+def _best_of(tests: list[Tested]) -> Tested:
+    """The test of the best of several columns, corrected for how many independent tests they are like."""
+    effective, smallest = 1.0, np.stack([test.p_values for test in tests]).min(0)
+    if len(tests) > 1:
+        median = float(np.clip(np.median(smallest[1:]), 1e-6, 0.5))
+        effective = max(1.0, math.log(0.5) / math.log1p(-median))
+    together = -np.expm1(effective * np.log1p(-np.minimum(smallest, 1 - 1e-12)))
+    return replace(min(tests, key=Tested.rank), p_values=together, effective=effective)
 
 
-def _best_of(tests: list[_Test]) -> tuple[Tested, np.ndarray]:
-    """The test of the best of several columns, and its p-values in every set."""
-    p_values = np.stack([test.p_values for test in tests])
-    effective = _effective(p_values[:, 1:].min(0)) if len(tests) > 1 else 1.0
-    together = -np.expm1(effective * np.log1p(-np.minimum(p_values.min(0), 1 - 1e-12)))
-    best = min(tests, key=_Test.rank).tested
-    return replace(best, p_value=float(together[0]), effective=effective), together
-
-
-def _untestable(column: Column, why: str) -> Tested:
-    nothing = np.zeros(column.size)
-    return Tested(column, 0.0, 1.0, nothing, nothing + math.inf, nothing + math.inf, untestable=why)
+def _untestable(column: Column, place: slice, why: str, sets: int) -> Tested:
+    nothing, endless = np.zeros(column.size), np.full(column.size, math.inf)
+    return Tested(column, place, 0.0, np.ones(sets), nothing, endless, endless, untestable=why)
 
 
 def _limit(tested: Tested, critical: float) -> np.ndarray:
     """The size of each number, the others zero, at which a noncentral χ² passes the family's level with 95 %."""
-    nothing = np.full(len(tested.coefficient), math.inf)
-    if tested.untestable or tested.is_curve or tested.alone is None or not math.isfinite(tested.variant.effect.null):
-        return nothing
     size = len(tested.coefficient)
+    if tested.untestable or tested.is_curve or tested.alone is None or not math.isfinite(tested.variant.effect.null):
+        return np.full(size, math.inf)
     level = -math.expm1(math.log1p(-critical) / tested.effective)
     threshold = special.chdtri(size, level)
     needed = optimize.brentq(lambda away: 1 - special.chndtr(threshold, size, away) - POWER, 1e-6, 1e4)
     return math.sqrt(needed) * tested.alone
 
 
-def _test(column: Column, place: slice, projected: Tensor, left: Tensor, before: Tensor) -> _Test | None:
+def _test(column: Column, place: slice, projected: Tensor, left: Tensor, before: Tensor) -> Tested | None:
     own, scores = left[place, place], projected[:, place]
-    if column.variant.effect.name == CURVE:
+    if column.is_curve:
         return _test_of_curve(column, place, scores, own) if bool((own.diagonal() > 0).any()) else None
     enough = own.diagonal() > MIN_SHARE_OF_INFORMATION * before[place]
     if not bool((before[place] > 0).all()) or not bool(enough.all()):
@@ -184,13 +180,10 @@ def _test(column: Column, place: slice, projected: Tensor, left: Tensor, before:
     statistics = (scores * steps).sum(-1).numpy()
     p_values = special.chdtrc(column.size, statistics.clip(min=0))  # by rounding some are negative
     sd, alone = torch.linalg.inv(own).diagonal().sqrt().numpy(), own.diagonal().rsqrt().numpy()
-    coefficient = steps[0].numpy()
-    return _Test(
-        Tested(column, float(statistics[0]), float(p_values[0]), coefficient, sd, sd, alone=alone), place, p_values
-    )
+    return Tested(column, place, float(statistics[0]), p_values, steps[0].numpy(), sd, sd, alone=alone)
 
 
-def _test_of_curve(column: Column, place: slice, scores: Tensor, own: Tensor) -> _Test:
+def _test_of_curve(column: Column, place: slice, scores: Tensor, own: Tensor) -> Tested:
     """A score test against the prior (Liu, Lin and Ghosh 2007): a weighted sum of χ² of one degree of freedom, matched
     by a scaled χ² of the same mean and variance (Satterthwaite)."""
     covariance = prior_covariance(column.variant.effect)
@@ -202,22 +195,21 @@ def _test_of_curve(column: Column, place: slice, scores: Tensor, own: Tensor) ->
     scale, freedom = float(weights.square().sum() / weights.sum()), float(weights.sum() ** 2 / weights.square().sum())
     statistics = squares.sum(-1).numpy()
     posterior = torch.linalg.inv(own + torch.linalg.inv(covariance))
-    p_values = special.chdtrc(freedom, statistics / scale)
     sd = posterior.diagonal().sqrt().numpy()
-    tested = Tested(
+    return Tested(
         column,
+        place,
         float(statistics[0]),
-        float(p_values[0]),
+        special.chdtrc(freedom, statistics / scale),
         coefficient=(posterior @ scores[0]).numpy(),
         sd=sd,
         detection_limit=sd,
         evidence=0.5 * float(statistics[0]) - 0.5 * float(torch.log1p(values).sum()),
         alone=own.diagonal().rsqrt().numpy(),
     )
-    return _Test(tested, place, p_values)
 
 
-def _departed(departure: Departure, information: Tensor, scores: Tensor) -> tuple[Tested, np.ndarray]:
+def _departed(departure: Departure, information: Tensor, scores: Tensor) -> Tested:
     """A Wald test of the fitted noise against the declared."""
     ridge = 1e-10 * float(information.diagonal().max()) * torch.eye(len(information)).double()
     step = torch.linalg.solve(information + ridge, departure.slope)  # a vanished noise has no information
@@ -225,41 +217,23 @@ def _departed(departure: Departure, information: Tensor, scores: Tensor) -> tupl
     z = torch.cat([torch.tensor([departure.away]).double(), scores[1:] @ step]).numpy() / sd
     p_values = 2 * special.ndtr(-np.abs(z))
     sds = np.array([sd * (math.sqrt(departure.share) * departure.factor)])
-    coefficient = np.array([departure.factor - 1])
-    column = Column(departure.variant)
-    tested = Tested(column, float(z[0] ** 2), float(p_values[0]), coefficient, sds, sds, alone=sds, departure=True)
-    return tested, p_values
+    column, nowhere, change = Column(departure.variant), slice(0, 0), np.array([departure.factor - 1])
+    return Tested(column, nowhere, float(z[0] ** 2), p_values, change, sds, sds, alone=sds, departure=True)
 
 
-def _effective(smallest: np.ndarray) -> float:
-    """How many independent tests the smallest of several p-values is like, from its median under the program."""
-    median = float(np.clip(np.median(smallest), 1e-6, 0.5))
-    return max(1.0, math.log(0.5) / math.log1p(-median))
-
-
-def _groups(columns: Sequence[Column]) -> list[list[int]]:
-    groups: dict[str, list[int]] = {}
-    for index, column in enumerate(columns):
-        effect = column.variant.effect.name
-        groups.setdefault(CURVE if effect == CURVE else column.variant.name, []).append(index)
-    return list(groups.values())
-
-
-def _alike(left: Tensor, chosen: Sequence[slice]) -> Tensor:
+def _alike(left: Tensor, places: Sequence[slice]) -> Tensor:
     """Largest canonical correlations between the candidates' columns."""
-    count = len(chosen)
-    whitened = []
-    for at in chosen:
-        own = left[at, at]
-        if bool((own.diagonal() > 0).all()):
-            whitened.append(torch.linalg.inv(torch.linalg.cholesky(own + 1e-10 * torch.diag(own.diagonal()))))
-        else:
-            whitened.append(torch.zeros_like(own))
-    alike = torch.eye(count, dtype=torch.float64)
-    for i in range(count):
-        for j in range(i):
-            across = whitened[i] @ left[chosen[i], chosen[j]] @ whitened[j].T
-            alike[i, j] = alike[j, i] = float(torch.linalg.matrix_norm(across, 2).clamp(max=1.0))
+
+    def whitening(own: Tensor) -> Tensor:
+        if not bool((own.diagonal() > 0).all()):
+            return torch.zeros_like(own)
+        return torch.linalg.inv(torch.linalg.cholesky(own + 1e-10 * torch.diag(own.diagonal())))
+
+    whitened = [whitening(left[place, place]) for place in places]
+    alike = torch.eye(len(places), dtype=torch.float64)
+    for j, i in itertools.combinations(range(len(places)), 2):
+        across = whitened[i] @ left[places[i], places[j]] @ whitened[j].T
+        alike[i, j] = alike[j, i] = float(torch.linalg.matrix_norm(across, 2).clamp(max=1.0))
     return alike
 
 
@@ -281,68 +255,46 @@ class Departure:
 
 @torch.no_grad()
 def departures(declared: Program, now: Refit, parts: Sequence[Element]) -> list[Departure]:
-    """Of every group of channels and of the measurements, where their noise is learned and no guess (`guesses`).
+    """Departures of every group of channels and of the measurements, where their noise is learned and no guess.
 
-    `declared` is the program as it was before it was fitted, `parts` are the learnable numbers of the first fold's
-    program. What effects that were added to the program do to its noise is no departure.
+    `declared` is the program before it was fitted, `parts` are the learnable numbers of the first fold's program. What
+    effects that were added to the program do to its noise is no departure.
     """
     if not parts:
         return []
     program, fold = now.program, now.folds[0]
     effects = {known.parameter for known in attached(program)}
     own = torch.tensor([part.name.split("[")[0] not in effects for part in parts])
+    guessed = torch.tensor([any(part.name.startswith(guess) for guess in program.guesses) for part in parts])
     found = []
-    for name, spread in SPREADS.items():
-        slope = _slope(spread, program, fold, parts) * own.unsqueeze(-1)
-        away = _away(spread, declared, program, fold)
-        mean = now.mean([_away(spread, declared, *one) for one in zip(now.judges.programs, now.folds, strict=True)])
-        variants = [v for effect in catalogue(program) if effect.name == name for v in effect.variants(program)]
-        for variant in variants:
-            index = _columns(program, variant)
-            index = [i for i in index if bool(slope[:, i].any()) and not _guessed(program, parts, slope[:, i])]
+    for name, log_spread in LOG_SPREADS.items():
+        sides = [on_both_sides(part, partial(log_spread, program, fold)) for part in parts]
+        slope = torch.stack([(up - down) / (2 * part.step) for part, (up, down) in zip(parts, sides, strict=True)])
+        slope = slope * own.unsqueeze(-1)
+        is_tested = (slope != 0).any(0) & ~(slope[guessed] != 0).any(0)
+        away, *judged = (
+            log_spread(one, drives) - log_spread(as_declared(declared, one), drives)
+            for one, drives in zip((program, *now.judges.programs), (fold, *now.folds), strict=True)
+        )
+        mean = now.mean(judged)
+        for variant in [v for effect in catalogue(program) if effect.name == name for v in effect.variants(program)]:
+            channels = [program.channel_names.index(name) for name in variant.options.get("channels", ())]
+            index = [i for i in channels or range(slope.shape[1]) if is_tested[i]]
             if index:
-                of_all = float(mean[index].mean())
-                found.append(
-                    Departure(variant, float(away[index].mean()), of_all, now.first_share, slope[:, index].mean(1))
-                )
+                of_first, of_all = float(away[index].mean()), float(mean[index].mean())
+                found.append(Departure(variant, of_first, of_all, now.first_share, slope[:, index].mean(1)))
     return found
 
 
-def _slope(spread: Spread, program: Program, fold: Fold, parts: Sequence[Element]) -> Tensor:
-    """The derivative of log standard deviations in the parameters, `(P, C)` or `(P, K)`."""
-    slopes = []
-    for part in parts:
-        up, down = on_both_sides(part, lambda: spread(program, fold.drives, fold.path.states))
-        slopes.append((up - down) / (2 * part.step))
-    return torch.stack(slopes)
+def _log_spreads_of_channels(program: Program, fold: Fold) -> Tensor:
+    """Mean log standard deviations over the drives, `(C,)`."""
+    spread = substep_spreads(program, fold.drives, fold.path.states[:-1].unsqueeze(0))
+    return spread[0][fold.drives.transitions].log().mean(0).double()
 
 
-def _away(spread: Spread, declared: Program, program: Program, fold: Fold) -> Tensor:
-    """Log ratios of standard deviations to the declared, `(C,)` or `(K,)`."""
-    here, there = (spread(one, fold.drives, fold.path.states) for one in (program, as_declared(declared, program)))
-    return here - there
+def _log_spreads_of_measurements(program: Program, fold: Fold) -> Tensor:
+    spread = measured(program, fold.path.states.unsqueeze(0)).spread
+    return spread[0][fold.drives.rows].log().mean(0).double()
 
 
-def _of_channels(program: Program, data: Trajectories, states: Tensor) -> Tensor:
-    spread = substep_spreads(program, data, states[:-1].unsqueeze(0))
-    return spread[0][data.transitions].log().mean(0).double()
-
-
-def _of_measurements(program: Program, data: Trajectories, states: Tensor) -> Tensor:
-    return measured(program, states.unsqueeze(0)).spread[0][data.rows].log().mean(0).double()
-
-
-Spread = Callable[[Program, Trajectories, Tensor], Tensor]
-SPREADS: dict[str, Spread] = {"process_noise": _of_channels, "measurement_noise": _of_measurements}
-
-
-def _columns(program: Program, variant: Variant) -> list[int]:
-    """Of the standard deviations that an effect multiplies."""
-    if "channels" not in variant.options:
-        return list(range(len(program.measurement_names)))
-    return [program.channel_names.index(channel) for channel in variant.options["channels"]]
-
-
-def _guessed(program: Program, parts: Sequence[Element], slope: Tensor) -> bool:
-    moving = [part.name for part, value in zip(parts, slope.tolist(), strict=True) if value]
-    return any(name.startswith(guess) for name in moving for guess in program.guesses)
+LOG_SPREADS = {"process_noise": _log_spreads_of_channels, "measurement_noise": _log_spreads_of_measurements}

@@ -7,7 +7,7 @@ is held-out log p(y), each drive judged by a program that was fitted without it,
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -25,16 +25,7 @@ from steady_ppl.discovery.candidates import (
     leaders,
     screen_program,
 )
-from steady_ppl.discovery.refits import (
-    ALWAYS,
-    Fits,
-    Refit,
-    Threshold,
-    first_refit,
-    fit_near,
-    judged_fits,
-    refit_with,
-)
+from steady_ppl.discovery.refits import ALWAYS, Fits, Refit, Threshold, first_refit, fit_near, judged_fits, refit_with
 from steady_ppl.discovery.screening import ALPHA, Tested
 from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
@@ -44,8 +35,6 @@ from steady_ppl.model.substeps import with_substeps
 from steady_ppl.utils.progress import stages
 
 MIN_GAIN_OF_CURVE = 3.0  # nats by which a curve must be better than named effects
-
-
 MAX_NATS_BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
 MAX_NATS_OF_RIVAL = 12.0  # nats behind the best in its round, with which one is fitted again beside other effects
 SAME = 0.2  # nats within which fits from two starts have ended at the same place
@@ -69,6 +58,10 @@ class Settings:
         """Test every candidate that a fitted program does not have, in a round counted from 0."""
         sets = self.later_sets if index else self.sets
         return screen_program(now, self.declared, sets=sets, seed=self.seed + index, withheld=self.withheld)
+
+    def with_substeps(self, substeps: int) -> Settings:
+        """The same of a program at another step."""
+        return replace(self, declared=with_substeps(self.declared, substeps))
 
 
 @dataclass(frozen=True)
@@ -109,13 +102,10 @@ class Search:
     final: Refit  # the program with all effects that were found, fitted
     step: StepCheck  # the program as it stands beside itself at finer steps; all else is at the step that suits
     gained: float  # nats that fitting the program as it stands gained on the training drives
-    with_found: StepCheck | None = None
-    """The program with what was found beside itself at finer steps, where these asked for a second search at the step
-    that suits; None where they did not."""
+    with_found: StepCheck | None = None  # the same with what was found, where that asked for a search at a finer step
     rounds: list[Round] = field(default_factory=list)  # the last tests the final program unless the search ended early
     found: list[Found] = field(default_factory=list)  # the effects that were added
-    curves: list[Candidate] = field(default_factory=list)
-    """Fits of curves in place of the first effect, best first, where effects alone did not explain the drives."""
+    curves: list[Candidate] = field(default_factory=list)  # fitted in place of the first effect, best first
     diverged: list[str] = field(default_factory=list)  # effects taken back: the program blew up with them
 
     @property
@@ -132,8 +122,7 @@ class Search:
 
     @property
     def curve(self) -> Candidate | None:
-        """The curve that explains the drives better than all effects that were found; where the noise alone may be what
-        the tests found, one that is significant itself."""
+        """The curve that gains more than all effects; where the noise departs as well, it must be significant."""
         best = next((curve for curve in self.curves if curve.is_judged), None)
         if best is None or best.total <= self.gain + MIN_GAIN_OF_CURVE:
             return None
@@ -148,10 +137,7 @@ class Search:
 
 
 def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
-    """Look for the effects that a program lacks, which is not changed.
-
-    It is tested by the drives of the problem; both they and `valid`, as returned by `for_program`, choose.
-    """
+    """Look for the effects that a program lacks; its drives test it, both they and `valid` choose."""
 
     def first(program: Program, nearer: Program | None = None) -> Refit:
         return first_refit(replace(problem, program=program), valid, seed=settings.seed, nearer=nearer)
@@ -164,44 +150,35 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
         begin()
         step = _step_of(base)
         if step.too_coarse:  # the step is no effect: what follows is about the program at the step that suits
-            program, settings = _with_substeps(program, settings, step.suited.substeps)
+            program = with_substeps(program, step.suited.substeps)
+            settings = settings.with_substeps(step.suited.substeps)
             base = first(program, step.suited.program)
         begin()
         found = _rounds(Search(base, base, step, gained), settings)
-        with_found = _step_of(found.final, found.found) if found.found else step
-        if found.found and with_found.too_coarse:  # what was found asks for a finer step: sizes are those of that step
+        if not found.found:
+            return found
+        parameters = [variant.parameter for variant in attached(found.final.program)]
+        with_found = _step_of(found.final, watched=parameters, max_shift=MAX_SHIFT_OF_SIZES)
+        if with_found.too_coarse:  # what was found asks for a finer step: sizes are those of that step
             finer = with_found.suited.substeps
-            program, settings = _with_substeps(program, settings, finer)
-            base = first(program, with_substeps(found.base.program, finer))
-            found = _rounds(Search(base, base, step, gained, with_found), settings)
+            base = first(with_substeps(program, finer), with_substeps(found.base.program, finer))
+            found = _rounds(Search(base, base, step, gained, with_found), settings.with_substeps(finer))
     return found
 
 
-def _with_substeps(program: Program, settings: Settings, substeps: int) -> tuple[Program, Settings]:
-    declared = with_substeps(settings.declared, substeps)
-    return with_substeps(program, substeps), replace(settings, declared=declared)
-
-
-def _step_of(refit: Refit, found: Sequence[Found] = ()) -> StepCheck:
-    """A program that was fitted to the first fold beside itself at finer steps, on these drives; sizes of what was
-    found must not go with the step."""
-    watched: dict[str, Any] = {}
-    if found:
-        parameters = [variant.parameter for variant in attached(refit.program)]
-        watched = {"watched": parameters, "max_shift": MAX_SHIFT_OF_SIZES}
-    fold = refit.folds[0]
-    settings = {"known_start": fold.known_start, "finest": MAX_SUBSTEPS_OF_FIT} | watched
-    return check_step(refit.program, fold.drives, refit.maxima[0], **settings)
+def _step_of(refit: Refit, **watched: Any) -> StepCheck:
+    """A program that was fitted to the first fold beside itself at finer steps, on these drives."""
+    given = (refit.program, refit.folds[0].drives, refit.maxima[0])
+    return check_step(*given, known_start=refit.folds[0].known_start, finest=MAX_SUBSTEPS_OF_FIT, **watched)
 
 
 def _rounds(found: Search, settings: Settings) -> Search:
     """Test, fit and add until nothing is left."""
     with stages(("", 6), ("looking again", 1), ("fitting curves", 1)) as begin:
         begin()
-        rounds = range(MAX_EFFECTS + 1)
-        shares = [part for index in rounds for part in (("testing every effect", 1 / 2**index), ("", 1 / 2**index))]
+        shares = [(said, 0.5**index) for index in range(MAX_EFFECTS + 1) for said in ("testing every effect", "")]
         with stages(*shares) as begin_part:
-            for index in rounds:
+            for index in range(MAX_EFFECTS + 1):
                 begin_part()
                 try:
                     screening = settings.screen(found.final, index)
@@ -233,9 +210,7 @@ def _rounds(found: Search, settings: Settings) -> Search:
 def _add_best(found: Search, screening: Screening, index: int) -> bool:
     """Fit what the tests of a round point at and add the best, if it brings enough; whether anything was added."""
     found.rounds.append(Round(screening, [], None))
-    if found.rounds[-1].quiet:
-        return False
-    if index == MAX_EFFECTS:
+    if found.rounds[-1].quiet or index == MAX_EFFECTS:
         return False
     candidates = _refits(found.final, screening, index == 0)
     able = [c for c in candidates if c.is_judged and not c.against_its_sign]
@@ -247,24 +222,26 @@ def _add_best(found: Search, screening: Screening, index: int) -> bool:
     found.rounds[-1] = Round(screening, candidates, best)
     if best is None:
         return False
-    found.found.append(Found(best, candidates, found.final))
     assert isinstance(best.refit, Refit)
+    found.found.append(Found(best, candidates, found.final))
     found.final = best.refit
     return True
 
 
 def _refits(now: Refit, screening: Screening, first: bool) -> list[Candidate]:
-    candidates: list[Candidate] = []
-    chosen = leaders(screening.tests, first)
+    candidates, chosen = list[Candidate](), leaders(screening.tests, first)
     with stages(*((f"fitting with {tested.variant.label}", 1) for tested in chosen)) as begin:
         for tested in chosen:
             begin()
             candidates.append(fitted(now, tested, screening, _threshold(candidates)))
     best = max((c for c in candidates if c.is_judged), key=lambda c: c.total, default=None)
     candidates = [c if c.is_judged else replace(c, behind=best) for c in candidates]
-    close = max((candidate.total for candidate in candidates), default=0.0) - MAX_NATS_OF_RIVAL
-    found = [at_its_best_place(now, c) if c.total > close else c for c in candidates]
-    return sorted(found, key=lambda candidate: -candidate.total)
+    least = max((c.total for c in candidates), default=0.0) - MAX_NATS_OF_RIVAL
+    return _ranked(at_its_best_place(now, c) if c.total > least else c for c in candidates)
+
+
+def _ranked(candidates: Iterable[Candidate]) -> list[Candidate]:
+    return sorted(candidates, key=lambda candidate: -candidate.total)
 
 
 def _threshold(candidates: Sequence[Candidate]) -> Threshold:
@@ -276,26 +253,22 @@ def _threshold(candidates: Sequence[Candidate]) -> Threshold:
 
 
 def _curves(search: Search) -> list[Candidate]:
-    """Fits of the curves that the first tests point at, to the program as it stands. One is given up where it stays
-    `MAX_NATS_BEHIND` behind all named effects together on the first fold."""
+    """Fits of the curves that the first tests point at; they are given up where they stay far behind all effects."""
     base, screening = search.base, search.rounds[0].screening
     named, threshold = None, ALWAYS
     if search.found:
         named = judged(base, search.found[0].candidate.tested, search.final)
         threshold = replace(_threshold([named]), stops_early=True)
 
-    def multiplies(tested: Tested) -> bool:
-        return bool(tested.variant.options.get("times"))
-
-    def worth(candidate: Candidate) -> float:
-        """The simpler one, unless the other brings clearly more."""
-        return candidate.total - (MIN_GAIN_OF_CURVE if multiplies(candidate.tested) else 0.0)
+    def multiplies(one: Tested | Candidate) -> bool:
+        return bool(one.variant.options.get("times"))
 
     adding = [tested for tested in screening.tests.curves if not multiplies(tested)]
     multiplying = [tested for tested in screening.tests.curves if multiplies(tested)]
     chosen = [*adding[:MAX_CURVES], *multiplying[:1]]
     found = [replace(fitted(base, tested, screening, threshold), behind=named) for tested in chosen]
-    return sorted(found, key=worth, reverse=True)
+    # the simpler one, unless the other brings clearly more
+    return sorted(found, key=lambda c: c.total - MIN_GAIN_OF_CURVE * multiplies(c), reverse=True)
 
 
 def labels(refit: Refit) -> list[str]:
@@ -321,7 +294,7 @@ def prune(search: Search) -> None:
         as_it_stands = judged(without, chosen.tested, search.final)
         if all(c.total < as_it_stands.total for c in again if c.variant.name == chosen.variant.name):
             again = [as_it_stands, *(c for c in again if c.variant.name != chosen.variant.name)]
-        again.sort(key=lambda candidate: -candidate.total)
+        again = _ranked(again)
         best = next((c for c in again if not c.against_its_sign), None)
         place = search.found.index(found)
         if best is None or best.total <= NATS or isinstance(best.refit, str):
@@ -333,8 +306,8 @@ def prune(search: Search) -> None:
 
 
 def _without(search: Search, found: Found) -> Refit | str:
-    """The program with the other effects. Of a fit of one after the other and one from where the fit of all ended it is
-    the likelier: a fit that has stopped early makes an effect look needed."""
+    """The program with the other effects, fitted one by one or from the fit of all, whichever is likelier: a fit that
+    has stopped early makes an effect look needed."""
     others = [other.candidate for other in search.found if other is not found]
     was_so = set(labels(found.without)) - set(labels(search.base)) == {other.variant.label for other in others}
     afresh = found.without if was_so else _with_all(search.base, others)

@@ -11,7 +11,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from steady_ppl.comparison.metrics import OPEN_LOOP
+from steady_ppl.comparison.evaluate import OPEN_LOOP
 from steady_ppl.discovery.discover import discover
 from steady_ppl.errors import ComputationError, RunError, UsageError, labelled
 from steady_ppl.model.loading import load_program

@@ -90,6 +90,11 @@ def command_line() -> str | None:
     return _command.get()
 
 
+def number(value: float | None, form: str) -> str:
+    """A figure as text, a dash where there is none."""
+    return "–" if value is None else f"{value:{form}}"
+
+
 def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list[str]:
     """Rows of cells as lines of equal columns, which are flush right but for those that are `left`.
 

@@ -12,7 +12,7 @@ from examples import drives, example
 from oracles import assert_mean, cart_parameters, cart_system, kalman
 
 from steady_ppl import seeded
-from steady_ppl.comparison.metrics import measurement_errors
+from steady_ppl.comparison.evaluate import measurement_errors
 from steady_ppl.likelihood.evidence import in_parts
 
 
@@ -151,7 +151,7 @@ def test_nothing_measured_gives_no_error(cart, data):
 
 def test_trajectories_in_parts_have_the_same_errors(still, data, monkeypatch):
     one = errors_of(still, data)
-    monkeypatch.setattr("steady_ppl.comparison.metrics.in_parts", partial(in_parts, at_once=20))
+    monkeypatch.setattr("steady_ppl.comparison.evaluate.in_parts", partial(in_parts, at_once=20))
     parts = errors_of(still, data)
     del one["coverage_90"], parts["coverage_90"]  # other random numbers
     assert parts == pytest.approx(one, rel=1e-6)

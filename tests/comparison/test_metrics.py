@@ -12,7 +12,7 @@ from examples import cut, drives, example
 from oracles import CartPosterior, assert_mean, cart_parameters, cart_system
 
 from steady_ppl import seeded
-from steady_ppl.comparison.metrics import forward, forward_mean, squared_errors, state_estimation
+from steady_ppl.comparison.evaluate import forward, forward_mean, squared_errors, state_estimation
 from steady_ppl.likelihood.evidence import in_parts
 
 HORIZON = 10
@@ -190,5 +190,5 @@ def test_groups_without_truth_are_left_out():
 
 def test_trajectories_in_parts_have_the_same_error(still, data, monkeypatch):
     one = state_estimation(still, data, particles=20, known_start=True, lineages=2)
-    monkeypatch.setattr("steady_ppl.comparison.metrics.in_parts", partial(in_parts, at_once=60))
+    monkeypatch.setattr("steady_ppl.comparison.evaluate.in_parts", partial(in_parts, at_once=60))
     assert state_estimation(still, data, particles=20, known_start=True, lineages=2) == pytest.approx(one, rel=1e-6)

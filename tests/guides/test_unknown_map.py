@@ -10,8 +10,7 @@ from examples import MODELS, drives, example
 from small import HOVERCRAFT, QUICK, only_start, simulated, steady, written
 
 from steady_ppl import Fit, ProgramError, UnknownMap, UsageError, load_program, log_likelihood, simulate
-from steady_ppl.comparison.evaluate import evaluate
-from steady_ppl.comparison.metrics import map_errors
+from steady_ppl.comparison.evaluate import evaluate, map_errors
 from steady_ppl.runs.recipes import find_recipe
 
 UNKNOWN = f"{MODELS / 'hovercraft_unknown_map.py'}:HovercraftUnknownMap"
