@@ -21,15 +21,12 @@ POINTER = FLOAT.as_pointer()
 
 
 def source(graph: ScalarGraph, inputs: Sequence[str], columns: dict[str, int]) -> str:
-    """The code of a graph, for a `Kernel`.
+    """The code of a graph, for a `Kernel`; `NotCompilable` where some operation has none.
 
     Args:
         graph: what to compute.
         inputs: the names of the inputs that differ between particles; the first is looked up at the ancestors.
         columns: those that differ between trajectories only, name → first column.
-
-    Raises:
-        NotCompilable: for some operation there is no code.
     """
     return str(_Writer(graph, inputs, columns).module)
 
@@ -188,19 +185,19 @@ class _Writer:
     # vectors
 
     def _bias(self, product: Product, k: Any) -> Lanes:
-        """The bias of one element; k is the kernel's own number, or known now."""
+        """The bias of one element; k is known now, or the kernel's own number."""
         run = self.graph.run_of_parameters(product.bias)
         if product.bias is None:
             return Lanes(self.builder, FLOAT(0))
         if run is not None:
-            return self._load(self.parameters, self.builder.add(LONG(run), _long(k)))
-        if not isinstance(k, int):
+            return self._load(self.parameters, self.builder.add(LONG(run), k))
+        if not isinstance(k, ir.Constant):
             raise NotCompilable("a long product whose bias is no parameter")
-        return self.scalar(product.bias[k])
+        return self.scalar(product.bias[k.constant])
 
     def _weight(self, product: Product, row: Any, column: Any) -> Lanes:
         builder = self.builder
-        down, across = builder.mul(_long(row), LONG(product.rows)), builder.mul(_long(column), LONG(product.columns))
+        down, across = builder.mul(row, LONG(product.rows)), builder.mul(column, LONG(product.columns))
         return self._load(self.parameters, builder.add(builder.add(LONG(product.at), down), across))
 
     def _base(self, vector: int) -> None:
@@ -211,32 +208,26 @@ class _Writer:
         with self._loop(LONG(product.length)) as k:
             value = self._bias(product, k)
             for i, x in shared:
-                value = value + self._weight(product, k, i) * x
+                value = value + self._weight(product, k, LONG(i)) * x
             self.builder.store(value.value, self.builder.gep(self.bases[vector], [k]))
 
     def _vector(self, vector: int) -> None:
         """Compute a vector as a whole and keep it."""
-        graph = self.graph
-        what = graph.vectors[vector]
+        what = self.graph.vectors[vector]
         place = self._reserve(WIDE, what.length)
-        whole = graph.whole_vector(what.x) if isinstance(what, Product) else None
-        if whole is None:
-            chain = self._chain(vector)
-            self._prepare(chain)
+        if isinstance(what, Each) or (whole := self.graph.whole_vector(what.x)) is None:
+            self._prepare(vector)
             with self._loop(LONG(what.length)) as k:
                 value = self._element(vector, k, {})
                 self.builder.store(value.spread(LANES).value, self.builder.gep(place, [k]))
-            self.stored[vector] = place
-            return
-        assert isinstance(what, Product)
-        if what.length > 8:
+        elif what.length > 8:
             if whole not in self.stored:
                 self._vector(whole)
             with self._loop(LONG(what.length)) as row:
                 self._sum(what, whole, [row], place)
         else:
-            self._prepare(self._chain(whole))
-            self._sum(what, whole, range(what.length), place)
+            self._prepare(whole)
+            self._sum(what, whole, [LONG(row) for row in range(what.length)], place)
         self.stored[vector] = place
 
     def _sum(self, product: Product, whole: int, rows: Sequence[Any], place: Any) -> None:
@@ -251,33 +242,24 @@ class _Writer:
                 so_far = Lanes(builder, builder.load(total))
                 builder.store((so_far + self._weight(product, row, k) * value).value, total)
         for row, total in zip(rows, sums, strict=True):
-            where = builder.gep(place, [_long(row)])
-            builder.store(builder.load(total), where)
+            builder.store(builder.load(total), builder.gep(place, [row]))
 
-    def _chain(self, vector: int) -> set[int]:
-        """The vectors that are computed along with a vector, element by element."""
+    def _prepare(self, vector: int) -> None:
+        """Compute before a loop over a vector's elements what its body takes as given."""
+        what = self.graph.vectors[vector]
         if vector in self.stored:
-            return set()
-        what, chain = self.graph.vectors[vector], {vector}
+            return
         if isinstance(what, Each):
             for kind, n in what.operands:
                 if kind == "vector":
-                    chain |= self._chain(n)
-        return chain
-
-    def _prepare(self, chain: set[int]) -> None:
-        """Compute before a loop what its body takes as given."""
-        for vector in sorted(chain):
-            what = self.graph.vectors[vector]
-            if isinstance(what, Each):
-                for kind, n in what.operands:
-                    if kind == "scalar":
-                        self.scalar(n)
-            elif self.graph.whole_vector(what.x) is not None:
-                self._vector(vector)
-            else:
-                for n in what.x:
+                    self._prepare(n)
+                elif kind == "scalar":
                     self.scalar(n)
+        elif self.graph.whole_vector(what.x) is not None:
+            self._vector(vector)
+        else:
+            for n in what.x:
+                self.scalar(n)
 
     def _element(self, vector: int, k: Any, done: dict[int, Lanes]) -> Lanes:
         """Element k of a vector, in the body of a loop over k."""
@@ -291,7 +273,7 @@ class _Writer:
             value = self._load(self.bases[vector], k)
             for i, n in enumerate(what.x):
                 if graph.levels[n] == PARTICLE:
-                    value = value + self._weight(what, k, i) * self.scalar(n)
+                    value = value + self._weight(what, k, LONG(i)) * self.scalar(n)
         else:
             operands = []
             for kind, n in what.operands:
@@ -304,7 +286,3 @@ class _Writer:
             value = self._operate(what.operation, operands)
         done[vector] = value
         return value
-
-
-def _long(index: Any) -> Any:
-    return LONG(index) if isinstance(index, int) else index

@@ -10,7 +10,7 @@ Derivatives that are zero are never written, so that a kernel of the Jacobian co
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 from typing import Any, NamedTuple
 
@@ -115,8 +115,15 @@ class ScalarGraph:
     def vector(self, vector: Product | Each) -> list[int]:
         """The elements of a new vector."""
         self.vectors.append(vector)
-        number = len(self.vectors) - 1
-        return [self.scalar("element", number, k) for k in range(vector.length)]
+        return self.elements("vector", len(self.vectors) - 1, vector.length)
+
+    def elements(self, kind: str, number: int, length: int) -> list[int]:
+        """The scalars of an operand, as in `Each`."""
+        if kind == "scalar":
+            return [number] * length
+        if kind == "parameters":
+            return [self.scalar("parameter", number + k) for k in range(length)]
+        return [self.scalar("element", number, k) for k in range(length)]
 
     def each(self, operation: str, *operands: Sequence[int]) -> list[int]:
         """An operation on each element of operands of one length."""
@@ -137,10 +144,9 @@ class ScalarGraph:
 
     def whole_vector(self, operand: Sequence[int]) -> int | None:
         """The vector whose elements these are, all of them and in order."""
-        first = self.scalars[operand[0]]
-        if first.operation != "element":
+        if self.scalars[operand[0]].operation != "element":
             return None
-        vector = first.arguments[0]
+        vector = self.scalars[operand[0]].arguments[0]
         same = self.vectors[vector].length == len(operand) and all(
             self.scalars[number] == Scalar("element", (vector, k)) for k, number in enumerate(operand)
         )
@@ -148,10 +154,9 @@ class ScalarGraph:
 
     def run_of_parameters(self, operand: Sequence[int] | None) -> int | None:
         """The offset of parameters that lie one after the other."""
-        first = self.scalars[operand[0]] if operand else None
-        if operand is None or first is None or first.operation != "parameter":
+        if not operand or self.scalars[operand[0]].operation != "parameter":
             return None
-        at = first.arguments[0]
+        at = self.scalars[operand[0]].arguments[0]
         same = all(self.scalars[number] == Scalar("parameter", (at + k,)) for k, number in enumerate(operand))
         return at if same else None
 
@@ -221,57 +226,40 @@ class Tangents:
         if number not in self.of_scalars:
             operation, arguments = self.graph.scalars[number]
             if operation == "element":
-                vector = self._of_vector(arguments[0])
-                found = None if vector is None else vector[arguments[1]]
-            elif operation in ("input", "parameter", "constant"):
-                found = self.graph.constant(1.0) if number == self.along else None
+                vector, k = arguments
+                found = self._of_vector(vector)
+                self.of_scalars[number] = None if found is None else found[k]
+            elif operation in LEAVES:
+                self.of_scalars[number] = self.graph.constant(1.0) if number == self.along else None
             else:
-                tangents = [self.of(n) for n in arguments]
-                lists = [None if tangent is None else [tangent] for tangent in tangents]
-                result = self._rule(operation, [[n] for n in arguments], lists, [number])
-                found = None if result is None else result[0]
-            self.of_scalars[number] = found
+                found = self._rule(operation, [[n] for n in arguments], [number])
+                self.of_scalars[number] = None if found is None else found[0]
         return self.of_scalars[number]
 
     def _of_vector(self, vector: int) -> Values | None:
         if vector not in self.of_vectors:
-            what = self.graph.vectors[vector]
-            found = self._of_product(what) if isinstance(what, Product) else self._of_each(vector, what)
+            graph, what = self.graph, self.graph.vectors[vector]
+            if isinstance(what, Each):
+                operands = [graph.elements(kind, n, what.length) for kind, n in what.operands]
+                found = self._rule(what.operation, operands, graph.elements("vector", vector, what.length))
+            elif self._of_all(what.bias or ()) is not None:
+                raise NotCompilable("a bias that differs between particles")
+            else:
+                x = self._of_all(what.x)
+                found = None if x is None else graph.vector(replace(what, bias=None, x=tuple(x)))
             self.of_vectors[vector] = found
         return self.of_vectors[vector]
 
-    def _of_product(self, product: Product) -> Values | None:
-        whole = self.graph.whole_vector(product.x)
-        tangents = self._of_vector(whole) if whole is not None else [self.of(n) for n in product.x]
-        if product.bias and any(self.of(n) is not None for n in product.bias):
-            raise NotCompilable("a bias that differs between particles")
-        if tangents is None or all(tangent is None for tangent in tangents):
+    def _of_all(self, numbers: Sequence[int]) -> Values | None:
+        """The derivatives of several scalars; None where all are zero."""
+        tangents = [self.of(number) for number in numbers]
+        if all(tangent is None for tangent in tangents):
             return None
-        x = tuple(self.graph.constant(0.0) if tangent is None else tangent for tangent in tangents)
-        return self.graph.vector(Product(product.length, product.at, product.rows, product.columns, None, x))
+        return [self.graph.constant(0.0) if tangent is None else tangent for tangent in tangents]
 
-    def _of_each(self, vector: int, what: Each) -> Values | None:
-        graph = self.graph
-        operands: list[Values] = []
-        tangents: list[Values | None] = []
-        for kind, n in what.operands:
-            if kind == "vector":
-                operands.append([graph.scalar("element", n, k) for k in range(what.length)])
-                tangents.append(self._of_vector(n))
-            elif kind == "scalar":
-                tangent = self.of(n)
-                operands.append([n] * what.length)
-                tangents.append(None if tangent is None else [tangent] * what.length)
-            else:
-                operands.append([graph.scalar("parameter", n + k) for k in range(what.length)])
-                tangents.append(None)
-        own = [graph.scalar("element", vector, k) for k in range(what.length)]
-        return self._rule(what.operation, operands, tangents, own)
-
-    def _rule(
-        self, operation: str, operands: Sequence[Values], tangents: Sequence[Values | None], value: Values
-    ) -> Values | None:
+    def _rule(self, operation: str, operands: Sequence[Values], value: Values) -> Values | None:
         """The chain rule, for scalars and for all elements of vectors."""
+        tangents = [self._of_all(operand) for operand in operands]
         if operation in FLAT or all(tangent is None for tangent in tangents):
             return None
         if operation in CHOICES:
@@ -289,10 +277,8 @@ class Tangents:
         return reduce(partial(self.do, "add"), terms)
 
     def _times(self, partial: Values, tangent: Values) -> Values:
-        one = self.graph.constant(1.0)
-        if all(number == one for number in tangent):
-            return partial
-        return self.do("mul", partial, tangent)
+        ones = self.constants(1.0, tangent)
+        return partial if tangent == ones else self.do("mul", partial, tangent)
 
     def constants(self, number: float, like: Values) -> Values:
         return [self.graph.constant(number)] * len(like)
@@ -358,7 +344,6 @@ PARTIALS: dict[str, Callable[..., tuple[Values | None, ...]]] = {
     "remainder": lambda d, value, x, y: (None, d.do("neg", d.do("floor", d.do("div", x, y)))),
 }
 
-
 # those that pass one operand on: which, and the derivatives that are passed on with it
 CHOICES: dict[str, Callable[[Tangents, Any, Any], Any]] = {
     "where": lambda d, operands, tangents: (operands[0], tangents[1], tangents[2]),
@@ -375,9 +360,3 @@ def derivatives(graph: ScalarGraph, outputs: Sequence[int], inputs: Sequence[int
         for tangents in by_input:
             tangents.of(number)
     return [[tangents.of(output) for tangents in by_input] for output in outputs]
-
-
-def jacobian(graph: ScalarGraph, outputs: Sequence[int], inputs: Sequence[int]) -> list[int]:
-    """The derivative of every output in every input, the outputs' rows one after the other."""
-    zero, rows = graph.constant(0.0), derivatives(graph, outputs, inputs)
-    return [zero if derivative is None else derivative for row in rows for derivative in row]

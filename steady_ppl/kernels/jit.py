@@ -8,7 +8,8 @@ import itertools
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -16,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from steady_ppl.kernels.codegen import LANES, NAME, source
-from steady_ppl.kernels.graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph, derivatives, jacobian
+from steady_ppl.kernels.graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph, derivatives
 from steady_ppl.kernels.lowering import Translation
 from steady_ppl.kernels.store import machine_code
 from steady_ppl.kernels.tape import first_names, where
@@ -33,7 +34,7 @@ Value = TypeVar("Value")
 Array = np.ndarray
 Examples = dict[str, Tensor]  # of the arguments of a function
 _COMPILED: WeakKeyDictionary[type[nn.Module], dict[Any, Any]] = WeakKeyDictionary()
-_NAMES: WeakKeyDictionary[type[nn.Module], list[tuple[int, list[str]]]] = WeakKeyDictionary()
+_NAMES: WeakKeyDictionary[type[nn.Module], list[str]] = WeakKeyDictionary()
 _READ: WeakKeyDictionary[nn.Module, dict[Any, Any]] = WeakKeyDictionary()  # of programs that are `unchanged` for now
 
 
@@ -75,6 +76,27 @@ class Kernel:
         self._call(*pointers, which, out.ctypes.data, trajectories, particles, uniform.shape[1])
 
 
+@contextmanager
+def _compiling() -> Iterator[None]:
+    """Whatever torch, the translation or the compiler makes of an unforeseen program has no kernel."""
+    try:
+        with torch.no_grad():
+            yield
+    except NotCompilable:
+        raise
+    except Exception as error:
+        raise NotCompilable(f"it cannot be compiled: {one_line(error)}") from error
+
+
+@dataclass(frozen=True)
+class Number:
+    """One learnable number."""
+
+    parameter: Tensor
+    index: int  # in its flat form
+    step: float  # by which finite differences move it
+
+
 class Method:
     """A function of a program as a kernel, for all programs that are alike, see `signature`.
 
@@ -94,6 +116,7 @@ class Method:
         NotCompilable: it cannot be traced, or what it does has no kernel.
     """
 
+    @_compiling()
     def __init__(
         self,
         program: nn.Module,
@@ -103,23 +126,6 @@ class Method:
         *,
         along: Sequence[str] = (),
         by_parameters: bool = False,
-    ) -> None:
-        try:
-            with torch.no_grad():
-                self._compile(program, function, particle, trajectory, along, by_parameters)
-        except NotCompilable:
-            raise
-        except Exception as error:  # whatever torch, the translation or the compiler makes of an unforeseen program
-            raise NotCompilable(f"it cannot be compiled: {one_line(error)}") from error
-
-    def _compile(
-        self,
-        program: nn.Module,
-        function: Callable[..., Any],
-        particle: Examples,
-        trajectory: Examples,
-        along: Sequence[str],
-        by_parameters: bool,
     ) -> None:
         levels = dict.fromkeys(particle, PARTICLE) | dict.fromkeys(trajectory, TRAJECTORY)
         translation = Translation(particle | trajectory, levels, _tensors(program))
@@ -132,7 +138,8 @@ class Method:
         values = list(self.graph.outputs)
         if along:
             inputs = [self.graph.scalar("input", name, k) for name in along for k in range(particle[name].numel())]
-            self.graph.outputs += jacobian(self.graph, values, inputs)
+            zero, rows = self.graph.constant(0.0), derivatives(self.graph, values, inputs)
+            self.graph.outputs += [zero if derivative is None else derivative for row in rows for derivative in row]
         if by_parameters:
             self._add_slopes(values)
         columns, at = {}, 0
@@ -179,22 +186,6 @@ class Method:
                 moved.append(self._taken(self.tape.run_again(values, name, other)))
             columns.append((moved[0] - moved[1]).double() / (2 * number.step))
         return torch.stack(columns, -1)
-
-
-class Number(Protocol):
-    """One learnable number."""
-
-    @property
-    def parameter(self) -> Tensor:
-        """Among whose numbers it is."""
-
-    @property
-    def index(self) -> int:
-        """In its flat form."""
-
-    @property
-    def step(self) -> float:
-        """By which differences move it."""
 
 
 _KERNELS: OrderedDict[str, Kernel] = OrderedDict()
@@ -305,26 +296,21 @@ def _content(value: Any) -> Any:
 
 def _settings(module: nn.Module) -> Iterator[tuple[str, Any]]:
     """A module's attributes: its own, its class's and its bases'."""
-    own = vars(module)
+    own, kind = vars(module), type(module)
     yield from ((name, value) for name, value in own.items() if name not in OF_MODULES)
-    kind = type(module)
     if kind not in _NAMES:
         _NAMES[kind] = _names_of(kind)
-    for at, names in _NAMES[kind]:
-        given = vars(kind.__mro__[at])
-        yield from ((name, given[name]) for name in names if name not in own and name in given)
+    yield from ((name, getattr(kind, name)) for name in _NAMES[kind] if name not in own and hasattr(kind, name))
 
 
-def _names_of(kind: type[nn.Module]) -> list[tuple[int, list[str]]]:
-    """The settings among the attributes of a class, each in the first of its bases that has it, by their order: a base
-    itself would keep the class, which is the first of them, for ever."""
-    found, known = [], set[str]()
-    for at, base in enumerate(itertools.takewhile(lambda base: base is not nn.Module, kind.__mro__)):
-        names = [name for name in vars(base) if name not in known and not name.startswith("__")]
-        known.update(names)
-        if not base.__module__.startswith("torch."):
-            found.append((at, [name for name in names if not callable(vars(base)[name])]))
-    return found
+def _names_of(kind: type[nn.Module]) -> list[str]:
+    """The settings among the attributes of a class and its bases; by name, since values may keep the class for ever."""
+    found = dict[str, bool]()
+    for base in itertools.takewhile(lambda base: base is not nn.Module, kind.__mro__):
+        for name, value in vars(base).items():
+            foreign = name.startswith("__") or base.__module__.startswith("torch.")
+            found.setdefault(name, not foreign and not callable(value))
+    return [name for name, is_setting in found.items() if is_setting]
 
 
 def close(mine: Tensor, theirs: Tensor) -> bool:

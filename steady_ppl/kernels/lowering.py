@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partialmethod
 from typing import Any
 
 import torch
@@ -160,11 +161,10 @@ class Translation(TorchDispatchMode):
     def _copy(self, value: Tensor, other: Tensor, non_blocking: bool = False) -> Tensor:
         return other.broadcast_to(value.shape)
 
-    def _add(self, left: Any, right: Any, *, alpha: float = 1) -> Tensor:
-        return self._each("add", left, right if alpha == 1 else self._each("mul", right, alpha))
+    def _scaled(self, operation: str, left: Any, right: Any, *, alpha: float = 1) -> Tensor:
+        return self._each(operation, left, right if alpha == 1 else self._each("mul", right, alpha))
 
-    def _sub(self, left: Any, right: Any, *, alpha: float = 1) -> Tensor:
-        return self._each("sub", left, right if alpha == 1 else self._each("mul", right, alpha))
+    _add, _sub = partialmethod(_scaled, "add"), partialmethod(_scaled, "sub")
 
     def _rsub(self, left: Any, right: Any, alpha: float = 1) -> Tensor:
         return self._sub(right, left, alpha=alpha)

@@ -63,7 +63,7 @@ def on_all_rows(
         The value `(rows, B, V)` and the Jacobians `(rows, B, V, ·)`; why there is no kernel; None where it is not
         worth one.
     """
-    found = _computed(program, f"{name} on all rows", function, arguments, kernels, along=along)
+    found = _computed(program, name, function, arguments, kernels, along=along)
     if not isinstance(found, tuple):
         return found
     method, values, rest = found
@@ -101,7 +101,7 @@ def slopes_on_all_rows(
     kernels: bool | None = None,
 ) -> Slopes | str | None:
     """A function's slopes in a program's learnable numbers; otherwise as `on_all_rows`."""
-    found = _computed(program, f"{name} by parameters", function, arguments, kernels, by_parameters=True)
+    found = _computed(program, name, function, arguments, kernels, by_parameters=True)
     if not isinstance(found, tuple):
         return found
     method, values, rest = found
@@ -135,7 +135,8 @@ def _computed(
     def build() -> Method:
         return Method(program, lambda *values: (function(*values),), examples, {}, **derivatives)
 
-    method = compiled(program, name, build)
+    compiled_as = f"{name} {derivatives}"
+    method = compiled(program, compiled_as, build)
     if isinstance(method, str):
         return _noted(name, method)
     found = _run(method, program, arguments, rows, trajectories)
@@ -145,14 +146,14 @@ def _computed(
     if runs[method] <= 2 or runs[method] % COMPARED_EVERY == 0:
         plain = function(*(_a_few(value) for value in arguments.values()))
         if not close(_a_few(values), plain):
-            return _noted(name, discard(program, name))
+            return _noted(name, discard(program, compiled_as))
     return method, values, rest
 
 
 def _noted(name: str, reason: str) -> str:
     found = _WHY.get()
     if found is not None:
-        found[name.partition(" on all rows")[0].partition(" by parameters")[0]] = reason
+        found[name] = reason
     return reason
 
 

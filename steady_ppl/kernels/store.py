@@ -50,13 +50,13 @@ def machine_code(key: str, text: Callable[[], str]) -> Any:
     Raises:
         Whatever `text` raises.
     """
-    name = _name(key)
+    name, machine, made = _name(key), _target_machine(), list[bytes]()
     with _folder() as folder:
-        code = None if folder is None else _read(folder, name)
-        if code is not None:
-            return _engine(binding.parse_assembly(""), _target_machine(), kept=code)
-        machine, made = _target_machine(), list[bytes]()
-        engine = _engine(_optimized(text(), machine), machine, made=made)
+        kept = None if folder is None else _read(folder, name)
+        module = binding.parse_assembly("") if kept is not None else _optimized(text(), machine)
+        engine = binding.create_mcjit_compiler(module, machine)
+        engine.set_object_cache(lambda _, code: made.append(code), lambda _: kept)
+        engine.finalize_object()
         if folder is not None and made:
             _write(folder, name, made.pop())
             if name.startswith(SWEEPS):
@@ -92,25 +92,9 @@ def _target_machine() -> Any:
 def _optimized(text: str, machine: Any) -> Any:
     """A module of LLVM's, its functions optimized."""
     module = binding.parse_assembly(text)
-    options = binding.create_pipeline_tuning_options(speed_level=2)
-    builder = binding.create_pass_builder(machine, options)
+    builder = binding.create_pass_builder(machine, binding.create_pipeline_tuning_options(speed_level=2))
     builder.getModulePassManager().run(module, builder)
     return module
-
-
-def _engine(module: Any, machine: Any, kept: bytes | None = None, made: list[bytes] | None = None) -> Any:
-    """An engine that has loaded a module.
-
-    Args:
-        kept: machine code to load in place of the module's, which may then be empty.
-        made: takes the machine code, where it is compiled.
-    """
-    engine = binding.create_mcjit_compiler(module, machine)
-    engine.set_object_cache(
-        None if made is None else lambda _, code: made.append(code), None if kept is None else lambda _: kept
-    )
-    engine.finalize_object()
-    return engine
 
 
 # files
