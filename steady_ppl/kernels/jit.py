@@ -18,9 +18,8 @@ from torch import Tensor, nn
 
 from steady_ppl.kernels.codegen import LANES, NAME, source
 from steady_ppl.kernels.graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph, derivatives
-from steady_ppl.kernels.lowering import Translation
+from steady_ppl.kernels.lowering import Translation, first_names, where
 from steady_ppl.kernels.store import machine_code
-from steady_ppl.kernels.tape import first_names, where
 from steady_ppl.utils.text import one_line
 
 TRACES = 32  # of one method of programs of one class; each takes some hundredths of a second
@@ -78,7 +77,7 @@ class Kernel:
 
 @contextmanager
 def _compiling() -> Iterator[None]:
-    """Whatever torch, the translation or the compiler makes of an unforeseen program has no kernel."""
+    """Say of whatever torch, the translation or the compiler makes of an unforeseen program that it has no kernel."""
     try:
         with torch.no_grad():
             yield

@@ -50,7 +50,9 @@ def machine_code(key: str, text: Callable[[], str]) -> Any:
     Raises:
         Whatever `text` raises.
     """
-    name, machine, made = _name(key), _target_machine(), list[bytes]()
+    name, made = _name(key), list[bytes]()
+    triple, cpu, features = _processor()
+    machine = binding.Target.from_triple(triple).create_target_machine(cpu=cpu, features=features, opt=3)
     with _folder() as folder:
         kept = None if folder is None else _read(folder, name)
         module = binding.parse_assembly("") if kept is not None else _optimized(text(), machine)
@@ -82,11 +84,6 @@ def _processor() -> tuple[str, str, str]:
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
     return binding.get_default_triple(), binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
-
-
-def _target_machine() -> Any:
-    triple, cpu, features = _processor()
-    return binding.Target.from_triple(triple).create_target_machine(cpu=cpu, features=features, opt=3)
 
 
 def _optimized(text: str, machine: Any) -> Any:
