@@ -44,12 +44,8 @@ class Potential(NamedTuple):
     log_scale: Array
 
     @classmethod
-    def empty(cls, *left: int, lanes: int, dimension: int) -> Potential:
-        return cls(
-            np.empty((*left, dimension, dimension, lanes)),
-            np.empty((*left, dimension, 1, lanes)),
-            np.empty((*left, 1, 1, lanes)),
-        )
+    def zeros(cls, *left: int, lanes: int, dimension: int) -> Potential:
+        return cls(*(np.zeros((*left, *shape, lanes)) for shape in ((dimension, dimension), (dimension, 1), (1, 1))))
 
 
 class Steering(NamedTuple):
@@ -77,13 +73,6 @@ class Steering(NamedTuple):
         return Steering(shift.squeeze(-1), gain, factor)
 
 
-class InLanes(NamedTuple):
-    """A linearization and the steering of its intervals."""
-
-    given: LinearArrays
-    steps: Steering
-
-
 @dataclass(frozen=True)
 class Lookahead:
     """The likelihood of all later measurements after every row, and the noise that it asks for.
@@ -98,7 +87,7 @@ class Lookahead:
         starts: steering of the start's noise, `(W, B, ...)`, its deviation zero.
         steps: of every interval's noise, `(T, B, ...)`.
         log_likelihood: log p(y) of the linearised program, `(B,)`, observations tempered as in the linearization.
-        lanes: what the recursions read of it.
+        given, steering: the linearization and `steps` in lanes, as the recursions read them.
     """
 
     linearization: Linearization
@@ -110,7 +99,8 @@ class Lookahead:
     starts: Steering
     steps: Steering
     log_likelihood: Tensor
-    lanes: InLanes = field(repr=False)
+    given: LinearArrays = field(repr=False)
+    steering: Steering = field(repr=False)
 
     def means(self) -> tuple[Tensor, Tensor]:
         """Posterior means of the linearised program, on the path's own turn: states `(T + 1, B, D)` and noise
@@ -121,7 +111,7 @@ class Lookahead:
 
     def means_in_lanes(self) -> tuple[Array, Array]:
         """The means, of the states less the path's: `(T + 1, blocks, D, 1, LANES)`; and `(T, blocks, C, 1, LANES)`."""
-        states, noise = self._forward(self.starts.shift[:1], self.lanes.steps.shift[None].copy())
+        states, noise = self._forward(self.starts.shift[:1], self.steering.shift[None].copy())
         return states[0], noise[0]
 
     def draws(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -131,18 +121,23 @@ class Lookahead:
             Start noise `(M, B, C₀)`, states `(M, T + 1, B, D)` and noise `(M, T, B, C)`, the last two on the turn that
             the start noise asks for.
         """
-        winding = torch.distributions.Categorical(logits=self.winding_masses.t()).sample((count,))
-        trajectory = torch.arange(winding.shape[1], device=winding.device)
-        starts = self.starts
-        shift, factor = starts.shift[winding, trajectory], starts.factor[winding, trajectory]
-        start = shift + _times(factor, torch.randn_like(shift))
+        winding, start, _ = self.draw_starts(count)
         turns = self.windings[winding]
-        random = torch.randn(count, *self.steps.shift.shape, dtype=shift.dtype, device=shift.device)
-        noise = self.steps.shift + _times(self.steps.factor, random)
+        random = torch.randn(count, *self.steps.shift.shape, dtype=start.dtype, device=start.device)
+        noise = self.steps.shift + times(self.steps.factor, random)
         rolled = self._forward(start, in_lanes(noise.unsqueeze(-1)), turns)
         states, noise = (self._tensor(part).squeeze(-1) for part in rolled)
         turned = self.linearization.path.states + (turns + self.linearization.start_turn).unsqueeze(1)
         return start, turned + states, noise
+
+    def draw_starts(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Draw which of the `windings` starts lie on, `(M, B)`, their noise, and the standard normal one that it was
+        made of, each `(M, B, C₀)`."""
+        winding = torch.distributions.Categorical(logits=self.winding_masses.t()).sample((count,))
+        trajectory = torch.arange(winding.shape[1], device=winding.device)
+        shift, factor = self.starts.shift[winding, trajectory], self.starts.factor[winding, trajectory]
+        own = torch.randn_like(shift)
+        return winding, shift + times(factor, own), own
 
     def covariances(self) -> tuple[Tensor, Tensor, Tensor]:
         """Posterior covariances on the path's own turn: of the states, `(T + 1, B, D, D)`, of the noise of each
@@ -152,14 +147,14 @@ class Lookahead:
 
     def covariances_in_lanes(self) -> tuple[Array, Array, Array]:
         spread = self.linearization.start_noise @ self.starts.factor[0]
-        return covariances(self.lanes.given, self.lanes.steps, in_lanes(spread @ spread.mT))
+        return covariances(self.given, self.steering, in_lanes(spread @ spread.mT))
 
     def _forward(self, start: Tensor, noise: Array, turns: Tensor | float = 0.0) -> tuple[Array, Array]:
         """States, less the path's, and noise in lanes: what the start's noise `(M, B, C₀)` and each interval's at a
         deviation of zero lead to."""
         linear = self.linearization
-        begin = linear.start_offset + _times(linear.start_noise, start) - turns
-        return roll_out(self.lanes.given, self.lanes.steps.gain, in_lanes(begin.unsqueeze(-1)), noise), noise
+        begin = linear.start_offset + times(linear.start_noise, start) - turns
+        return roll_out(self.given, self.steering.gain, in_lanes(begin.unsqueeze(-1)), noise), noise
 
     def _tensor(self, blocks: Array) -> Tensor:
         linear = self.linearization
@@ -171,9 +166,10 @@ def look_ahead(linear: Linearization) -> Lookahead:
     device, (trajectories, dimension, starting) = linear.offset.device, linear.start_noise.shape
     given = _in_lanes(linear)
     rows, blocks, *_, lanes = given.measurement.shape
-    futures = Potential.empty(rows, blocks, lanes=lanes, dimension=dimension)
+    first = Potential.zeros(blocks, lanes=lanes, dimension=dimension)
+    futures = Potential.zeros(rows, blocks, lanes=lanes, dimension=dimension)
     steps = Steering.in_lanes(rows - 1, blocks, lanes=lanes, dimension=dimension, channels=linear.noise.shape[-1])
-    first = backward(given, in_lanes(linear.log_scale[..., None, None]), futures, steps)
+    backward(given, in_lanes(linear.log_scale[..., None, None]), first, futures, steps)
     windings = _windings(linear)
     offsets = linear.start_offset - windings.unsqueeze(1)
     begun = Steering.in_lanes(len(windings), blocks, lanes=lanes, dimension=dimension, channels=starting)
@@ -196,7 +192,8 @@ def look_ahead(linear: Linearization) -> Lookahead:
         starts=starts,
         steps=steps.tensors(linear.offset),
         log_likelihood=log_likelihood,
-        lanes=InLanes(given, steps),
+        given=given,
+        steering=steps,
     )
 
 
@@ -217,41 +214,24 @@ def _windings(linear: Linearization) -> Tensor:
     return 2 * math.pi * linear.start_offset.new_tensor(list(itertools.product(*choices)))
 
 
-def _times(matrix: Tensor, vectors: Tensor) -> Tensor:
+def times(matrix: Tensor, vectors: Tensor) -> Tensor:
     """A vector for each matrix, or draws of it in front: these are side by side for the product."""
     if vectors.dim() < matrix.dim():
         return (matrix @ vectors.unsqueeze(-1)).squeeze(-1)
     return (matrix @ vectors.movedim(0, -1)).movedim(-1, 0)
 
 
-class Room(NamedTuple):
+@njit(cache=True, error_model="numpy")
+def _room(dimension: int, channels: int, lanes: int) -> tuple[Array, ...]:
     """What `integrate` works in: to allocate takes as long as a product."""
-
-    pushed: Array
-    by_noise: Array
-    pull: Array
-    gram: Array
-    root: Array
-    half: Array
-    white: Array
+    square, wide, column = (channels, channels, lanes), (channels, dimension, lanes), (channels, 1, lanes)
+    pushed, pull, white = np.zeros((dimension, 1, lanes)), np.zeros(column), np.zeros(column)
+    by_noise, half, gram, root = np.zeros(wide), np.zeros(wide), np.zeros(square), np.zeros(square)
+    return pushed, by_noise, pull, gram, root, half, white
 
 
 @njit(cache=True, error_model="numpy")
-def _room(dimension: int, channels: int, lanes: int) -> Room:
-    square, wide = (channels, channels, lanes), (channels, dimension, lanes)
-    return Room(
-        pushed=np.zeros((dimension, 1, lanes)),
-        by_noise=np.zeros(wide),
-        pull=np.zeros((channels, 1, lanes)),
-        gram=np.zeros(square),
-        root=np.zeros(square),
-        half=np.zeros(wide),
-        white=np.zeros((channels, 1, lanes)),
-    )
-
-
-@njit(cache=True, error_model="numpy")
-def integrate(ahead: Potential, noise: Array, offset: Array, out: Steering, room: Room) -> None:
+def integrate(ahead: Potential, noise: Array, offset: Array, out: Steering, room: tuple[Array, ...]) -> None:
     """∫ ψ(μ + offset + G ε) N(ε; 0, I) dε as a function of μ, and the noise's conditional given μ; in lanes.
 
     ψ(x) = exp(c − ½ xᵀ Λ x + λᵀ x). With S = (I + GᵀΛG)⁻¹ and u = λ − Λ offset the integral is again of that form,
@@ -319,18 +299,13 @@ def integrate_starts(noise: Array, ahead: Potential, offset: Array, steering: St
 
 
 @njit(cache=True, error_model="numpy")
-def backward(given: LinearArrays, log_scale: Array, futures: Potential, steering: Steering) -> Potential:
+def backward(given: LinearArrays, log_scale: Array, first: Potential, futures: Potential, steering: Steering) -> None:
     """The backward information filter of δ' = F δ + offset + G ε, for every trajectory.
 
-    It fills what all later measurements say of each row's state, `futures`, and the noise that they ask for in each
-    interval. Returns what all measurements say of the first state. `log_scale` is of each row's own measurements.
+    It adds to `first`, of zeros, what all measurements say of the first state, and fills what all later ones say of
+    each row's, `futures`, and the noise that they ask for in each interval. `log_scale` is of each row's own.
     """
     rows, blocks, components, dimension, lanes = given.measurement.shape
-    first = Potential(
-        np.zeros((blocks, dimension, dimension, lanes)),
-        np.zeros((blocks, dimension, 1, lanes)),
-        np.zeros((blocks, 1, 1, lanes)),
-    )
     weighted, pull = np.zeros((components, dimension, lanes)), np.zeros((components, 1, lanes))
     half, gain = np.zeros((dimension, dimension, lanes)), np.zeros(steering.gain.shape[2:])
     moved, room = np.zeros((dimension, 1, lanes)), _room(dimension, steering.gain.shape[2], lanes)
@@ -357,7 +332,6 @@ def backward(given: LinearArrays, log_scale: Array, futures: Potential, steering
                 ahead.precision[:], ahead.information[:] = 0.0, 0.0
                 add_gram(ahead.precision, forward, half, 1.0)
                 add_gram(ahead.information, forward, moved, 1.0)
-    return first
 
 
 @njit(cache=True, error_model="numpy")

@@ -60,7 +60,7 @@ def posterior_moments(ahead: Lookahead, data: Trajectories) -> Posterior:
     found = Posterior(
         states, empty(rows - 1, channels), empty(rows, components), np.zeros((channels, rows - 1, drives))
     )
-    fill(ahead.lanes.given, ahead.lanes.steps, (moved, noise), ahead.covariances_in_lanes(), means, *found[1:])
+    fill(ahead.given, ahead.steering, (moved, noise), ahead.covariances_in_lanes(), means, *found[1:])
     return found
 
 

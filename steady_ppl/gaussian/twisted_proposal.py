@@ -235,13 +235,8 @@ class Twist(Proposal):
         return future(state, *parts)
 
     def start(self, particles: int) -> tuple[Tensor | None, Tensor | float]:
-        ahead = self.lookahead
-        starts = ahead.starts
-        winding = torch.distributions.Categorical(logits=ahead.winding_masses.t()).sample((particles,))
-        trajectory = torch.arange(winding.shape[1], device=winding.device)
-        shift = starts.shift[winding, trajectory]
-        own = torch.randn_like(shift)
-        twisted = shift + (starts.factor[winding, trajectory] @ own.unsqueeze(-1)).squeeze(-1)
+        ahead, starts = self.lookahead, self.lookahead.starts
+        _, twisted, own = ahead.draw_starts(particles)
         stays = torch.rand(own.shape[:-1], dtype=torch.float64, device=own.device) < self.untwisted
         noise = torch.where(stays.unsqueeze(-1), own, twisted)
         whitening = inverse(starts.factor)
