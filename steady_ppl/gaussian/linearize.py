@@ -25,14 +25,13 @@ from steady_ppl.model.handlers import (
     Observing,
     Recording,
     Standardised,
-    as_vector,
     broadcast_event,
     residual,
     running,
     tangent_normal,
 )
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, advance
+from steady_ppl.model.substeps import acting_controls, advance, joined
 from steady_ppl.model.validate import start_size, step_size
 from steady_ppl.utils.angles import wrap
 
@@ -230,15 +229,13 @@ def _residuals(program: Program, state: Tensor, measurement: Tensor, observed: T
     noise is not normal, of the normal that touches it."""
     with running(*state.shape[:-1]), Recording() as seen, Observing(measurement, observed):
         program.observe(state)
-    residuals, log_sds, heights = [], [], []
+    residuals, log_sds, heights = {}, {}, {}
     for site, fn in seen.distributions.items():
-        apart = residual(fn, seen.observed[site])
-        sd, height = tangent_normal(fn, apart, site)
-        difference = as_vector(apart, fn.event_dim)
-        residuals.append(difference)
-        log_sds.append(as_vector(sd.log(), fn.event_dim).expand(difference.shape))
-        heights.append(as_vector(height, fn.event_dim).expand(difference.shape))
-    return torch.cat(residuals + log_sds + heights, -1)
+        residuals[site] = residual(fn, seen.observed[site])
+        sd, heights[site] = tangent_normal(fn, residuals[site], site)
+        log_sds[site] = sd.log()
+    parts = (joined(values, seen.distributions, state.shape[:-1]) for values in (residuals, log_sds, heights))
+    return torch.cat(list(parts), -1)
 
 
 def _start(program: Program, data: Trajectories, first: Tensor, known_start: bool) -> tuple[Tensor, Tensor]:

@@ -13,9 +13,9 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.kernels.rows import on_all_rows
-from steady_ppl.model.handlers import AtMean, Observing, Recording, as_vector, residual, running
+from steady_ppl.model.handlers import AtMean, Observing, Recording, residual, running
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, advance
+from steady_ppl.model.substeps import acting_controls, advance, joined
 from steady_ppl.smc.backends import Stepping
 from steady_ppl.smc.simulate import measure
 
@@ -103,8 +103,8 @@ def errors(program: Program, states: Tensor, measurements: Tensor, observed: Ten
     """Measured less what the program measures in these states, `(..., K)`, on the circle for angles."""
     with running(*states.shape[:-1]), Recording() as seen, Observing(measurements, observed):
         program.observe(states)
-    parts = [as_vector(residual(fn, seen.observed[site]), fn.event_dim) for site, fn in seen.distributions.items()]
-    return torch.cat(parts, -1)
+    apart = {site: residual(fn, seen.observed[site]) for site, fn in seen.distributions.items()}
+    return joined(apart, seen.distributions, states.shape[:-1])
 
 
 def row_errors(program: Program, states: Tensor, measurements: Tensor, observed: Tensor) -> Tensor:

@@ -182,8 +182,7 @@ def mixture(log_ratio: Tensor, untwisted: float) -> Tensor:
 
 def inverse(upper: Tensor) -> Tensor:
     """Of upper triangular matrices."""
-    unit = torch.eye(upper.shape[-1], dtype=upper.dtype, device=upper.device).expand_as(upper)
-    return torch.linalg.solve_triangular(upper, unit, upper=True)
+    return torch.linalg.solve_triangular(upper, torch.eye(upper.shape[-1]).to(upper), upper=True)
 
 
 def _deviation(state: Tensor, path: Tensor, angles: Tensor) -> Tensor:
