@@ -37,12 +37,11 @@ from steady_ppl.gaussian.linearize import LinearArrays, Linearization
 
 
 class Potential(NamedTuple):
-    """exp(c − ½ δᵀ Λ δ + λᵀ δ) of a state in lanes: Λ `(..., D, D, LANES)`, λ `(..., D, 1, LANES)` and c
-    `(..., 1, 1, LANES)`."""
+    """exp(c − ½ δᵀ Λ δ + λᵀ δ) of a state in lanes."""
 
-    precision: Array
-    information: Array
-    log_scale: Array
+    precision: Array  # Λ (..., D, D, LANES)
+    information: Array  # λ (..., D, 1, LANES)
+    log_scale: Array  # c (..., 1, 1, LANES)
 
     @classmethod
     def zeros(cls, *left: int, lanes: int, dimension: int) -> Potential:
@@ -51,17 +50,11 @@ class Potential(NamedTuple):
 
 class Steering(NamedTuple):
     """Noise that leads to the later measurements, ε ~ N(shift − gain δ, factor factorᵀ); tensors, or arrays in lanes,
-    whose shift is a matrix of one column.
+    whose shift is a matrix of one column."""
 
-    Attributes:
-        shift: `(..., C)`.
-        gain: `(..., C, D)`.
-        factor: `(..., C, C)`, upper triangular.
-    """
-
-    shift: Any
-    gain: Any
-    factor: Any
+    shift: Any  # (..., C)
+    gain: Any  # (..., C, D)
+    factor: Any  # (..., C, C), upper triangular
 
     @classmethod
     def in_lanes(cls, *left: int, lanes: int, dimension: int, channels: int) -> Steering:
@@ -76,32 +69,19 @@ class Steering(NamedTuple):
 
 @dataclass(frozen=True)
 class Lookahead:
-    """The likelihood of all later measurements after every row, and the noise that it asks for.
+    """The likelihood of all later measurements after every row, and the noise that it asks for."""
 
-    Attributes:
-        linearization: of the program; deviations are from its path.
-        precision: Λ `(T + 1, B, D, D)`.
-        information: λ `(T + 1, B, D)`.
-        log_scale: c `(T + 1, B)`.
-        windings: `(W, D)` whole turns from the one nearest to the prior's mean on which the start may lie, none first.
-        winding_masses: `(W, B)` log posterior probability of each.
-        starts: steering of the start's noise, `(W, B, ...)`, its deviation zero.
-        steps: of every interval's noise, `(T, B, ...)`.
-        log_likelihood: log p(y) of the linearised program, `(B,)`, observations tempered as in the linearization.
-        given, steering: the linearization and `steps` in lanes, as the recursions read them.
-    """
-
-    linearization: Linearization
-    precision: Tensor
-    information: Tensor
-    log_scale: Tensor
-    windings: Tensor
-    winding_masses: Tensor
-    starts: Steering
-    steps: Steering
-    log_likelihood: Tensor
-    given: LinearArrays = field(repr=False)
-    steering: Steering = field(repr=False)
+    linearization: Linearization  # of the program; deviations are from its path
+    precision: Tensor  # Λ (T + 1, B, D, D)
+    information: Tensor  # λ (T + 1, B, D)
+    log_scale: Tensor  # c (T + 1, B)
+    windings: Tensor  # (W, D), turns from the one nearest to the prior's mean on which the start may lie, none first
+    winding_masses: Tensor  # (W, B), log posterior probability of each
+    starts: Steering  # of the start's noise, (W, B, ...), its deviation zero
+    steps: Steering  # of every interval's noise, (T, B, ...)
+    log_likelihood: Tensor  # log p(y) of the linearised program, (B,), observations tempered as in the linearization
+    given: LinearArrays = field(repr=False)  # the linearization in lanes
+    steering: Steering = field(repr=False)  # `steps` in lanes
 
     def means(self) -> tuple[Tensor, Tensor]:
         """Posterior means of the linearised program, on the path's own turn: states `(T + 1, B, D)` and noise
@@ -392,16 +372,11 @@ def _add_symmetric(out: Array, left: Array, right: Array) -> None:
 
 
 class Moments(NamedTuple):
-    """Deviations of one kind, with the components first.
+    """Deviations of one kind, with the components first."""
 
-    Attributes:
-        mean, variance: posterior means and variances, `(C, rows, B)`.
-        points: x̂, x̂ + v and x̂ − v for each component, v = Cov(x, z), `(D, 1 + 2 C, rows, B)`.
-    """
-
-    mean: Array
-    variance: Array
-    points: Array
+    mean: Array  # (C, rows, B), posterior means
+    variance: Array  # (C, rows, B), and variances
+    points: Array  # x̂, x̂ + v and x̂ − v for each component, v = Cov(x, z), (D, 1 + 2 C, rows, B)
 
     def tensors(self, device: torch.device) -> dict[str, Tensor]:
         """By name, with the components last."""
@@ -409,13 +384,12 @@ class Moments(NamedTuple):
 
 
 class Posterior(NamedTuple):
-    """The states' means x̂ `(T + 1, B, D)`, the first row's past a trajectory's end; moments of channels and of
-    measurements; and covariances of each channel's deviation with its last one, `(C, T, B)`, zero at the first."""
+    """Moments of a linearised program's posterior."""
 
-    states: Tensor
+    states: Tensor  # means x̂ (T + 1, B, D), the first row's past a trajectory's end
     channels: Moments
     measurements: Moments
-    lag: Array
+    lag: Array  # covariances of each channel's deviation with its last one, (C, T, B), zero at the first
 
 
 def posterior_moments(ahead: Lookahead, data: Trajectories) -> Posterior:

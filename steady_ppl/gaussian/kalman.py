@@ -29,43 +29,28 @@ from steady_ppl.model.program import Program
 
 
 class Filtered(NamedTuple):
-    """The states given the measurements up to each row, and what each measured component changed of them.
+    """The states given the measurements up to each row, and what each measured component changes, given those before
+    it; zero, one and zero where it is missing."""
 
-    Attributes:
-        means, covariances: `(T + 1, B, D)` and `(T + 1, B, D, D)`.
-        innovation, variance, gain: of each component given those before it, `(T + 1, B, K)` twice and
-            `(T + 1, B, K, D)`; zero, one and zero where it is missing.
-    """
-
-    means: Array
-    covariances: Array
-    innovation: Array
-    variance: Array
-    gain: Array
+    means: Array  # (T + 1, B, D)
+    covariances: Array  # (T + 1, B, D, D)
+    innovation: Array  # (T + 1, B, K)
+    variance: Array  # (T + 1, B, K)
+    gain: Array  # (T + 1, B, K, D)
 
 
 @dataclass(frozen=True)
 class Tracked:
-    """The Kalman filter and smoother of a linearised program, in double precision.
+    """The Kalman filter and smoother of a linearised program, in double precision."""
 
-    Attributes:
-        linearization: of the program, along the path that the last pass began with.
-        states, covariances: `(T + 1, B, D)` and `(T + 1, B, D, D)`, given the measurements up to each row.
-        smoothed: `(T + 1, B, D)`, the states given all measurements.
-        noise: `(T, B, C)`, E[ε | y]: also the score of a push by each channel, per standard deviation of it.
-        arrival: `(T + 1, B, D)`, the score of a push on the state that each row begins with.
-        reading: `(T + 1, B, K)`, the score of a shift of each measurement; zero where it is missing.
-        log_likelihood: `(B,)` log p(y).
-    """
-
-    linearization: Linearization
-    states: Tensor
-    covariances: Tensor
-    smoothed: Tensor
-    noise: Tensor
-    arrival: Tensor
-    reading: Tensor
-    log_likelihood: Tensor
+    linearization: Linearization  # of the program, along the path that the last pass began with
+    states: Tensor  # (T + 1, B, D), given the measurements up to each row
+    covariances: Tensor  # (T + 1, B, D, D), of these
+    smoothed: Tensor  # (T + 1, B, D), the states given all measurements
+    noise: Tensor  # (T, B, C), E[ε | y]: also the score of a push by each channel, per standard deviation of it
+    arrival: Tensor  # (T + 1, B, D), the score of a push on the state that each row begins with
+    reading: Tensor  # (T + 1, B, K), the score of a shift of each measurement; zero where it is missing
+    log_likelihood: Tensor  # (B,), log p(y)
 
     def path(self, data: Trajectories) -> ReferencePath:
         """The posterior mean as a path to linearise along."""

@@ -38,15 +38,10 @@ from steady_ppl.utils.angles import wrap
 
 @dataclass(frozen=True)
 class ReferencePath:
-    """States and the standard normal noise that goes with them.
+    """States and the standard normal noise that goes with them."""
 
-    Attributes:
-        states: `(T + 1, B, D)`.
-        noise: `(T, B, C)`, in standard deviations of the channels.
-    """
-
-    states: Tensor
-    noise: Tensor
+    states: Tensor  # (T + 1, B, D)
+    noise: Tensor  # (T, B, C), in standard deviations of the channels
 
     @classmethod
     def of_means(cls, states: Tensor, noise: Tensor, data: Trajectories) -> ReferencePath:
@@ -60,21 +55,13 @@ class ReferencePath:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensors:
-    """What is measured, to first order around states, in double precision.
+    """What is measured, to first order around states, in double precision; zero where it is missing."""
 
-    Attributes:
-        residual: r̄ `(T + 1, B, K)`, on the circle where the measurement is an angle; zero where missing.
-        measurement: H `(T + 1, B, K, D)`.
-        precision: `(T + 1, B, K)` observation weight over variance; zero where missing.
-        log_scale: `(T + 1, B)` the measurements' log-density at residual zero, times the observation weight.
-        in_plain_torch: why no kernels served; None where they did or were not worth it.
-    """
-
-    residual: Tensor
-    measurement: Tensor
-    precision: Tensor
-    log_scale: Tensor
-    in_plain_torch: str | None = None
+    residual: Tensor  # r̄ (T + 1, B, K), on the circle where the measurement is an angle
+    measurement: Tensor  # H (T + 1, B, K, D)
+    precision: Tensor  # (T + 1, B, K), observation weight over variance
+    log_scale: Tensor  # (T + 1, B), the measurements' log-density at residual zero, times the observation weight
+    in_plain_torch: str | None = None  # why no kernels served; None where they did or were not worth it
 
 
 class LinearArrays(NamedTuple):
@@ -92,26 +79,16 @@ class LinearArrays(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Linearization(Sensors):
-    """The whole program to first order along a path; nothing moves past a trajectory's end.
+    """The whole program to first order along a path; nothing moves past a trajectory's end."""
 
-    Attributes:
-        path: what it was taken along.
-        angles: the state's components that live on a circle: the declared ones that a whole turn does not change.
-        start_offset: `(B, D)` the mean start less the path's, angles on the circle.
-        start_turn: `(B, D)` the whole turns that this leaves out.
-        start_noise: G₀ `(B, D, C₀)`; zero where the start is known.
-        offset: `(T, B, D)` where the program arrives without noise, less the path's next state, angles on the circle.
-        state, noise: F `(T, B, D, D)` and G `(T, B, D, C)`.
-    """
-
-    path: ReferencePath
-    angles: tuple[int, ...]
-    start_offset: Tensor
-    start_turn: Tensor
-    start_noise: Tensor
-    offset: Tensor
-    state: Tensor
-    noise: Tensor
+    path: ReferencePath  # what it was taken along
+    angles: tuple[int, ...]  # the state's components on a circle: the declared ones that a whole turn does not change
+    start_offset: Tensor  # (B, D), the mean start less the path's, angles on the circle
+    start_turn: Tensor  # (B, D), the whole turns that this leaves out
+    start_noise: Tensor  # G₀ (B, D, C₀); zero where the start is known
+    offset: Tensor  # (T, B, D), where the program arrives without noise less the path's next state, likewise
+    state: Tensor  # F (T, B, D, D)
+    noise: Tensor  # G (T, B, D, C)
 
     @property
     def circular(self) -> Tensor:

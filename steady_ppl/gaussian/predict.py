@@ -22,17 +22,12 @@ from steady_ppl.smc.simulate import measure
 
 @dataclass(frozen=True)
 class Prediction:
-    """Measured less predicted, of rows `horizon`, `horizon` + 1, … from what was measured up to `horizon` rows before.
+    """Measured less predicted, of rows `horizon`, `horizon` + 1, … from what was measured up to `horizon` rows before;
+    each is `(T + 1 − horizon, B, K)`."""
 
-    Attributes:
-        error: `(T + 1 − horizon, B, K)`, on the circle where the measurement is an angle.
-        variance: of the same shape, of the linearised program, measurement noise included; NaN where missing.
-        observed: of the same shape, where there is something to compare.
-    """
-
-    error: Tensor
-    variance: Tensor
-    observed: Tensor
+    error: Tensor  # on the circle where the measurement is an angle
+    variance: Tensor  # of the linearised program, measurement noise included; NaN where missing
+    observed: Tensor  # where there is something to compare
 
     @property
     def standardised(self) -> Tensor:

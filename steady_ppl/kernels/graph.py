@@ -33,59 +33,45 @@ class NotCompilable(SteadyError):
 
 
 class Scalar(NamedTuple):
-    """One operation on scalars; `arguments` are other scalars' numbers, or the operation's own constants."""
+    """One operation on scalars. The leaves are "input" (name, element), "parameter" (offset), "constant" (value) and
+    "element" (vector, index)."""
 
     operation: str
-    arguments: tuple[Any, ...]
+    arguments: tuple[Any, ...]  # other scalars' numbers, or a leaf's own
 
 
 @dataclass(frozen=True)
 class Product:
-    """A matrix of parameters times a vector: element k is bias[k] + Σ p[at + k·rows + i·columns] x[i].
-
-    Attributes:
-        bias: one scalar an element, or None.
-        x: the vector's elements.
-    """
+    """A matrix of parameters times a vector: element k is bias[k] + Σ p[at + k·rows + i·columns] x[i]."""
 
     length: int
     at: int
     rows: int
     columns: int
-    bias: tuple[int, ...] | None
-    x: tuple[int, ...]
+    bias: tuple[int, ...] | None  # one scalar an element
+    x: tuple[int, ...]  # the vector's elements
 
 
 @dataclass(frozen=True)
 class Each:
-    """An operation on each element of vectors: operands are ("vector", number), ("parameters", offset) or
-    ("scalar", number)."""
+    """An operation on each element of vectors."""
 
     length: int
     operation: str
-    operands: tuple[tuple[str, int], ...]
+    operands: tuple[tuple[str, int], ...]  # ("vector", number), ("parameters", offset) or ("scalar", number)
 
 
 @dataclass
 class ScalarGraph:
-    """Scalars and vectors in the order in which they can be computed.
-
-    Attributes:
-        scalars: all operations; "input" (name, element), "parameter" (offset), "constant" (value), "element" (vector,
-            index) are the leaves.
-        levels: for each scalar, what it depends on.
-        vectors: products and elementwise operations on long vectors.
-        outputs: the scalars to be returned, in order.
-        parameters: places on the tape whose values the kernel takes, one after the other.
-    """
+    """Scalars and vectors in the order in which they can be computed."""
 
     levels_of_inputs: dict[str, int]
     scalars: list[Scalar] = field(default_factory=list)
-    levels: list[int] = field(default_factory=list)
+    levels: list[int] = field(default_factory=list)  # what each scalar depends on
     vectors: list[Product | Each] = field(default_factory=list)
-    outputs: list[int] = field(default_factory=list)
-    parameters: list[int] = field(default_factory=list)
-    numbers: dict[Scalar, int] = field(default_factory=dict)
+    outputs: list[int] = field(default_factory=list)  # the scalars to be returned, in order
+    parameters: list[int] = field(default_factory=list)  # places on the tape whose values the kernel takes, in order
+    numbers: dict[Scalar, int] = field(default_factory=dict)  # where each is in `scalars`
     operations: int = 0
 
     def scalar(self, operation: str, *arguments: Any) -> int:

@@ -72,19 +72,12 @@ def on_all_rows(
 
 
 class Slopes(NamedTuple):
-    """What a function's components change by with the parameters that a kernel takes, where that is not zero.
+    """What a function's components change by with the parameters that a kernel takes, where that is not zero."""
 
-    Attributes:
-        function: its own values, `(rows, B, V)`.
-        components: of the function, one for each slope, `(N,)`.
-        values: the slopes, `(N, rows, B)`.
-        by_number: what the kernel's parameter of each slope changes by with each learnable number, `(N, P)`.
-    """
-
-    function: Tensor
-    components: Tensor
-    values: Tensor
-    by_number: Tensor
+    function: Tensor  # its own values, (rows, B, V)
+    components: Tensor  # of the function, one for each slope, (N,)
+    values: Tensor  # the slopes, (N, rows, B)
+    by_number: Tensor  # what the kernel's parameter of each slope changes by with each learnable number, (N, P)
 
     def weighted(self, weights: Tensor) -> Tensor:
         """The sum over rows and components of weights `(rows, B, V)` times slopes, `(B, P)` in double precision."""

@@ -66,15 +66,6 @@ def machine_code(key: str, text: Callable[[], str]) -> Any:
         return engine
 
 
-def not_kept() -> str | None:
-    """Why no machine code is kept on disk; None where it is."""
-    try:
-        os.close(_open_folder())
-    except _NotKept as reason:
-        return str(reason)
-    return None
-
-
 # LLVM
 
 
