@@ -96,12 +96,8 @@ class Lookahead:
         return states[0], noise[0]
 
     def draws(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Independent draws of the linearised program's posterior.
-
-        Returns:
-            Start noise `(M, B, C₀)`, states `(M, T + 1, B, D)` and noise `(M, T, B, C)`, the last two on the turn that
-            the start noise asks for.
-        """
+        """Independent draws of the linearised program's posterior: start noise `(M, B, C₀)`, states `(M, T + 1, B, D)`
+        and noise `(M, T, B, C)`, the last two on the turn that the start noise asks for."""
         winding, start, _ = self.draw_starts(count)
         turns = self.windings[winding]
         random = torch.randn(count, *self.steps.shift.shape, dtype=start.dtype, device=start.device)

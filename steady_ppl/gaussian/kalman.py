@@ -6,10 +6,8 @@ shifts. They are no estimates: the smoother has believed the program, so that a 
 of its size.
 
 The recursions are compiled, on numpy arrays in double precision; rows or intervals first, trajectories second. Products
-of small matrices are written out: NumPy's own call BLAS, which at six rows takes longer than the product.
-
-The notation is that of `linearize`: δ' = F δ + offset + G ε, and a measurement's residual r̄ − H δ with the given
-precision, zero where it is missing.
+of small matrices are written out: NumPy's own call BLAS, which at six rows takes longer than the product. The notation
+is that of `linearize`.
 """
 
 from __future__ import annotations
@@ -73,10 +71,8 @@ def track(
     passes: int = 2,
     kernels: bool | None = None,
 ) -> Tracked:
-    """Linearise along a path near the posterior's mode, filter and smooth, and again along what was smoothed.
-
-    There are so many passes; the other arguments are those of `linearize`.
-    """
+    """Linearise along a path near the posterior's mode, filter and smooth, and again along what was smoothed, in so
+    many passes; the other arguments are those of `linearize`."""
     for _ in range(passes):
         tracked = filter_and_smooth(linearize(program, data, path, known_start=known_start, kernels=kernels))
         path = tracked.path(data)

@@ -137,18 +137,17 @@ def linearize(
     moved, (by_state, by_noise), in_plain_torch = _jacobians(program, step, along, given, kernels)
     offset = (moved - (by_noise @ noise.unsqueeze(-1)).squeeze(-1) - states[1:]).double()
     offset[..., angles] = wrap(offset[..., angles])  # a program may keep its angles on the circle, and so may a path
-    start_offset, start_noise = _start(program, data, states[0], known_start)
-    start_turn = torch.zeros_like(start_offset, dtype=torch.float64)
-    for angle in angles:
-        start_turn[:, angle] = start_offset[:, angle].double() - wrap(start_offset[:, angle].double())
+    start_offset, start_noise = (part.double() for part in _start(program, data, states[0], known_start))
+    start_turn = torch.zeros_like(start_offset)
+    start_turn[:, angles] = (start_offset - wrap(start_offset))[:, angles]
     seen = linearize_sensors(program, data, states, observation_weight=observation_weight, kernels=kernels)
     both = vars(seen) | {"in_plain_torch": in_plain_torch or seen.in_plain_torch}
     return Linearization(
         path=path,
         angles=angles,
-        start_offset=start_offset.double() - start_turn,
+        start_offset=start_offset - start_turn,
         start_turn=start_turn,
-        start_noise=start_noise.double(),
+        start_noise=start_noise,
         offset=torch.where(data.transitions[..., None], offset, 0.0),
         state=torch.where(data.transitions[..., None, None], by_state, 0.0).double(),
         noise=torch.where(data.transitions[..., None, None], by_noise, 0.0).double(),
@@ -259,10 +258,8 @@ def _jacobians(
     kernels: bool | None,
     outputs: int | None = None,
 ) -> tuple[Tensor, list[Tensor], str | None]:
-    """A function's value `(..., V)`, its Jacobians `(..., V, ·)`, and why they had to come from plain torch, if so.
-
-    Torch differentiates the first `outputs` components only.
-    """
+    """A function's value `(..., V)`, its Jacobians `(..., V, ·)`, and why they had to come from plain torch, if so,
+    which differentiates the first `outputs` components only."""
     found = on_all_rows(program, function.__name__, function, along | given, tuple(along), kernels)
     if isinstance(found, tuple):
         return (*found, None)

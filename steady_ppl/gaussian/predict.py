@@ -113,11 +113,8 @@ def row_errors(program: Program, states: Tensor, measurements: Tensor, observed:
 def simulate_again(
     program: Program, data: Trajectories, starts: Tensor, channels: int
 ) -> tuple[Trajectories, ReferencePath]:
-    """Drives that the program makes of the same controls, with the same gaps in the measurements.
-
-    From starts `(M, B, D)` and with C noise channels it makes `M · B` drives, all of the first set first, and their
-    true paths.
-    """
+    """`M · B` drives that the program makes of the same controls from starts `(M, B, D)` with C noise channels, with
+    the same gaps in the measurements, all of the first set first; and their true paths."""
     sets, drives, _ = starts.shape
     stepping = Stepping(program, data, 1.0)
     states, noises = [starts.to(data.controls.dtype)], []

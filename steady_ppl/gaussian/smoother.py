@@ -19,14 +19,7 @@ from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
 from steady_ppl.gaussian.linearize import ReferencePath, angles_on_a_circle, linearize
 from steady_ppl.kernels.jit import unchanged
 from steady_ppl.kernels.rows import on_all_rows
-from steady_ppl.model.handlers import (
-    KnownStart,
-    Recording,
-    Standardised,
-    broadcast_event,
-    normal_moments,
-    running,
-)
+from steady_ppl.model.handlers import KnownStart, Recording, Standardised, broadcast_event, normal_moments, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import divergence
 from steady_ppl.model.substeps import acting_controls, joined, parted, sample_channels
@@ -147,11 +140,8 @@ def find_and_smooth(
     may_fail: bool = False,
     path: ReferencePath | None = None,
 ) -> Lookahead:
-    """Find paths from the measurements alone, unless some are given, and look ahead along them.
-
-    Raises:
-        FilterError: the bootstrap filter of the search broke down, or the linearised program unless it `may_fail`.
-    """
+    """Find paths from the measurements alone, unless some are given, and look ahead along them; a `FilterError` says
+    that the bootstrap filter of the search broke down, or the linearised program unless it `may_fail`."""
     near = path or find_path(program, data, known_start=known_start, observation_weight=observation_weight)
     ahead = smooth(program, data, near, known_start=known_start, observation_weight=observation_weight)
     if not may_fail:
@@ -178,10 +168,8 @@ def means_as_path(ahead: Lookahead, data: Trajectories) -> ReferencePath:
 
 
 def resting_path(ahead: Lookahead, data: Trajectories) -> ReferencePath:
-    """`means_as_path` after several passes, to go on from. What has not come to rest stays where it was linearised.
-
-    How good a path is a step further is not known there. After a single pass it would never move.
-    """
+    """`means_as_path` after several passes, to go on from. What has not come to rest stays where it was linearised: how
+    good a path is a step further is not known there. After a single pass it would never move."""
     means, path = means_as_path(ahead, data), ahead.linearization.path
     far = ~((means.noise - path.noise).abs().amax((0, 2)) <= REST_TOLERANCE)
     return _either(far, path, means)

@@ -23,10 +23,8 @@ POINTER = FLOAT.as_pointer()
 def source(graph: ScalarGraph, inputs: Sequence[str], columns: dict[str, int]) -> str:
     """The code of a graph, for a `Kernel`; `NotCompilable` where some operation has none.
 
-    Args:
-        graph: what to compute.
-        inputs: the names of the inputs that differ between particles; the first is looked up at the ancestors.
-        columns: those that differ between trajectories only, name → first column.
+    `inputs` are those that differ between particles, the first of which is looked up at the ancestors. `columns` are of
+    those that differ between trajectories only, name → first column.
     """
     return str(_Writer(graph, inputs, columns).module)
 
@@ -63,17 +61,16 @@ class _Writer:
     @contextmanager
     def _loop(self, end: Any, step: int = 1) -> Any:
         """for i in range(0, end, step)."""
-        builder = self.builder
-        index = self._reserve(LONG, 1)
-        builder.store(LONG(0), index)
+        builder, before = self.builder, self.builder.block
         head, body, after = (builder.append_basic_block(name) for name in ("head", "body", "after"))
         builder.branch(head)
         builder.position_at_end(head)
-        i = builder.load(index)
+        i = builder.phi(LONG)
+        i.add_incoming(LONG(0), before)
         builder.cbranch(builder.icmp_signed("<", i, end), body, after)
         builder.position_at_end(body)
         yield i
-        builder.store(builder.add(i, LONG(step)), index)
+        i.add_incoming(builder.add(i, LONG(step)), builder.block)
         builder.branch(head)
         builder.position_at_end(after)
 

@@ -6,7 +6,7 @@ import ctypes
 import hashlib
 import itertools
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -38,12 +38,9 @@ _READ: WeakKeyDictionary[nn.Module, dict[Any, Any]] = WeakKeyDictionary()  # of 
 
 
 class Kernel:
-    """A compiled function.
+    """A compiled function of so many `inputs`, arrays, that gives so many `outputs` a particle.
 
-    Args:
-        key: a digest of what its source is made of.
-        text: writes its `source`.
-        inputs, outputs: how many arrays it takes, and how many numbers a particle it gives.
+    `text` writes its `source`; `key` is a digest of what that is made of.
     """
 
     def __init__(self, key: str, text: Callable[[], str], inputs: int, outputs: int) -> None:
@@ -107,10 +104,6 @@ class Method:
         along: the arguments in which to differentiate; the Jacobian's rows follow the values.
         by_parameters: differentiate in the parameters that the kernel takes; these derivatives come last.
 
-    Attributes:
-        values: how many numbers the function returns.
-        slopes: value and parameter of each derivative that `by_parameters` adds, those that are zero left out.
-
     Raises:
         NotCompilable: it cannot be traced, or what it does has no kernel.
     """
@@ -132,9 +125,9 @@ class Method:
             made = torch.func.functionalize(function)(*particle.values(), *trajectory.values())
         translation.end(made)
         self.tape, self.graph = translation.tape, translation.graph
-        self.values = len(self.graph.outputs)
-        self.slopes: list[tuple[int, int]] = []
         values = list(self.graph.outputs)
+        self.values = len(values)  # how many numbers the function returns
+        self.slopes: list[tuple[int, int]] = []  # value and parameter of each derivative that `by_parameters` adds
         if along:
             inputs = [self.graph.scalar("input", name, k) for name in along for k in range(particle[name].numel())]
             zero, rows = self.graph.constant(0.0), derivatives(self.graph, values, inputs)
@@ -228,15 +221,11 @@ def _tensors(program: nn.Module) -> dict[str, Tensor]:
     found = dict(itertools.chain(program.named_parameters(), program.named_buffers()))
     for at, module in program.named_modules():
         for name, value in _settings(module):
-            for index, part in enumerate(_members(value)):
+            held = value.values() if isinstance(value, dict) else value if isinstance(value, tuple | list) else [value]
+            for index, part in enumerate(held):
                 if isinstance(part, Tensor):
                     found[f"{at}.{name}[{index}] among the settings"] = part
     return found
-
-
-def _members(value: Any) -> Iterable[Any]:
-    """What a setting holds, or itself."""
-    return value.values() if isinstance(value, dict) else value if isinstance(value, tuple | list) else (value,)
 
 
 @contextmanager

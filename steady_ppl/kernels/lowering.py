@@ -95,10 +95,7 @@ def first_names(tensors: Mapping[str, Tensor]) -> dict[Any, str]:
 class Tape:
     """Values by place: a program's tensors, other tensors, which never change, and what is computed of them.
 
-    It is noted with one program, and runs for any that has tensors of the same names and shapes.
-
-    Args:
-        tensors: the program's, by name.
+    It is noted with one program's tensors, by name, and runs for any that has tensors of the same names and shapes.
     """
 
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
@@ -129,11 +126,8 @@ class Tape:
         self._values.append(value)
 
     def note(self, operation: OpOverload, arguments: Sequence[Any], keywords: dict[str, Any], made: Any) -> None:
-        """Note an operation on values that are here, and what it made.
-
-        Raises:
-            NotCompilable: it writes into a tensor, whose views and earlier values the tape would lose.
-        """
+        """Note an operation on values that are here, and what it made; refuse one that writes into a tensor, whose
+        views and earlier values the tape would lose."""
         if operation._schema.is_mutable:
             raise NotCompilable(f"{operation} writes into a tensor that does not depend on the state")
 
@@ -145,9 +139,10 @@ class Tape:
         first = len(self._values)
         for value in tree_leaves(made):
             self._add(value)
+        makes = range(first, len(self._values))
         if not needs.isdisjoint(self._varying):
-            self._varying.update(range(first, len(self._values)))
-        self._steps.append(_Step(operation, arguments, keywords, needs, range(first, len(self._values))))
+            self._varying.update(makes)
+        self._steps.append(_Step(operation, arguments, keywords, needs, makes))
 
     def cut(self, wanted: Iterable[int]) -> None:
         """End the noting, and leave out what these places do not need."""
@@ -190,10 +185,7 @@ class Tape:
 class Translation(TorchDispatchMode):
     """Notes what torch does meanwhile: tensors of values become tensors of scalars' numbers, of the same shape.
 
-    Args:
-        inputs: the arguments of what is traced, by name.
-        levels: what each of them differs between.
-        tensors: the program's, by name.
+    It is given the arguments of what is traced, what each of them differs between, and the program's tensors, by name.
     """
 
     def __init__(self, inputs: Mapping[str, Tensor], levels: dict[str, int], tensors: Mapping[str, Tensor]) -> None:

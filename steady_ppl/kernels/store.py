@@ -46,9 +46,6 @@ def machine_code(key: str, text: Callable[[], str]) -> Any:
         key: a digest of all that the text is made of. With the sources of this package, its version and that of
             llvmlite it must determine the text: kernels of the same key are taken for the same.
         text: writes the code for LLVM, which must hold no address. It is called only where none is kept.
-
-    Raises:
-        Whatever `text` raises.
     """
     name, made = _name(key), list[bytes]()
     triple, cpu, features = _processor()
@@ -145,10 +142,8 @@ def _write(folder: int, name: str, code: bytes) -> None:
 
 
 def _forget(folder: int) -> None:
-    """Remove the files that were used longest ago until three quarters of the bound are left.
-
-    The last quarter is for what is written until the folder is next looked through.
-    """
+    """Remove the files that were used longest ago until three quarters of the bound are left: the last one is for what
+    is written until the folder is next looked through."""
     found = []
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
@@ -183,10 +178,8 @@ def _folder() -> Iterator[int | None]:
 
 
 def _open_folder() -> int:
-    """Open the folder, made if need be, and check what was opened: its files are then found through it alone.
-
-    Those above it are checked too, since who can write there can put another folder of the user's in its place.
-    """
+    """Open the folder, made if need be, and check what was opened: its files are then found through it alone. Those
+    above it are checked too: who can write there can put another folder of the user's in its place."""
     if not hasattr(os, "geteuid") or os.open not in os.supports_dir_fd:
         raise _NotKept("this system does not say who owns a folder")
     place = _place()
@@ -229,10 +222,8 @@ def _place() -> Path:
 
 
 def _require_trusted(folder: Path) -> None:
-    """Refuse a folder or link of another user's, root excepted, and a folder where others can write.
-
-    In a folder like `/tmp` others can write, but can put nothing in the place of what is the user's.
-    """
+    """Refuse a folder or link of another user's, root excepted, and a folder where others can write; but in one like
+    `/tmp` they can put nothing in the place of what is the user's."""
     try:
         about = folder.lstat()
     except FileNotFoundError:
