@@ -141,7 +141,9 @@ class Lookahead:
 def look_ahead(linear: Linearization) -> Lookahead:
     """Run the backward information filter."""
     device, (trajectories, dimension, starting) = linear.offset.device, linear.start_noise.shape
-    given = _in_lanes(linear)
+    matrices = ("start_noise", "state", "noise", "measurement")
+    parts = ((name, getattr(linear, name)) for name in LinearArrays._fields)
+    given = LinearArrays(*(in_lanes(part if name in matrices else part.unsqueeze(-1)) for name, part in parts))
     rows, blocks, *_, lanes = given.measurement.shape
     first = Potential.zeros(blocks, lanes=lanes, dimension=dimension)
     futures = Potential.zeros(rows, blocks, lanes=lanes, dimension=dimension)
@@ -172,12 +174,6 @@ def look_ahead(linear: Linearization) -> Lookahead:
         given=given,
         steering=steps,
     )
-
-
-def _in_lanes(linear: Linearization) -> LinearArrays:
-    matrices = ("start_noise", "state", "noise", "measurement")
-    parts = ((name, getattr(linear, name)) for name in LinearArrays._fields)
-    return LinearArrays(*(in_lanes(part if name in matrices else part.unsqueeze(-1)) for name, part in parts))
 
 
 def _windings(linear: Linearization) -> Tensor:

@@ -42,7 +42,11 @@ def fixes(program: Program, data: Trajectories, *, places: int = 32, passes: int
         DataError: nothing is measured, or fewer than two rows of a drive have enough measurements.
     """
     data = data.without_truth()
-    guesses = _guesses(program, data, places)
+    left = torch.Size((places, len(data)))
+    with running(*left):
+        starts = broadcast_event(program.initial(), left, 1)
+    _, made_up = simulate_again(program, data, starts, step_size(program))
+    guesses = made_up.states.unflatten(1, left)  # (T + 1, S, B, D)
     told = (linearize_sensors(program, data, guesses[:, 0]).measurement != 0).flatten(0, 2).any(0)
     enough = (data.observed.sum(-1) >= told.sum()) & data.rows
     _require_enough(program, data, told, enough)
@@ -56,15 +60,6 @@ def fixes(program: Program, data: Trajectories, *, places: int = 32, passes: int
         [_found(program, data.subset(part), guesses[:, :, part], told, prior, passes) for part in parts], 1
     )
     return torch.where(enough[..., None] & told, states, torch.nan)
-
-
-def _guesses(program: Program, data: Trajectories, places: int) -> Tensor:
-    """Where the search begins, `(T + 1, S, B, D)`: drives that the program makes up."""
-    left = torch.Size((places, len(data)))
-    with running(*left):
-        starts = broadcast_event(program.initial(), left, 1)
-    _, made_up = simulate_again(program, data, starts, step_size(program))
-    return made_up.states.unflatten(1, left)
 
 
 def _require_enough(program: Program, data: Trajectories, told: Tensor, enough: Tensor) -> None:

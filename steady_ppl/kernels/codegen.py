@@ -56,8 +56,6 @@ class _Writer:
         self._write()
         self.builder.ret_void()
 
-    # loops
-
     @contextmanager
     def _loop(self, end: Any, step: int = 1) -> Any:
         """for i in range(0, end, step)."""
@@ -102,12 +100,10 @@ class _Writer:
                     self.scalar(number)
                 for k, number in enumerate(graph.outputs):
                     value = self.scalar(number).spread(LANES)
-                    if value.type.element == ir.IntType(1):
+                    if value.element == ir.IntType(1):
                         raise NotCompilable("a truth value as a result")
                     self._store_wide(value, self.out, builder.add(builder.mul(LONG(k), self.stride), self.at))
             self.values = shared
-
-    # memory
 
     def _load(self, pointer: Any, index: Any) -> Lanes:
         return Lanes(self.builder, self.builder.load(self.builder.gep(pointer, [index])))
@@ -145,8 +141,6 @@ class _Writer:
         for number, place in zip(wanted, places, strict=True):
             self.values[number] = Lanes(builder, builder.load(place))
 
-    # scalars
-
     def scalar(self, number: int) -> Lanes:
         """The value of a scalar of the graph."""
         if number in self.values:
@@ -178,8 +172,6 @@ class _Writer:
         if operation not in OPERATIONS:
             raise NotCompilable(f"no kernel for {operation}")
         return OPERATIONS[operation](*operands)
-
-    # vectors
 
     def _bias(self, product: Product, k: Any) -> Lanes:
         """The bias of one element; k is known now, or the kernel's own number."""

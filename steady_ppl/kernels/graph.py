@@ -204,37 +204,34 @@ class Tangents:
 
     def __init__(self, graph: ScalarGraph, along: int) -> None:
         self.graph, self.along = graph, along
-        self.of_scalars: dict[int, int | None] = {}
-        self.of_vectors: dict[int, Values | None] = {}
+        self.known: dict[int, int | None] = {}
 
     def of(self, number: int) -> int | None:
         """The derivative of a scalar; None where it is zero."""
-        if number not in self.of_scalars:
+        if number not in self.known:
             operation, arguments = self.graph.scalars[number]
             if operation == "element":
-                vector, k = arguments
-                found = self._of_vector(vector)
-                self.of_scalars[number] = None if found is None else found[k]
+                self._of_elements(arguments[0])
             elif operation in LEAVES:
-                self.of_scalars[number] = self.graph.constant(1.0) if number == self.along else None
+                self.known[number] = self.graph.constant(1.0) if number == self.along else None
             else:
                 found = self._rule(operation, [[n] for n in arguments], [number])
-                self.of_scalars[number] = None if found is None else found[0]
-        return self.of_scalars[number]
+                self.known[number] = found[0] if found else None
+        return self.known[number]
 
-    def _of_vector(self, vector: int) -> Values | None:
-        if vector not in self.of_vectors:
-            graph, what = self.graph, self.graph.vectors[vector]
-            if isinstance(what, Each):
-                operands = [graph.elements(kind, n, what.length) for kind, n in what.operands]
-                found = self._rule(what.operation, operands, graph.elements("vector", vector, what.length))
-            elif self._of_all(what.bias or ()) is not None:
-                raise NotCompilable("a bias that differs between particles")
-            else:
-                x = self._of_all(what.x)
-                found = None if x is None else graph.vector(replace(what, bias=None, x=tuple(x)))
-            self.of_vectors[vector] = found
-        return self.of_vectors[vector]
+    def _of_elements(self, vector: int) -> None:
+        graph, what = self.graph, self.graph.vectors[vector]
+        elements = graph.elements("vector", vector, what.length)
+        if isinstance(what, Each):
+            operands = [graph.elements(kind, n, what.length) for kind, n in what.operands]
+            found = self._rule(what.operation, operands, elements)
+        elif self._of_all(what.bias or ()) is not None:
+            raise NotCompilable("a bias that differs between particles")
+        else:
+            x = self._of_all(what.x)
+            found = None if x is None else graph.vector(replace(what, bias=None, x=tuple(x)))
+        for k, element in enumerate(elements):
+            self.known[element] = found[k] if found else None
 
     def _of_all(self, numbers: Sequence[int]) -> Values | None:
         """The derivatives of several scalars; None where all are zero."""

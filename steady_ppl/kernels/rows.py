@@ -128,7 +128,7 @@ def _computed(
     def build() -> Method:
         return Method(program, lambda *values: (function(*values),), examples, {}, **derivatives)
 
-    compiled_as = f"{name} {derivatives}"
+    compiled_as = f"{name} by parameters" if "by_parameters" in derivatives else f"{name} on all rows"
     method = compiled(program, compiled_as, build)
     if isinstance(method, str):
         return _noted(name, method)

@@ -52,7 +52,10 @@ def machine_code(key: str, text: Callable[[], str]) -> Any:
     machine = binding.Target.from_triple(triple).create_target_machine(cpu=cpu, features=features, opt=3)
     with _folder() as folder:
         kept = None if folder is None else _read(folder, name)
-        module = binding.parse_assembly("") if kept is not None else _optimized(text(), machine)
+        module = binding.parse_assembly(text() if kept is None else "")
+        if kept is None:
+            passes = binding.create_pass_builder(machine, binding.create_pipeline_tuning_options(speed_level=2))
+            passes.getModulePassManager().run(module, passes)
         engine = binding.create_mcjit_compiler(module, machine)
         engine.set_object_cache(lambda _, code: made.append(code), lambda _: kept)
         engine.finalize_object()
@@ -63,26 +66,12 @@ def machine_code(key: str, text: Callable[[], str]) -> Any:
         return engine
 
 
-# LLVM
-
-
 @lru_cache(maxsize=1)
 def _processor() -> tuple[str, str, str]:
     """What code is made for: the system, the processor and what it can do."""
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
     return binding.get_default_triple(), binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
-
-
-def _optimized(text: str, machine: Any) -> Any:
-    """A module of LLVM's, its functions optimized."""
-    module = binding.parse_assembly(text)
-    builder = binding.create_pass_builder(machine, binding.create_pipeline_tuning_options(speed_level=2))
-    builder.getModulePassManager().run(module, builder)
-    return module
-
-
-# files
 
 
 def _name(key: str) -> str:
@@ -158,9 +147,6 @@ def _forget(folder: int) -> None:
         with suppress(OSError):
             os.unlink(name, dir_fd=folder)
         left -= size
-
-
-# the folder
 
 
 @contextmanager
