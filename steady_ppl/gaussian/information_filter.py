@@ -86,9 +86,8 @@ class Lookahead:
     def means(self) -> tuple[Tensor, Tensor]:
         """Posterior means of the linearised program, on the path's own turn: states `(T + 1, B, D)` and noise
         `(T, B, C)`."""
-        deviations, noise = self.means_in_lanes()
-        moved = self._tensor(deviations).squeeze(-1)
-        return self.linearization.path.states + moved, self._tensor(noise).squeeze(-1)
+        moved, noise = (self._tensor(part).squeeze(-1) for part in self.means_in_lanes())
+        return self.linearization.path.states + moved, noise
 
     def means_in_lanes(self) -> tuple[Array, Array]:
         """The means, of the states less the path's: `(T + 1, blocks, D, 1, LANES)`; and `(T, blocks, C, 1, LANES)`."""
@@ -214,7 +213,6 @@ def integrate(ahead: Potential, noise: Array, offset: Array, out: Steering, room
         ahead: c, Λ and λ, overwritten by those of the integral.
         noise, offset: G `(D, C, LANES)` and `(D, 1, LANES)`.
         out: filled with ε ~ N(shift − gain μ, factor factorᵀ).
-        room: from `_room`.
     """
     precision, information, log_scale = ahead
     channels = len(out.factor)
@@ -399,9 +397,8 @@ def posterior_moments(ahead: Lookahead, data: Trajectories) -> Posterior:
     states = linear.path.states + out_of_lanes(moved, drives).squeeze(-1).to(device)
     states = torch.where(data.rows.unsqueeze(-1), states, states[:1])
     means = states.movedim(-1, 0).contiguous().numpy(force=True)
-    found = Posterior(
-        states, empty(rows - 1, channels), empty(rows, components), np.zeros((channels, rows - 1, drives))
-    )
+    lag = np.zeros((channels, rows - 1, drives))
+    found = Posterior(states, empty(rows - 1, channels), empty(rows, components), lag)
     fill_moments(ahead.given, ahead.steering, (moved, noise), ahead.covariances_in_lanes(), means, *found[1:])
     return found
 

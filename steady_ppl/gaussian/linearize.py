@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -114,9 +115,7 @@ def linearize(
 
     Args:
         program: its channel noise normal, its measurements normal or wrapped normal, components independent.
-        data: as returned by `for_program`.
-        path: states and noise of every trajectory.
-        known_start: the first state is certain.
+        data: as returned by `for_program`; where `known_start`, the first state is certain.
         observation_weight: tempers the observations.
         kernels: differentiate by kernels where they can serve; None: if there are rows enough, see `on_all_rows`.
         angles: `Linearization.angles`, where they are known.
@@ -134,7 +133,7 @@ def linearize(
         angles = angles_on_a_circle(program, data, states[0, :1])
     along = {"state": states[:-1], "noise": noise}
     given = {"control": acting_controls(program, data)[:-1], "time": data.elapsed[:-1], "step": data.steps}
-    moved, (by_state, by_noise), in_plain_torch = _jacobians(program, step, along, given, kernels)
+    moved, (by_state, by_noise), in_plain_torch = _jacobians(program, "step", step, along, given, kernels)
     offset = (moved - (by_noise @ noise.unsqueeze(-1)).squeeze(-1) - states[1:]).double()
     offset[..., angles] = wrap(offset[..., angles])  # a program may keep its angles on the circle, and so may a path
     start_offset, start_noise = (part.double() for part in _start(program, data, states[0], known_start))
@@ -165,12 +164,9 @@ def linearize_sensors(
     kernels: bool | None = None,
 ) -> Sensors:
     """The part of `linearize` that is about what is measured, around states `(T + 1, B, D)`."""
-
-    def measure(state: Tensor, measurement: Tensor, observed: Tensor) -> Tensor:
-        return _residuals(program, state, measurement, observed)
-
-    given, count = {"measurement": data.measurements, "observed": data.observed}, data.measurements.shape[-1]
-    measured, by, in_plain_torch = _jacobians(program, measure, {"state": states}, given, kernels, outputs=count)
+    along, given = {"state": states}, {"measurement": data.measurements, "observed": data.observed}
+    measure, count = partial(_residuals, program), data.measurements.shape[-1]
+    measured, by, in_plain_torch = _jacobians(program, "measure", measure, along, given, kernels, outputs=count)
     residuals, log_sd, log_density = measured.chunk(3, -1)
     by_measured = -by[0][..., :count, :]
     observed = data.observed & torch.isfinite(by_measured.sum(-1))  # a bearing to where one stands has no derivative
@@ -252,6 +248,7 @@ def angles_on_a_circle(program: Program, data: Trajectories, state: Tensor) -> t
 
 def _jacobians(
     program: Program,
+    name: str,
     function: Callable[..., Tensor],
     along: dict[str, Tensor],
     given: dict[str, Tensor],
@@ -260,7 +257,7 @@ def _jacobians(
 ) -> tuple[Tensor, list[Tensor], str | None]:
     """A function's value `(..., V)`, its Jacobians `(..., V, ·)`, and why they had to come from plain torch, if so,
     which differentiates the first `outputs` components only."""
-    found = on_all_rows(program, function.__name__, function, along | given, tuple(along), kernels)
+    found = on_all_rows(program, name, function, along | given, tuple(along), kernels)
     if isinstance(found, tuple):
         return (*found, None)
     value, by = _derivatives(lambda *inputs: function(*inputs, *given.values()), *along.values(), outputs=outputs)

@@ -45,13 +45,8 @@ def predict(
 ) -> dict[int, Prediction]:
     """Run the program without noise from the filtered state of every row, with the recorded controls.
 
-    Args:
-        program, data, tracked: the drives as they were tracked.
-        horizons: how many rows ahead.
-        bands: the horizons whose variances are wanted, the others' are NaN; None: all.
-
-    Returns:
-        A prediction for each horizon that is shorter than the longest drive.
+    Gives a prediction for each horizon, in rows ahead, that is shorter than the longest drive; `bands` are the horizons
+    whose variances are wanted, the others' are NaN; None: all.
     """
     found = {}
     for horizon, state in states_ahead(program, data, tracked, max(horizons)):
@@ -70,9 +65,8 @@ def states_ahead(program: Program, data: Trajectories, tracked: Tracked, most: i
     state = tracked.states.to(data.controls.dtype)
     controls, elapsed, steps = acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps
     for ahead in range(1, min(most, len(steps)) + 1):
-        rows = slice(ahead - 1, len(steps))
-        state = state[: len(steps) - ahead + 1]
-        state = mean_steps(program, state, controls[rows], elapsed[rows], steps[rows])
+        since = slice(ahead - 1, None)
+        state = mean_steps(program, state[:-1], controls[since], elapsed[since], steps[since])
         yield ahead, state
 
 

@@ -39,15 +39,10 @@ def log_future(
 def steer(
     state: Tensor, path: Tensor, angles: Tensor, steering: Steering, own: Tensor, stays: Tensor, untwisted: float
 ) -> tuple[Tensor, Tensor]:
-    """Draw every particle's noise, steered unless it stays as it is.
+    """Draw every particle's noise `(N, B, C)`: its own, standard normal, if it `stays`, else steered.
 
-    Args:
-        own: standard normal noise `(N, B, C)`.
-        stays: `(N, B)` bool, which particles keep it.
-        untwisted: the probability of that.
-
-    Returns:
-        The noise `(N, B, C)`, and its log density less that of the mixture that it was drawn from, `(N, B)`.
+    Returns it, and its log density less that of the mixture that it was drawn from, `(N, B)`: `untwisted` is the
+    probability to stay.
     """
     noise = torch.empty(own.shape[::-1], dtype=own.dtype)
     ratio = torch.empty(noise.shape[1:], dtype=torch.float64)

@@ -199,14 +199,15 @@ def compiled(program: nn.Module, name: str, build: Callable[[], Value]) -> Value
     """What was compiled under a name for programs like this one, built once; or why there is none."""
     known = _COMPILED.setdefault(type(program), {})
     key = (name, signature(program))
-    if key not in known and sum(at == name for at, _ in known) >= TRACES:
+    if key in known:
+        return known[key]
+    if sum(at == name for at, _ in known) >= TRACES:
         return KEEPS_CHANGING
-    if key not in known:
-        with torch.random.fork_rng(devices=[]):
-            try:
-                known[key] = build()
-            except NotCompilable as reason:
-                known[key] = str(reason)
+    with torch.random.fork_rng(devices=[]):
+        try:
+            known[key] = build()
+        except NotCompilable as reason:
+            known[key] = str(reason)
     return known[key]
 
 
@@ -246,8 +247,7 @@ def _read(program: nn.Module, what: Any, read: Callable[[], Value]) -> Value:
         return read()
     if what not in known:
         known[what] = read()
-    found: Value = known[what]
-    return found
+    return known[what]
 
 
 def signature(program: nn.Module) -> tuple[Any, ...]:

@@ -49,7 +49,8 @@ def on_all_rows(
     along: Sequence[str] = (),
     kernels: bool | None = None,
 ) -> tuple[Tensor, list[Tensor]] | str | None:
-    """A function's value and its Jacobians.
+    """A function's value `(rows, B, V)` and its Jacobians `(rows, B, V, ·)`; why there is no kernel; or None where it
+    is not worth one.
 
     Args:
         program: what the function belongs to.
@@ -58,10 +59,6 @@ def on_all_rows(
         arguments: its arguments in order, each `(rows, B)` or `(rows, B, ·)`.
         along: those in which to differentiate, the first ones.
         kernels: whether a kernel is worth compiling; None: if there are `ROWS_WORTH_COMPILING`.
-
-    Returns:
-        The value `(rows, B, V)` and the Jacobians `(rows, B, V, ·)`; why there is no kernel; None where it is not
-        worth one.
     """
     found = _computed(program, name, function, arguments, kernels, along=along)
     if not isinstance(found, tuple):
@@ -124,12 +121,10 @@ def _computed(
     if first.device.type != "cpu" or first.dtype != torch.float32:
         return f"{str(first.dtype).removeprefix('torch.')} on {first.device.type}"
     examples = {at: value[:1, :1].unsqueeze(0).clone() for at, value in arguments.items()}
-
-    def build() -> Method:
-        return Method(program, lambda *values: (function(*values),), examples, {}, **derivatives)
-
     compiled_as = f"{name} by parameters" if "by_parameters" in derivatives else f"{name} on all rows"
-    method = compiled(program, compiled_as, build)
+    method = compiled(
+        program, compiled_as, lambda: Method(program, lambda *given: (function(*given),), examples, {}, **derivatives)
+    )
     if isinstance(method, str):
         return _noted(name, method)
     found = _run(method, program, arguments, rows, trajectories)
