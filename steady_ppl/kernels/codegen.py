@@ -102,19 +102,16 @@ class _Writer:
                     value = self.scalar(number).spread(LANES)
                     if value.element == ir.IntType(1):
                         raise NotCompilable("a truth value as a result")
-                    self._store_wide(value, self.out, builder.add(builder.mul(LONG(k), self.stride), self.at))
+                    place = self._wide(self.out, builder.add(builder.mul(LONG(k), self.stride), self.at))
+                    builder.store(value.value, place, align=4)
             self.values = shared
 
     def _load(self, pointer: Any, index: Any) -> Lanes:
         return Lanes(self.builder, self.builder.load(self.builder.gep(pointer, [index])))
 
-    def _load_wide(self, pointer: Any, index: Any) -> Lanes:
-        where = self.builder.bitcast(self.builder.gep(pointer, [index]), WIDE.as_pointer())
-        return Lanes(self.builder, self.builder.load(where, align=4))
-
-    def _store_wide(self, value: Lanes, pointer: Any, index: Any) -> None:
-        where = self.builder.bitcast(self.builder.gep(pointer, [index]), WIDE.as_pointer())
-        self.builder.store(value.value, where, align=4)
+    def _wide(self, pointer: Any, index: Any) -> Any:
+        """Where the numbers of all lanes lie, aligned as a single one."""
+        return self.builder.bitcast(self.builder.gep(pointer, [index]), WIDE.as_pointer())
 
     def _gather(self) -> None:
         """Load the elements of the first input that are needed, where the ancestors lie."""
@@ -127,7 +124,7 @@ class _Writer:
         with builder.if_else(none) as (same, moved):
             with same:
                 for start, place in zip(starts, places, strict=True):
-                    builder.store(self._load_wide(pointer, builder.add(start, self.at)).value, place)
+                    builder.store(builder.load(self._wide(pointer, builder.add(start, self.at)), align=4), place)
             with moved:
                 from_row = [builder.add(start, self.row) for start in starts]
                 gathered = [ir.Constant(WIDE, ir.Undefined)] * len(wanted)
@@ -157,7 +154,8 @@ class _Writer:
                 value = self._load(self.uniform, builder.add(self.trajectory, LONG(column)))
             case "input":
                 start = builder.mul(LONG(arguments[1]), self.stride)
-                value = self._load_wide(self.data[arguments[0]], builder.add(start, self.at))
+                place = self._wide(self.data[arguments[0]], builder.add(start, self.at))
+                value = Lanes(builder, builder.load(place, align=4))
             case "element":
                 vector, k = arguments
                 if vector not in self.stored:
