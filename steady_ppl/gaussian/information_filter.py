@@ -365,7 +365,7 @@ class Moments(NamedTuple):
     """Deviations of one kind, with the components first."""
 
     mean: Array  # (C, rows, B), posterior means
-    variance: Array  # (C, rows, B), and variances
+    variance: Array  # (C, rows, B), posterior variances
     points: Array  # x̂, x̂ + v and x̂ − v for each component, v = Cov(x, z), (D, 1 + 2 C, rows, B)
 
     def tensors(self, device: torch.device) -> dict[str, Tensor]:

@@ -6,8 +6,10 @@ shifts. They are no estimates: the smoother has believed the program, so that a 
 of its size.
 
 The recursions are compiled, on numpy arrays in double precision; rows or intervals first, trajectories second. Products
-of small matrices are written out: NumPy's own call BLAS, which at six rows takes longer than the product. The notation
-is that of `linearize`.
+of small matrices are written out: NumPy's own call BLAS, which at six rows takes longer than the product.
+
+The notation is that of `linearize`: δ' = F δ + offset + G ε, and a measurement's residual r̄ − H δ with the given
+precision, zero where it is missing.
 """
 
 from __future__ import annotations

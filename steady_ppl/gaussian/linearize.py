@@ -87,7 +87,7 @@ class Linearization(Sensors):
     start_offset: Tensor  # (B, D), the mean start less the path's, angles on the circle
     start_turn: Tensor  # (B, D), the whole turns that this leaves out
     start_noise: Tensor  # G₀ (B, D, C₀); zero where the start is known
-    offset: Tensor  # (T, B, D), where the program arrives without noise less the path's next state, likewise
+    offset: Tensor  # (T, B, D), where the program arrives without noise less the path's next, angles on the circle
     state: Tensor  # F (T, B, D, D)
     noise: Tensor  # G (T, B, D, C)
 

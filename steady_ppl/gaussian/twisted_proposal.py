@@ -41,7 +41,7 @@ def steer(
 ) -> tuple[Tensor, Tensor]:
     """Draw every particle's noise `(N, B, C)`: its own, standard normal, if it `stays`, else steered.
 
-    Returns it, and its log density less that of the mixture that it was drawn from, `(N, B)`: `untwisted` is the
+    Return it, and its log density less that of the mixture that it was drawn from, `(N, B)`. `untwisted` is the
     probability to stay.
     """
     noise = torch.empty(own.shape[::-1], dtype=own.dtype)
