@@ -209,8 +209,9 @@ def set_product(out: Array, left: Array, right: Array) -> None:
     out[:] = 0.0
     for i in range(out.shape[0]):
         for k in range(left.shape[1]):
+            weight = left[i, k]
             for j in range(out.shape[1]):
-                out[i, j] += left[i, k] * right[k, j]
+                out[i, j] += weight * right[k, j]
 
 
 @njit(cache=True, error_model="numpy", inline="always")
