@@ -22,6 +22,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.lanes import (
     Array,
     add_dot,
@@ -36,35 +37,24 @@ from steady_ppl.gaussian.linearize import LinearArrays, Linearization
 
 
 class Potential(NamedTuple):
-    """exp(c − ½ δᵀ Λ δ + λᵀ δ) of a state in lanes: Λ `(..., D, D, LANES)`, λ `(..., D, 1, LANES)` and c
-    `(..., 1, 1, LANES)`."""
+    """exp(c − ½ δᵀ Λ δ + λᵀ δ) of a state in lanes."""
 
-    precision: Array
-    information: Array
-    log_scale: Array
+    precision: Array  # Λ (..., D, D, LANES)
+    information: Array  # λ (..., D, 1, LANES)
+    log_scale: Array  # c (..., 1, 1, LANES)
 
     @classmethod
-    def empty(cls, *left: int, lanes: int, dimension: int) -> Potential:
-        return cls(
-            np.empty((*left, dimension, dimension, lanes)),
-            np.empty((*left, dimension, 1, lanes)),
-            np.empty((*left, 1, 1, lanes)),
-        )
+    def zeros(cls, *left: int, lanes: int, dimension: int) -> Potential:
+        return cls(*(np.zeros((*left, *shape, lanes)) for shape in ((dimension, dimension), (dimension, 1), (1, 1))))
 
 
 class Steering(NamedTuple):
     """Noise that leads to the later measurements, ε ~ N(shift − gain δ, factor factorᵀ); tensors, or arrays in lanes,
-    whose shift is a matrix of one column.
+    whose shift is a matrix of one column."""
 
-    Attributes:
-        shift: `(..., C)`.
-        gain: `(..., C, D)`.
-        factor: `(..., C, C)`, upper triangular.
-    """
-
-    shift: Any
-    gain: Any
-    factor: Any
+    shift: Any  # (..., C)
+    gain: Any  # (..., C, D)
+    factor: Any  # (..., C, C), upper triangular
 
     @classmethod
     def in_lanes(cls, *left: int, lanes: int, dimension: int, channels: int) -> Steering:
@@ -77,72 +67,53 @@ class Steering(NamedTuple):
         return Steering(shift.squeeze(-1), gain, factor)
 
 
-class InLanes(NamedTuple):
-    """A linearization and the steering of its intervals."""
-
-    given: LinearArrays
-    steps: Steering
-
-
 @dataclass(frozen=True)
 class Lookahead:
-    """The likelihood of all later measurements after every row, and the noise that it asks for.
+    """The likelihood of all later measurements after every row, and the noise that it asks for."""
 
-    Attributes:
-        linearization: of the program; deviations are from its path.
-        precision: Λ `(T + 1, B, D, D)`.
-        information: λ `(T + 1, B, D)`.
-        log_scale: c `(T + 1, B)`.
-        windings: `(W, D)` whole turns from the one nearest to the prior's mean on which the start may lie, none first.
-        winding_masses: `(W, B)` log posterior probability of each.
-        starts: steering of the start's noise, `(W, B, ...)`, its deviation zero.
-        steps: of every interval's noise, `(T, B, ...)`.
-        log_likelihood: log p(y) of the linearised program, `(B,)`, observations tempered as in the linearization.
-        lanes: what the recursions read of it.
-    """
-
-    linearization: Linearization
-    precision: Tensor
-    information: Tensor
-    log_scale: Tensor
-    windings: Tensor
-    winding_masses: Tensor
-    starts: Steering
-    steps: Steering
-    log_likelihood: Tensor
-    lanes: InLanes = field(repr=False)
+    linearization: Linearization  # of the program; deviations are from its path
+    precision: Tensor  # Λ (T + 1, B, D, D)
+    information: Tensor  # λ (T + 1, B, D)
+    log_scale: Tensor  # c (T + 1, B)
+    windings: Tensor  # (W, D), turns from the one nearest to the prior's mean on which the start may lie, none first
+    winding_masses: Tensor  # (W, B), log posterior probability of each
+    starts: Steering  # of the start's noise, (W, B, ...), its deviation zero
+    steps: Steering  # of every interval's noise, (T, B, ...)
+    log_likelihood: Tensor  # log p(y) of the linearised program, (B,), observations tempered as in the linearization
+    given: LinearArrays = field(repr=False)  # the linearization in lanes
+    steering: Steering = field(repr=False)  # `steps` in lanes
 
     def means(self) -> tuple[Tensor, Tensor]:
         """Posterior means of the linearised program, on the path's own turn: states `(T + 1, B, D)` and noise
         `(T, B, C)`."""
-        deviations, noise = self.means_in_lanes()
-        moved = self._tensor(deviations).squeeze(-1)
-        return self.linearization.path.states + moved, self._tensor(noise).squeeze(-1)
+        moved, noise = (self._tensor(part).squeeze(-1) for part in self.means_in_lanes())
+        return self.linearization.path.states + moved, noise
 
     def means_in_lanes(self) -> tuple[Array, Array]:
         """The means, of the states less the path's: `(T + 1, blocks, D, 1, LANES)`; and `(T, blocks, C, 1, LANES)`."""
-        states, noise = self._forward(self.starts.shift[:1], self.lanes.steps.shift[None].copy())
+        states, noise = self._forward(self.starts.shift[:1], self.steering.shift[None].copy())
         return states[0], noise[0]
 
     def draws(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Independent draws of the linearised program's posterior.
-
-        Returns:
-            Start noise `(M, B, C₀)`, states `(M, T + 1, B, D)` and noise `(M, T, B, C)`, the last two on the turn that
-            the start noise asks for.
-        """
-        winding = torch.distributions.Categorical(logits=self.winding_masses.t()).sample((count,))
-        trajectory = torch.arange(winding.shape[1], device=winding.device)
-        starts = self.starts
-        shift, factor = starts.shift[winding, trajectory], starts.factor[winding, trajectory]
-        start = shift + _times(factor, torch.randn_like(shift))
+        """Independent draws of the linearised program's posterior: start noise `(M, B, C₀)`, states `(M, T + 1, B, D)`
+        and noise `(M, T, B, C)`, the last two on the turn that the start noise asks for."""
+        winding, start, _ = self.draw_starts(count)
         turns = self.windings[winding]
-        random = torch.randn(count, *self.steps.shift.shape, dtype=shift.dtype, device=shift.device)
-        noise = self.steps.shift + _times(self.steps.factor, random)
+        random = torch.randn(count, *self.steps.shift.shape, dtype=start.dtype, device=start.device)
+        noise = self.steps.shift + times(self.steps.factor, random)
         rolled = self._forward(start, in_lanes(noise.unsqueeze(-1)), turns)
         states, noise = (self._tensor(part).squeeze(-1) for part in rolled)
         turned = self.linearization.path.states + (turns + self.linearization.start_turn).unsqueeze(1)
         return start, turned + states, noise
+
+    def draw_starts(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Draw which of the `windings` starts lie on, `(M, B)`, their noise, and the standard normal one that it was
+        made of, each `(M, B, C₀)`."""
+        winding = torch.distributions.Categorical(logits=self.winding_masses.t()).sample((count,))
+        trajectory = torch.arange(winding.shape[1], device=winding.device)
+        shift, factor = self.starts.shift[winding, trajectory], self.starts.factor[winding, trajectory]
+        own = torch.randn_like(shift)
+        return winding, shift + times(factor, own), own
 
     def covariances(self) -> tuple[Tensor, Tensor, Tensor]:
         """Posterior covariances on the path's own turn: of the states, `(T + 1, B, D, D)`, of the noise of each
@@ -152,14 +123,14 @@ class Lookahead:
 
     def covariances_in_lanes(self) -> tuple[Array, Array, Array]:
         spread = self.linearization.start_noise @ self.starts.factor[0]
-        return covariances(self.lanes.given, self.lanes.steps, in_lanes(spread @ spread.mT))
+        return covariances(self.given, self.steering, in_lanes(spread @ spread.mT))
 
     def _forward(self, start: Tensor, noise: Array, turns: Tensor | float = 0.0) -> tuple[Array, Array]:
         """States, less the path's, and noise in lanes: what the start's noise `(M, B, C₀)` and each interval's at a
         deviation of zero lead to."""
         linear = self.linearization
-        begin = linear.start_offset + _times(linear.start_noise, start) - turns
-        return roll_out(self.lanes.given, self.lanes.steps.gain, in_lanes(begin.unsqueeze(-1)), noise), noise
+        begin = linear.start_offset + times(linear.start_noise, start) - turns
+        return roll_out(self.given, self.steering.gain, in_lanes(begin.unsqueeze(-1)), noise), noise
 
     def _tensor(self, blocks: Array) -> Tensor:
         linear = self.linearization
@@ -169,11 +140,14 @@ class Lookahead:
 def look_ahead(linear: Linearization) -> Lookahead:
     """Run the backward information filter."""
     device, (trajectories, dimension, starting) = linear.offset.device, linear.start_noise.shape
-    given = _in_lanes(linear)
+    matrices = ("start_noise", "state", "noise", "measurement")
+    parts = ((name, getattr(linear, name)) for name in LinearArrays._fields)
+    given = LinearArrays(*(in_lanes(part if name in matrices else part.unsqueeze(-1)) for name, part in parts))
     rows, blocks, *_, lanes = given.measurement.shape
-    futures = Potential.empty(rows, blocks, lanes=lanes, dimension=dimension)
+    first = Potential.zeros(blocks, lanes=lanes, dimension=dimension)
+    futures = Potential.zeros(rows, blocks, lanes=lanes, dimension=dimension)
     steps = Steering.in_lanes(rows - 1, blocks, lanes=lanes, dimension=dimension, channels=linear.noise.shape[-1])
-    first = backward(given, in_lanes(linear.log_scale[..., None, None]), futures, steps)
+    backward(given, in_lanes(linear.log_scale[..., None, None]), first, futures, steps)
     windings = _windings(linear)
     offsets = linear.start_offset - windings.unsqueeze(1)
     begun = Steering.in_lanes(len(windings), blocks, lanes=lanes, dimension=dimension, channels=starting)
@@ -196,14 +170,9 @@ def look_ahead(linear: Linearization) -> Lookahead:
         starts=starts,
         steps=steps.tensors(linear.offset),
         log_likelihood=log_likelihood,
-        lanes=InLanes(given, steps),
+        given=given,
+        steering=steps,
     )
-
-
-def _in_lanes(linear: Linearization) -> LinearArrays:
-    matrices = ("start_noise", "state", "noise", "measurement")
-    parts = ((name, getattr(linear, name)) for name in LinearArrays._fields)
-    return LinearArrays(*(in_lanes(part if name in matrices else part.unsqueeze(-1)) for name, part in parts))
 
 
 def _windings(linear: Linearization) -> Tensor:
@@ -217,41 +186,24 @@ def _windings(linear: Linearization) -> Tensor:
     return 2 * math.pi * linear.start_offset.new_tensor(list(itertools.product(*choices)))
 
 
-def _times(matrix: Tensor, vectors: Tensor) -> Tensor:
+def times(matrix: Tensor, vectors: Tensor) -> Tensor:
     """A vector for each matrix, or draws of it in front: these are side by side for the product."""
     if vectors.dim() < matrix.dim():
         return (matrix @ vectors.unsqueeze(-1)).squeeze(-1)
     return (matrix @ vectors.movedim(0, -1)).movedim(-1, 0)
 
 
-class Room(NamedTuple):
+@njit(cache=True, error_model="numpy")
+def _room(dimension: int, channels: int, lanes: int) -> tuple[Array, ...]:
     """What `integrate` works in: to allocate takes as long as a product."""
-
-    pushed: Array
-    by_noise: Array
-    pull: Array
-    gram: Array
-    root: Array
-    half: Array
-    white: Array
+    square, wide, column = (channels, channels, lanes), (channels, dimension, lanes), (channels, 1, lanes)
+    pushed, pull, white = np.zeros((dimension, 1, lanes)), np.zeros(column), np.zeros(column)
+    by_noise, half, gram, root = np.zeros(wide), np.zeros(wide), np.zeros(square), np.zeros(square)
+    return pushed, by_noise, pull, gram, root, half, white
 
 
 @njit(cache=True, error_model="numpy")
-def _room(dimension: int, channels: int, lanes: int) -> Room:
-    square, wide = (channels, channels, lanes), (channels, dimension, lanes)
-    return Room(
-        pushed=np.zeros((dimension, 1, lanes)),
-        by_noise=np.zeros(wide),
-        pull=np.zeros((channels, 1, lanes)),
-        gram=np.zeros(square),
-        root=np.zeros(square),
-        half=np.zeros(wide),
-        white=np.zeros((channels, 1, lanes)),
-    )
-
-
-@njit(cache=True, error_model="numpy")
-def integrate(ahead: Potential, noise: Array, offset: Array, out: Steering, room: Room) -> None:
+def integrate(ahead: Potential, noise: Array, offset: Array, out: Steering, room: tuple[Array, ...]) -> None:
     """∫ ψ(μ + offset + G ε) N(ε; 0, I) dε as a function of μ, and the noise's conditional given μ; in lanes.
 
     ψ(x) = exp(c − ½ xᵀ Λ x + λᵀ x). With S = (I + GᵀΛG)⁻¹ and u = λ − Λ offset the integral is again of that form,
@@ -261,7 +213,6 @@ def integrate(ahead: Potential, noise: Array, offset: Array, out: Steering, room
         ahead: c, Λ and λ, overwritten by those of the integral.
         noise, offset: G `(D, C, LANES)` and `(D, 1, LANES)`.
         out: filled with ε ~ N(shift − gain μ, factor factorᵀ).
-        room: from `_room`.
     """
     precision, information, log_scale = ahead
     channels = len(out.factor)
@@ -319,18 +270,13 @@ def integrate_starts(noise: Array, ahead: Potential, offset: Array, steering: St
 
 
 @njit(cache=True, error_model="numpy")
-def backward(given: LinearArrays, log_scale: Array, futures: Potential, steering: Steering) -> Potential:
+def backward(given: LinearArrays, log_scale: Array, first: Potential, futures: Potential, steering: Steering) -> None:
     """The backward information filter of δ' = F δ + offset + G ε, for every trajectory.
 
-    It fills what all later measurements say of each row's state, `futures`, and the noise that they ask for in each
-    interval. Returns what all measurements say of the first state. `log_scale` is of each row's own measurements.
+    It adds to `first`, of zeros, what all measurements say of the first state, and fills what all later ones say of
+    each row's, `futures`, and the noise that they ask for in each interval. `log_scale` is of each row's own.
     """
     rows, blocks, components, dimension, lanes = given.measurement.shape
-    first = Potential(
-        np.zeros((blocks, dimension, dimension, lanes)),
-        np.zeros((blocks, dimension, 1, lanes)),
-        np.zeros((blocks, 1, 1, lanes)),
-    )
     weighted, pull = np.zeros((components, dimension, lanes)), np.zeros((components, 1, lanes))
     half, gain = np.zeros((dimension, dimension, lanes)), np.zeros(steering.gain.shape[2:])
     moved, room = np.zeros((dimension, 1, lanes)), _room(dimension, steering.gain.shape[2], lanes)
@@ -357,7 +303,6 @@ def backward(given: LinearArrays, log_scale: Array, futures: Potential, steering
                 ahead.precision[:], ahead.information[:] = 0.0, 0.0
                 add_gram(ahead.precision, forward, half, 1.0)
                 add_gram(ahead.information, forward, moved, 1.0)
-    return first
 
 
 @njit(cache=True, error_model="numpy")
@@ -414,3 +359,107 @@ def _add_symmetric(out: Array, left: Array, right: Array) -> None:
         for j in range(i + 1):
             add_dot(out, i * rows + j, left, i * inner, 1, right, j * inner, 1, inner, 1.0)
             out[j, i] = out[i, j]
+
+
+class Moments(NamedTuple):
+    """Deviations of one kind, with the components first."""
+
+    mean: Array  # (C, rows, B), posterior means
+    variance: Array  # (C, rows, B), posterior variances
+    points: Array  # x̂, x̂ + v and x̂ − v for each component, v = Cov(x, z), (D, 1 + 2 C, rows, B)
+
+    def tensors(self, device: torch.device) -> dict[str, Tensor]:
+        """By name, with the components last."""
+        return {name: torch.from_numpy(part).movedim(0, -1).to(device) for name, part in self._asdict().items()}
+
+
+class Posterior(NamedTuple):
+    """Moments of a linearised program's posterior."""
+
+    states: Tensor  # means x̂ (T + 1, B, D), the first row's past a trajectory's end
+    channels: Moments
+    measurements: Moments
+    lag: Array  # covariances of each channel's deviation with its last one, (C, T, B), zero at the first
+
+
+def posterior_moments(ahead: Lookahead, data: Trajectories) -> Posterior:
+    """The moments in double precision, or in single as the data are: programs read the points as such."""
+    linear = ahead.linearization
+    (rows, drives, components, dimension), channels = linear.measurement.shape, linear.noise.shape[-1]
+    number = torch.empty(0, dtype=data.controls.dtype).numpy().dtype
+
+    def empty(rows: int, count: int) -> Moments:
+        shapes = (count, rows, drives), (count, rows, drives), (dimension, 1 + 2 * count, rows, drives)
+        return Moments(*(np.empty(shape, number) for shape in shapes))
+
+    moved, noise = ahead.means_in_lanes()
+    device = linear.offset.device
+    states = linear.path.states + out_of_lanes(moved, drives).squeeze(-1).to(device)
+    states = torch.where(data.rows.unsqueeze(-1), states, states[:1])
+    means = states.movedim(-1, 0).contiguous().numpy(force=True)
+    lag = np.zeros((channels, rows - 1, drives))
+    found = Posterior(states, empty(rows - 1, channels), empty(rows, components), lag)
+    fill_moments(ahead.given, ahead.steering, (moved, noise), ahead.covariances_in_lanes(), means, *found[1:])
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def fill_moments(
+    given: LinearArrays,
+    steering: Steering,
+    posterior: tuple[Array, Array],
+    covariances: tuple[Array, Array, Array],
+    states: Array,
+    channels: Moments,
+    measurements: Moments,
+    lag: Array,
+) -> None:
+    """`posterior_moments` from means and covariances in lanes; `states` are x̂ `(D, T + 1, B)`."""
+    (deviations, noise), (spread, every, sway) = posterior, covariances
+    rows, blocks, count, dimension, lanes = given.measurement.shape
+    drives, driven = states.shape[2], noise.shape[2]
+    then, shift = np.zeros((dimension, driven, lanes)), np.zeros((driven, driven, lanes))
+    by_state, apart = np.zeros((count, dimension, lanes)), np.zeros((count, 1, lanes))
+    across, variance = np.zeros((dimension, count, lanes)), np.zeros((count, count, lanes))
+    for t in range(rows):
+        for k in range(blocks):
+            few = min(lanes, drives - k * lanes)
+            weight = np.sqrt(given.precision[t, k])
+            for a in range(count):
+                apart[a] = weight[a] * given.residual[t, k, a]
+                by_state[a] = weight[a, 0] * given.measurement[t, k, a]
+            across[:], variance[:] = 0.0, 0.0
+            add_product(apart, by_state, deviations[t, k], -1.0)
+            add_outer(across, spread[t, k], by_state, -1.0)
+            add_product(variance, by_state, across, -1.0)
+            _fill_row(measurements, t, k * lanes, few, apart, variance, states, across)
+            if t + 1 < rows:
+                _fill_row(channels, t, k * lanes, few, noise[t, k], every[t, k], states, sway[t, k])
+            if t + 2 < rows:
+                then[:], shift[:] = 0.0, 0.0
+                add_product(then, given.state[t, k], sway[t, k], 1.0)
+                add_product(then, given.noise[t, k], every[t, k], 1.0)
+                add_product(shift, steering.gain[t + 1, k], then, -1.0)
+                for c in range(driven):
+                    for lane in range(few):
+                        lag[c, t + 1, k * lanes + lane] = shift[c, c, lane]
+
+
+@njit(cache=True, error_model="numpy")
+def _fill_row(
+    out: Moments, t: int, first: int, few: int, mean: Array, variance: Array, states: Array, across: Array
+) -> None:
+    """One row of one block of trajectories, of which `first` is the first."""
+    count = len(mean)
+    for c in range(count):
+        for lane in range(few):
+            out.mean[c, t, first + lane] = mean[c, 0, lane]
+            out.variance[c, t, first + lane] = variance[c, c, lane]
+    for i in range(len(states)):
+        for lane in range(few):
+            out.points[i, 0, t, first + lane] = states[i, t, first + lane]
+        for c in range(count):
+            for lane in range(few):
+                here, push = states[i, t, first + lane], across[i, c, lane]
+                out.points[i, 1 + c, t, first + lane] = here + push
+                out.points[i, 1 + count + c, t, first + lane] = here - push

@@ -28,46 +28,29 @@ from steady_ppl.gaussian.linearize import LinearArrays, Linearization, Reference
 from steady_ppl.model.program import Program
 
 
-class FilteredMoments(NamedTuple):
-    """The states given the measurements up to each row: `(T + 1, B, D)` and `(T + 1, B, D, D)`."""
+class Filtered(NamedTuple):
+    """The states given the measurements up to each row, and what each measured component changes, given those before
+    it; zero, one and zero where it is missing."""
 
-    means: Array
-    covariances: Array
-
-
-class Updates(NamedTuple):
-    """What each measured component changes, given those before it; zero, one and zero where it is missing.
-
-    Innovation and variance are `(T + 1, B, K)`, the gain `(T + 1, B, K, D)`.
-    """
-
-    innovation: Array
-    variance: Array
-    gain: Array
+    means: Array  # (T + 1, B, D)
+    covariances: Array  # (T + 1, B, D, D)
+    innovation: Array  # (T + 1, B, K)
+    variance: Array  # (T + 1, B, K)
+    gain: Array  # (T + 1, B, K, D)
 
 
 @dataclass(frozen=True)
 class Tracked:
-    """The Kalman filter and smoother of a linearised program, in double precision.
+    """The Kalman filter and smoother of a linearised program, in double precision."""
 
-    Attributes:
-        linearization: of the program, along the path that the last pass began with.
-        states, covariances: `(T + 1, B, D)` and `(T + 1, B, D, D)`, given the measurements up to each row.
-        smoothed: `(T + 1, B, D)`, the states given all measurements.
-        noise: `(T, B, C)`, E[ε | y]: also the score of a push by each channel, per standard deviation of it.
-        arrival: `(T + 1, B, D)`, the score of a push on the state that each row begins with.
-        reading: `(T + 1, B, K)`, the score of a shift of each measurement; zero where it is missing.
-        log_likelihood: `(B,)` log p(y).
-    """
-
-    linearization: Linearization
-    states: Tensor
-    covariances: Tensor
-    smoothed: Tensor
-    noise: Tensor
-    arrival: Tensor
-    reading: Tensor
-    log_likelihood: Tensor
+    linearization: Linearization  # of the program, along the path that the last pass began with
+    states: Tensor  # (T + 1, B, D), given the measurements up to each row
+    covariances: Tensor  # (T + 1, B, D, D), of these
+    smoothed: Tensor  # (T + 1, B, D), the states given all measurements
+    noise: Tensor  # (T, B, C), E[ε | y]: also the score of a push by each channel, per standard deviation of it
+    arrival: Tensor  # (T + 1, B, D), the score of a push on the state that each row begins with
+    reading: Tensor  # (T + 1, B, K), the score of a shift of each measurement; zero where it is missing
+    log_likelihood: Tensor  # (B,), log p(y)
 
     def path(self, data: Trajectories) -> ReferencePath:
         """The posterior mean as a path to linearise along."""
@@ -90,34 +73,26 @@ def track(
     passes: int = 2,
     kernels: bool | None = None,
 ) -> Tracked:
-    """Linearise along a path near the posterior's mode, filter and smooth, and again along what was smoothed.
-
-    There are so many passes; the other arguments are those of `linearize`.
-    """
-    tracked = filter_and_smooth(linearize(program, data, path, known_start=known_start, kernels=kernels))
-    for _ in range(passes - 1):
-        path = tracked.path(data)
+    """Linearise along a path near the posterior's mode, filter and smooth, and again along what was smoothed, in so
+    many passes; the other arguments are those of `linearize`."""
+    for _ in range(passes):
         tracked = filter_and_smooth(linearize(program, data, path, known_start=known_start, kernels=kernels))
+        path = tracked.path(data)
     return tracked
 
 
 def filter_and_smooth(linear: Linearization) -> Tracked:
     """Run the recursions along a linearization."""
     rows, drives, components, dimension = linear.measurement.shape
-    filtered = FilteredMoments(np.empty((rows, drives, dimension)), np.empty((rows, drives, dimension, dimension)))
-    updates = Updates(
-        innovation=np.empty((rows, drives, components)),
-        variance=np.empty((rows, drives, components)),
-        gain=np.empty((rows, drives, components, dimension)),
-    )
-    given = linear.arrays()
-    forward(given, filtered, updates)
+    shapes = (dimension,), (dimension, dimension), (components,), (components,), (components, dimension)
+    given, filtered = linear.arrays(), Filtered(*(np.empty((rows, drives, *shape)) for shape in shapes))
+    forward(given, filtered)
     arrival, smoothed = np.empty_like(filtered.means), np.empty_like(filtered.means)
-    reading = np.empty_like(updates.innovation)
-    backward(given, filtered, updates, arrival, reading, smoothed)
+    reading = np.empty_like(filtered.innovation)
+    backward(given, filtered, arrival, reading, smoothed)
     with np.errstate(divide="ignore", invalid="ignore"):
-        excess = np.log(np.where(given.precision > 0, updates.variance * given.precision, 1.0))
-        misfit = updates.innovation**2 / updates.variance + excess
+        excess = np.log(np.where(given.precision > 0, filtered.variance * given.precision, 1.0))
+        misfit = filtered.innovation**2 / filtered.variance + excess
     pushes = torch.from_numpy(arrival)
     around = linear.path.states.double()
     return Tracked(
@@ -133,8 +108,8 @@ def filter_and_smooth(linear: Linearization) -> Tracked:
 
 
 @njit(cache=True, error_model="numpy")
-def forward(given: LinearArrays, filtered: FilteredMoments, updates: Updates) -> None:
-    """Kalman (1960), a measurement component at a time. Fills `filtered` and `updates`."""
+def forward(given: LinearArrays, filtered: Filtered) -> None:
+    """Kalman (1960), a measurement component at a time. Fills `filtered`."""
     rows, trajectories, _ = filtered.means.shape
     for t in range(rows):  # outside, as the arrays lie in memory
         for b in range(trajectories):
@@ -147,15 +122,16 @@ def forward(given: LinearArrays, filtered: FilteredMoments, updates: Updates) ->
                 add_times(mean, given.state[t - 1, b], filtered.means[t - 1, b])
                 before = filtered.covariances[t - 1, b]
                 propagate(covariance, before, given.state[t - 1, b], given.noise[t - 1, b])
-            _update(given, updates, t, b, mean, covariance)
+            _update(given, filtered, t, b)
 
 
 @njit(cache=True, error_model="numpy")
-def _update(given: LinearArrays, updates: Updates, t: int, b: int, mean: Array, covariance: Array) -> None:
+def _update(given: LinearArrays, filtered: Filtered, t: int, b: int) -> None:
     """Condition the mean and the covariance, in place, on a row's components, one after the other."""
     components, dimension = given.measurement.shape[2:]
+    mean, covariance = filtered.means[t, b], filtered.covariances[t, b]
     for k in range(components):
-        gain, by_state, precision = updates.gain[t, b, k], given.measurement[t, b, k], given.precision[t, b, k]
+        gain, by_state, precision = filtered.gain[t, b, k], given.measurement[t, b, k], given.precision[t, b, k]
         gain[:] = 0.0
         variance, innovation = 1.0, 0.0
         if precision != 0.0:
@@ -170,13 +146,11 @@ def _update(given: LinearArrays, updates: Updates, t: int, b: int, mean: Array, 
             for i in range(dimension):
                 for j in range(dimension):
                     covariance[i, j] -= gain[i] * gain[j] * variance
-        updates.innovation[t, b, k], updates.variance[t, b, k] = innovation, variance
+        filtered.innovation[t, b, k], filtered.variance[t, b, k] = innovation, variance
 
 
 @njit(cache=True, error_model="numpy")
-def backward(
-    given: LinearArrays, filtered: FilteredMoments, updates: Updates, arrival: Array, reading: Array, smoothed: Array
-) -> None:
+def backward(given: LinearArrays, filtered: Filtered, arrival: Array, reading: Array, smoothed: Array) -> None:
     """Fill the scores of log p(y), `arrival` and `reading`, and the posterior means `smoothed`; see `Tracked`.
 
     De Jong (1989): what is left of later innovations, carried back. Gᵀ arrival is the posterior mean of the noise.
@@ -185,15 +159,14 @@ def backward(
     for t in range(rows - 1, -1, -1):
         for b in range(trajectories):
             later = arrival[t, b]
+            later[:] = 0.0
             if t < rows - 1:
-                set_times(later, given.state[t, b].T, arrival[t + 1, b])
-            else:
-                later[:] = 0.0
+                add_times(later, given.state[t, b].T, arrival[t + 1, b])
             smoothed[t, b] = filtered.means[t, b]
             add_times(smoothed[t, b], filtered.covariances[t, b], later)
             for k in range(components - 1, -1, -1):
-                gain, by_state = updates.gain[t, b, k], given.measurement[t, b, k]
-                score = updates.innovation[t, b, k] / updates.variance[t, b, k]
+                gain, by_state = filtered.gain[t, b, k], given.measurement[t, b, k]
+                score = filtered.innovation[t, b, k] / filtered.variance[t, b, k]
                 for i in range(dimension):
                     score -= gain[i] * later[i]
                 for i in range(dimension):
@@ -231,44 +204,31 @@ def spread_ahead(given: LinearArrays, covariances: Array, horizon: int, variance
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def add_matrix_product(out: Array, left: Array, right: Array, sign: float = 1.0) -> None:
-    """out += sign · left right, of matrices."""
+def set_product(out: Array, left: Array, right: Array) -> None:
+    """out = left right, of matrices."""
+    out[:] = 0.0
     for i in range(out.shape[0]):
         for k in range(left.shape[1]):
-            weight = sign * left[i, k]
+            weight = left[i, k]
             for j in range(out.shape[1]):
                 out[i, j] += weight * right[k, j]
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def set_product(out: Array, left: Array, right: Array) -> None:
-    """out = left right, of matrices."""
-    out[:] = 0.0
-    add_matrix_product(out, left, right)
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def add_times(out: Array, matrix: Array, vector: Array, sign: float = 1.0) -> None:
-    """out += sign · matrix vector."""
+def add_times(out: Array, matrix: Array, vector: Array) -> None:
+    """out += matrix vector."""
     for i in range(out.shape[0]):
         entry = out[i]
         for k in range(matrix.shape[1]):
-            entry += sign * matrix[i, k] * vector[k]
+            entry += matrix[i, k] * vector[k]
         out[i] = entry
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def set_times(out: Array, matrix: Array, vector: Array) -> None:
-    """out = matrix vector."""
-    out[:] = 0.0
-    add_times(out, matrix, vector)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def propagate(out: Array, covariance: Array, moved: Array, spread: Array) -> None:
     """out = moved covariance movedᵀ + spread spreadᵀ, symmetric to the bit; `out` may be the covariance itself."""
-    half = np.zeros_like(covariance)
-    add_matrix_product(half, moved, covariance)
+    half = np.empty_like(covariance)
+    set_product(half, moved, covariance)
     for i in range(out.shape[0]):
         for j in range(i + 1):
             entry = 0.0

@@ -27,14 +27,9 @@ def array(tensor: Tensor) -> Array:
     return tensor.contiguous().numpy(force=True)
 
 
-def lanes_for(trajectories: int) -> int:
-    """One or two trajectories go one by one: blocks of mostly zeros would be no faster."""
-    return LANES if trajectories > 2 else 1
-
-
 def in_lanes(matrices: Tensor) -> Array:
     """`(..., B, R, C)` as `(..., blocks, R, C, LANES)` in the host's memory, the last block filled with zeros."""
-    lanes = lanes_for(matrices.shape[-3])
+    lanes = LANES if matrices.shape[-3] > 2 else 1  # blocks of mostly zeros would be no faster
     missing = -matrices.shape[-3] % lanes
     if missing:
         matrices = torch.nn.functional.pad(matrices, (0, 0, 0, 0, 0, missing))

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -25,29 +26,23 @@ from steady_ppl.model.handlers import (
     Observing,
     Recording,
     Standardised,
-    as_vector,
     broadcast_event,
     residual,
     running,
     tangent_normal,
 )
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, advance
+from steady_ppl.model.substeps import acting_controls, advance, joined
 from steady_ppl.model.validate import start_size, step_size
 from steady_ppl.utils.angles import wrap
 
 
 @dataclass(frozen=True)
 class ReferencePath:
-    """States and the standard normal noise that goes with them.
+    """States and the standard normal noise that goes with them."""
 
-    Attributes:
-        states: `(T + 1, B, D)`.
-        noise: `(T, B, C)`, in standard deviations of the channels.
-    """
-
-    states: Tensor
-    noise: Tensor
+    states: Tensor  # (T + 1, B, D)
+    noise: Tensor  # (T, B, C), in standard deviations of the channels
 
     @classmethod
     def of_means(cls, states: Tensor, noise: Tensor, data: Trajectories) -> ReferencePath:
@@ -61,21 +56,13 @@ class ReferencePath:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensors:
-    """What is measured, to first order around states, in double precision.
+    """What is measured, to first order around states, in double precision; zero where it is missing."""
 
-    Attributes:
-        residual: r̄ `(T + 1, B, K)`, on the circle where the measurement is an angle; zero where missing.
-        measurement: H `(T + 1, B, K, D)`.
-        precision: `(T + 1, B, K)` observation weight over variance; zero where missing.
-        log_scale: `(T + 1, B)` the measurements' log-density at residual zero, times the observation weight.
-        in_plain_torch: why no kernels served; None where they did or were not worth it.
-    """
-
-    residual: Tensor
-    measurement: Tensor
-    precision: Tensor
-    log_scale: Tensor
-    in_plain_torch: str | None = None
+    residual: Tensor  # r̄ (T + 1, B, K), on the circle where the measurement is an angle
+    measurement: Tensor  # H (T + 1, B, K, D)
+    precision: Tensor  # (T + 1, B, K), observation weight over variance
+    log_scale: Tensor  # (T + 1, B), the measurements' log-density at residual zero, times the observation weight
+    in_plain_torch: str | None = None  # why no kernels served; None where they did or were not worth it
 
 
 class LinearArrays(NamedTuple):
@@ -93,26 +80,16 @@ class LinearArrays(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Linearization(Sensors):
-    """The whole program to first order along a path; nothing moves past a trajectory's end.
+    """The whole program to first order along a path; nothing moves past a trajectory's end."""
 
-    Attributes:
-        path: what it was taken along.
-        angles: the state's components that live on a circle: the declared ones that a whole turn does not change.
-        start_offset: `(B, D)` the mean start less the path's, angles on the circle.
-        start_turn: `(B, D)` the whole turns that this leaves out.
-        start_noise: G₀ `(B, D, C₀)`; zero where the start is known.
-        offset: `(T, B, D)` where the program arrives without noise, less the path's next state, angles on the circle.
-        state, noise: F `(T, B, D, D)` and G `(T, B, D, C)`.
-    """
-
-    path: ReferencePath
-    angles: tuple[int, ...]
-    start_offset: Tensor
-    start_turn: Tensor
-    start_noise: Tensor
-    offset: Tensor
-    state: Tensor
-    noise: Tensor
+    path: ReferencePath  # what it was taken along
+    angles: tuple[int, ...]  # the state's components on a circle: the declared ones that a whole turn does not change
+    start_offset: Tensor  # (B, D), the mean start less the path's, angles on the circle
+    start_turn: Tensor  # (B, D), the whole turns that this leaves out
+    start_noise: Tensor  # G₀ (B, D, C₀); zero where the start is known
+    offset: Tensor  # (T, B, D), where the program arrives without noise less the path's next, angles on the circle
+    state: Tensor  # F (T, B, D, D)
+    noise: Tensor  # G (T, B, D, C)
 
     @property
     def circular(self) -> Tensor:
@@ -138,9 +115,7 @@ def linearize(
 
     Args:
         program: its channel noise normal, its measurements normal or wrapped normal, components independent.
-        data: as returned by `for_program`.
-        path: states and noise of every trajectory.
-        known_start: the first state is certain.
+        data: as returned by `for_program`; where `known_start`, the first state is certain.
         observation_weight: tempers the observations.
         kernels: differentiate by kernels where they can serve; None: if there are rows enough, see `on_all_rows`.
         angles: `Linearization.angles`, where they are known.
@@ -158,21 +133,20 @@ def linearize(
         angles = angles_on_a_circle(program, data, states[0, :1])
     along = {"state": states[:-1], "noise": noise}
     given = {"control": acting_controls(program, data)[:-1], "time": data.elapsed[:-1], "step": data.steps}
-    moved, (by_state, by_noise), in_plain_torch = _jacobians(program, step, along, given, kernels)
+    moved, (by_state, by_noise), in_plain_torch = _jacobians(program, "step", step, along, given, kernels)
     offset = (moved - (by_noise @ noise.unsqueeze(-1)).squeeze(-1) - states[1:]).double()
     offset[..., angles] = wrap(offset[..., angles])  # a program may keep its angles on the circle, and so may a path
-    start_offset, start_noise = _start(program, data, states[0], known_start)
-    start_turn = torch.zeros_like(start_offset, dtype=torch.float64)
-    for angle in angles:
-        start_turn[:, angle] = start_offset[:, angle].double() - wrap(start_offset[:, angle].double())
+    start_offset, start_noise = (part.double() for part in _start(program, data, states[0], known_start))
+    start_turn = torch.zeros_like(start_offset)
+    start_turn[:, angles] = (start_offset - wrap(start_offset))[:, angles]
     seen = linearize_sensors(program, data, states, observation_weight=observation_weight, kernels=kernels)
     both = vars(seen) | {"in_plain_torch": in_plain_torch or seen.in_plain_torch}
     return Linearization(
         path=path,
         angles=angles,
-        start_offset=start_offset.double() - start_turn,
+        start_offset=start_offset - start_turn,
         start_turn=start_turn,
-        start_noise=start_noise.double(),
+        start_noise=start_noise,
         offset=torch.where(data.transitions[..., None], offset, 0.0),
         state=torch.where(data.transitions[..., None, None], by_state, 0.0).double(),
         noise=torch.where(data.transitions[..., None, None], by_noise, 0.0).double(),
@@ -190,12 +164,9 @@ def linearize_sensors(
     kernels: bool | None = None,
 ) -> Sensors:
     """The part of `linearize` that is about what is measured, around states `(T + 1, B, D)`."""
-
-    def measure(state: Tensor, measurement: Tensor, observed: Tensor) -> Tensor:
-        return _residuals(program, state, measurement, observed)
-
-    given, count = {"measurement": data.measurements, "observed": data.observed}, data.measurements.shape[-1]
-    measured, by, in_plain_torch = _jacobians(program, measure, {"state": states}, given, kernels, outputs=count)
+    along, given = {"state": states}, {"measurement": data.measurements, "observed": data.observed}
+    measure, count = partial(_residuals, program), data.measurements.shape[-1]
+    measured, by, in_plain_torch = _jacobians(program, "measure", measure, along, given, kernels, outputs=count)
     residuals, log_sd, log_density = measured.chunk(3, -1)
     by_measured = -by[0][..., :count, :]
     observed = data.observed & torch.isfinite(by_measured.sum(-1))  # a bearing to where one stands has no derivative
@@ -230,15 +201,13 @@ def _residuals(program: Program, state: Tensor, measurement: Tensor, observed: T
     noise is not normal, of the normal that touches it."""
     with running(*state.shape[:-1]), Recording() as seen, Observing(measurement, observed):
         program.observe(state)
-    residuals, log_sds, heights = [], [], []
+    residuals, log_sds, heights = {}, {}, {}
     for site, fn in seen.distributions.items():
-        apart = residual(fn, seen.observed[site])
-        sd, height = tangent_normal(fn, apart, site)
-        difference = as_vector(apart, fn.event_dim)
-        residuals.append(difference)
-        log_sds.append(as_vector(sd.log(), fn.event_dim).expand(difference.shape))
-        heights.append(as_vector(height, fn.event_dim).expand(difference.shape))
-    return torch.cat(residuals + log_sds + heights, -1)
+        residuals[site] = residual(fn, seen.observed[site])
+        sd, heights[site] = tangent_normal(fn, residuals[site], site)
+        log_sds[site] = sd.log()
+    parts = (joined(values, seen.distributions, state.shape[:-1]) for values in (residuals, log_sds, heights))
+    return torch.cat(list(parts), -1)
 
 
 def _start(program: Program, data: Trajectories, first: Tensor, known_start: bool) -> tuple[Tensor, Tensor]:
@@ -279,17 +248,16 @@ def angles_on_a_circle(program: Program, data: Trajectories, state: Tensor) -> t
 
 def _jacobians(
     program: Program,
+    name: str,
     function: Callable[..., Tensor],
     along: dict[str, Tensor],
     given: dict[str, Tensor],
     kernels: bool | None,
     outputs: int | None = None,
 ) -> tuple[Tensor, list[Tensor], str | None]:
-    """A function's value `(..., V)`, its Jacobians `(..., V, ·)`, and why they had to come from plain torch, if so.
-
-    Torch differentiates the first `outputs` components only.
-    """
-    found = on_all_rows(program, function.__name__, function, along | given, tuple(along), kernels)
+    """A function's value `(..., V)`, its Jacobians `(..., V, ·)`, and why they had to come from plain torch, if so,
+    which differentiates the first `outputs` components only."""
+    found = on_all_rows(program, name, function, along | given, tuple(along), kernels)
     if isinstance(found, tuple):
         return (*found, None)
     value, by = _derivatives(lambda *inputs: function(*inputs, *given.values()), *along.values(), outputs=outputs)

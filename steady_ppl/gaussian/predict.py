@@ -13,26 +13,21 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.kernels.rows import on_all_rows
-from steady_ppl.model.handlers import AtMean, Observing, Recording, as_vector, residual, running
+from steady_ppl.model.handlers import AtMean, Observing, Recording, residual, running
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, advance
+from steady_ppl.model.substeps import acting_controls, advance, joined
 from steady_ppl.smc.backends import Stepping
 from steady_ppl.smc.simulate import measure
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Measured less predicted, of rows `horizon`, `horizon` + 1, … from what was measured up to `horizon` rows before.
+    """Measured less predicted, of rows `horizon`, `horizon` + 1, … from what was measured up to `horizon` rows before;
+    each is `(T + 1 − horizon, B, K)`."""
 
-    Attributes:
-        error: `(T + 1 − horizon, B, K)`, on the circle where the measurement is an angle.
-        variance: of the same shape, of the linearised program, measurement noise included; NaN where missing.
-        observed: of the same shape, where there is something to compare.
-    """
-
-    error: Tensor
-    variance: Tensor
-    observed: Tensor
+    error: Tensor  # on the circle where the measurement is an angle
+    variance: Tensor  # of the linearised program, measurement noise included; NaN where missing
+    observed: Tensor  # where there is something to compare
 
     @property
     def standardised(self) -> Tensor:
@@ -50,13 +45,8 @@ def predict(
 ) -> dict[int, Prediction]:
     """Run the program without noise from the filtered state of every row, with the recorded controls.
 
-    Args:
-        program, data, tracked: the drives as they were tracked.
-        horizons: how many rows ahead.
-        bands: the horizons whose variances are wanted, the others' are NaN; None: all.
-
-    Returns:
-        A prediction for each horizon that is shorter than the longest drive.
+    Gives a prediction for each horizon, in rows ahead, that is shorter than the longest drive; `bands` are the horizons
+    whose variances are wanted, the others' are NaN; None: all.
     """
     found = {}
     for horizon, state in states_ahead(program, data, tracked, max(horizons)):
@@ -75,9 +65,8 @@ def states_ahead(program: Program, data: Trajectories, tracked: Tracked, most: i
     state = tracked.states.to(data.controls.dtype)
     controls, elapsed, steps = acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps
     for ahead in range(1, min(most, len(steps)) + 1):
-        rows = slice(ahead - 1, len(steps))
-        state = state[: len(steps) - ahead + 1]
-        state = mean_steps(program, state, controls[rows], elapsed[rows], steps[rows])
+        since = slice(ahead - 1, None)
+        state = mean_steps(program, state[:-1], controls[since], elapsed[since], steps[since])
         yield ahead, state
 
 
@@ -103,8 +92,8 @@ def errors(program: Program, states: Tensor, measurements: Tensor, observed: Ten
     """Measured less what the program measures in these states, `(..., K)`, on the circle for angles."""
     with running(*states.shape[:-1]), Recording() as seen, Observing(measurements, observed):
         program.observe(states)
-    parts = [as_vector(residual(fn, seen.observed[site]), fn.event_dim) for site, fn in seen.distributions.items()]
-    return torch.cat(parts, -1)
+    apart = {site: residual(fn, seen.observed[site]) for site, fn in seen.distributions.items()}
+    return joined(apart, seen.distributions, states.shape[:-1])
 
 
 def row_errors(program: Program, states: Tensor, measurements: Tensor, observed: Tensor) -> Tensor:
@@ -118,11 +107,8 @@ def row_errors(program: Program, states: Tensor, measurements: Tensor, observed:
 def simulate_again(
     program: Program, data: Trajectories, starts: Tensor, channels: int
 ) -> tuple[Trajectories, ReferencePath]:
-    """Drives that the program makes of the same controls, with the same gaps in the measurements.
-
-    From starts `(M, B, D)` and with C noise channels it makes `M · B` drives, all of the first set first, and their
-    true paths.
-    """
+    """`M · B` drives that the program makes of the same controls from starts `(M, B, D)` with C noise channels, with
+    the same gaps in the measurements, all of the first set first; and their true paths."""
     sets, drives, _ = starts.shape
     stepping = Stepping(program, data, 1.0)
     states, noises = [starts.to(data.controls.dtype)], []

@@ -42,9 +42,14 @@ def fixes(program: Program, data: Trajectories, *, places: int = 32, passes: int
         DataError: nothing is measured, or fewer than two rows of a drive have enough measurements.
     """
     data = data.without_truth()
-    guesses = _guesses(program, data, places)
-    told = _told(program, data, guesses[:, 0])
-    _require_enough(program, data, told)
+    left = torch.Size((places, len(data)))
+    with running(*left):
+        starts = broadcast_event(program.initial(), left, 1)
+    _, made_up = simulate_again(program, data, starts, step_size(program))
+    guesses = made_up.states.unflatten(1, left)  # (T + 1, S, B, D)
+    told = (linearize_sensors(program, data, guesses[:, 0]).measurement != 0).flatten(0, 2).any(0)
+    enough = (data.observed.sum(-1) >= told.sum()) & data.rows
+    _require_enough(program, data, told, enough)
     drawn = guesses[data.rows[:, None].expand(guesses.shape[:3])].double()
     precision = 1 / drawn.var(0).clamp(min=1e-12)
     precision[list(program.angle_indices)] = 0.0  # normal, flat over angles
@@ -54,26 +59,12 @@ def fixes(program: Program, data: Trajectories, *, places: int = 32, passes: int
     states = torch.cat(
         [_found(program, data.subset(part), guesses[:, :, part], told, prior, passes) for part in parts], 1
     )
-    enough = (data.observed.sum(-1) >= told.sum()) & data.rows
     return torch.where(enough[..., None] & told, states, torch.nan)
 
 
-def _guesses(program: Program, data: Trajectories, places: int) -> Tensor:
-    """Where the search begins, `(T + 1, S, B, D)`: drives that the program makes up."""
-    left = torch.Size((places, len(data)))
-    with running(*left):
-        starts = broadcast_event(program.initial(), left, 1)
-    _, made_up = simulate_again(program, data, starts, step_size(program))
-    return made_up.states.unflatten(1, left)
-
-
-def _told(program: Program, data: Trajectories, states: Tensor) -> Tensor:
-    """Which components some measurement depends on, `(D,)`."""
-    return (linearize_sensors(program, data, states).measurement != 0).flatten(0, 2).any(0)
-
-
-def _require_enough(program: Program, data: Trajectories, told: Tensor) -> None:
-    poor = ((data.observed.sum(-1) >= told.sum()) & data.rows).sum(0) < 2
+def _require_enough(program: Program, data: Trajectories, told: Tensor, enough: Tensor) -> None:
+    """Refuse drives without two rows of `enough` measurements, `(T + 1, B)`, for the components `told`, `(D,)`."""
+    poor = enough.sum(0) < 2
     if not bool(data.observed.any()):
         raise DataError("nothing is measured: every y. cell of the table is empty")
     if bool(poor.any()):
@@ -113,12 +104,8 @@ def _found(
         tried = judged(states + torch.where(told, torch.linalg.solve(damped, downhill), 0.0).to(states))
         better = tried[1] < cost
         damping = torch.where(better, damping / 5, damping * 5).clamp(1e-9, 1e9)
-        best = tuple(_where(better, new, old) for new, old in zip(tried, best, strict=True))  # type: ignore[assignment]
+        cells = [better[..., None], better, better[..., None], better[..., None, None]]
+        best = tuple(map(torch.where, cells, tried, best))  # type: ignore[assignment]
     states, cost = (part.unflatten(1, left) for part in best[:2])
     chosen = cost.nan_to_num(torch.inf).argmin(1)
     return states.take_along_dim(chosen[:, None, :, None], 1).squeeze(1)
-
-
-def _where(which: Tensor, one: Tensor, other: Tensor) -> Tensor:
-    """By rows and drives, `(T + 1, B)`, whatever is on the right."""
-    return torch.where(which.reshape(*which.shape, *[1] * (one.dim() - 2)), one, other)

@@ -19,18 +19,10 @@ from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
 from steady_ppl.gaussian.linearize import ReferencePath, angles_on_a_circle, linearize
 from steady_ppl.kernels.jit import unchanged
 from steady_ppl.kernels.rows import on_all_rows
-from steady_ppl.model.handlers import (
-    KnownStart,
-    Recording,
-    Standardised,
-    as_vector,
-    broadcast_event,
-    normal_moments,
-    running,
-)
+from steady_ppl.model.handlers import KnownStart, Recording, Standardised, broadcast_event, normal_moments, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import divergence
-from steady_ppl.model.substeps import acting_controls, sample_channels
+from steady_ppl.model.substeps import acting_controls, joined, parted, sample_channels
 from steady_ppl.smc.filter import particle_filter
 from steady_ppl.smc.genealogy import Paths, event_dims
 from steady_ppl.utils.angles import wrap_angles
@@ -148,11 +140,8 @@ def find_and_smooth(
     may_fail: bool = False,
     path: ReferencePath | None = None,
 ) -> Lookahead:
-    """Find paths from the measurements alone, unless some are given, and look ahead along them.
-
-    Raises:
-        FilterError: the bootstrap filter of the search broke down, or the linearised program unless it `may_fail`.
-    """
+    """Find paths from the measurements alone, unless some are given, and look ahead along them; a `FilterError` says
+    that the bootstrap filter of the search broke down, or the linearised program unless it `may_fail`."""
     near = path or find_path(program, data, known_start=known_start, observation_weight=observation_weight)
     ahead = smooth(program, data, near, known_start=known_start, observation_weight=observation_weight)
     if not may_fail:
@@ -179,10 +168,8 @@ def means_as_path(ahead: Lookahead, data: Trajectories) -> ReferencePath:
 
 
 def resting_path(ahead: Lookahead, data: Trajectories) -> ReferencePath:
-    """`means_as_path` after several passes, to go on from. What has not come to rest stays where it was linearised.
-
-    How good a path is a step further is not known there. After a single pass it would never move.
-    """
+    """`means_as_path` after several passes, to go on from. What has not come to rest stays where it was linearised: how
+    good a path is a step further is not known there. After a single pass it would never move."""
     means, path = means_as_path(ahead, data), ahead.linearization.path
     far = ~((means.noise - path.noise).abs().amax((0, 2)) <= REST_TOLERANCE)
     return _either(far, path, means)
@@ -228,11 +215,11 @@ def find_path(
 @torch.no_grad()
 def standard_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor:
     """The channel noise of paths in its standard deviations, `(M, T, B, C)`."""
-    parts = []
-    for site, fn in paths.channels(program, data).items():
+    channels, scaled = paths.channels(program, data), {}
+    for site, fn in channels.items():
         mean, sd = normal_moments(fn, site)
-        parts.append(as_vector((paths.noise[site] - mean) / sd, fn.event_dim))
-    return torch.cat(parts, -1)
+        scaled[site] = (paths.noise[site] - mean) / sd
+    return joined(scaled, channels, paths.states[:, 1:].shape[:-1])
 
 
 @torch.no_grad()
@@ -260,39 +247,23 @@ def smoother_paths(
         sample_channels(program, states[few, few], data.controls[few], data.elapsed[few], data.steps[few])
     dims = event_dims(start, moving)
     first = torch.Size((draws, 1, trajectories))
-    values, reason = _noise_along(program, data, states, noise, moving, kernels)
-    return Paths(
-        states=states,
-        start={site: broadcast_event(value, first, dims[site]) for site, value in start.values.items()},
-        noise=values,
-        event_dims=dims | {"states": 1},
-        in_plain_torch=reason,
-    )
-
-
-def _noise_along(
-    program: Program, data: Trajectories, states: Tensor, noise: Tensor, sites: Recording, kernels: bool | None
-) -> tuple[dict[str, Tensor], str | None]:
-    """What each site of `transition` draws at given states for standard normal noise, `(M, T, B, ...)`; and why no
-    kernel served."""
 
     def drawn(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
         with running(*state.shape[:-1]), Recording() as seen, Standardised(noise):
             sample_channels(program, state, control, time, step)
-        values = [as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()]
-        return torch.cat([value.expand(*state.shape[:-1], value.shape[-1]) for value in values], -1)
+        return joined(seen.values, seen.distributions, state.shape[:-1])
 
-    draws, rows = noise.shape[:2]
     given = {"control": acting_controls(program, data)[:-1], "time": data.elapsed[:-1], "step": data.steps}
     arguments = {"state": states[:, :-1], "noise": noise} | {
         name: value.expand(draws, *value.shape) for name, value in given.items()
     }
     by_row = {name: value.flatten(0, 1) for name, value in arguments.items()}
     found = on_all_rows(program, "drawn", drawn, by_row, kernels=kernels)
-    values = found[0].unflatten(0, (draws, rows)) if isinstance(found, tuple) else drawn(*arguments.values())
-    widths = [fn.event_shape.numel() for fn in sites.distributions.values()]
-    by_site = {
-        site: part if fn.event_dim else part.squeeze(-1)
-        for (site, fn), part in zip(sites.distributions.items(), values.split(widths, -1), strict=True)
-    }
-    return by_site, found if isinstance(found, str) else None
+    values = found[0].unflatten(0, (draws, -1)) if isinstance(found, tuple) else drawn(*arguments.values())
+    return Paths(
+        states=states,
+        start={site: broadcast_event(value, first, dims[site]) for site, value in start.values.items()},
+        noise=parted(values, moving.distributions),
+        event_dims=dims | {"states": 1},
+        in_plain_torch=found if isinstance(found, str) else None,
+    )

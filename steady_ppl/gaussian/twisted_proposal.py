@@ -39,15 +39,10 @@ def log_future(
 def steer(
     state: Tensor, path: Tensor, angles: Tensor, steering: Steering, own: Tensor, stays: Tensor, untwisted: float
 ) -> tuple[Tensor, Tensor]:
-    """Draw every particle's noise, steered unless it stays as it is.
+    """Draw every particle's noise `(N, B, C)`: its own, standard normal, if it `stays`, else steered.
 
-    Args:
-        own: standard normal noise `(N, B, C)`.
-        stays: `(N, B)` bool, which particles keep it.
-        untwisted: the probability of that.
-
-    Returns:
-        The noise `(N, B, C)`, and its log density less that of the mixture that it was drawn from, `(N, B)`.
+    Return it, and its log density less that of the mixture that it was drawn from, `(N, B)`. `untwisted` is the
+    probability to stay.
     """
     noise = torch.empty(own.shape[::-1], dtype=own.dtype)
     ratio = torch.empty(noise.shape[1:], dtype=torch.float64)
@@ -182,8 +177,7 @@ def mixture(log_ratio: Tensor, untwisted: float) -> Tensor:
 
 def inverse(upper: Tensor) -> Tensor:
     """Of upper triangular matrices."""
-    unit = torch.eye(upper.shape[-1], dtype=upper.dtype, device=upper.device).expand_as(upper)
-    return torch.linalg.solve_triangular(upper, unit, upper=True)
+    return torch.linalg.solve_triangular(upper, torch.eye(upper.shape[-1]).to(upper), upper=True)
 
 
 def _deviation(state: Tensor, path: Tensor, angles: Tensor) -> Tensor:
@@ -235,13 +229,8 @@ class Twist(Proposal):
         return future(state, *parts)
 
     def start(self, particles: int) -> tuple[Tensor | None, Tensor | float]:
-        ahead = self.lookahead
-        starts = ahead.starts
-        winding = torch.distributions.Categorical(logits=ahead.winding_masses.t()).sample((particles,))
-        trajectory = torch.arange(winding.shape[1], device=winding.device)
-        shift = starts.shift[winding, trajectory]
-        own = torch.randn_like(shift)
-        twisted = shift + (starts.factor[winding, trajectory] @ own.unsqueeze(-1)).squeeze(-1)
+        ahead, starts = self.lookahead, self.lookahead.starts
+        _, twisted, own = ahead.draw_starts(particles)
         stays = torch.rand(own.shape[:-1], dtype=torch.float64, device=own.device) < self.untwisted
         noise = torch.where(stays.unsqueeze(-1), own, twisted)
         whitening = inverse(starts.factor)

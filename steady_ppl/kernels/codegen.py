@@ -21,15 +21,10 @@ POINTER = FLOAT.as_pointer()
 
 
 def source(graph: ScalarGraph, inputs: Sequence[str], columns: dict[str, int]) -> str:
-    """The code of a graph, for a `Kernel`.
+    """The code of a graph, for a `Kernel`; `NotCompilable` where some operation has none.
 
-    Args:
-        graph: what to compute.
-        inputs: the names of the inputs that differ between particles; the first is looked up at the ancestors.
-        columns: those that differ between trajectories only, name → first column.
-
-    Raises:
-        NotCompilable: for some operation there is no code.
+    `inputs` are those that differ between particles, the first of which is looked up at the ancestors. `columns` are of
+    those that differ between trajectories only, name → first column.
     """
     return str(_Writer(graph, inputs, columns).module)
 
@@ -61,22 +56,19 @@ class _Writer:
         self._write()
         self.builder.ret_void()
 
-    # loops
-
     @contextmanager
     def _loop(self, end: Any, step: int = 1) -> Any:
         """for i in range(0, end, step)."""
-        builder = self.builder
-        index = self._reserve(LONG, 1)
-        builder.store(LONG(0), index)
+        builder, before = self.builder, self.builder.block
         head, body, after = (builder.append_basic_block(name) for name in ("head", "body", "after"))
         builder.branch(head)
         builder.position_at_end(head)
-        i = builder.load(index)
+        i = builder.phi(LONG)
+        i.add_incoming(LONG(0), before)
         builder.cbranch(builder.icmp_signed("<", i, end), body, after)
         builder.position_at_end(body)
         yield i
-        builder.store(builder.add(i, LONG(step)), index)
+        i.add_incoming(builder.add(i, LONG(step)), builder.block)
         builder.branch(head)
         builder.position_at_end(after)
 
@@ -108,23 +100,18 @@ class _Writer:
                     self.scalar(number)
                 for k, number in enumerate(graph.outputs):
                     value = self.scalar(number).spread(LANES)
-                    if value.type.element == ir.IntType(1):
+                    if value.element == ir.IntType(1):
                         raise NotCompilable("a truth value as a result")
-                    self._store_wide(value, self.out, builder.add(builder.mul(LONG(k), self.stride), self.at))
+                    place = self._wide(self.out, builder.add(builder.mul(LONG(k), self.stride), self.at))
+                    builder.store(value.value, place, align=4)
             self.values = shared
-
-    # memory
 
     def _load(self, pointer: Any, index: Any) -> Lanes:
         return Lanes(self.builder, self.builder.load(self.builder.gep(pointer, [index])))
 
-    def _load_wide(self, pointer: Any, index: Any) -> Lanes:
-        where = self.builder.bitcast(self.builder.gep(pointer, [index]), WIDE.as_pointer())
-        return Lanes(self.builder, self.builder.load(where, align=4))
-
-    def _store_wide(self, value: Lanes, pointer: Any, index: Any) -> None:
-        where = self.builder.bitcast(self.builder.gep(pointer, [index]), WIDE.as_pointer())
-        self.builder.store(value.value, where, align=4)
+    def _wide(self, pointer: Any, index: Any) -> Any:
+        """Where the numbers of all lanes lie, aligned as a single one."""
+        return self.builder.bitcast(self.builder.gep(pointer, [index]), WIDE.as_pointer())
 
     def _gather(self) -> None:
         """Load the elements of the first input that are needed, where the ancestors lie."""
@@ -137,7 +124,7 @@ class _Writer:
         with builder.if_else(none) as (same, moved):
             with same:
                 for start, place in zip(starts, places, strict=True):
-                    builder.store(self._load_wide(pointer, builder.add(start, self.at)).value, place)
+                    builder.store(builder.load(self._wide(pointer, builder.add(start, self.at)), align=4), place)
             with moved:
                 from_row = [builder.add(start, self.row) for start in starts]
                 gathered = [ir.Constant(WIDE, ir.Undefined)] * len(wanted)
@@ -150,8 +137,6 @@ class _Writer:
                     builder.store(value, place)
         for number, place in zip(wanted, places, strict=True):
             self.values[number] = Lanes(builder, builder.load(place))
-
-    # scalars
 
     def scalar(self, number: int) -> Lanes:
         """The value of a scalar of the graph."""
@@ -169,7 +154,8 @@ class _Writer:
                 value = self._load(self.uniform, builder.add(self.trajectory, LONG(column)))
             case "input":
                 start = builder.mul(LONG(arguments[1]), self.stride)
-                value = self._load_wide(self.data[arguments[0]], builder.add(start, self.at))
+                place = self._wide(self.data[arguments[0]], builder.add(start, self.at))
+                value = Lanes(builder, builder.load(place, align=4))
             case "element":
                 vector, k = arguments
                 if vector not in self.stored:
@@ -185,22 +171,20 @@ class _Writer:
             raise NotCompilable(f"no kernel for {operation}")
         return OPERATIONS[operation](*operands)
 
-    # vectors
-
     def _bias(self, product: Product, k: Any) -> Lanes:
-        """The bias of one element; k is the kernel's own number, or known now."""
+        """The bias of one element; k is known now, or the kernel's own number."""
         run = self.graph.run_of_parameters(product.bias)
         if product.bias is None:
             return Lanes(self.builder, FLOAT(0))
         if run is not None:
-            return self._load(self.parameters, self.builder.add(LONG(run), _long(k)))
-        if not isinstance(k, int):
+            return self._load(self.parameters, self.builder.add(LONG(run), k))
+        if not isinstance(k, ir.Constant):
             raise NotCompilable("a long product whose bias is no parameter")
-        return self.scalar(product.bias[k])
+        return self.scalar(product.bias[k.constant])
 
     def _weight(self, product: Product, row: Any, column: Any) -> Lanes:
         builder = self.builder
-        down, across = builder.mul(_long(row), LONG(product.rows)), builder.mul(_long(column), LONG(product.columns))
+        down, across = builder.mul(row, LONG(product.rows)), builder.mul(column, LONG(product.columns))
         return self._load(self.parameters, builder.add(builder.add(LONG(product.at), down), across))
 
     def _base(self, vector: int) -> None:
@@ -211,32 +195,26 @@ class _Writer:
         with self._loop(LONG(product.length)) as k:
             value = self._bias(product, k)
             for i, x in shared:
-                value = value + self._weight(product, k, i) * x
+                value = value + self._weight(product, k, LONG(i)) * x
             self.builder.store(value.value, self.builder.gep(self.bases[vector], [k]))
 
     def _vector(self, vector: int) -> None:
         """Compute a vector as a whole and keep it."""
-        graph = self.graph
-        what = graph.vectors[vector]
+        what = self.graph.vectors[vector]
         place = self._reserve(WIDE, what.length)
-        whole = graph.whole_vector(what.x) if isinstance(what, Product) else None
-        if whole is None:
-            chain = self._chain(vector)
-            self._prepare(chain)
+        if isinstance(what, Each) or (whole := self.graph.whole_vector(what.x)) is None:
+            self._prepare(vector)
             with self._loop(LONG(what.length)) as k:
                 value = self._element(vector, k, {})
                 self.builder.store(value.spread(LANES).value, self.builder.gep(place, [k]))
-            self.stored[vector] = place
-            return
-        assert isinstance(what, Product)
-        if what.length > 8:
+        elif what.length > 8:
             if whole not in self.stored:
                 self._vector(whole)
             with self._loop(LONG(what.length)) as row:
                 self._sum(what, whole, [row], place)
         else:
-            self._prepare(self._chain(whole))
-            self._sum(what, whole, range(what.length), place)
+            self._prepare(whole)
+            self._sum(what, whole, [LONG(row) for row in range(what.length)], place)
         self.stored[vector] = place
 
     def _sum(self, product: Product, whole: int, rows: Sequence[Any], place: Any) -> None:
@@ -251,33 +229,24 @@ class _Writer:
                 so_far = Lanes(builder, builder.load(total))
                 builder.store((so_far + self._weight(product, row, k) * value).value, total)
         for row, total in zip(rows, sums, strict=True):
-            where = builder.gep(place, [_long(row)])
-            builder.store(builder.load(total), where)
+            builder.store(builder.load(total), builder.gep(place, [row]))
 
-    def _chain(self, vector: int) -> set[int]:
-        """The vectors that are computed along with a vector, element by element."""
+    def _prepare(self, vector: int) -> None:
+        """Compute before a loop over a vector's elements what its body takes as given."""
+        what = self.graph.vectors[vector]
         if vector in self.stored:
-            return set()
-        what, chain = self.graph.vectors[vector], {vector}
+            return
         if isinstance(what, Each):
             for kind, n in what.operands:
                 if kind == "vector":
-                    chain |= self._chain(n)
-        return chain
-
-    def _prepare(self, chain: set[int]) -> None:
-        """Compute before a loop what its body takes as given."""
-        for vector in sorted(chain):
-            what = self.graph.vectors[vector]
-            if isinstance(what, Each):
-                for kind, n in what.operands:
-                    if kind == "scalar":
-                        self.scalar(n)
-            elif self.graph.whole_vector(what.x) is not None:
-                self._vector(vector)
-            else:
-                for n in what.x:
+                    self._prepare(n)
+                elif kind == "scalar":
                     self.scalar(n)
+        elif self.graph.whole_vector(what.x) is not None:
+            self._vector(vector)
+        else:
+            for n in what.x:
+                self.scalar(n)
 
     def _element(self, vector: int, k: Any, done: dict[int, Lanes]) -> Lanes:
         """Element k of a vector, in the body of a loop over k."""
@@ -291,7 +260,7 @@ class _Writer:
             value = self._load(self.bases[vector], k)
             for i, n in enumerate(what.x):
                 if graph.levels[n] == PARTICLE:
-                    value = value + self._weight(what, k, i) * self.scalar(n)
+                    value = value + self._weight(what, k, LONG(i)) * self.scalar(n)
         else:
             operands = []
             for kind, n in what.operands:
@@ -304,7 +273,3 @@ class _Writer:
             value = self._operate(what.operation, operands)
         done[vector] = value
         return value
-
-
-def _long(index: Any) -> Any:
-    return LONG(index) if isinstance(index, int) else index

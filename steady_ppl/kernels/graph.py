@@ -10,7 +10,7 @@ Derivatives that are zero are never written, so that a kernel of the Jacobian co
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 from typing import Any, NamedTuple
 
@@ -33,59 +33,45 @@ class NotCompilable(SteadyError):
 
 
 class Scalar(NamedTuple):
-    """One operation on scalars; `arguments` are other scalars' numbers, or the operation's own constants."""
+    """One operation on scalars. The leaves are "input" (name, element), "parameter" (offset), "constant" (value) and
+    "element" (vector, index)."""
 
     operation: str
-    arguments: tuple[Any, ...]
+    arguments: tuple[Any, ...]  # other scalars' numbers, or a leaf's own
 
 
 @dataclass(frozen=True)
 class Product:
-    """A matrix of parameters times a vector: element k is bias[k] + Σ p[at + k·rows + i·columns] x[i].
-
-    Attributes:
-        bias: one scalar an element, or None.
-        x: the vector's elements.
-    """
+    """A matrix of parameters times a vector: element k is bias[k] + Σ p[at + k·rows + i·columns] x[i]."""
 
     length: int
     at: int
     rows: int
     columns: int
-    bias: tuple[int, ...] | None
-    x: tuple[int, ...]
+    bias: tuple[int, ...] | None  # one scalar an element
+    x: tuple[int, ...]  # the vector's elements
 
 
 @dataclass(frozen=True)
 class Each:
-    """An operation on each element of vectors: operands are ("vector", number), ("parameters", offset) or
-    ("scalar", number)."""
+    """An operation on each element of vectors."""
 
     length: int
     operation: str
-    operands: tuple[tuple[str, int], ...]
+    operands: tuple[tuple[str, int], ...]  # ("vector", number), ("parameters", offset) or ("scalar", number)
 
 
 @dataclass
 class ScalarGraph:
-    """Scalars and vectors in the order in which they can be computed.
-
-    Attributes:
-        scalars: all operations; "input" (name, element), "parameter" (offset), "constant" (value), "element" (vector,
-            index) are the leaves.
-        levels: for each scalar, what it depends on.
-        vectors: products and elementwise operations on long vectors.
-        outputs: the scalars to be returned, in order.
-        parameters: places on the tape whose values the kernel takes, one after the other.
-    """
+    """Scalars and vectors in the order in which they can be computed."""
 
     levels_of_inputs: dict[str, int]
     scalars: list[Scalar] = field(default_factory=list)
-    levels: list[int] = field(default_factory=list)
+    levels: list[int] = field(default_factory=list)  # what each scalar depends on
     vectors: list[Product | Each] = field(default_factory=list)
-    outputs: list[int] = field(default_factory=list)
-    parameters: list[int] = field(default_factory=list)
-    numbers: dict[Scalar, int] = field(default_factory=dict)
+    outputs: list[int] = field(default_factory=list)  # the scalars to be returned, in order
+    parameters: list[int] = field(default_factory=list)  # places on the tape whose values the kernel takes, in order
+    numbers: dict[Scalar, int] = field(default_factory=dict)  # where each is in `scalars`
     operations: int = 0
 
     def scalar(self, operation: str, *arguments: Any) -> int:
@@ -115,8 +101,15 @@ class ScalarGraph:
     def vector(self, vector: Product | Each) -> list[int]:
         """The elements of a new vector."""
         self.vectors.append(vector)
-        number = len(self.vectors) - 1
-        return [self.scalar("element", number, k) for k in range(vector.length)]
+        return self.elements("vector", len(self.vectors) - 1, vector.length)
+
+    def elements(self, kind: str, number: int, length: int) -> list[int]:
+        """The scalars of an operand, as in `Each`."""
+        if kind == "scalar":
+            return [number] * length
+        if kind == "parameters":
+            return [self.scalar("parameter", number + k) for k in range(length)]
+        return [self.scalar("element", number, k) for k in range(length)]
 
     def each(self, operation: str, *operands: Sequence[int]) -> list[int]:
         """An operation on each element of operands of one length."""
@@ -137,10 +130,9 @@ class ScalarGraph:
 
     def whole_vector(self, operand: Sequence[int]) -> int | None:
         """The vector whose elements these are, all of them and in order."""
-        first = self.scalars[operand[0]]
-        if first.operation != "element":
+        if self.scalars[operand[0]].operation != "element":
             return None
-        vector = first.arguments[0]
+        vector = self.scalars[operand[0]].arguments[0]
         same = self.vectors[vector].length == len(operand) and all(
             self.scalars[number] == Scalar("element", (vector, k)) for k, number in enumerate(operand)
         )
@@ -148,10 +140,9 @@ class ScalarGraph:
 
     def run_of_parameters(self, operand: Sequence[int] | None) -> int | None:
         """The offset of parameters that lie one after the other."""
-        first = self.scalars[operand[0]] if operand else None
-        if operand is None or first is None or first.operation != "parameter":
+        if not operand or self.scalars[operand[0]].operation != "parameter":
             return None
-        at = first.arguments[0]
+        at = self.scalars[operand[0]].arguments[0]
         same = all(self.scalars[number] == Scalar("parameter", (at + k,)) for k, number in enumerate(operand))
         return at if same else None
 
@@ -213,65 +204,45 @@ class Tangents:
 
     def __init__(self, graph: ScalarGraph, along: int) -> None:
         self.graph, self.along = graph, along
-        self.of_scalars: dict[int, int | None] = {}
-        self.of_vectors: dict[int, Values | None] = {}
+        self.known: dict[int, int | None] = {}
 
     def of(self, number: int) -> int | None:
         """The derivative of a scalar; None where it is zero."""
-        if number not in self.of_scalars:
+        if number not in self.known:
             operation, arguments = self.graph.scalars[number]
             if operation == "element":
-                vector = self._of_vector(arguments[0])
-                found = None if vector is None else vector[arguments[1]]
-            elif operation in ("input", "parameter", "constant"):
-                found = self.graph.constant(1.0) if number == self.along else None
+                self._of_elements(arguments[0])
+            elif operation in LEAVES:
+                self.known[number] = self.graph.constant(1.0) if number == self.along else None
             else:
-                tangents = [self.of(n) for n in arguments]
-                lists = [None if tangent is None else [tangent] for tangent in tangents]
-                result = self._rule(operation, [[n] for n in arguments], lists, [number])
-                found = None if result is None else result[0]
-            self.of_scalars[number] = found
-        return self.of_scalars[number]
+                found = self._rule(operation, [[n] for n in arguments], [number])
+                self.known[number] = found[0] if found else None
+        return self.known[number]
 
-    def _of_vector(self, vector: int) -> Values | None:
-        if vector not in self.of_vectors:
-            what = self.graph.vectors[vector]
-            found = self._of_product(what) if isinstance(what, Product) else self._of_each(vector, what)
-            self.of_vectors[vector] = found
-        return self.of_vectors[vector]
-
-    def _of_product(self, product: Product) -> Values | None:
-        whole = self.graph.whole_vector(product.x)
-        tangents = self._of_vector(whole) if whole is not None else [self.of(n) for n in product.x]
-        if product.bias and any(self.of(n) is not None for n in product.bias):
+    def _of_elements(self, vector: int) -> None:
+        graph, what = self.graph, self.graph.vectors[vector]
+        elements = graph.elements("vector", vector, what.length)
+        if isinstance(what, Each):
+            operands = [graph.elements(kind, n, what.length) for kind, n in what.operands]
+            found = self._rule(what.operation, operands, elements)
+        elif self._of_all(what.bias or ()) is not None:
             raise NotCompilable("a bias that differs between particles")
-        if tangents is None or all(tangent is None for tangent in tangents):
+        else:
+            x = self._of_all(what.x)
+            found = None if x is None else graph.vector(replace(what, bias=None, x=tuple(x)))
+        for k, element in enumerate(elements):
+            self.known[element] = found[k] if found else None
+
+    def _of_all(self, numbers: Sequence[int]) -> Values | None:
+        """The derivatives of several scalars; None where all are zero."""
+        tangents = [self.of(number) for number in numbers]
+        if all(tangent is None for tangent in tangents):
             return None
-        x = tuple(self.graph.constant(0.0) if tangent is None else tangent for tangent in tangents)
-        return self.graph.vector(Product(product.length, product.at, product.rows, product.columns, None, x))
+        return [self.graph.constant(0.0) if tangent is None else tangent for tangent in tangents]
 
-    def _of_each(self, vector: int, what: Each) -> Values | None:
-        graph = self.graph
-        operands: list[Values] = []
-        tangents: list[Values | None] = []
-        for kind, n in what.operands:
-            if kind == "vector":
-                operands.append([graph.scalar("element", n, k) for k in range(what.length)])
-                tangents.append(self._of_vector(n))
-            elif kind == "scalar":
-                tangent = self.of(n)
-                operands.append([n] * what.length)
-                tangents.append(None if tangent is None else [tangent] * what.length)
-            else:
-                operands.append([graph.scalar("parameter", n + k) for k in range(what.length)])
-                tangents.append(None)
-        own = [graph.scalar("element", vector, k) for k in range(what.length)]
-        return self._rule(what.operation, operands, tangents, own)
-
-    def _rule(
-        self, operation: str, operands: Sequence[Values], tangents: Sequence[Values | None], value: Values
-    ) -> Values | None:
+    def _rule(self, operation: str, operands: Sequence[Values], value: Values) -> Values | None:
         """The chain rule, for scalars and for all elements of vectors."""
+        tangents = [self._of_all(operand) for operand in operands]
         if operation in FLAT or all(tangent is None for tangent in tangents):
             return None
         if operation in CHOICES:
@@ -289,10 +260,8 @@ class Tangents:
         return reduce(partial(self.do, "add"), terms)
 
     def _times(self, partial: Values, tangent: Values) -> Values:
-        one = self.graph.constant(1.0)
-        if all(number == one for number in tangent):
-            return partial
-        return self.do("mul", partial, tangent)
+        ones = self.constants(1.0, tangent)
+        return partial if tangent == ones else self.do("mul", partial, tangent)
 
     def constants(self, number: float, like: Values) -> Values:
         return [self.graph.constant(number)] * len(like)
@@ -358,7 +327,6 @@ PARTIALS: dict[str, Callable[..., tuple[Values | None, ...]]] = {
     "remainder": lambda d, value, x, y: (None, d.do("neg", d.do("floor", d.do("div", x, y)))),
 }
 
-
 # those that pass one operand on: which, and the derivatives that are passed on with it
 CHOICES: dict[str, Callable[[Tangents, Any, Any], Any]] = {
     "where": lambda d, operands, tangents: (operands[0], tangents[1], tangents[2]),
@@ -375,9 +343,3 @@ def derivatives(graph: ScalarGraph, outputs: Sequence[int], inputs: Sequence[int
         for tangents in by_input:
             tangents.of(number)
     return [[tangents.of(output) for tangents in by_input] for output in outputs]
-
-
-def jacobian(graph: ScalarGraph, outputs: Sequence[int], inputs: Sequence[int]) -> list[int]:
-    """The derivative of every output in every input, the outputs' rows one after the other."""
-    zero, rows = graph.constant(0.0), derivatives(graph, outputs, inputs)
-    return [zero if derivative is None else derivative for row in rows for derivative in row]

@@ -6,9 +6,10 @@ import ctypes
 import hashlib
 import itertools
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -16,10 +17,9 @@ import torch
 from torch import Tensor, nn
 
 from steady_ppl.kernels.codegen import LANES, NAME, source
-from steady_ppl.kernels.graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph, derivatives, jacobian
-from steady_ppl.kernels.lowering import Translation
+from steady_ppl.kernels.graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph, derivatives
+from steady_ppl.kernels.lowering import Translation, first_names, where
 from steady_ppl.kernels.store import machine_code
-from steady_ppl.kernels.tape import first_names, where
 from steady_ppl.utils.text import one_line
 
 TRACES = 32  # of one method of programs of one class; each takes some hundredths of a second
@@ -33,17 +33,14 @@ Value = TypeVar("Value")
 Array = np.ndarray
 Examples = dict[str, Tensor]  # of the arguments of a function
 _COMPILED: WeakKeyDictionary[type[nn.Module], dict[Any, Any]] = WeakKeyDictionary()
-_NAMES: WeakKeyDictionary[type[nn.Module], list[tuple[int, list[str]]]] = WeakKeyDictionary()
+_NAMES: WeakKeyDictionary[type[nn.Module], list[str]] = WeakKeyDictionary()
 _READ: WeakKeyDictionary[nn.Module, dict[Any, Any]] = WeakKeyDictionary()  # of programs that are `unchanged` for now
 
 
 class Kernel:
-    """A compiled function.
+    """A compiled function of so many `inputs`, arrays, that gives so many `outputs` a particle.
 
-    Args:
-        key: a digest of what its source is made of.
-        text: writes its `source`.
-        inputs, outputs: how many arrays it takes, and how many numbers a particle it gives.
+    `text` writes its `source`; `key` is a digest of what that is made of.
     """
 
     def __init__(self, key: str, text: Callable[[], str], inputs: int, outputs: int) -> None:
@@ -75,6 +72,27 @@ class Kernel:
         self._call(*pointers, which, out.ctypes.data, trajectories, particles, uniform.shape[1])
 
 
+@contextmanager
+def _compiling() -> Iterator[None]:
+    """Say of whatever torch, the translation or the compiler makes of an unforeseen program that it has no kernel."""
+    try:
+        with torch.no_grad():
+            yield
+    except NotCompilable:
+        raise
+    except Exception as error:
+        raise NotCompilable(f"it cannot be compiled: {one_line(error)}") from error
+
+
+@dataclass(frozen=True)
+class Number:
+    """One learnable number."""
+
+    parameter: Tensor
+    index: int  # in its flat form
+    step: float  # by which finite differences move it
+
+
 class Method:
     """A function of a program as a kernel, for all programs that are alike, see `signature`.
 
@@ -86,14 +104,11 @@ class Method:
         along: the arguments in which to differentiate; the Jacobian's rows follow the values.
         by_parameters: differentiate in the parameters that the kernel takes; these derivatives come last.
 
-    Attributes:
-        values: how many numbers the function returns.
-        slopes: value and parameter of each derivative that `by_parameters` adds, those that are zero left out.
-
     Raises:
         NotCompilable: it cannot be traced, or what it does has no kernel.
     """
 
+    @_compiling()
     def __init__(
         self,
         program: nn.Module,
@@ -104,35 +119,19 @@ class Method:
         along: Sequence[str] = (),
         by_parameters: bool = False,
     ) -> None:
-        try:
-            with torch.no_grad():
-                self._compile(program, function, particle, trajectory, along, by_parameters)
-        except NotCompilable:
-            raise
-        except Exception as error:  # whatever torch, the translation or the compiler makes of an unforeseen program
-            raise NotCompilable(f"it cannot be compiled: {one_line(error)}") from error
-
-    def _compile(
-        self,
-        program: nn.Module,
-        function: Callable[..., Any],
-        particle: Examples,
-        trajectory: Examples,
-        along: Sequence[str],
-        by_parameters: bool,
-    ) -> None:
         levels = dict.fromkeys(particle, PARTICLE) | dict.fromkeys(trajectory, TRAJECTORY)
         translation = Translation(particle | trajectory, levels, _tensors(program))
         with translation:
             made = torch.func.functionalize(function)(*particle.values(), *trajectory.values())
         translation.end(made)
         self.tape, self.graph = translation.tape, translation.graph
-        self.values = len(self.graph.outputs)
-        self.slopes: list[tuple[int, int]] = []
         values = list(self.graph.outputs)
+        self.values = len(values)  # how many numbers the function returns
+        self.slopes: list[tuple[int, int]] = []  # value and parameter of each derivative that `by_parameters` adds
         if along:
             inputs = [self.graph.scalar("input", name, k) for name in along for k in range(particle[name].numel())]
-            self.graph.outputs += jacobian(self.graph, values, inputs)
+            zero, rows = self.graph.constant(0.0), derivatives(self.graph, values, inputs)
+            self.graph.outputs += [zero if derivative is None else derivative for row in rows for derivative in row]
         if by_parameters:
             self._add_slopes(values)
         columns, at = {}, 0
@@ -181,22 +180,6 @@ class Method:
         return torch.stack(columns, -1)
 
 
-class Number(Protocol):
-    """One learnable number."""
-
-    @property
-    def parameter(self) -> Tensor:
-        """Among whose numbers it is."""
-
-    @property
-    def index(self) -> int:
-        """In its flat form."""
-
-    @property
-    def step(self) -> float:
-        """By which differences move it."""
-
-
 _KERNELS: OrderedDict[str, Kernel] = OrderedDict()
 
 
@@ -216,14 +199,15 @@ def compiled(program: nn.Module, name: str, build: Callable[[], Value]) -> Value
     """What was compiled under a name for programs like this one, built once; or why there is none."""
     known = _COMPILED.setdefault(type(program), {})
     key = (name, signature(program))
-    if key not in known and sum(at == name for at, _ in known) >= TRACES:
+    if key in known:
+        return known[key]
+    if sum(at == name for at, _ in known) >= TRACES:
         return KEEPS_CHANGING
-    if key not in known:
-        with torch.random.fork_rng(devices=[]):
-            try:
-                known[key] = build()
-            except NotCompilable as reason:
-                known[key] = str(reason)
+    with torch.random.fork_rng(devices=[]):
+        try:
+            known[key] = build()
+        except NotCompilable as reason:
+            known[key] = str(reason)
     return known[key]
 
 
@@ -238,15 +222,11 @@ def _tensors(program: nn.Module) -> dict[str, Tensor]:
     found = dict(itertools.chain(program.named_parameters(), program.named_buffers()))
     for at, module in program.named_modules():
         for name, value in _settings(module):
-            for index, part in enumerate(_members(value)):
+            held = value.values() if isinstance(value, dict) else value if isinstance(value, tuple | list) else [value]
+            for index, part in enumerate(held):
                 if isinstance(part, Tensor):
                     found[f"{at}.{name}[{index}] among the settings"] = part
     return found
-
-
-def _members(value: Any) -> Iterable[Any]:
-    """What a setting holds, or itself."""
-    return value.values() if isinstance(value, dict) else value if isinstance(value, tuple | list) else (value,)
 
 
 @contextmanager
@@ -267,8 +247,7 @@ def _read(program: nn.Module, what: Any, read: Callable[[], Value]) -> Value:
         return read()
     if what not in known:
         known[what] = read()
-    found: Value = known[what]
-    return found
+    return known[what]
 
 
 def signature(program: nn.Module) -> tuple[Any, ...]:
@@ -305,26 +284,21 @@ def _content(value: Any) -> Any:
 
 def _settings(module: nn.Module) -> Iterator[tuple[str, Any]]:
     """A module's attributes: its own, its class's and its bases'."""
-    own = vars(module)
+    own, kind = vars(module), type(module)
     yield from ((name, value) for name, value in own.items() if name not in OF_MODULES)
-    kind = type(module)
     if kind not in _NAMES:
         _NAMES[kind] = _names_of(kind)
-    for at, names in _NAMES[kind]:
-        given = vars(kind.__mro__[at])
-        yield from ((name, given[name]) for name in names if name not in own and name in given)
+    yield from ((name, getattr(kind, name)) for name in _NAMES[kind] if name not in own and hasattr(kind, name))
 
 
-def _names_of(kind: type[nn.Module]) -> list[tuple[int, list[str]]]:
-    """The settings among the attributes of a class, each in the first of its bases that has it, by their order: a base
-    itself would keep the class, which is the first of them, for ever."""
-    found, known = [], set[str]()
-    for at, base in enumerate(itertools.takewhile(lambda base: base is not nn.Module, kind.__mro__)):
-        names = [name for name in vars(base) if name not in known and not name.startswith("__")]
-        known.update(names)
-        if not base.__module__.startswith("torch."):
-            found.append((at, [name for name in names if not callable(vars(base)[name])]))
-    return found
+def _names_of(kind: type[nn.Module]) -> list[str]:
+    """The settings among the attributes of a class and its bases; by name, since values may keep the class for ever."""
+    found = dict[str, bool]()
+    for base in itertools.takewhile(lambda base: base is not nn.Module, kind.__mro__):
+        for name, value in vars(base).items():
+            foreign = name.startswith("__") or base.__module__.startswith("torch.")
+            found.setdefault(name, not foreign and not callable(value))
+    return [name for name, is_setting in found.items() if is_setting]
 
 
 def close(mine: Tensor, theirs: Tensor) -> bool:

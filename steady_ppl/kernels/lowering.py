@@ -1,17 +1,20 @@
-"""From what torch notes of a method to scalars: tensors of values become tensors of scalars' numbers."""
+"""From what torch does in a method to scalars: tensors of values become tensors of scalars' numbers. What it computes
+of a program's tensors alone is noted on a tape, to be computed again when they have changed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partialmethod
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch._ops import OpOverload
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 from steady_ppl.kernels.graph import NotCompilable, ScalarGraph
-from steady_ppl.kernels.tape import Tape
 
 aten: Any = torch.ops.aten
 
@@ -45,15 +48,144 @@ ELEMENTWISE = _packets(
 FILLED = {aten.zeros_like: 0.0, aten.new_zeros: 0.0, aten.zeros: 0.0, aten.ones_like: 1.0, aten.new_ones: 1.0}
 
 
+@dataclass(frozen=True)
+class _Place:
+    """Where a value is on the tape."""
+
+    number: int
+
+
+@dataclass(frozen=True)
+class _Step:
+    """An operation on values at places; what it makes lies at others."""
+
+    operation: OpOverload
+    arguments: Sequence[Any]
+    keywords: dict[str, Any]
+    needs: frozenset[int]
+    makes: range
+
+    def run(self, values: list[Tensor]) -> None:
+        arguments = [_filled(argument, values) for argument in self.arguments]
+        made = self.operation(*arguments, **{name: _filled(value, values) for name, value in self.keywords.items()})
+        values[self.makes.start : self.makes.stop] = made if isinstance(made, list | tuple) else [made]
+
+
+def _filled(argument: Any, values: Sequence[Tensor]) -> Any:
+    """An argument with values where it has places; `tree_map` takes ten times as long."""
+    if isinstance(argument, _Place):
+        return values[argument.number]
+    return [_filled(part, values) for part in argument] if isinstance(argument, list) else argument
+
+
+def where(tensor: Tensor) -> tuple[Any, ...]:
+    """What tensors have in common that are the same numbers in memory."""
+    return tensor.data_ptr(), tensor.shape, tensor.stride(), tensor.dtype
+
+
+def first_names(tensors: Mapping[str, Tensor]) -> dict[Any, str]:
+    """Names of tensors by `where` they are; of several names that are one tensor, the first."""
+    names: dict[Any, str] = {}
+    for name, tensor in tensors.items():
+        if tensor.numel():
+            names.setdefault(where(tensor), name)
+    return names
+
+
+class Tape:
+    """Values by place: a program's tensors, other tensors, which never change, and what is computed of them.
+
+    It is noted with one program's tensors, by name, and runs for any that has tensors of the same names and shapes.
+    """
+
+    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
+        self._names = first_names(tensors)
+        self._program: dict[int, str] = {}  # place → name
+        self._values: list[Tensor] = []  # a tensor that is kept shares its `id` with no later one
+        self._places: dict[int, int] = {}  # id → place
+        self._steps: list[_Step] = []
+        self._varying: set[int] = set()  # places that depend on the program's tensors; of whole numbers, none changes
+
+    def varies(self, value: Tensor) -> bool:
+        """Whether a value changes as the program's parameters do."""
+        return self.place(value) in self._varying
+
+    def place(self, value: Tensor) -> int:
+        """Where a value is; one that is new there is the program's, or never changes."""
+        if id(value) not in self._places:
+            name = self._names.get(where(value))
+            if name is not None:
+                self._program[len(self._values)] = name
+                if value.dtype.is_floating_point:
+                    self._varying.add(len(self._values))
+            self._add(value)
+        return self._places[id(value)]
+
+    def _add(self, value: Tensor) -> None:
+        self._places[id(value)] = len(self._values)
+        self._values.append(value)
+
+    def note(self, operation: OpOverload, arguments: Sequence[Any], keywords: dict[str, Any], made: Any) -> None:
+        """Note an operation on values that are here, and what it made; refuse one that writes into a tensor, whose
+        views and earlier values the tape would lose."""
+        if operation._schema.is_mutable:
+            raise NotCompilable(f"{operation} writes into a tensor that does not depend on the state")
+
+        def placed(leaf: Any) -> Any:
+            return _Place(self.place(leaf)) if isinstance(leaf, Tensor) else leaf
+
+        arguments, keywords = tree_map(placed, (tuple(arguments), keywords))
+        needs = frozenset(leaf.number for leaf in tree_leaves((arguments, keywords)) if isinstance(leaf, _Place))
+        first = len(self._values)
+        for value in tree_leaves(made):
+            self._add(value)
+        makes = range(first, len(self._values))
+        if not needs.isdisjoint(self._varying):
+            self._varying.update(makes)
+        self._steps.append(_Step(operation, arguments, keywords, needs, makes))
+
+    def cut(self, wanted: Iterable[int]) -> None:
+        """End the noting, and leave out what these places do not need."""
+        needed, steps = set(wanted), list[_Step]()
+        for step in reversed(self._steps):
+            if not needed.isdisjoint(step.makes):
+                needed |= step.needs
+                steps.append(step)
+        self._steps = steps[::-1]
+        self._places.clear()
+        made = {place for step in self._steps for place in step.makes}
+        for place in range(len(self._values)):  # these come from the program and from steps, or nothing takes them
+            if place in made or place in self._program or place not in needed:
+                self._values[place] = torch.empty(0)
+
+    def takes(self, name: str) -> bool:
+        """Whether one of the program's tensors is on it."""
+        return name in self._program.values()
+
+    def run(self, tensors: Mapping[str, Tensor]) -> list[Tensor]:
+        """Values by place, for a program's tensors as they are now."""
+        values = [
+            tensors[self._program[place]] if place in self._program else v for place, v in enumerate(self._values)
+        ]
+        for step in self._steps:
+            step.run(values)
+        return values
+
+    def run_again(self, values: Sequence[Tensor], name: str, tensor: Tensor) -> list[Tensor]:
+        """What `run` returned, where one of the program's tensors is another."""
+        changed = {place for place, known in self._program.items() if known == name}
+        found = [tensor if place in changed else value for place, value in enumerate(values)]
+        for step in self._steps:
+            if not changed.isdisjoint(step.needs):
+                step.run(found)
+                changed.update(step.makes)
+        return found
+
+
 class Translation(TorchDispatchMode):
     """Notes what torch does meanwhile: tensors of values become tensors of scalars' numbers, of the same shape.
 
-    What depends on the program's tensors alone stays with torch, on a tape.
-
-    Args:
-        inputs: the arguments of what is traced, by name.
-        levels: what each of them differs between.
-        tensors: the program's, by name.
+    It is given the arguments of what is traced, what each of them differs between, and the program's tensors, by name.
     """
 
     def __init__(self, inputs: Mapping[str, Tensor], levels: dict[str, int], tensors: Mapping[str, Tensor]) -> None:
@@ -160,11 +292,10 @@ class Translation(TorchDispatchMode):
     def _copy(self, value: Tensor, other: Tensor, non_blocking: bool = False) -> Tensor:
         return other.broadcast_to(value.shape)
 
-    def _add(self, left: Any, right: Any, *, alpha: float = 1) -> Tensor:
-        return self._each("add", left, right if alpha == 1 else self._each("mul", right, alpha))
+    def _scaled(self, operation: str, left: Any, right: Any, *, alpha: float = 1) -> Tensor:
+        return self._each(operation, left, right if alpha == 1 else self._each("mul", right, alpha))
 
-    def _sub(self, left: Any, right: Any, *, alpha: float = 1) -> Tensor:
-        return self._each("sub", left, right if alpha == 1 else self._each("mul", right, alpha))
+    _add, _sub = partialmethod(_scaled, "add"), partialmethod(_scaled, "sub")
 
     def _rsub(self, left: Any, right: Any, alpha: float = 1) -> Tensor:
         return self._sub(right, left, alpha=alpha)

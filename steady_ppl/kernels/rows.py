@@ -49,7 +49,8 @@ def on_all_rows(
     along: Sequence[str] = (),
     kernels: bool | None = None,
 ) -> tuple[Tensor, list[Tensor]] | str | None:
-    """A function's value and its Jacobians.
+    """A function's value `(rows, B, V)` and its Jacobians `(rows, B, V, ·)`; why there is no kernel; or None where it
+    is not worth one.
 
     Args:
         program: what the function belongs to.
@@ -58,12 +59,8 @@ def on_all_rows(
         arguments: its arguments in order, each `(rows, B)` or `(rows, B, ·)`.
         along: those in which to differentiate, the first ones.
         kernels: whether a kernel is worth compiling; None: if there are `ROWS_WORTH_COMPILING`.
-
-    Returns:
-        The value `(rows, B, V)` and the Jacobians `(rows, B, V, ·)`; why there is no kernel; None where it is not
-        worth one.
     """
-    found = _computed(program, f"{name} on all rows", function, arguments, kernels, along=along)
+    found = _computed(program, name, function, arguments, kernels, along=along)
     if not isinstance(found, tuple):
         return found
     method, values, rest = found
@@ -72,19 +69,12 @@ def on_all_rows(
 
 
 class Slopes(NamedTuple):
-    """What a function's components change by with the parameters that a kernel takes, where that is not zero.
+    """What a function's components change by with the parameters that a kernel takes, where that is not zero."""
 
-    Attributes:
-        function: its own values, `(rows, B, V)`.
-        components: of the function, one for each slope, `(N,)`.
-        values: the slopes, `(N, rows, B)`.
-        by_number: what the kernel's parameter of each slope changes by with each learnable number, `(N, P)`.
-    """
-
-    function: Tensor
-    components: Tensor
-    values: Tensor
-    by_number: Tensor
+    function: Tensor  # its own values, (rows, B, V)
+    components: Tensor  # of the function, one for each slope, (N,)
+    values: Tensor  # the slopes, (N, rows, B)
+    by_number: Tensor  # what the kernel's parameter of each slope changes by with each learnable number, (N, P)
 
     def weighted(self, weights: Tensor) -> Tensor:
         """The sum over rows and components of weights `(rows, B, V)` times slopes, `(B, P)` in double precision."""
@@ -101,7 +91,7 @@ def slopes_on_all_rows(
     kernels: bool | None = None,
 ) -> Slopes | str | None:
     """A function's slopes in a program's learnable numbers; otherwise as `on_all_rows`."""
-    found = _computed(program, f"{name} by parameters", function, arguments, kernels, by_parameters=True)
+    found = _computed(program, name, function, arguments, kernels, by_parameters=True)
     if not isinstance(found, tuple):
         return found
     method, values, rest = found
@@ -131,11 +121,10 @@ def _computed(
     if first.device.type != "cpu" or first.dtype != torch.float32:
         return f"{str(first.dtype).removeprefix('torch.')} on {first.device.type}"
     examples = {at: value[:1, :1].unsqueeze(0).clone() for at, value in arguments.items()}
-
-    def build() -> Method:
-        return Method(program, lambda *values: (function(*values),), examples, {}, **derivatives)
-
-    method = compiled(program, name, build)
+    compiled_as = f"{name} by parameters" if "by_parameters" in derivatives else f"{name} on all rows"
+    method = compiled(
+        program, compiled_as, lambda: Method(program, lambda *given: (function(*given),), examples, {}, **derivatives)
+    )
     if isinstance(method, str):
         return _noted(name, method)
     found = _run(method, program, arguments, rows, trajectories)
@@ -145,14 +134,14 @@ def _computed(
     if runs[method] <= 2 or runs[method] % COMPARED_EVERY == 0:
         plain = function(*(_a_few(value) for value in arguments.values()))
         if not close(_a_few(values), plain):
-            return _noted(name, discard(program, name))
+            return _noted(name, discard(program, compiled_as))
     return method, values, rest
 
 
 def _noted(name: str, reason: str) -> str:
     found = _WHY.get()
     if found is not None:
-        found[name.partition(" on all rows")[0].partition(" by parameters")[0]] = reason
+        found[name] = reason
     return reason
 
 

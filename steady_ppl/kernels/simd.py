@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import operator
 from dataclasses import dataclass
 from functools import partialmethod
+from operator import methodcaller
 from typing import Any
 
 from llvmlite import ir
@@ -69,7 +71,8 @@ class Lanes:
 
     __add__, __sub__ = partialmethod(_do, "fadd"), partialmethod(_do, "fsub")
     __mul__, __truediv__ = partialmethod(_do, "fmul"), partialmethod(_do, "fdiv")
-    __lt__, __gt__, __ge__ = partialmethod(compare, "<"), partialmethod(compare, ">"), partialmethod(compare, ">=")
+    __lt__, __le__ = partialmethod(compare, "<"), partialmethod(compare, "<=")
+    __gt__, __ge__ = partialmethod(compare, ">"), partialmethod(compare, ">=")
 
     def __rsub__(self, other: Any) -> Lanes:
         return self.like(other) - self
@@ -79,6 +82,9 @@ class Lanes:
 
     def __neg__(self) -> Lanes:
         return Lanes(self.builder, self.builder.fneg(self.value))
+
+    def __abs__(self) -> Lanes:
+        return self.call("fabs")
 
     def where(self, yes: Any, no: Any) -> Lanes:
         """`yes` where this truth value holds, else `no`."""
@@ -126,11 +132,6 @@ def polynomial(x: Lanes, *coefficients: float) -> Lanes:
     for coefficient in coefficients[2:]:
         value = value * x + coefficient
     return value
-
-
-def absolute(x: Lanes) -> Lanes:
-    """|x|."""
-    return x.call("fabs")
 
 
 def _turned(x: Lanes, quarters: int) -> Lanes:
@@ -193,14 +194,14 @@ def log1p(x: Lanes) -> Lanes:
 
 def sigmoid(x: Lanes) -> Lanes:
     """1 / (1 + e⁻ˣ)."""
-    e = exp(-absolute(x))
+    e = exp(-abs(x))
     share = 1.0 / (e + 1.0)
     return (x < 0.0).where(e * share, share)
 
 
 def tanh(x: Lanes) -> Lanes:
     """The hyperbolic tangent."""
-    size, s = absolute(x), x * x
+    size, s = abs(x), x * x
     small = polynomial(s, -5.70498872745e-3, 2.06390887954e-2, -5.37397155531e-2, 1.33314422036e-1, -3.33332819422e-1)
     large = 1.0 - 2.0 / (exp(size + size) + 1.0)
     return (size < 0.625).where(small * s * x + x, (x < 0.0).where(-large, large))
@@ -209,7 +210,7 @@ def tanh(x: Lanes) -> Lanes:
 def atan2(y: Lanes, x: Lanes) -> Lanes:
     """The angle of (x, y) against the first axis, in (−π, π]."""
     y, x = y.pair(x)
-    a, b = absolute(y), absolute(x)
+    a, b = abs(y), abs(x)
     steep = a > b
     larger, smaller = steep.where(a, b), steep.where(b, a)
     t = smaller / (larger > 0.0).where(larger, larger.like(1.0))  # in [0, 1]
@@ -236,14 +237,14 @@ def minimum(x: Lanes, y: Lanes) -> Lanes:
 def expm1(x: Lanes) -> Lanes:
     """eˣ − 1, exact near zero."""
     half = tanh(x * 0.5)
-    return (absolute(x) < 0.5).where(half * 2.0 / (1.0 - half), exp(x) - 1.0)
+    return (abs(x) < 0.5).where(half * 2.0 / (1.0 - half), exp(x) - 1.0)
 
 
 def remainder(x: Lanes, y: Lanes) -> Lanes:
     """x less the multiple of y below it; in [0, y) for positive y."""
     rest = x - (x / y).call("floor") * y
     rest = (rest < 0.0).logical("and_", y > y.like(0.0)).where(rest + y, rest)
-    return (absolute(rest) < absolute(y)).where(rest, rest - y)
+    return (abs(rest) < abs(y)).where(rest, rest - y)
 
 
 def _other_leg(x: Lanes) -> Lanes:
@@ -260,33 +261,22 @@ OPERATIONS: dict[str, Any] = {
     "asin": lambda x: atan2(x, _other_leg(x)),
     "acos": lambda x: atan2(_other_leg(x), x),
     "hypot": lambda x, y: (x * x + y * y).call("sqrt"),
-    "remainder": remainder,
-    "softplus": lambda x: maximum(x, x.like(0.0)) + log1p(exp(-absolute(x))),
+    "softplus": lambda x: maximum(x, x.like(0.0)) + log1p(exp(-abs(x))),
     "silu": lambda x: x * sigmoid(x),
-    "add": lambda x, y: x + y,
-    "sub": lambda x, y: x - y,
-    "mul": lambda x, y: x * y,
-    "div": lambda x, y: x / y,
-    "neg": lambda x: -x,
-    "abs": absolute,
-    "sqrt": lambda x: x.call("sqrt"),
     "rsqrt": lambda x: 1.0 / x.call("sqrt"),
     "reciprocal": lambda x: 1.0 / x,
     "square": lambda x: x * x,
     "relu": lambda x: (x < 0.0).where(0.0, x),
-    "floor": lambda x: x.call("floor"),
-    "ceil": lambda x: x.call("ceil"),
+    "div": operator.truediv,
     "round": lambda x: x.call("rint"),
     "sign": lambda x: (x > 0.0).where(1.0, (x < 0.0).where(-1.0, x.like(0.0))),
     "where": lambda condition, yes, no: truth(condition).where(yes, no),
     "logical_and": lambda x, y: truth(x).logical("and_", truth(y)),
     "logical_or": lambda x, y: truth(x).logical("or_", truth(y)),
     "logical_not": lambda x: Lanes(x.builder, x.builder.not_(truth(x).value)),
-    "lt": lambda x, y: x < y,
-    "le": lambda x, y: x.compare("<=", y),
-    "gt": lambda x, y: x > y,
-    "ge": lambda x, y: x >= y,
     "eq": lambda x, y: x.compare("==", y),
     "ne": lambda x, y: x.compare("!=", y),
-    **{f.__name__: f for f in (exp, log, log1p, sigmoid, tanh, expm1, atan2, maximum, minimum)},
+    **{name: getattr(operator, name) for name in ("add", "sub", "mul", "neg", "abs", "lt", "le", "gt", "ge")},
+    **{name: methodcaller("call", name) for name in ("sqrt", "floor", "ceil")},
+    **{f.__name__: f for f in (exp, log, log1p, sigmoid, tanh, expm1, atan2, maximum, minimum, remainder)},
 }

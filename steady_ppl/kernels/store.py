@@ -46,34 +46,24 @@ def machine_code(key: str, text: Callable[[], str]) -> Any:
         key: a digest of all that the text is made of. With the sources of this package, its version and that of
             llvmlite it must determine the text: kernels of the same key are taken for the same.
         text: writes the code for LLVM, which must hold no address. It is called only where none is kept.
-
-    Raises:
-        Whatever `text` raises.
     """
-    name = _name(key)
+    name, made = _name(key), list[bytes]()
+    triple, cpu, features = _processor()
+    machine = binding.Target.from_triple(triple).create_target_machine(cpu=cpu, features=features, opt=3)
     with _folder() as folder:
-        code = None if folder is None else _read(folder, name)
-        if code is not None:
-            return _engine(binding.parse_assembly(""), _target_machine(), kept=code)
-        machine, made = _target_machine(), list[bytes]()
-        engine = _engine(_optimized(text(), machine), machine, made=made)
+        kept = None if folder is None else _read(folder, name)
+        module = binding.parse_assembly(text() if kept is None else "")
+        if kept is None:
+            passes = binding.create_pass_builder(machine, binding.create_pipeline_tuning_options(speed_level=2))
+            passes.getModulePassManager().run(module, passes)
+        engine = binding.create_mcjit_compiler(module, machine)
+        engine.set_object_cache(lambda _, code: made.append(code), lambda _: kept)
+        engine.finalize_object()
         if folder is not None and made:
             _write(folder, name, made.pop())
             if name.startswith(SWEEPS):
                 _forget(folder)
         return engine
-
-
-def not_kept() -> str | None:
-    """Why no machine code is kept on disk; None where it is."""
-    try:
-        os.close(_open_folder())
-    except _NotKept as reason:
-        return str(reason)
-    return None
-
-
-# LLVM
 
 
 @lru_cache(maxsize=1)
@@ -82,38 +72,6 @@ def _processor() -> tuple[str, str, str]:
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
     return binding.get_default_triple(), binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
-
-
-def _target_machine() -> Any:
-    triple, cpu, features = _processor()
-    return binding.Target.from_triple(triple).create_target_machine(cpu=cpu, features=features, opt=3)
-
-
-def _optimized(text: str, machine: Any) -> Any:
-    """A module of LLVM's, its functions optimized."""
-    module = binding.parse_assembly(text)
-    options = binding.create_pipeline_tuning_options(speed_level=2)
-    builder = binding.create_pass_builder(machine, options)
-    builder.getModulePassManager().run(module, builder)
-    return module
-
-
-def _engine(module: Any, machine: Any, kept: bytes | None = None, made: list[bytes] | None = None) -> Any:
-    """An engine that has loaded a module.
-
-    Args:
-        kept: machine code to load in place of the module's, which may then be empty.
-        made: takes the machine code, where it is compiled.
-    """
-    engine = binding.create_mcjit_compiler(module, machine)
-    engine.set_object_cache(
-        None if made is None else lambda _, code: made.append(code), None if kept is None else lambda _: kept
-    )
-    engine.finalize_object()
-    return engine
-
-
-# files
 
 
 def _name(key: str) -> str:
@@ -173,10 +131,8 @@ def _write(folder: int, name: str, code: bytes) -> None:
 
 
 def _forget(folder: int) -> None:
-    """Remove the files that were used longest ago until three quarters of the bound are left.
-
-    The last quarter is for what is written until the folder is next looked through.
-    """
+    """Remove the files that were used longest ago until three quarters of the bound are left: the last one is for what
+    is written until the folder is next looked through."""
     found = []
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
@@ -191,9 +147,6 @@ def _forget(folder: int) -> None:
         with suppress(OSError):
             os.unlink(name, dir_fd=folder)
         left -= size
-
-
-# the folder
 
 
 @contextmanager
@@ -211,10 +164,8 @@ def _folder() -> Iterator[int | None]:
 
 
 def _open_folder() -> int:
-    """Open the folder, made if need be, and check what was opened: its files are then found through it alone.
-
-    Those above it are checked too, since who can write there can put another folder of the user's in its place.
-    """
+    """Open the folder, made if need be, and check what was opened: its files are then found through it alone. Those
+    above it are checked too: who can write there can put another folder of the user's in its place."""
     if not hasattr(os, "geteuid") or os.open not in os.supports_dir_fd:
         raise _NotKept("this system does not say who owns a folder")
     place = _place()
@@ -257,10 +208,8 @@ def _place() -> Path:
 
 
 def _require_trusted(folder: Path) -> None:
-    """Refuse a folder or link of another user's, root excepted, and a folder where others can write.
-
-    In a folder like `/tmp` others can write, but can put nothing in the place of what is the user's.
-    """
+    """Refuse a folder or link of another user's, root excepted, and a folder where others can write; but in one like
+    `/tmp` they can put nothing in the place of what is the user's."""
     try:
         about = folder.lstat()
     except FileNotFoundError:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from steady_ppl.effects import attached
 from steady_ppl.errors import UsageError
+from steady_ppl.kernels.jit import Number
 from steady_ppl.model.program import Program
 
 MAX_PARAMETERS = 60  # parameters that are screened one by one; networks have more
@@ -20,13 +21,10 @@ Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
-class Element:
+class Element(Number):
     """One number among a program's parameters, in the unconstrained space in which it is learned."""
 
     name: str  # of the parameter, with an index where it has several numbers
-    parameter: Tensor
-    index: int  # in its flat form
-    step: float  # by which finite differences move it
 
     def move(self, by: float) -> None:
         """Change it."""
@@ -51,7 +49,7 @@ def elements(program: Program, *, frozen: bool = False) -> list[Element]:
         name = name.removesuffix("_unconstrained")
         for index, value in enumerate(parameter.detach().flatten().tolist()):
             label = f"{name}[{index}]" if parameter.numel() > 1 else name
-            found.append(Element(label, parameter, index, max(steps.get(name, 0.01), MIN_RELATIVE_MOVE * abs(value))))
+            found.append(Element(parameter, index, max(steps.get(name, 0.01), MIN_RELATIVE_MOVE * abs(value)), label))
     if len(found) > MAX_PARAMETERS:
         raise UsageError(
             f"program {type(program).__name__} has {len(found)} learnable numbers: a network cannot be looked at "

@@ -131,7 +131,7 @@ def channel_scales(program: Program, state: Tensor, control: Tensor, time: Tenso
     found = []
     for _, seen in _through(program, state, _parts(program, control, time, step), 0.0):
         scales = {site: location_and_scale(fn, site)[1] for site, fn in seen.distributions.items()}
-        found.append(_joined(scales, seen.distributions, state.shape[:-1]))
+        found.append(joined(scales, seen.distributions, state.shape[:-1]))
     return _mean(found)
 
 
@@ -243,15 +243,15 @@ def _on_average(program: Program, state: Tensor, control: Tensor, time: Tensor, 
     if program.substeps == 1:
         return kinds
     moments = {site: location_and_scale(fn, site) for site, fn in kinds.items()}
-    loc, scale = (_joined({site: both[i] for site, both in moments.items()}, kinds, left) for i in range(2))
+    loc, scale = (joined({site: both[i] for site, both in moments.items()}, kinds, left) for i in range(2))
     reach = 1 + MIN_SHARE_OF_PUSH * (loc / torch.where(scale > 0, scale, torch.ones_like(scale))).abs().detach()
     count = scale.shape[-1]
     units = torch.cat([scale.new_zeros(1, count), torch.eye(count).to(scale)]).view(1 + count, *[1] * len(left), count)
-    states, noise = state.expand(1 + count, *state.shape), _parted(units * reach, kinds)
+    states, noise = state.expand(1 + count, *state.shape), parted(units * reach, kinds)
     rows = _through(program, states, _parts(program, *given), noise)
-    still, *pushed = _mean([_joined(seen.values, kinds, (1 + count, *left)) for _, seen in rows])
+    still, *pushed = _mean([joined(seen.values, kinds, (1 + count, *left)) for _, seen in rows])
     change = torch.stack([one[..., index] - still[..., index] for index, one in enumerate(pushed)], -1) / reach
-    locs, scales = _parted(still, kinds), _parted(torch.maximum(change, MIN_SHARE_OF_SD * scale), kinds)
+    locs, scales = parted(still, kinds), parted(torch.maximum(change, MIN_SHARE_OF_SD * scale), kinds)
     return {site: with_moments(fn, locs[site], scales[site]) for site, fn in kinds.items()}
 
 
@@ -270,13 +270,13 @@ def _mean(values: Sequence[Tensor]) -> Tensor:
     return sum(values[1:], values[0]) / len(values)
 
 
-def _joined(values: Mapping[str, Tensor], kinds: Mapping[str, Any], left: Sequence[int]) -> Tensor:
-    """The sites' values side by side, `(*left, C)`."""
+def joined(values: Mapping[str, Tensor], kinds: Mapping[str, Any], left: Sequence[int]) -> Tensor:
+    """Return the sites' values side by side, `(*left, C)`."""
     parts = [as_vector(value, kinds[site].event_dim) for site, value in values.items()]
     return torch.cat([part.expand(*left, part.shape[-1]) for part in parts], -1)
 
 
-def _parted(values: Tensor, kinds: Mapping[str, Any]) -> dict[str, Tensor]:
-    """What `_joined` puts side by side, by site."""
+def parted(values: Tensor, kinds: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Return what `joined` puts side by side, by site."""
     parts = values.split([fn.event_shape.numel() for fn in kinds.values()], -1)
     return {site: as_event(part, fn.event_dim) for (site, fn), part in zip(kinds.items(), parts, strict=True)}

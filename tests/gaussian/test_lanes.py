@@ -10,9 +10,8 @@ from examples import drives, example
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.gaussian.information_filter import look_ahead
+from steady_ppl.gaussian.information_filter import look_ahead, posterior_moments
 from steady_ppl.gaussian.linearize import ReferencePath, linearize
-from steady_ppl.gaussian.moments import posterior_moments
 from steady_ppl.model.program import Program
 
 

@@ -18,8 +18,8 @@ from pyro.nn import PyroModule, PyroParam
 from torch import Tensor, nn
 
 from steady_ppl.kernels import jit, rows as rows_by_kernels
+from steady_ppl.kernels.lowering import Tape
 from steady_ppl.kernels.rows import Slopes, in_plain_torch, on_all_rows, slopes_on_all_rows, without_kernels
-from steady_ppl.kernels.tape import Tape
 
 STATES = torch.linspace(-2.0, 2.0, 90).view(10, 3, 3)
 Lines = Callable[[Any, Tensor], Tensor]
