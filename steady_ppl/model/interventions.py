@@ -7,6 +7,7 @@ with pushed(self, {"forward": -c * velocity}):
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import pyro.distributions as dist
@@ -29,9 +30,8 @@ from steady_ppl.model.handlers import (
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import row_ends
 
-Change = Callable[[Any, slice], Any]
 
-
+@dataclass(eq=False)
 class Altering(ByColumn):
     """Replace the distribution of each site that a method of a program samples.
 
@@ -39,9 +39,7 @@ class Altering(ByColumn):
         change: (distribution, which columns of the channels or measurements it has) → distribution.
     """
 
-    def __init__(self, change: Change) -> None:
-        super().__init__()
-        self.change = change
+    change: Callable[[Any, slice], Any]
 
     def _pyro_sample(self, message: Any) -> None:
         message["fn"] = self.change(message["fn"], self.take(message["fn"]))
