@@ -29,15 +29,13 @@ WIDTH = 120  # characters of a line
 
 
 def write_program(program: Program, path: str | Path, *, force: bool = False) -> list[str]:
-    """Write a program with the effects that were added to it (`program.with_effect(…)`) beside the file of its own.
+    """Write a program with the effects that were added to it (`program.with_effect(…)`) beside the file of its own, and
+    return what could not be carried over, a sentence each.
 
     Args:
         program: its parameters are carried over as starting values.
         path: the file, after which the class is named: `hovercraft_with_drag.py` holds `HovercraftWithDrag`.
         force: overwrite a file.
-
-    Returns:
-        What could not be carried over, a sentence each.
 
     Raises:
         UsageError: nothing was added, an effect cannot be named, or the file cannot be written there.
@@ -85,11 +83,7 @@ def _docstring(program: Program, base: type[Program], listed: str) -> list[str]:
 
 
 def _named(program: Program, variant: Variant) -> str:
-    """An effect with its coefficient, as a class lists it.
-
-    Raises:
-        UsageError: the name does not say all that the effect depends on, or no file that is loaded registers it.
-    """
+    """An effect with its coefficient, as a class lists it; UsageError unless its text and the file say all of it."""
     if dict(chosen_variant(program, variant.written).options) != dict(variant.options):
         raise UsageError(f"effect {variant.name}: the name {variant.written} does not say all that it depends on")
     known = {"steady_ppl", *(one.__module__ for one in type(program).__mro__)}
@@ -124,12 +118,6 @@ def _numbers(value: Tensor) -> Any:
     return said(value.cpu().tolist())
 
 
-def _tensor(value: Tensor) -> str:
-    """`tensor(0.12)`."""
-    text = str(_numbers(value)).replace("'", "")
-    return f"tensor({text})".replace("inf", 'float("inf")')
-
-
 def _carried_over(program: Program, base: type[Program]) -> tuple[list[str], list[str]]:
     """Lines that set the parameters that are not as the file has them, and what is too much for a file."""
     with torch.random.fork_rng():
@@ -139,20 +127,19 @@ def _carried_over(program: Program, base: type[Program]) -> tuple[list[str], lis
         value = getattr(program, name).detach()
         if name in coefficients or (hasattr(fresh, name) and torch.equal(value, getattr(fresh, name).to(value))):
             continue
-        line = f"self.{name} = {_tensor(value)}"
+        text = str(_numbers(value)).replace("'", "").replace("inf", 'float("inf")')
+        line = f"self.{name} = tensor({text})"
         lines.append(line if len(line) <= WIDTH - 8 else f"{line}  # fmt: skip  # noqa: E501")
     if lines:
         lines.insert(0, "# where its own parameters begin; they are learned as before")
     before = fresh.state_dict()
     own = {f"{name}_unconstrained" for name in program._pyro_params}
-    weights = [
-        name
-        for name, value in program.state_dict().items()
-        if name not in own and not (name in before and torch.equal(value, before[name].to(value)))
-    ]
-    if weights:
-        modules = ", ".join(dict.fromkeys(name.partition(".")[0] for name in weights))
-        notes.append(f"not carried over, being too much for a program file: {modules}; fit them again")
+    modules: dict[str, None] = {}
+    for name, value in program.state_dict().items():
+        if name not in own and not (name in before and torch.equal(value, before[name].to(value))):
+            modules[name.partition(".")[0]] = None
+    if modules:
+        notes.append(f"not carried over, being too much for a program file: {', '.join(modules)}; fit them again")
     return lines, notes
 
 
