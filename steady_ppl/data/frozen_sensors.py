@@ -17,8 +17,6 @@ from steady_ppl.data.trajectories import Trajectories
 
 MIN_ROWS = 12  # rows of a stretch
 MAX_DEVIATION = 1e-6  # of the column's range over all drives, by which a row may be beside the line
-
-
 Run = tuple[int, int, int, str]  # drive, first and last row, column
 
 
@@ -41,11 +39,8 @@ class Stretch:
 
 
 def frozen_stretches(data: Trajectories) -> list[Stretch]:
-    """Stretches in which a measurement or a known state is on a line over time though it scatters elsewhere.
-
-    Known states are looked at because they were logged, too: where somebody's tracking lost the vehicle, whatever was
-    made of its poses is made up.
-    """
+    """Stretches in which a measurement or a known state, which was logged too, is on a line over time though it
+    scatters elsewhere."""
     runs: list[Run] = []
     moving: set[Run] = set()
     for column, values, there in _columns(data):

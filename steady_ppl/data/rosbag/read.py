@@ -2,8 +2,7 @@
 
 A bag has messages at any time; a table has one row every `step` seconds.
 
-- Rows lie on a grid from the first moment at which every control is known to the last measurement. Each trajectory's
-  time starts at zero.
+- Rows lie on a grid, in time from zero, from the first moment at which every control is known to the last measurement.
 - A control is held, or with `between = "interpolate"` on the line between two commands, angles the shorter way round;
   after the last command that one goes on.
 - A measurement is in the row that is nearest to it. It is never interpolated or held, which would make up data. Of
@@ -27,9 +26,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from steady_ppl.data.rosbag.fields import check_field, has_stamp, stamp_of, value_at
 from steady_ppl.data.rosbag.mapping import BagColumn, BagMapping
-from steady_ppl.data.rosbag.reader import Bag, Say, bag_name, open_bag
+from steady_ppl.data.rosbag.reader import Bag, Say, bag_name, check_field, has_stamp, open_bag, stamp_of, value_at
 from steady_ppl.data.rosbag.resample import Piece, Series, align, held_pauses, in_rows
 from steady_ppl.data.table import from_frame
 from steady_ppl.data.trajectories import Trajectories
@@ -39,15 +37,12 @@ from steady_ppl.utils.text import say as say_aside
 
 
 def read_bags(paths: Sequence[str | Path], mapping: BagMapping, say: Say = say_aside) -> Trajectories:
-    """Read ROS bags into trajectories.
+    """Read ROS bags into trajectories, in the order of the bags, float64, the columns in the order of the mapping.
 
     Args:
         paths: ROS 1 .bag files, ROS 2 folders, or single .mcap or .db3 files.
         mapping: which field becomes which column.
         say: is told what was left out and which clocks were moved; by default on stderr.
-
-    Returns:
-        In the order of the bags, float64, the columns in the order of the mapping.
 
     Raises:
         DataError: naming the bag and, where they apply, the column, the topic and the field.

@@ -22,6 +22,11 @@ STARTS = 500  # drawn, where nothing else says where a vehicle goes
 
 AXES: Need = (lambda program: program.axes, "the program does not say which channels move what (`motion`)")
 SPRINGS: Need = (lambda program: any(p for p, _ in program.motion.values()), "no channel has a position (`motion`)")
+BODY: Need = (
+    lambda program: {"forward", "lateral"} <= set(program.axes.get("translation", ())),
+    "it is no planar vehicle",
+)
+ONE_COMPONENT: Need = (lambda program: not BODY[0](program), "it has two components there")
 YAW: Need = (lambda program: "yaw" in program.axes, "there is no yaw channel")
 PLANAR: Need = (lambda program: isinstance(program, PlanarVehicle), "it acts on vehicles in the plane only")
 SLIP: Need = (lambda program: program.slips, "the program holds the lateral velocity at zero")
@@ -44,8 +49,12 @@ def _springs(program: Program, data: Trajectories | None) -> Choices:
     return _each({channel: (channel,) for channel, (position, _) in program.motion.items() if position})
 
 
-def _planar(program: Program) -> bool:
-    return {"forward", "lateral"} <= set(program.axes.get("translation", ()))
+def _drags(program: Program, data: Trajectories | None) -> Choices:
+    return [{"drag": drag} for drag in (0.06, 0.02, 0.2)]
+
+
+def _leads(program: Program, data: Trajectories | None) -> Choices:
+    return [{"lead": lead} for lead in (0.2, 0.0, 0.5)]
 
 
 def _limits(program: Program, data: Trajectories | None) -> Choices:
@@ -152,13 +161,7 @@ def yaw_bias(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -
     return dict.fromkeys(channels, c + torch.zeros_like(state[..., 0]))
 
 
-@_force(
-    "m/s²",
-    typical=0.05,
-    limit=0.5,
-    choices=_axes,
-    lacks=needs((lambda program: not _planar(program), "it has two components there"), AXES),
-)
+@_force("m/s²", typical=0.05, limit=0.5, choices=_axes, lacks=needs(ONE_COMPONENT, AXES))
 def acceleration_bias(self: Any, *given: Tensor, c: Tensor, channels: Names) -> Pushes:
     """a = c in the body frame
 
@@ -170,12 +173,7 @@ def acceleration_bias(self: Any, *given: Tensor, c: Tensor, channels: Names) -> 
 
 
 @_force(
-    "m/s²",
-    name="acceleration_bias",
-    typical=(0.05, 0.0),
-    limit=0.5,
-    components=("forward", "lateral"),
-    lacks=needs((_planar, "it is no planar vehicle")),
+    "m/s²", name="acceleration_bias", typical=(0.05, 0), limit=0.5, components=("forward", "lateral"), lacks=needs(BODY)
 )
 def planar_acceleration_bias(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""(a_forward, a_lateral) = (c₁, c₂)
@@ -225,14 +223,7 @@ def slope(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     return {"forward": cos * x + sin * y, "lateral": cos * y - sin * x}
 
 
-@_where_it_slips(
-    "m/s",
-    typical=(1.0, 0.5),
-    limit=10.0,
-    components=("x", "y"),
-    profiled=("drag",),
-    choices=lambda program, data: [{"drag": drag} for drag in (0.06, 0.02, 0.2)],
-)
+@_where_it_slips("m/s", typical=(1.0, 0.5), limit=10.0, components=("x", "y"), profiled=("drag",), choices=_drags)
 def wind(self: Any, state: Tensor, *_: Tensor, c: Tensor, drag: Any) -> Pushes:
     r"""a = -k (v-w)|v-w| + k v|v| per axis, w the world-frame wind (c₁, c₂) in the body frame
 
@@ -299,14 +290,7 @@ def lever_arm(self: Any, state: Tensor, *_: Tensor, c: Tensor, mean: Means) -> P
     return {"forward": c * yaw_rate**2, "lateral": -c * mean["yaw"]}
 
 
-@_where_it_slips(
-    "1/s",
-    typical=0.2,
-    limit=5.0,
-    sign=1,
-    profiled=("lead",),
-    choices=lambda program, data: [{"lead": lead} for lead in (0.2, 0.0, 0.5)],
-)
+@_where_it_slips("1/s", typical=0.2, limit=5.0, sign=1, profiled=("lead",), choices=_leads)
 def side_slip(self: Any, state: Tensor, *_: Tensor, c: Tensor, lead: Any) -> Pushes:
     r"""a_lateral = -c (v_y - k ω)
 

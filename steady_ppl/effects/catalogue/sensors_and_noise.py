@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
@@ -41,15 +42,11 @@ def _each(program: Program, data: Trajectories | None) -> Choices:
 
 
 def _each_of_its_size(program: Program, data: Trajectories | None) -> Choices:
-    return [{**choice, "scale": _spread(data, choice["component"])} for choice in _each(program, data)]
-
-
-def _spread(data: Trajectories | None, component: int) -> float:
-    """Of a measurement, over all drives."""
-    if data is None:
-        return 1.0
-    values = data.measurements[..., component][data.observed[..., component]].double()
-    return power_of_two_below(float(values.std()) if len(values) > 1 else 0.0)
+    choices = []
+    for index, choice in enumerate(_each(program, data)):
+        seen = torch.empty(0) if data is None else data.measurements[..., index][data.observed[..., index]].double()
+        choices.append({**choice, "scale": power_of_two_below(float(seen.std()) if len(seen) > 1 else 0.0)})
+    return choices
 
 
 def _groups(program: Program, data: Trajectories | None) -> Choices:

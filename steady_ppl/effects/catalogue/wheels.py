@@ -9,8 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.catalogue.forces import PLANAR
-from steady_ppl.effects.declaration import Effect, Means, Names, Need, Pushes, declare, needs
+from steady_ppl.effects.declaration import Choices, Effect, Means, Names, Need, Pushes, declare, needs
+from steady_ppl.model.program import Program
 
 COMMANDED: Need = (
     lambda program: {"speed", "turn"} <= set(program.control_names),
@@ -18,21 +20,19 @@ COMMANDED: Need = (
 )
 GRIP: Need = (lambda program: not program.slips, "the lateral velocity is free")
 
+
+def _each_channel(program: Program, data: Trajectories | None) -> Choices:
+    return [{"channels": (name,), "at": name} for name in program.channel_names]
+
+
 WHEELS: list[Effect] = []
-_force = partial(declare, WHEELS, "push")
 _on_command = partial(declare, WHEELS, "command", lacks=needs(COMMANDED, PLANAR))
-_on_lateral_velocity = partial(_force, lacks=needs(PLANAR, GRIP))
+_on_lateral_velocity = partial(declare, WHEELS, "push", lacks=needs(PLANAR, GRIP))
+_on_wheels = partial(declare, WHEELS, "push", lacks=needs(COMMANDED, PLANAR, GRIP))
 
 
-@_force(
-    "s",
-    typical=0.2,
-    limit=2.0,
-    sign=1,
-    between=(0.0, math.inf),
-    probes=(0.05, 0.15, 0.4),
-    choices=lambda program, data: [{"channels": (name,), "at": name} for name in program.channel_names],
-    lacks=needs(COMMANDED, PLANAR, GRIP),
+@_on_wheels(
+    "s", typical=0.2, limit=2.0, sign=1, between=(0.0, math.inf), probes=(0.05, 0.15, 0.4), choices=_each_channel
 )
 def response_time(
     self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, channels: Names, mean: Means
@@ -135,7 +135,7 @@ def slip_angle(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Te
     return {"lateral": -c * (forward * yaw_rate / self.settles_in(step) + change)}
 
 
-@_force("1/m", typical=0.5, limit=5.0, lacks=needs(COMMANDED, PLANAR, GRIP))
+@_on_wheels("1/m", typical=0.5, limit=5.0)
 def caster(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""a_yaw = -c v_x ω
 
