@@ -1,5 +1,4 @@
-"""Stretches of a drive in which what was logged did not move or moved along a ruler: a sensor that hung, or a gap that
-somebody filled by interpolation.
+"""Stretches of a drive in which what was logged stood still or lay on a line: a sensor hung, or a gap was interpolated.
 
 A real sensor scatters: no twelve rows of it lie on a line to one part in a million of what it sees on all drives. A
 known state that keeps its value is left alone: the vehicle may have stood still.
@@ -66,11 +65,8 @@ def _beside(run: Run, moving: set[Run]) -> bool:
 
 
 def masked(data: Trajectories, stretches: list[Stretch]) -> Trajectories:
-    """The drives without what nobody measured.
-
-    Where a measurement hung, it alone is left out. Where the known states are made up, so may be everything that was
-    logged with them: all measurements are left out, and the states, but for a first row's, are forgotten.
-    """
+    """The drives without what nobody measured: a measurement that hung and, where known states are made up, everything
+    that was logged with them but a first row's states."""
     observed = data.observed.clone()
     states = None if data.states is None else data.states.clone()
     for stretch in stretches:

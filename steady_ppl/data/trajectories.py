@@ -189,10 +189,7 @@ class Trajectories(Displayed):
         return replace(self._each(cast), time=time, lengths=cast(self.lengths))
 
     def select(self, controls: Sequence[str], measurements: Sequence[str], states: Sequence[str]) -> Trajectories:
-        """The named columns in the named order; unknown state components become NaN.
-
-        DataError where the table lacks a control or a measurement names what is missing and what is there.
-        """
+        """The named columns in order, unknown states NaN; DataError names missing controls or measurements."""
         columns = (("u", controls, self.control_names), ("y", measurements, self.measurement_names))
         said, missing = [], list[str]()
         for prefix, wanted, have in columns:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 import os
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,13 +54,17 @@ def write_program(program: Program, path: str | Path, *, force: bool = False) ->
 
 
 def _program_text(program: Program, class_name: str, base: type[Program], module: str, values: Sequence[str]) -> str:
-    listed = _listed(variant.name for variant in added(program))
+    *most, last = (variant.name for variant in added(program))
+    listed = f"{', '.join(most)} and {last}" if most else last
     title = f'"""{base.__name__} with {listed}, as `steady add` wrote it."""'
     lines = [title if len(title) <= WIDTH else f'"""{base.__name__} with effects, as `steady add` wrote it."""', ""]
     lines += ["from torch import tensor", ""] if any("tensor(" in line for line in values) else []
     lines += [f"from .{module} import {base.__name__}", "", "", f"class {class_name}({base.__name__}):"]
     lines += [f"    {line}" if line else "" for line in _docstring(program, base, listed)]
-    lines += ["", *_tuple("effects", [_named(program, variant) for variant in added(program)])]
+    quoted = [f'"{_named(program, variant)}"' for variant in added(program)]
+    line = f"    effects = ({', '.join(quoted)}{',' if len(quoted) == 1 else ''})"
+    long = ["    effects = (", *(f"        {one}," for one in quoted), "    )"]
+    lines += ["", *([line] if len(line) <= WIDTH else long)]
     if program.substeps != base.substeps:
         lines.append(f"    substeps = {program.substeps}")
     if values:
@@ -95,17 +99,6 @@ def _named(program: Program, variant: Variant) -> str:
         )
     numbers = _numbers(coefficient(program, variant).detach())
     return f"{variant.written}={','.join(numbers if isinstance(numbers, list) else [numbers])}"
-
-
-def _tuple(name: str, entries: Sequence[str]) -> list[str]:
-    quoted = [f'"{entry}"' for entry in entries]
-    line = f"    {name} = ({', '.join(quoted)}{',' if len(quoted) == 1 else ''})"
-    return [line] if len(line) <= WIDTH else [f"    {name} = (", *(f"        {one}," for one in quoted), "    )"]
-
-
-def _listed(found: Iterable[str]) -> str:
-    *most, last = found
-    return f"{', '.join(most)} and {last}" if most else last
 
 
 def _numbers(value: Tensor) -> Any:

@@ -79,7 +79,8 @@ def parsed(text: str) -> tuple[str, str, dict[str, float], tuple[float, ...] | N
     *middle, last = parts
     pieces = last.split("=")
     value: tuple[float, ...] | None = None
-    if len(pieces) == 3 or (len(pieces) == 2 and not _is_option(head, pieces[0])):
+    is_option = any(pieces[0] in effect.profiled for effect in _EFFECTS if effect.name == head)
+    if len(pieces) == 3 or (len(pieces) == 2 and not is_option):
         value = _numbers(text, pieces.pop())
     at, options = "", {}
     for part in [*middle, "=".join(pieces)]:
@@ -120,10 +121,6 @@ def chosen_variant(program: Program, effect: str | Effect, at: str = "", **optio
     raise UsageError(
         f"effect {effect.name} has no place {at!r}: " + (f"it can be at {places}" if places else "there is one only")
     )
-
-
-def _is_option(name: str, option: str) -> bool:
-    return any(option in effect.profiled for effect in _EFFECTS if effect.name == name)
 
 
 def _numbers(text: str, numbers: str, most: int | None = None) -> tuple[float, ...]:

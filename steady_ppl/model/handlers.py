@@ -41,17 +41,11 @@ class ByColumn(Messenger):
 
 @dataclass(eq=False)
 class Observing(ByColumn):
-    """Condition the sites of `observe` on measurements and temper them. A missing cell contributes nothing.
+    """Condition the sites of `observe` on measurements and temper them. A missing cell contributes nothing."""
 
-    Args:
-        measurements: `(..., K)`, finite also where missing.
-        observed: `(..., K)` bool.
-        weight: multiplies the observations' log-density (w_obs in STEADY), `(...)` where it is a tensor.
-    """
-
-    measurements: Tensor
-    observed: Tensor
-    weight: float | Tensor = 1.0
+    measurements: Tensor  # (..., K), finite also where missing
+    observed: Tensor  # (..., K) bool
+    weight: float | Tensor = 1.0  # of the observations' log-density (w_obs in STEADY), (...) where it is a tensor
 
     def __exit__(self, *exception: Any) -> None:
         super().__exit__(*exception)
@@ -223,10 +217,8 @@ def residual(fn: Any, value: Tensor) -> Tensor:
 
 
 def normal_moments(fn: Any, site: str) -> tuple[Tensor, Tensor]:
-    """Return mean and standard deviation of a site with independent normal components, each `(...)` or `(..., C)`.
-
-    Any other distribution is a ProgramError.
-    """
+    """Return mean and standard deviation, `(...)` or `(..., C)`, of a site with independent normal components, or raise
+    ProgramError."""
     base = unwrapped(fn)
     if not isinstance(base, dist.Normal) or fn.event_dim > 1:
         raise ProgramError(

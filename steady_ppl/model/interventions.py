@@ -33,24 +33,16 @@ from steady_ppl.model.substeps import row_ends
 
 @dataclass(eq=False)
 class Altering(ByColumn):
-    """Replace the distribution of each site that a method of a program samples.
+    """Replace the distribution of each site that a method of a program samples."""
 
-    Args:
-        change: (distribution, which columns of the channels or measurements it has) → distribution.
-    """
-
-    change: Callable[[Any, slice], Any]
+    change: Callable[[Any, slice], Any]  # of a distribution and the columns of the channels or measurements that it has
 
     def _pyro_sample(self, message: Any) -> None:
         message["fn"] = self.change(message["fn"], self.take(message["fn"]))
 
 
 def pushed(program: Program, pushes: Mapping[str, Tensor]) -> Altering:
-    """Add to the means of a program's channels while its `transition` runs.
-
-    Args:
-        pushes: channel → what is added, `(...)`, in the channel's unit.
-    """
+    """Add to the means of a program's channels while its `transition` runs: channel → `(...)` in the channel's unit."""
     return _by_channel(program, pushes, 0.0, lambda fn, push: _moved(fn, lambda loc: loc + push))
 
 
@@ -72,11 +64,7 @@ def _by_channel(
 
 
 def misread(program: Program, change: Callable[[Tensor], Tensor]) -> Altering:
-    """Change what is measured on average while a program's `observe` runs.
-
-    Args:
-        change: of the mean measurement, `(..., K)`, on the circle where the measurement is an angle.
-    """
+    """Change the mean measurement, `(..., K)` and angles on the circle, while a program's `observe` runs."""
 
     def at_site(fn: Any, columns: slice) -> Any:
         def moved(loc: Tensor) -> Tensor:

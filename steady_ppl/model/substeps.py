@@ -5,10 +5,9 @@ the others reuse its standardised noise, so that a row still has one latent draw
 code act in every substep. K = 1 is the program itself.
 
 A row's channel is what it is on average over the substeps. Its site has the mean of a row without noise. Its standard
-deviation is what one of its own noise, held over the row, changes of that mean: a program that takes noise back leaves
-less of it at the end of a row. A slope in a parameter is then that of a row's average. What is left out is when in the
-row the noise came, and what it does to other channels. Noise that is taken back to less than a tenth, or turned round,
-counts as a tenth.
+deviation is what one of its own noise, held over the row, changes of that mean, a tenth at least: a program that takes
+noise back leaves less of it. A slope in a parameter is then that of a row's average. What is left out is when in the
+row the noise came, and what it does to other channels.
 """
 
 from __future__ import annotations
@@ -61,16 +60,13 @@ def row_ends() -> bool:
 
 
 def advance(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-    """Move on by one row; handlers meet the channels' sites of the first substep.
+    """Return the state `(..., D)` after a row; handlers meet the channels' sites of the first substep.
 
     Args:
         state: `(..., D)`.
         control: `(..., U)`, held over the row, or `(..., K U)` as `acting_controls` gives them.
         time: `(...)` s since the trajectory's first row.
         step: `(...)` s, of the row.
-
-    Returns:
-        The next state, `(..., D)`.
 
     Raises:
         ProgramError: with more than one substep, a channel's noise has no location and scale.

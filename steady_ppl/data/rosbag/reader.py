@@ -91,8 +91,7 @@ class Bag:
 def open_bag(path: Path, messages: Sequence[Path] = ()) -> Iterator[Bag]:
     """Open a ROS 1 .bag, a ROS 2 folder, or a single .mcap or .db3 file; DataError for no bag or a damaged one.
 
-    Args:
-        messages: .msg files of types that the bag does not define; UsageError where one is missing or wrong.
+    `messages` are .msg files of types that the bag does not define; UsageError where one is missing or wrong.
     """
     name = bag_name(path)
     own = _definitions(messages)
@@ -277,7 +276,19 @@ def listing(bags: Sequence[Bag]) -> str:
     from, whose sections are comments."""
     sections: dict[tuple[str, str], list[str]] = {}
     lines = [line for bag in bags for line in _of_bag(bag, sections)]
-    return "\n".join(lines + _skeleton(sections))
+    lines += [
+        "",
+        "# A mapping to start from: take the sections that you need out of the comments and name their columns u.NAME",
+        "# (a control), y.NAME (a measurement) or x.NAME (a state that is known).",
+        "step = 0.1  # s between two rows",
+    ]
+    taken: list[str] = []
+    for (topic, field), said in sections.items():
+        name = re.sub(r"\W+", "_", f"{topic}_{field}").strip("_")
+        again = taken.count(name)  # /a/b with c, and /a with b.c
+        taken.append(name)
+        lines += ["#", f'# [columns."y.{name}{f"_{again + 1}" if again else ""}"]', *said]
+    return "\n".join(lines)
 
 
 def _of_bag(bag: Bag, sections: dict[tuple[str, str], list[str]]) -> list[str]:
@@ -317,19 +328,3 @@ def _section(topic: str, fields: list[str], stamped: bool) -> dict[tuple[str, st
     if stamped:
         lines.append('# clock = "aligned"  # its header says when it was made; leave out for the time of arrival')
     return {(topic, field): lines}
-
-
-def _skeleton(sections: dict[tuple[str, str], list[str]]) -> list[str]:
-    lines = [
-        "",
-        "# A mapping to start from: take the sections that you need out of the comments and name their columns u.NAME",
-        "# (a control), y.NAME (a measurement) or x.NAME (a state that is known).",
-        "step = 0.1  # s between two rows",
-    ]
-    taken: list[str] = []
-    for (topic, field), said in sections.items():
-        name = re.sub(r"\W+", "_", f"{topic}_{field}").strip("_")
-        again = taken.count(name)  # /a/b with c, and /a with b.c
-        taken.append(name)
-        lines += ["#", f'# [columns."y.{name}{f"_{again + 1}" if again else ""}"]', *said]
-    return lines
