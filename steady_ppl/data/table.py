@@ -109,7 +109,7 @@ def from_frame(frame: pd.DataFrame, name: str = "table") -> Trajectories:
     every, none = np.ones_like(inner), np.zeros_like(inner)
 
     def numbers(column: str, required: np.ndarray) -> np.ndarray:
-        values, bad = _parse(frame[column])
+        values, bad = parse_cells(frame[column])
         bad = bad | np.isinf(values) | (np.isnan(values) & required)
         if bad.any():
             row = int(bad.argmax())
@@ -187,7 +187,7 @@ def _trajectories(cells: pd.Series, name: str) -> tuple[np.ndarray, np.ndarray]:
     return labels, lengths
 
 
-def _parse(cells: pd.Series) -> tuple[np.ndarray, np.ndarray]:
+def parse_cells(cells: pd.Series) -> tuple[np.ndarray, np.ndarray]:
     """The cells as float64, NaN where empty, and where they are not numbers."""
     bad = np.zeros(len(cells), dtype=bool)
     if pd.api.types.is_float_dtype(cells.dtype) or pd.api.types.is_integer_dtype(cells.dtype):

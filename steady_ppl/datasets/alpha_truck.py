@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from steady_ppl.data.table import cell_text, fail
+from steady_ppl.data.table import cell_text, fail, parse_cells
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.model.planar_vehicle import bearings_to
@@ -138,11 +138,8 @@ def _read_log(path: Path, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarra
     for column in (*STAMP, *columns):
         if column not in log.columns:
             raise DataError(f"{where}: column {column} is missing", column=column)
-        cells = log[column]
-        if cells.dtype == object and any(isinstance(cell, int) for cell in cells):  # whole numbers beyond 64 bits
-            cells = cells.astype(str)
-        numbers = pd.to_numeric(cells, errors="coerce")
-        bad = ~np.isfinite(numbers.to_numpy(dtype=np.float64))
+        numbers, bad = parse_cells(log[column])
+        bad |= ~np.isfinite(numbers)
         if bad.any():
             row = int(bad.argmax())
             problem = f"got {cell_text(log[column].iloc[row])}, expected a finite number"

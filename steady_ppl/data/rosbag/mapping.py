@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -12,12 +11,14 @@ from typing import Any
 
 from steady_ppl.errors import UsageError, labelled
 from steady_ppl.utils.files import require_file
+from steady_ppl.utils.schema import NUMBER, TEXT, mismatch
 
 CHOICES = {
     "between": (None, "hold", "interpolate"),
     "reading": (None, "yaw", "angle"),
     "clock": ("bag", "header", "aligned"),
 }
+FORM = {"topic": TEXT, "field": TEXT, "longest": (NUMBER, None), "late": NUMBER, "scale": NUMBER, "offset": NUMBER}
 MAX_LATE = 1e9  # s; times are whole nanoseconds in 64 bits
 SPELLING = re.compile(r"[A-Za-z_]\w*(\[\d+\])*(\.[A-Za-z_]\w*(\[\d+\])*)*", re.ASCII)  # twist.linear.x, ranges[0]
 Steps = tuple[str | int, ...]  # the names and indices that lead to a field
@@ -59,19 +60,14 @@ class BagColumn:
     def _check(self) -> None:
         if self.name[:2] not in ("u.", "y.", "x.") or len(self.name) < 3:
             raise UsageError("expected u.NAME (a control), y.NAME (a measurement) or x.NAME (a known state)")
-        for key in ("topic", "field"):
-            value = getattr(self, key)
-            if not isinstance(value, str) or not value:
-                raise UsageError(f"{key} is {value!r}, expected text")
+        problem = mismatch(vars(self), FORM)
+        if problem or not self.topic:
+            raise UsageError(problem or "topic is '', expected text")
         for key, choices in CHOICES.items():
             value = getattr(self, key)
             if value not in choices:
                 known = " or ".join(f'"{choice}"' for choice in choices if choice)
                 raise UsageError(f"{'as' if key == 'reading' else key} is {value!r}, expected {known}")
-        for key in ("longest", "late", "scale", "offset"):
-            value = getattr(self, key)
-            if not _is_number(value) and not (key == "longest" and value is None):
-                raise UsageError(f"{key} is {value!r}, expected a finite number")
         if self.kind != "u" and (self.between is not None or self.longest is not None):
             key = "between" if self.between is not None else "longest"
             raise UsageError(f"{key} is for controls (u.); measurements and states are not held: leave it out")
@@ -114,7 +110,7 @@ class BagMapping:
     messages: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
-        if not _is_number(self.step) or self.step <= 0:
+        if mismatch(self.step, NUMBER) or self.step <= 0:
             raise UsageError(f"step is {self.step!r}, expected the seconds between two rows, more than 0")
         names = [column.name for column in self.columns]
         for i, column in enumerate(self.columns):
@@ -199,7 +195,3 @@ def _known(said: Mapping[str, Any], keys: Sequence[str], where: str) -> None:
     for key in said:
         if key not in keys:
             raise UsageError(f"{where}unknown key {key}; there are {', '.join(keys)}")
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

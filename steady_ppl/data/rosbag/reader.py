@@ -211,12 +211,14 @@ def undefined_type(store: Any, type_name: str, seen: set[str] | None = None) -> 
     return None
 
 
-def value_at(message: Any, steps: Steps, *, yaw: bool = False) -> float:
-    """The number that a message has in a field, or the heading of a quaternion; IndexError in too short an array.
+def value_at(message: Any, steps: Steps, *, yaw: bool = False) -> float | None:
+    """The number that a message has in a field, or the heading of a quaternion; None in too short an array.
 
     The heading, −π to π rad, is the rotation about z that comes last in z-y-x angles; NaN for a quaternion of zeros.
     """
     for step in steps:
+        if isinstance(step, int) and step >= len(message):
+            return None
         message = message[step] if isinstance(step, int) else getattr(message, step)
     if not yaw:
         return float(message)
