@@ -257,11 +257,12 @@ def as_event(values: Tensor, event_dim: int) -> Tensor:
     return values if event_dim else values.squeeze(-1)
 
 
-def with_moments(fn: Any, loc: Tensor, scale: Tensor) -> Any:
-    """A distribution of the kind of another one, with another location and scale."""
+def with_moments(fn: Any, loc: Tensor | None = None, scale: Tensor | None = None) -> Any:
+    """A distribution of the kind of another one, with another location or scale."""
     base = unwrapped(fn)
     freedom = (base.df,) if isinstance(base, dist.StudentT) else ()
-    return type(base)(*freedom, loc, scale).to_event(fn.event_dim)
+    moments = (base.loc if loc is None else loc, base.scale if scale is None else scale)
+    return type(base)(*freedom, *moments).to_event(fn.event_dim)
 
 
 def broadcast_event(value: Tensor, left: torch.Size, event_dim: int) -> Tensor:
