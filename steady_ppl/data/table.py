@@ -111,8 +111,7 @@ def from_frame(frame: pd.DataFrame, name: str = "table") -> Trajectories:
     def numbers(column: str, required: np.ndarray) -> np.ndarray:
         values, bad = parse_cells(frame[column])
         bad = bad | np.isinf(values) | (np.isnan(values) & required)
-        if bad.any():
-            row = int(bad.argmax())
+        for row in np.flatnonzero(bad)[:1].tolist():
             wanted = "a finite number" if required[row] else "a finite number or an empty cell"
             problem = f"got {cell_text(frame[column].iloc[row])}, expected {wanted}"
             fail(name, problem, column=column, trajectory=row_labels[row], row=row + 1)
@@ -125,8 +124,7 @@ def from_frame(frame: pd.DataFrame, name: str = "table") -> Trajectories:
     time = numbers("time", every)
     back = np.append(False, np.diff(time) <= 0)
     back[ends[:-1]] = False
-    if back.any():
-        row = int(back.argmax())
+    for row in np.flatnonzero(back)[:1].tolist():
         problem = f"time must strictly increase, got {time[row]} after {time[row - 1]}"
         fail(name, problem, column="time", trajectory=row_labels[row], row=row + 1)
     acting, measured, truth = split(controls, inner), split(measurements, none), split(states, none)
@@ -181,8 +179,7 @@ def _trajectories(cells: pd.Series, name: str) -> tuple[np.ndarray, np.ndarray]:
         (again, "this trajectory goes on after another one; keep its rows together"),
         (lengths < 2, "a trajectory needs at least two rows, got one"),
     ):
-        if bad.any():
-            i = int(bad.argmax())
+        for i in np.flatnonzero(bad)[:1].tolist():
             fail(name, problem, column="trajectory", trajectory=labels[i], row=int(starts[i]) + 1)
     return labels, lengths
 

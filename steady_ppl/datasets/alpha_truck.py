@@ -139,18 +139,14 @@ def _read_log(path: Path, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarra
         if column not in log.columns:
             raise DataError(f"{where}: column {column} is missing", column=column)
         numbers, bad = parse_cells(log[column])
-        bad |= ~np.isfinite(numbers)
-        if bad.any():
-            row = int(bad.argmax())
+        for row in np.flatnonzero(bad | ~np.isfinite(numbers))[:1].tolist():
             problem = f"got {cell_text(log[column].iloc[row])}, expected a finite number"
             fail(where, problem, column=column, row=row + 1)
         log[column] = numbers
     if len(log) == 0:
         raise DataError(f"{where}: the log has no rows")
     for column, most in zip(STAMP, (LATEST, 10**9), strict=True):
-        outside = ((log[column] < 0) | (log[column] >= most)).to_numpy()
-        if outside.any():
-            row = int(outside.argmax())
+        for row in np.flatnonzero((log[column] < 0) | (log[column] >= most))[:1].tolist():
             problem = f"got {log[column].iloc[row]:g}, expected a part of a time stamp, 0 to {most}"
             fail(where, problem, column=column, row=row + 1)
     stamps = log[STAMP[0]].to_numpy(np.int64) * 10**9 + log[STAMP[1]].to_numpy(np.int64)
