@@ -1,5 +1,4 @@
-"""Stretches of a drive in which what was logged did not move or moved along a ruler: a sensor that hung, or a gap that
-somebody filled by interpolation.
+"""Stretches of a drive in which what was logged stood still or lay on a line: a sensor hung, or a gap was interpolated.
 
 A real sensor scatters: no twelve rows of it lie on a line to one part in a million of what it sees on all drives. A
 known state that keeps its value is left alone: the vehicle may have stood still.
@@ -17,8 +16,6 @@ from steady_ppl.data.trajectories import Trajectories
 
 MIN_ROWS = 12  # rows of a stretch
 MAX_DEVIATION = 1e-6  # of the column's range over all drives, by which a row may be beside the line
-
-
 Run = tuple[int, int, int, str]  # drive, first and last row, column
 
 
@@ -41,11 +38,8 @@ class Stretch:
 
 
 def frozen_stretches(data: Trajectories) -> list[Stretch]:
-    """Stretches in which a measurement or a known state is on a line over time though it scatters elsewhere.
-
-    Known states are looked at because they were logged, too: where somebody's tracking lost the vehicle, whatever was
-    made of its poses is made up.
-    """
+    """Stretches in which a measurement or a known state, which was logged too, is on a line over time though it
+    scatters elsewhere."""
     runs: list[Run] = []
     moving: set[Run] = set()
     for column, values, there in _columns(data):
@@ -71,11 +65,8 @@ def _beside(run: Run, moving: set[Run]) -> bool:
 
 
 def masked(data: Trajectories, stretches: list[Stretch]) -> Trajectories:
-    """The drives without what nobody measured.
-
-    Where a measurement hung, it alone is left out. Where the known states are made up, so may be everything that was
-    logged with them: all measurements are left out, and the states, but for a first row's, are forgotten.
-    """
+    """The drives without what nobody measured: a measurement that hung and, where known states are made up, everything
+    that was logged with them but a first row's states."""
     observed = data.observed.clone()
     states = None if data.states is None else data.states.clone()
     for stretch in stretches:

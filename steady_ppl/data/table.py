@@ -33,10 +33,7 @@ MAX_ROWS = 20_000  # of a drive that is looked at as a whole
 
 
 def read_table(path: str | Path) -> Trajectories:
-    """Read a table from a `.csv` or `.parquet` file.
-
-    Returns:
-        The trajectories in order of first appearance, float64; `states` is None when no `x.` cell is filled.
+    """Read the trajectories of a `.csv` or `.parquet` file, float64; `states` is None when no `x.` cell is filled.
 
     Raises:
         DataError: naming the file and, where they apply, the column, the trajectory and the row.
@@ -57,10 +54,8 @@ def read_table(path: str | Path) -> Trajectories:
 def write_table(data: Trajectories, path: str | Path) -> None:
     """Write a table to a `.csv` or `.parquet` file; `read_table` gives the same numbers back, bit for bit in float64.
 
-    The file appears whole or not at all, and a table that `read_table` would refuse is not written.
-
-    Raises:
-        DataError: for another suffix, a missing folder, or data that makes no valid table.
+    The file appears whole or not at all. DataError for another suffix, a missing folder, or a table that `read_table`
+    would refuse.
     """
     path = Path(path)
     suffix = require_table_file(path)
@@ -77,15 +72,14 @@ def to_frame(data: Trajectories) -> pd.DataFrame:
     """The table as a pandas frame, trajectory after trajectory; missing cells are NaN.
 
     Raises:
-        DataError: where two trajectories have the same label, or a measurement that was made is NaN: as rows of a
-            table they would be one trajectory, or a missing measurement.
+        DataError: two trajectories have the same label, or a measurement that was made is NaN.
     """
     again = pd.Series(data.labels, dtype=object).duplicated()
     if again.any():
-        _fail("table", "two trajectories have this label", column="trajectory", trajectory=data.labels[again.argmax()])
+        fail("table", "two trajectories have this label", column="trajectory", trajectory=data.labels[again.argmax()])
     for t, b, k in (data.measurements.isnan() & data.observed & data.rows[..., None]).nonzero()[:1].tolist():
         row, column = int(data.lengths[:b].sum()) + t + 1, f"y.{data.measurement_names[k]}"
-        _fail("table", "a measurement is NaN", column=column, trajectory=data.labels[b], row=row)
+        fail("table", "a measurement is NaN", column=column, trajectory=data.labels[b], row=row)
     blocks = [data.time[..., None], data.controls, data.measurements.masked_fill(~data.observed, torch.nan)]
     names = ["time", *(f"u.{n}" for n in data.control_names), *(f"y.{n}" for n in data.measurement_names)]
     if data.states is not None:
@@ -115,15 +109,12 @@ def from_frame(frame: pd.DataFrame, name: str = "table") -> Trajectories:
     every, none = np.ones_like(inner), np.zeros_like(inner)
 
     def numbers(column: str, required: np.ndarray) -> np.ndarray:
-        values, bad = _parse(frame[column])
+        values, bad = parse_cells(frame[column])
         bad = bad | np.isinf(values) | (np.isnan(values) & required)
-        if bad.any():
-            row = int(bad.argmax())
-            cell = frame[column].iloc[row]
-            empty = not str(cell).strip() or (pd.api.types.is_scalar(cell) and pd.isna(cell))
-            came = "an empty cell" if empty else f"{str(cell)[:40]!r}"
+        for row in np.flatnonzero(bad)[:1].tolist():
             wanted = "a finite number" if required[row] else "a finite number or an empty cell"
-            _fail(name, f"got {came}, expected {wanted}", column=column, trajectory=row_labels[row], row=row + 1)
+            problem = f"got {cell_text(frame[column].iloc[row])}, expected {wanted}"
+            fail(name, problem, column=column, trajectory=row_labels[row], row=row + 1)
         return values
 
     def split(columns: list[str], required: np.ndarray) -> tuple[Tensor, ...]:
@@ -133,10 +124,9 @@ def from_frame(frame: pd.DataFrame, name: str = "table") -> Trajectories:
     time = numbers("time", every)
     back = np.append(False, np.diff(time) <= 0)
     back[ends[:-1]] = False
-    if back.any():
-        row = int(back.argmax())
+    for row in np.flatnonzero(back)[:1].tolist():
         problem = f"time must strictly increase, got {time[row]} after {time[row - 1]}"
-        _fail(name, problem, column="time", trajectory=row_labels[row], row=row + 1)
+        fail(name, problem, column="time", trajectory=row_labels[row], row=row + 1)
     acting, measured, truth = split(controls, inner), split(measurements, none), split(states, none)
     known = any(bool((~values.isnan()).any()) for values in truth)
     return Trajectories(
@@ -159,29 +149,29 @@ def _columns(frame: pd.DataFrame, name: str) -> tuple[list[str], list[str], list
     groups: dict[str, list[str]] = {"u.": [], "y.": [], "x.": []}
     for i, column in enumerate(columns):
         if column in columns[:i]:
-            _fail(name, "this column appears twice", column=column)
+            fail(name, "this column appears twice", column=column)
         if column in ("trajectory", "time"):
             continue
         if str(column)[:2] not in groups or len(column) < 3:
-            _fail(name, "unknown column, expected trajectory, time, u.…, y.… or x.…; is it misnamed?", column=column)
+            fail(name, "unknown column, expected trajectory, time, u.…, y.… or x.…; is it misnamed?", column=column)
         groups[column[:2]].append(column)
     for required in ("trajectory", "time"):
         if required not in columns:
-            _fail(name, "this column is missing", column=required)
+            fail(name, "this column is missing", column=required)
     if not groups["y."]:
-        _fail(name, "there is no measurement, expected at least one column y.…")
+        fail(name, "there is no measurement, expected at least one column y.…")
     return groups["u."], groups["y."], groups["x."]
 
 
 def _trajectories(cells: pd.Series, name: str) -> tuple[np.ndarray, np.ndarray]:
     """The labels in order of first appearance and the trajectories' numbers of rows."""
     if len(cells) == 0:
-        _fail(name, "the table has no rows")
+        fail(name, "the table has no rows")
     whole = pd.api.types.is_float_dtype(cells.dtype) and bool((cells.dropna() % 1 == 0).all())  # numbers with a gap
     labels = np.array([f"{cell:.0f}" if whole else str(cell) for cell in cells], dtype=object)
     empty = cells.isna().to_numpy() | np.array([not label.strip() for label in labels])
     if empty.any():
-        _fail(name, "got an empty cell, expected a label", column="trajectory", row=int(empty.argmax()) + 1)
+        fail(name, "got an empty cell, expected a label", column="trajectory", row=int(empty.argmax()) + 1)
     starts = np.flatnonzero(np.append(True, labels[1:] != labels[:-1]))
     lengths, labels = np.diff(starts, append=len(labels)), labels[starts]
     again = pd.Series(labels).duplicated().to_numpy()
@@ -189,13 +179,12 @@ def _trajectories(cells: pd.Series, name: str) -> tuple[np.ndarray, np.ndarray]:
         (again, "this trajectory goes on after another one; keep its rows together"),
         (lengths < 2, "a trajectory needs at least two rows, got one"),
     ):
-        if bad.any():
-            i = int(bad.argmax())
-            _fail(name, problem, column="trajectory", trajectory=labels[i], row=int(starts[i]) + 1)
+        for i in np.flatnonzero(bad)[:1].tolist():
+            fail(name, problem, column="trajectory", trajectory=labels[i], row=int(starts[i]) + 1)
     return labels, lengths
 
 
-def _parse(cells: pd.Series) -> tuple[np.ndarray, np.ndarray]:
+def parse_cells(cells: pd.Series) -> tuple[np.ndarray, np.ndarray]:
     """The cells as float64, NaN where empty, and where they are not numbers."""
     bad = np.zeros(len(cells), dtype=bool)
     if pd.api.types.is_float_dtype(cells.dtype) or pd.api.types.is_integer_dtype(cells.dtype):
@@ -216,14 +205,14 @@ def _read_csv(path: Path) -> pd.DataFrame:
     with path.open(newline="", encoding="utf-8-sig") as file:
         lines = [line for line in csv.reader(file, strict=True) if line]
     if not lines:
-        _fail(path.name, "the table is empty")
+        fail(path.name, "the table is empty")
     header, *rows = lines
     for sign, word in SEPARATORS.items():
         if sign in header[0]:
-            _fail(path.name, f"the columns are separated by {word}, expected commas, and numbers with a decimal point")
+            fail(path.name, f"the columns are separated by {word}, expected commas, and numbers with a decimal point")
     for i, row in enumerate(rows):
         if len(row) != len(header):
-            _fail(path.name, f"got {len(row)} cells, expected {len(header)} as in the header", row=i + 1)
+            fail(path.name, f"got {len(row)} cells, expected {len(header)} as in the header", row=i + 1)
     return pd.DataFrame(rows, columns=header, dtype=object)
 
 
@@ -251,7 +240,13 @@ def _suffix(path: Path) -> str:
     return suffix
 
 
-def _fail(
+def cell_text(cell: Any) -> str:
+    """What an error message says came in a cell."""
+    empty = not str(cell).strip() or (pd.api.types.is_scalar(cell) and pd.isna(cell))
+    return "an empty cell" if empty else f"{str(cell)[:40]!r}"
+
+
+def fail(
     name: str, problem: str, *, column: str | None = None, trajectory: str | None = None, row: int | None = None
 ) -> NoReturn:
     """Raise a DataError whose one line says where."""
@@ -315,14 +310,10 @@ def refuse_long(data: Trajectories) -> None:
 
 
 def cut(data: Trajectories, seconds: float) -> Trajectories:
-    """The same drives in pieces.
+    """Return the same drives in pieces of some seconds: one that is longer becomes `…-1`, `…-2`, …
 
-    A drive that is longer becomes `…-1`, `…-2`, … Each piece begins at its first row that has a measurement; pieces of
-    one row or without a measurement are left out. Time stays as recorded.
-
-    Args:
-        data: drives with labels.
-        seconds: of a piece.
+    Each piece begins at its first row that has a measurement; pieces of one row or without a measurement are left out.
+    Time stays as recorded.
 
     Raises:
         UsageError: no length of time.
@@ -330,7 +321,6 @@ def cut(data: Trajectories, seconds: float) -> Trajectories:
 
     Example:
         >>> import torch
-        >>> from steady_ppl import from_arrays
         >>> time = torch.arange(50) / 10
         >>> cut(from_arrays([{"time": time, "u.push": 0 * time, "y.range": time}]), 2.0).labels
         ('1-1', '1-2', '1-3')

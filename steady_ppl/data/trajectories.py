@@ -105,15 +105,10 @@ class Trajectories(Displayed):
 
     @property
     def known_start(self) -> Tensor:
-        """`(B, D)` the true first states.
-
-        Raises:
-            DataError: where the first row's states are not all known.
-        """
+        """`(B, D)` the true first states; DataError where they are not all known."""
         if self.states is None:
-            raise DataError(
-                "a known start needs the true states of every trajectory's first row: the table has no x. columns"
-            )
+            wanted = "the true states of every trajectory's first row"
+            raise DataError(f"a known start needs {wanted}: the table has no x. columns")
         for trajectory, component in (~torch.isfinite(self.states[0])).nonzero()[:1].tolist():
             column, label = f"x.{self.state_names[component]}", self.labels[trajectory]
             problem = f"a known start needs every trajectory's first state: {column} of trajectory {label} is empty"
@@ -143,10 +138,7 @@ class Trajectories(Displayed):
 
         Args:
             controls: `(H, U)` for all drives, or `(H, B, U)`; the first acts from each drive's last row on.
-            step: s between the new rows; the median step when None.
-
-        Raises:
-            DataError: other numbers of drives or controls than the table has, or no step forward in time.
+            step: s between the new rows; the median step when None. DataError where it leads nowhere.
         """
         step = self.median_step if step is None else step
         plan = torch.as_tensor(controls).to(self.controls)
@@ -197,11 +189,7 @@ class Trajectories(Displayed):
         return replace(self._each(cast), time=time, lengths=cast(self.lengths))
 
     def select(self, controls: Sequence[str], measurements: Sequence[str], states: Sequence[str]) -> Trajectories:
-        """The named columns in the named order; what a program reads. Unknown state components become NaN.
-
-        Raises:
-            DataError: the table lacks a control or a measurement; it names what is missing and what is there.
-        """
+        """The named columns in order, unknown states NaN; DataError names missing controls or measurements."""
         columns = (("u", controls, self.control_names), ("y", measurements, self.measurement_names))
         said, missing = [], list[str]()
         for prefix, wanted, have in columns:
@@ -245,14 +233,9 @@ def pad_time(times: Sequence[Tensor]) -> Tensor:
 
 
 def joined(**tables: Trajectories) -> Trajectories:
-    """The trajectories of several tables, one table after another; where two have the same label, every label gets the
-    name of its table before it.
+    """The trajectories of several tables by name, one after another; DataError where their columns differ.
 
-    Args:
-        tables: by name, with the same controls, measurements and states.
-
-    Raises:
-        DataError: their columns differ.
+    Where two trajectories have the same label, every label gets the name of its table before it.
     """
     parts = list(tables.values())
     for name, part in tables.items():

@@ -1,4 +1,1 @@
-"""Published logs as trajectories.
-
-Nothing here downloads; a reader is given a folder.
-"""
+"""Published logs as trajectories. Nothing here downloads; a reader is given a folder."""

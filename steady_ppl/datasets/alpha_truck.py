@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 import torch
 
+from steady_ppl.data.table import cell_text, fail, parse_cells
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.model.planar_vehicle import bearings_to
@@ -25,15 +26,10 @@ from steady_ppl.utils.angles import wrap
 from steady_ppl.utils.files import require_file
 from steady_ppl.utils.random import seeded
 
-LANDMARKS = ((-1.230314, -0.606814), (0.797073, 0.889471), (-3.496525, 0.207874), (0.0, 6.0))
-"""The landmarks of the published experiments, m."""
-
-FRAMES = 100
-"""Rows a trajectory, which spans a little more than 10 s."""
-
+LANDMARKS = ((-1.230314, -0.606814), (0.797073, 0.889471), (-3.496525, 0.207874), (0.0, 6.0))  # m, as published
+FRAMES = 100  # rows a trajectory, which spans a little more than 10 s
 LONGEST_HEADER = 1_000_000  # characters; the reader takes minutes for a line of ten million
 LATEST = 2**33  # s since 1970, whose nanoseconds fit into 64 bits
-
 STAMP = ("header.stamp.secs", "header.stamp.nsecs")
 POSE = ("pose.position.x", "pose.position.y", "pose.orientation.z", "pose.orientation.w")
 COMMAND = ("twist.linear.x", "twist.angular.z")
@@ -53,15 +49,13 @@ def read_alpha_truck(
     heading and both commands are interpolated linearly at 100 n evenly spaced times over the whole window; velocities
     are forward differences there, the last one repeated: those of half a row later, which suit an explicit Euler step.
     Centred ones, the displacement from half a row before to half a row after, are those of the row itself. Nothing is
-    filtered. Times are the messages' header stamps; a log whose stamps are out of order is sorted by them, equal stamps
-    staying in the order of the file.
+    filtered. Times are the messages' header stamps, by which a log is sorted.
 
     Args:
         folder: holds `vrpn-pose.csv` and `vesc_drive.csv`.
         sigma_degrees: standard deviation of the bearings, degrees; larger within 0.1 m of a landmark, see
             `bearings_to`.
-        seed: of the bearings' noise, drawn once; with the folder's name it keys the draw, so that the splits of one
-            seed share no noise. Torch's global random state is left alone.
+        seed: of the bearings' noise, drawn once; the folder's name makes it another for each split.
         landmarks: `(K, 2)` m.
         centred: take centred velocities.
 
@@ -71,9 +65,8 @@ def read_alpha_truck(
         yaw_rate (rad/s).
 
     Raises:
-        DataError: for a missing file or column, a cell that is not a finite number, or logs that overlap by less
-            than 10 s.
-        UsageError: for a sigma that is not positive.
+        DataError: a missing file or column, a cell that is no finite number, or logs that overlap by less than 10 s.
+        UsageError: a sigma that is not positive.
     """
     if not (sigma_degrees > 0 and math.isfinite(sigma_degrees)):
         raise UsageError(f"the bearings' standard deviation must be positive and finite, got {sigma_degrees} degrees")
@@ -121,7 +114,6 @@ def read_alpha_truck(
         observed=torch.ones_like(bearings, dtype=torch.bool),
         lengths=torch.full((count,), FRAMES),
         states=states,
-        labels=tuple(str(i + 1) for i in range(count)),
         control_names=("speed", "turn"),
         measurement_names=tuple(f"bearing_{i}" for i in range(len(landmarks))),
         state_names=("x", "y", "heading", "vx", "vy", "yaw_rate"),
@@ -146,26 +138,17 @@ def _read_log(path: Path, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarra
     for column in (*STAMP, *columns):
         if column not in log.columns:
             raise DataError(f"{where}: column {column} is missing", column=column)
-        cells = log[column]
-        if cells.dtype == object and any(isinstance(cell, int) for cell in cells):  # whole numbers beyond 64 bits
-            cells = cells.astype(str)
-        numbers = pd.to_numeric(cells, errors="coerce")
-        bad = ~np.isfinite(numbers.to_numpy(dtype=np.float64))
-        if bad.any():
-            row = int(bad.argmax())
-            cell = log[column].iloc[row]
-            came = "an empty cell" if pd.isna(cell) else f"{str(cell)[:40]!r}"
-            problem = f"{where}: column {column}, row {row + 1}: got {came}, expected a finite number"
-            raise DataError(problem, column=column, row=row + 1)
+        numbers, bad = parse_cells(log[column])
+        for row in np.flatnonzero(bad | ~np.isfinite(numbers))[:1].tolist():
+            problem = f"got {cell_text(log[column].iloc[row])}, expected a finite number"
+            fail(where, problem, column=column, row=row + 1)
         log[column] = numbers
     if len(log) == 0:
         raise DataError(f"{where}: the log has no rows")
     for column, most in zip(STAMP, (LATEST, 10**9), strict=True):
-        outside = ((log[column] < 0) | (log[column] >= most)).to_numpy()
-        if outside.any():
-            row = int(outside.argmax())
+        for row in np.flatnonzero((log[column] < 0) | (log[column] >= most))[:1].tolist():
             problem = f"got {log[column].iloc[row]:g}, expected a part of a time stamp, 0 to {most}"
-            raise DataError(f"{where}: column {column}, row {row + 1}: {problem}", column=column, row=row + 1)
+            fail(where, problem, column=column, row=row + 1)
     stamps = log[STAMP[0]].to_numpy(np.int64) * 10**9 + log[STAMP[1]].to_numpy(np.int64)
     order = stamps.argsort(kind="stable")
     return stamps[order], log[list(columns)].to_numpy(np.float64)[order]

@@ -1,7 +1,4 @@
-"""Physical effects that a program may lack: what they are, which apply, and how to add one.
-
-Nothing here knows of data beyond what an effect's choices need, or of how an effect is found.
-"""
+"""Physical effects that a program may lack: what they are, which apply, and how to add one."""
 
 from steady_ppl.effects.attach import (
     added,

@@ -29,10 +29,9 @@ _GROWN: WeakKeyDictionary[type[Program], WeakValueDictionary[Variant, type[Progr
 def with_effect(
     program: Program, effect: str | Effect | Variant, value: Value | None = None, **options: Any
 ) -> Program:
-    """A copy of a program with an effect, its coefficient a learnable parameter called `effect` or `effect_where`.
+    """Return a copy of a program with an effect, its coefficient a learnable parameter `effect` or `effect_where`.
 
     Args:
-        program: any program.
         effect: a catalogue name ("linear_drag", "gain_error:turn", "landmark_bias:2"), or one of your own.
         value: the coefficient; the effect's typical one when None.
         options: knees, widths, places (`knee=0.6`); the first of its choices when not given.
@@ -56,7 +55,8 @@ def attach(program: Program, variant: Variant, value: Value | None = None) -> Pr
     program.__class__ = _class_with(type(program), variant)
     with pyro.settings.context(module_local_params=True):
         setattr(program, name, PyroParam(start, _constraint(effect)))
-    program.priors = {**program.priors, name: prior(effect)}  # type: ignore[misc]
+    prior = effect.prior or dist.Cauchy(1.0 if effect.null == 1 else 0.0, effect.limit)  # as wide as is physical
+    program.priors = {**program.priors, name: prior}  # type: ignore[misc]
     rate = float(variant.typical.abs().max()) if effect.null == 0 else 1.0  # Adam's steps are of this size in any unit
     program.rates = {name: rate, **program.rates}  # type: ignore[misc]
     return program
@@ -95,19 +95,11 @@ def _constraint(effect: Effect) -> constraints.Constraint:
 
 
 def _start(variant: Variant, value: Value | None, like: Tensor) -> Tensor:
-    """A value of the coefficient that can be one."""
     effect, start = variant.effect, variant.coefficient(value, like.detach())
     if not bool((_constraint(effect).check(start) & (start.isfinite() | (start == effect.null))).all()):
         expected = "a positive number" if effect.null != 0 else "finite numbers"
         raise UsageError(f"effect {effect.name} takes {expected}, got {start.tolist()}")
     return start
-
-
-def prior(effect: Effect) -> Any:
-    """The prior of an effect's coefficient: its own, or a Cauchy as wide as is physical."""
-    if effect.prior is not None:
-        return effect.prior
-    return dist.Cauchy(1.0 if effect.null == 1 else 0.0, effect.limit)
 
 
 def added(program: Program) -> tuple[Variant, ...]:
@@ -116,10 +108,7 @@ def added(program: Program) -> tuple[Variant, ...]:
 
 
 def attached(program: Program) -> tuple[Variant, ...]:
-    """The effects that were added to a program or written out in its file, in their order.
-
-    One that a file names but that nobody has registered here is left out: nothing proposes it.
-    """
+    """The effects that were added to a program or written out in its file and are known here, in their order."""
     return tuple(
         which if isinstance(which, Variant) else replace(chosen_variant(program, which), called=parameter)
         for parameter, which in _effects(program)
@@ -128,8 +117,7 @@ def attached(program: Program) -> tuple[Variant, ...]:
 
 
 def _effects(program: Program) -> list[tuple[str, str | Variant]]:
-    classes = reversed(type(program).__mro__)
-    return [item for one in classes for item in vars(one).get("attached", {}).items()]
+    return [item for one in reversed(type(program).__mro__) for item in vars(one).get("attached", {}).items()]
 
 
 def written_class(program: Program) -> type[Program]:
@@ -220,36 +208,32 @@ def _colour(base: Any, variant: Variant) -> Methods:
     return methods | {"states": (*base.states, *deviations), "resting": (*base.resting, *deviations)}
 
 
-def _spread(base: Any, variant: Variant) -> Methods:
-    def transition(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-        with interventions.widened(self, variant(self, state, control, time, step, c=coefficient(self, variant))):
-            return base.transition(self, state, control, time, step)
-
-    return {"transition": transition}
-
-
-def _observing(handler: Callable[..., interventions.Altering]) -> Callable[[Any, Variant], Methods]:
-    """`observe` under a handler, which is made of the program, its effect and the state."""
+def _under(handler: Callable[..., interventions.Altering], method: str) -> Callable[[Any, Variant], Methods]:
+    """A method under a handler, which is made of the program, its effect and the method's arguments."""
 
     def around(base: Any, variant: Variant) -> Methods:
-        def observe(self: Any, state: Tensor) -> None:
-            with handler(self, partial(variant, self, c=coefficient(self, variant)), state):
-                return base.observe(self, state)
+        def run(self: Any, *given: Tensor, **named: Tensor) -> Tensor | None:
+            with handler(self, partial(variant, self, c=coefficient(self, variant)), *given, **named):
+                return getattr(base, method)(self, *given, **named)
 
-        return {"observe": observe}
+        return {method: run}
 
     return around
+
+
+def _widened(program: Any, act: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Any:
+    return interventions.widened(program, act(state, control, time, step))
 
 
 _AROUND: dict[str, Callable[[Any, Variant], Methods]] = {
     "push": _push,
     "command": _command,
     "history": _history,
-    "measured": _observing(lambda program, act, state: interventions.misread(program, partial(act, state))),
+    "measured": _under(lambda program, act, state: interventions.misread(program, partial(act, state)), "observe"),
     "viewpoint": _viewpoint,
-    "spread": _spread,
-    "blur": _observing(lambda program, act, state: interventions.blurred(act(state))),
-    "tails": _observing(lambda program, act, state: interventions.heavy_tailed(act())),
+    "spread": _under(_widened, "transition"),
+    "blur": _under(lambda program, act, state: interventions.blurred(act(state)), "observe"),
+    "tails": _under(lambda program, act, state: interventions.heavy_tailed(act()), "observe"),
     "colour": _colour,
 }
 

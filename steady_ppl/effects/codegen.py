@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 import os
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,15 +29,13 @@ WIDTH = 120  # characters of a line
 
 
 def write_program(program: Program, path: str | Path, *, force: bool = False) -> list[str]:
-    """Write a program with the effects that were added to it (`program.with_effect(…)`) beside the file of its own.
+    """Write a program with the effects that were added to it (`program.with_effect(…)`) beside the file of its own, and
+    return what could not be carried over, a sentence each.
 
     Args:
         program: its parameters are carried over as starting values.
         path: the file, after which the class is named: `hovercraft_with_drag.py` holds `HovercraftWithDrag`.
         force: overwrite a file.
-
-    Returns:
-        What could not be carried over, a sentence each.
 
     Raises:
         UsageError: nothing was added, an effect cannot be named, or the file cannot be written there.
@@ -56,13 +54,17 @@ def write_program(program: Program, path: str | Path, *, force: bool = False) ->
 
 
 def _program_text(program: Program, class_name: str, base: type[Program], module: str, values: Sequence[str]) -> str:
-    listed = _listed(variant.name for variant in added(program))
+    *most, last = (variant.name for variant in added(program))
+    listed = f"{', '.join(most)} and {last}" if most else last
     title = f'"""{base.__name__} with {listed}, as `steady add` wrote it."""'
     lines = [title if len(title) <= WIDTH else f'"""{base.__name__} with effects, as `steady add` wrote it."""', ""]
     lines += ["from torch import tensor", ""] if any("tensor(" in line for line in values) else []
     lines += [f"from .{module} import {base.__name__}", "", "", f"class {class_name}({base.__name__}):"]
     lines += [f"    {line}" if line else "" for line in _docstring(program, base, listed)]
-    lines += ["", *_tuple("effects", [_named(program, variant) for variant in added(program)])]
+    quoted = [f'"{_named(program, variant)}"' for variant in added(program)]
+    line = f"    effects = ({', '.join(quoted)}{',' if len(quoted) == 1 else ''})"
+    long = ["    effects = (", *(f"        {one}," for one in quoted), "    )"]
+    lines += ["", *([line] if len(line) <= WIDTH else long)]
     if program.substeps != base.substeps:
         lines.append(f"    substeps = {program.substeps}")
     if values:
@@ -85,11 +87,7 @@ def _docstring(program: Program, base: type[Program], listed: str) -> list[str]:
 
 
 def _named(program: Program, variant: Variant) -> str:
-    """An effect with its coefficient, as a class lists it.
-
-    Raises:
-        UsageError: the name does not say all that the effect depends on, or no file that is loaded registers it.
-    """
+    """An effect with its coefficient, as a class lists it; UsageError unless its text and the file say all of it."""
     if dict(chosen_variant(program, variant.written).options) != dict(variant.options):
         raise UsageError(f"effect {variant.name}: the name {variant.written} does not say all that it depends on")
     known = {"steady_ppl", *(one.__module__ for one in type(program).__mro__)}
@@ -103,17 +101,6 @@ def _named(program: Program, variant: Variant) -> str:
     return f"{variant.written}={','.join(numbers if isinstance(numbers, list) else [numbers])}"
 
 
-def _tuple(name: str, entries: Sequence[str]) -> list[str]:
-    quoted = [f'"{entry}"' for entry in entries]
-    line = f"    {name} = ({', '.join(quoted)}{',' if len(quoted) == 1 else ''})"
-    return [line] if len(line) <= WIDTH else [f"    {name} = (", *(f"        {one}," for one in quoted), "    )"]
-
-
-def _listed(found: Iterable[str]) -> str:
-    *most, last = found
-    return f"{', '.join(most)} and {last}" if most else last
-
-
 def _numbers(value: Tensor) -> Any:
     """Each number in as few digits as give it again, in lists as the tensor has them."""
     number = np.float32 if value.element_size() == 4 else np.float64
@@ -122,12 +109,6 @@ def _numbers(value: Tensor) -> Any:
         return [said(one) for one in numbers] if isinstance(numbers, list) else repr(float(str(number(numbers))))
 
     return said(value.cpu().tolist())
-
-
-def _tensor(value: Tensor) -> str:
-    """`tensor(0.12)`."""
-    text = str(_numbers(value)).replace("'", "")
-    return f"tensor({text})".replace("inf", 'float("inf")')
 
 
 def _carried_over(program: Program, base: type[Program]) -> tuple[list[str], list[str]]:
@@ -139,20 +120,19 @@ def _carried_over(program: Program, base: type[Program]) -> tuple[list[str], lis
         value = getattr(program, name).detach()
         if name in coefficients or (hasattr(fresh, name) and torch.equal(value, getattr(fresh, name).to(value))):
             continue
-        line = f"self.{name} = {_tensor(value)}"
+        text = str(_numbers(value)).replace("'", "").replace("inf", 'float("inf")')
+        line = f"self.{name} = tensor({text})"
         lines.append(line if len(line) <= WIDTH - 8 else f"{line}  # fmt: skip  # noqa: E501")
     if lines:
         lines.insert(0, "# where its own parameters begin; they are learned as before")
     before = fresh.state_dict()
     own = {f"{name}_unconstrained" for name in program._pyro_params}
-    weights = [
-        name
-        for name, value in program.state_dict().items()
-        if name not in own and not (name in before and torch.equal(value, before[name].to(value)))
-    ]
-    if weights:
-        modules = ", ".join(dict.fromkeys(name.partition(".")[0] for name in weights))
-        notes.append(f"not carried over, being too much for a program file: {modules}; fit them again")
+    modules: dict[str, None] = {}
+    for name, value in program.state_dict().items():
+        if name not in own and not (name in before and torch.equal(value, before[name].to(value))):
+            modules[name.partition(".")[0]] = None
+    if modules:
+        notes.append(f"not carried over, being too much for a program file: {', '.join(modules)}; fit them again")
     return lines, notes
 
 

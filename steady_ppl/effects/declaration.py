@@ -37,7 +37,11 @@ VERDICTS = {
     **dict.fromkeys(("measured", "viewpoint"), "sensor"),
     **dict.fromkeys(("spread", "blur", "tails", "colour"), "noise"),
 }
-Choices = Callable[[Program, Trajectories | None], Sequence[Mapping[str, Any]]]
+Choices = Sequence[Mapping[str, Any]]  # of a function's further arguments
+Names = Sequence[str]  # of channels or controls
+Need = tuple[Callable[[Any], object], str]  # what must hold for a program, and the reason why an effect lacks it
+Means = Mapping[str, Tensor]  # of channels, `(...)`
+Pushes = dict[str, Tensor]  # of channels, `(...)`
 Value = float | Sequence[float] | Tensor  # of a coefficient, before it is a tensor
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -45,6 +49,11 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def power_of_two_below(size: float) -> float:
     """For a coefficient to be learned in units of; one where nothing has a size."""
     return 2.0 ** math.floor(math.log2(size)) if size > 0 else 1.0
+
+
+def needs(*conditions: Need) -> Callable[[Program], str | None]:
+    """Return what an effect `lacks`: the reason of the first condition that does not hold for a program."""
+    return lambda program: next((reason for holds, reason in conditions if not holds(program)), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,13 +74,12 @@ class Effect:
         sign: of the coefficient where physics fixes it, else 0.
         null: the coefficient at which the effect is absent.
         components: names of a vector coefficient's components.
-        between: coefficients outside of which the equation means nothing; nobody can give one.
+        between: the least and the most that can be given as a coefficient.
         probes: finite coefficients at which it is screened as well, for effects that do not grow in proportion.
-        choices: what else it depends on, one mapping of the function's further arguments a choice: which channels,
-            controls or component, called `at`, and knees, widths or places.
+        choices: the function's further arguments, a mapping a choice: channels, controls or component, called `at`, and
+            knees, widths or places.
         profiled: the arguments among these that are knees, widths or places.
-        prior: of the coefficient, a Pyro distribution; a Cauchy of scale `limit` about its absence when None, whose
-            tails leave room for vehicles of another size.
+        prior: of the coefficient, a Pyro distribution; a wide-tailed Cauchy of scale `limit` about its absence if None.
         lacks: why it does not apply to a program, or None.
     """
 
@@ -90,7 +98,7 @@ class Effect:
     components: tuple[str, ...] = ()
     between: tuple[float, float] = (-math.inf, math.inf)
     probes: tuple[float, ...] = ()
-    choices: Choices = field(default=lambda program, data: [{}])
+    choices: Callable[[Program, Trajectories | None], Choices] = field(default=lambda program, data: [{}])
     profiled: tuple[str, ...] = ()
     prior: Any = None
     lacks: Callable[[Program], str | None] = field(default=lambda program: None)
@@ -132,11 +140,9 @@ class Effect:
 
 
 def declare(effects: list[Effect], form: str, unit: str, **more: Any) -> Callable[[Function], Function]:
-    """Append the effect that the function below is: its docstring begins with the `text` and labels what else is shown.
+    """Append to a list the effect that the function below is, with what its docstring begins with and labels.
 
-    Args:
-        effects: what it is appended to.
-        form, unit, more: of the effect; it has the function's name unless `more` gives another one.
+    It has the function's name unless `more` gives another one.
     """
 
     def append(function: Function) -> Function:
@@ -152,23 +158,14 @@ def declare(effects: list[Effect], form: str, unit: str, **more: Any) -> Callabl
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """An effect with everything settled but its coefficient.
-
-    Attributes:
-        effect: which.
-        at: where it acts, if there is a choice.
-        options: the further arguments of its function.
-        called: another name for the coefficient, where a program has a parameter of the effect's name.
-        scale: by which the effect's probes and typical value are multiplied for the drives that were looked at.
-        unit: of the coefficient in this program.
-    """
+    """An effect with everything settled but its coefficient."""
 
     effect: Effect
-    at: str
-    options: Mapping[str, Any]
-    called: str = ""
-    scale: float = 1.0
-    unit: str = ""
+    at: str  # where it acts, if there is a choice
+    options: Mapping[str, Any]  # the further arguments of its function
+    called: str = ""  # another name for the coefficient, where a program has a parameter of the effect's name
+    scale: float = 1.0  # of the effect's probes and typical value for the drives that were looked at
+    unit: str = ""  # of the coefficient in this program
 
     @property
     def probes(self) -> list[float]:
@@ -207,28 +204,18 @@ class Variant:
         return f"{self.name} ({said})" if said else self.name
 
     def coefficient(self, value: Value | None, like: Tensor) -> Tensor:
-        """A value as a tensor, the typical one when None.
-
-        Raises:
-            UsageError: it has another number of components.
-        """
+        """A value as a tensor, the typical one when None; UsageError for another number of components."""
         given = torch.as_tensor(self.effect.typical if value is None else value, dtype=like.dtype, device=like.device)
         wanted = self.effect.components
         if not wanted and given.shape == (1,):
             given = given[0]
         if given.shape != torch.Size([len(wanted)] if wanted else []):
-            raise UsageError(
-                f"effect {self.effect.name} takes {len(wanted) or 'one'} number{'s' if wanted else ''}"
-                f"{' (' + ', '.join(wanted) + ')' if wanted else ''}, got {given.numel()}"
-            )
+            takes = f"{len(wanted)} numbers ({', '.join(wanted)})" if wanted else "one number"
+            raise UsageError(f"effect {self.effect.name} takes {takes}, got {given.numel()}")
         return given
 
     def require_meaning(self, value: Value | None) -> None:
-        """Refuse a coefficient with which the effect's equation means nothing.
-
-        Raises:
-            UsageError: it is outside of the effect's bounds.
-        """
+        """Raise UsageError for a coefficient outside of the effect's bounds."""
         least, most = self.effect.between
         given = torch.as_tensor(self.effect.typical if value is None else value)
         if bool(((given < least) | (given > most)).any()):
@@ -241,8 +228,8 @@ class Variant:
         shape = (self.effect.size,) if self.effect.components else ()
         return like.new_full(shape, self.effect.null)
 
-    def __call__(self, program: Program, *arguments: Any, c: Tensor, mean: Mapping[str, Tensor] | None = None) -> Any:
-        """The effect's function with its options; `mean` is what the channels' means are without it, where it asks."""
+    def __call__(self, program: Program, *arguments: Any, c: Tensor, mean: Means | None = None) -> Any:
+        """Call the effect's function with its options and, where it asks, the channels' means without the effect."""
         options = {**self.options, "mean": mean} if self.needs_mean else self.options
         return self.effect.function(program, *arguments, c=c, **options)
 

@@ -9,8 +9,7 @@ from typing import Any
 
 from steady_ppl.effects.catalogue.actuators import ACTUATORS
 from steady_ppl.effects.catalogue.forces import FORCES
-from steady_ppl.effects.catalogue.noise import NOISES
-from steady_ppl.effects.catalogue.planar_forces import PLANAR_FORCES
+from steady_ppl.effects.catalogue.noise import NOISE
 from steady_ppl.effects.catalogue.sensors import SENSORS
 from steady_ppl.effects.catalogue.wheels import WHEELS
 from steady_ppl.effects.declaration import VERDICTS, Effect, Variant
@@ -23,7 +22,7 @@ What `steady effects` prints. `steady simulate MODEL --effect NAME[:AT][:OPTION=
 a simulation, `steady add` writes it into a program, `program.with_effect(NAME, VALUE)` does so in Python. `c` is the \
 coefficient; without a value it is the typical one.
 """
-_EFFECTS: list[Effect] = [*FORCES, *PLANAR_FORCES, *WHEELS, *ACTUATORS, *SENSORS, *NOISES]
+_EFFECTS: list[Effect] = [*FORCES, *WHEELS, *ACTUATORS, *SENSORS, *NOISE]
 
 
 def register(effect: Effect) -> Effect:
@@ -50,11 +49,7 @@ def is_known(text: str) -> bool:
 
 
 def of_name(name: str) -> list[Effect]:
-    """All effects of a name, which differ in what they apply to.
-
-    Raises:
-        UsageError: there is none; the nearest name is suggested.
-    """
+    """All effects of a name, which differ in what they apply to; UsageError, with the nearest name, without any."""
     named = [effect for effect in _EFFECTS if effect.name == name]
     if not named:
         near = difflib.get_close_matches(name, [effect.name for effect in _EFFECTS], n=1, cutoff=0.5)
@@ -64,11 +59,7 @@ def of_name(name: str) -> list[Effect]:
 
 
 def find(name: str, program: Program) -> Effect:
-    """The effect of a name that applies to a program.
-
-    Raises:
-        UsageError: there is none; the nearest name is suggested.
-    """
+    """The effect of a name that applies to a program; UsageError where there is none, with the nearest name."""
     return _applicable(of_name(name), program)
 
 
@@ -81,11 +72,7 @@ def _applicable(effects: list[Effect], program: Program) -> Effect:
 
 
 def parsed(text: str) -> tuple[str, str, dict[str, float], tuple[float, ...] | None]:
-    """`NAME[:AT][:OPTION=NUMBER]...[=NUMBER[,NUMBER]]` as name, place, options and value.
-
-    Raises:
-        UsageError: it reads otherwise.
-    """
+    """`NAME[:AT][:OPTION=NUMBER]...[=NUMBER[,NUMBER]]` as name, place, options and value; UsageError for other text."""
     head, *parts = text.strip().split(":")
     if not parts:
         head, equals, numbers = head.partition("=")
@@ -93,7 +80,8 @@ def parsed(text: str) -> tuple[str, str, dict[str, float], tuple[float, ...] | N
     *middle, last = parts
     pieces = last.split("=")
     value: tuple[float, ...] | None = None
-    if len(pieces) == 3 or (len(pieces) == 2 and not _is_option(head, pieces[0])):
+    is_option = any(pieces[0] in effect.profiled for effect in _EFFECTS if effect.name == head)
+    if len(pieces) == 3 or (len(pieces) == 2 and not is_option):
         value = _numbers(text, pieces.pop())
     at, options = "", {}
     for part in [*middle, "=".join(pieces)]:
@@ -110,8 +98,7 @@ def parsed(text: str) -> tuple[str, str, dict[str, float], tuple[float, ...] | N
 def chosen_variant(program: Program, effect: str | Effect, at: str = "", **options: Any) -> Variant:
     """An effect with everything settled but its coefficient; what is not said is the first of its choices.
 
-    Raises:
-        UsageError: no such effect or place, or no such option.
+    An effect, a place or an option that does not exist is a UsageError.
     """
     if isinstance(effect, str):
         effect, said, more, value = parsed(effect)
@@ -135,10 +122,6 @@ def chosen_variant(program: Program, effect: str | Effect, at: str = "", **optio
     raise UsageError(
         f"effect {effect.name} has no place {at!r}: " + (f"it can be at {places}" if places else "there is one only")
     )
-
-
-def _is_option(name: str, option: str) -> bool:
-    return any(option in effect.profiled for effect in _EFFECTS if effect.name == name)
 
 
 def _numbers(text: str, numbers: str, most: int | None = None) -> tuple[float, ...]:

@@ -6,6 +6,7 @@ import math
 import operator
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import reduce
 from typing import Any, Self, cast
 
@@ -22,8 +23,7 @@ from steady_ppl.errors import ProgramError
 
 
 class ByColumn(Messenger):
-    """A handler whose sites take the columns of something in the order in which they are met, from the first whenever
-    it is entered."""
+    """A handler whose sites take columns in the order in which they are met, from the first whenever it is entered."""
 
     column = 0
 
@@ -39,21 +39,13 @@ class ByColumn(Messenger):
         return columns
 
 
+@dataclass(eq=False)
 class Observing(ByColumn):
-    """Condition the sites of `observe` on measurements, cell by cell, and temper them.
+    """Condition the sites of `observe` on measurements and temper them. A missing cell contributes nothing."""
 
-    The sites take the measurement's columns in the order in which they are met. A missing cell contributes nothing.
-
-    Args:
-        measurements: `(..., K)`, finite also where missing.
-        observed: `(..., K)` bool.
-        weight: multiplies the observations' log-density (w_obs in STEADY), `(...)` where it is a tensor; 1 is the model
-            as written.
-    """
-
-    def __init__(self, measurements: Tensor, observed: Tensor, weight: float | Tensor = 1.0) -> None:
-        super().__init__()
-        self.measurements, self.observed, self.weight = measurements, observed, weight
+    measurements: Tensor  # (..., K), finite also where missing
+    observed: Tensor  # (..., K) bool
+    weight: float | Tensor = 1.0  # of the observations' log-density (w_obs in STEADY), (...) where it is a tensor
 
     def __exit__(self, *exception: Any) -> None:
         super().__exit__(*exception)
@@ -101,12 +93,11 @@ class Observing(ByColumn):
         message["scale"] = message["scale"] * self.weight
 
 
+@dataclass(eq=False)
 class Broadcasting(Messenger):
     """Give every site the batch shape `left`, as plates would, without claiming any plate's dimension."""
 
-    def __init__(self, left: tuple[int, ...]) -> None:
-        super().__init__()
-        self.left = torch.Size(left)
+    left: tuple[int, ...]
 
     def _pyro_sample(self, message: Any) -> None:
         fn = message["fn"]
@@ -117,7 +108,7 @@ class Broadcasting(Messenger):
         except RuntimeError:
             raise ProgramError(
                 f"site {message['name']!r} has batch shape {tuple(fn.batch_shape)} and event shape "
-                f"{tuple(fn.event_shape)} on states of batch shape {tuple(self.left)} (is .to_event(1) missing?)",
+                f"{tuple(fn.event_shape)} on states of batch shape {self.left} (is .to_event(1) missing?)",
                 site=message["name"],
             ) from None
 
@@ -131,12 +122,11 @@ def running(*left: int) -> Iterator[None]:
         yield
 
 
+@dataclass(eq=False)
 class KnownStart(Messenger):
     """Replace the prior of `initial` by certainty about the first state, `(B, D)`."""
 
-    def __init__(self, state: Tensor) -> None:
-        super().__init__()
-        self.state = state
+    state: Tensor
 
     def _pyro_sample(self, message: Any) -> None:
         width = message["fn"].event_shape.numel()
@@ -150,12 +140,11 @@ class KnownStart(Messenger):
         message["fn"] = dist.Delta(self.state[..., :width], event_dim=1)  # what is left rests
 
 
+@dataclass(eq=False)
 class Replaying(Messenger):
     """Give latent sites the values that are already known, site name → value."""
 
-    def __init__(self, values: Mapping[str, Tensor]) -> None:
-        super().__init__()
-        self.values = values
+    values: Mapping[str, Tensor]
 
     def _pyro_sample(self, message: Any) -> None:
         if message["name"] in self.values:
@@ -170,15 +159,11 @@ class AtMean(Messenger):
             message["value"] = message["fn"].mean
 
 
+@dataclass(eq=False)
 class Standardised(ByColumn):
-    """Give latent sites `mean + sd · noise`: the program as a function of standard normal noise.
+    """Give latent sites `mean + sd · noise`, of standard normal noise `(..., C)`."""
 
-    The sites take the columns of the noise, `(..., C)`, in the order in which they are met.
-    """
-
-    def __init__(self, noise: Tensor) -> None:
-        super().__init__()
-        self.noise = noise
+    noise: Tensor
 
     def _pyro_sample(self, message: Any) -> None:
         if message["is_observed"]:
@@ -188,22 +173,14 @@ class Standardised(ByColumn):
         message["value"] = mean + sd * as_event(noise, message["fn"].event_dim)
 
 
+@dataclass(eq=False)
 class Recording(Messenger):
-    """Keep the values of latent sites, every site's distribution, and the observed sites' tempered log-densities.
+    """Keep the values of latent sites, every site's distribution, and the observed sites' tempered log-densities."""
 
-    Attributes:
-        values: latent site → value.
-        observed: observed site → value.
-        distributions: site → distribution.
-        log_likelihood: one `(...)` an observed site.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.values: dict[str, Tensor] = {}
-        self.observed: dict[str, Tensor] = {}
-        self.distributions: dict[str, Any] = {}
-        self.log_likelihood: list[Tensor] = []
+    values: dict[str, Tensor] = field(default_factory=dict)  # of latent sites
+    observed: dict[str, Tensor] = field(default_factory=dict)  # values of observed sites
+    distributions: dict[str, Any] = field(default_factory=dict)
+    log_likelihood: list[Tensor] = field(default_factory=list)  # one `(...)` an observed site
 
     def total(self) -> Tensor:
         """The sum of the observed sites' log-densities, `(...)`."""
@@ -240,11 +217,8 @@ def residual(fn: Any, value: Tensor) -> Tensor:
 
 
 def normal_moments(fn: Any, site: str) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of a site with independent normal components, each `(...)` or `(..., C)`.
-
-    Raises:
-        ProgramError: the site has another distribution.
-    """
+    """Return mean and standard deviation, `(...)` or `(..., C)`, of a site with independent normal components, or raise
+    ProgramError."""
     base = unwrapped(fn)
     if not isinstance(base, dist.Normal) or fn.event_dim > 1:
         raise ProgramError(
@@ -257,15 +231,11 @@ def normal_moments(fn: Any, site: str) -> tuple[Tensor, Tensor]:
 
 
 def tangent_normal(fn: Any, residual: Tensor, site: str) -> tuple[Tensor, Tensor]:
-    """The normal that touches a measurement site's log-density at a residual from below, with the same slope.
+    """Return standard deviation and log-density at residual zero, each as `residual`, of the normal that touches a
+    measurement site's log-density at a residual from below, with the same slope.
 
-    A normal is its own; a Student t's is wider the farther out it is touched (Lange, Little and Taylor 1989).
-
-    Returns:
-        Standard deviation and log-density at residual zero, each as `residual`.
-
-    Raises:
-        ProgramError: the site is neither normal nor Student t.
+    A normal is its own; a Student t's is wider the farther out it is touched (Lange, Little and Taylor 1989). Any other
+    site is a ProgramError.
     """
     base = unwrapped(fn)
     if not isinstance(base, dist.StudentT) or fn.event_dim > 1:
@@ -287,11 +257,12 @@ def as_event(values: Tensor, event_dim: int) -> Tensor:
     return values if event_dim else values.squeeze(-1)
 
 
-def with_moments(fn: Any, loc: Tensor, scale: Tensor) -> Any:
-    """A distribution of the kind of another one, with another location and scale."""
+def with_moments(fn: Any, loc: Tensor | None = None, scale: Tensor | None = None) -> Any:
+    """A distribution of the kind of another one, with another location or scale."""
     base = unwrapped(fn)
     freedom = (base.df,) if isinstance(base, dist.StudentT) else ()
-    return type(base)(*freedom, loc, scale).to_event(fn.event_dim)
+    moments = (base.loc if loc is None else loc, base.scale if scale is None else scale)
+    return type(base)(*freedom, *moments).to_event(fn.event_dim)
 
 
 def broadcast_event(value: Tensor, left: torch.Size, event_dim: int) -> Tensor:
@@ -300,10 +271,7 @@ def broadcast_event(value: Tensor, left: torch.Size, event_dim: int) -> Tensor:
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
-    """The shape that all of these go together to. `torch.broadcast_shapes` loads sympy, half a second.
-
-    Raises:
-        RuntimeError: they do not go together.
+    """Do as `torch.broadcast_shapes`, which loads sympy for half a second; RuntimeError where shapes do not fit.
 
     Example:
         >>> broadcast_shapes((3, 1), (2,))

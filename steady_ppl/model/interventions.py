@@ -7,6 +7,7 @@ with pushed(self, {"forward": -c * velocity}):
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import pyro.distributions as dist
@@ -29,36 +30,25 @@ from steady_ppl.model.handlers import (
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import row_ends
 
-Change = Callable[[Any, slice], Any]
 
-
+@dataclass(eq=False)
 class Altering(ByColumn):
-    """Replace the distribution of each site that a method of a program samples.
+    """Replace the distribution of each site that a method of a program samples."""
 
-    Args:
-        change: (distribution, which columns of the channels or measurements it has) → distribution.
-    """
-
-    def __init__(self, change: Change) -> None:
-        super().__init__()
-        self.change = change
+    change: Callable[[Any, slice], Any]  # of a distribution and the columns of the channels or measurements that it has
 
     def _pyro_sample(self, message: Any) -> None:
         message["fn"] = self.change(message["fn"], self.take(message["fn"]))
 
 
 def pushed(program: Program, pushes: Mapping[str, Tensor]) -> Altering:
-    """Add to the means of a program's channels while its `transition` runs.
-
-    Args:
-        pushes: channel → what is added, `(...)`, in the channel's unit.
-    """
-    return _by_channel(program, pushes, 0.0, lambda fn, push: _moved(fn, lambda loc: loc + push))
+    """Add to the means of a program's channels while its `transition` runs: channel → `(...)` in the channel's unit."""
+    return _by_channel(program, pushes, 0.0, lambda fn, push: with_moments(fn, loc=unwrapped(fn).loc + push))
 
 
 def widened(program: Program, factors: Mapping[str, Tensor]) -> Altering:
     """Multiply the spreads of a program's channels, channel → factor `(...)`, while its `transition` runs."""
-    return _by_channel(program, factors, 1.0, _rescaled)
+    return _by_channel(program, factors, 1.0, lambda fn, factor: with_moments(fn, scale=unwrapped(fn).scale * factor))
 
 
 def _by_channel(
@@ -74,28 +64,26 @@ def _by_channel(
 
 
 def misread(program: Program, change: Callable[[Tensor], Tensor]) -> Altering:
-    """Change what is measured on average while a program's `observe` runs.
-
-    Args:
-        change: of the mean measurement, `(..., K)`, on the circle where the measurement is an angle.
-    """
+    """Change the mean measurement, `(..., K)` and angles on the circle, while a program's `observe` runs."""
 
     def at_site(fn: Any, columns: slice) -> Any:
-        def moved(loc: Tensor) -> Tensor:
-            reading = -unwrapped(fn).residual(torch.zeros_like(loc)) if hasattr(unwrapped(fn), "residual") else loc
-            reading = as_vector(reading, fn.event_dim)
-            whole = reading.new_zeros((*reading.shape[:-1], len(program.measurements)))
-            whole = torch.cat([whole[..., : columns.start], reading, whole[..., columns.stop :]], -1)
-            return as_event(change(whole)[..., columns], fn.event_dim)
-
-        return _moved(fn, moved)
+        base = unwrapped(fn)
+        reading = -base.residual(torch.zeros_like(base.loc)) if hasattr(base, "residual") else base.loc
+        reading = as_vector(reading, fn.event_dim)
+        whole = reading.new_zeros((*reading.shape[:-1], len(program.measurements)))
+        whole = torch.cat([whole[..., : columns.start], reading, whole[..., columns.stop :]], -1)
+        return with_moments(fn, loc=as_event(change(whole)[..., columns], fn.event_dim))
 
     return Altering(at_site)
 
 
 def blurred(factors: Tensor) -> Altering:
     """Multiply the measurements' standard deviations by factors `(..., K)` while a program's `observe` runs."""
-    return Altering(lambda fn, columns: _rescaled(fn, as_event(factors[..., columns], fn.event_dim)))
+
+    def change(fn: Any, columns: slice) -> Any:
+        return with_moments(fn, scale=unwrapped(fn).scale * as_event(factors[..., columns], fn.event_dim))
+
+    return Altering(change)
 
 
 def heavy_tailed(share: Tensor) -> Altering:
@@ -120,7 +108,7 @@ class Coloured(Altering):
 
     def _change(self, fn: Any, columns: slice) -> Any:
         pushes, factors = (as_event(values[..., columns], fn.event_dim) for values in (self.pushes, self.factors))
-        return _moved(_rescaled(fn, factors), lambda loc: loc + pushes)
+        return with_moments(fn, unwrapped(fn).loc + pushes, unwrapped(fn).scale * factors)
 
     def beside(self, state: Tensor) -> Tensor:
         """A state and the deviations side by side, `(..., D + C)`: the new ones where the row ends, else the last."""
@@ -148,16 +136,6 @@ def channel_means(program: Program, transition: Callable[..., Tensor], *argument
 def by_channel(program: Program, values: Mapping[str, Tensor], missing: float, like: Tensor) -> Tensor:
     """Values by channel side by side, `(..., C)` as `like`."""
     return _side_by_side(values, program.channel_names, missing, like).expand_as(like)
-
-
-def _moved(fn: Any, change: Callable[[Tensor], Tensor]) -> Any:
-    base = unwrapped(fn)
-    return with_moments(fn, change(base.loc), base.scale)
-
-
-def _rescaled(fn: Any, factor: Tensor) -> Any:
-    base = unwrapped(fn)
-    return with_moments(fn, base.loc, base.scale * factor)
 
 
 def _side_by_side(values: Mapping[str, Tensor], channels: tuple[str, ...], missing: float, like: Tensor) -> Tensor:

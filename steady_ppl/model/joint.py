@@ -19,11 +19,7 @@ class Joint:
 
     The site `states` carries what a guide knows about the states, at density one; with the channel noise that goes with
     them the transitions need no loop over time. Draws, if any, are at dimension −3, rows at −2, trajectories at −1.
-    Priors of the program's parameters are counted once a call.
-
-    Args:
-        program: the state-space model.
-        known_start: the first state is certain and not scored.
+    Priors of the program's parameters are counted once a call. With `known_start` the first state is not scored.
     """
 
     def __init__(self, program: Program, *, known_start: bool = False) -> None:

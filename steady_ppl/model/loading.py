@@ -20,13 +20,10 @@ _LOADS = itertools.count()
 
 
 def load_program(source: str | Path) -> Program:
-    """Load a program by path: `models/hovercraft.py` (the class named after the file, or its only program) or
-    `mine.py:Boat`.
+    """Load a program by path: `models/hovercraft.py` (the class named after the file, or its only one), `mine.py:Boat`.
 
-    The file is run afresh under a private module name; `from .sibling import …` finds files of its own folder.
-
-    Raises:
-        ProgramError: the file does not exist or does not import, or has no such class.
+    The file is run afresh under a private module name; `from .sibling import …` finds files of its own folder. A file
+    that does not exist or import, or has no such class, is a ProgramError.
     """
     path, class_name = _parted(str(source))
     file = Path(path)
@@ -67,21 +64,15 @@ class _AsWritten(SourceFileLoader):
 
 
 def run_file(file: Path) -> ModuleType:
-    """Run a Python file as a module of a private package that stands for its folder.
-
-    Raises:
-        ProgramError: the file does not exist or raises while it is imported.
-    """
+    """Run a Python file as a module of a private package that stands for its folder; ProgramError where it fails."""
     require_file(file, ProgramError)
     if not file.is_file():
         raise ProgramError(f"no file {file}")
-    folder = file.resolve().parent
-    package = f"_steady_folder_{next(_LOADS)}"
-    parent = ModuleType(package)
-    parent.__path__ = [str(folder)]
-    sys.modules[package] = parent
     if file.suffix != ".py":
         raise ProgramError(f"{file} is not a Python file")
+    folder, package = file.resolve().parent, f"_steady_folder_{next(_LOADS)}"
+    sys.modules[package] = parent = ModuleType(package)
+    parent.__path__ = [str(folder)]
     name = f"{package}.{file.stem}"
     spec = importlib.util.spec_from_file_location(name, file, loader=_AsWritten(name, str(file)))
     assert spec is not None and spec.loader is not None

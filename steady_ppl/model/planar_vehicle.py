@@ -59,7 +59,7 @@ class PlanarVehicle(Program):
 
     @property
     def sees_bearings(self) -> bool:
-        """Whether a bearing to each landmark, and nothing else, is measured; not where a subclass has other sensors."""
+        """Whether a bearing to each landmark, and nothing else, is measured."""
         return len(self.landmarks) > 0 and self.measurement_names == names(self._bearings)
 
     @property
@@ -67,7 +67,7 @@ class PlanarVehicle(Program):
         return tuple(f"bearing_{i} [rad]" for i in range(len(self.landmarks)))
 
     def integrate(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
-        """Move on under an acceleration that is held in the body frame, to second order in the step.
+        """Return the next state, `(..., 6)`, under an acceleration held in the body frame, to second order in the step.
 
         The acceleration acts at the heading in the middle of the step, averaged over the turn; the pose moves by the
         mean of the old and the new velocity.
@@ -76,9 +76,6 @@ class PlanarVehicle(Program):
             state: `(..., 6)`.
             acceleration: `(..., 3)` forward, lateral (m/s²) and yaw (rad/s²), in the body frame.
             step: `(...)` s.
-
-        Returns:
-            The next state, `(..., 6)`.
         """
         x, y, heading, vx, vy, yaw_rate = state.unbind(-1)
         forward, lateral, yaw = acceleration.unbind(-1)
@@ -97,23 +94,9 @@ class PlanarVehicle(Program):
         )
 
     def halfway(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
-        """Return the state in the middle of a step under an acceleration, `(..., 6)`: where forces that depend on the
-        state are taken, so that the step is of second order in them too."""
+        """Return the state in the middle of a step, `(..., 6)`: a step whose forces are taken there is of second order
+        in them too."""
         return self.integrate(state, acceleration, 0.5 * step)
-
-    def integrate_euler(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
-        """Move on by one explicit Euler step, with the old pose and velocity; see `ExplicitEuler`."""
-        x, y, heading, vx, vy, yaw_rate = state.unbind(-1)
-        forward, lateral, yaw = acceleration.unbind(-1)
-        cos, sin = heading.cos(), heading.sin()
-        return stack(
-            x + vx * step,
-            y + vy * step,
-            heading + yaw_rate * step,
-            vx + (cos * forward - sin * lateral) * step,
-            vy + (sin * forward + cos * lateral) * step,
-            yaw_rate + yaw * step,
-        )
 
     def body_velocity(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Forward and lateral velocity (m/s) and yaw rate (rad/s), each `(...)`."""
@@ -138,8 +121,7 @@ class PlanarVehicle(Program):
         return step if self.settling is None else self.settling
 
     def carried(self, state: Tensor) -> dict[str, Tensor]:
-        """Accelerations by channel that turn the velocity along with the vehicle, `(...)` m/s², as a program with a
-        `settling` has them besides what its wheels do; zero for others."""
+        """Accelerations by channel that turn the velocity along with a vehicle that has a `settling`, `(...)` m/s²."""
         forward, lateral, yaw_rate = self.body_velocity(state)
         turns = 0.0 if self.settling is None else yaw_rate
         parts = (-lateral * turns, forward * turns, torch.zeros_like(forward))
@@ -157,10 +139,9 @@ def stack(*components: Tensor) -> Tensor:
 
 
 def dense(layer: nn.Linear, inputs: Tensor) -> Tensor:
-    """The layer applied to inputs `(..., I)` that are laid out component by component, as its outputs `(..., O)` are.
+    """Apply a layer to inputs `(..., I)` that are laid out component by component, as its outputs `(..., O)` are.
 
-    The same numbers as `layer(inputs)` but for rounding; matrix products of few rows and many columns take half the
-    time, their gradients a third.
+    The numbers are those of `layer(inputs)` but for rounding, in half the time, their gradients in a third.
     """
     if inputs.dim() < 2 or layer.bias is None:
         return layer(inputs)
@@ -170,7 +151,7 @@ def dense(layer: nn.Linear, inputs: Tensor) -> Tensor:
 
 
 def bearings_to(landmarks: Sequence[Sequence[float]] | Tensor, state: Tensor, sd: float | Tensor) -> dist.Independent:
-    """Bearings to landmarks relative to the heading, with independent noise.
+    """Return the distribution of bearings to landmarks relative to the heading, `(..., K)` rad, with independent noise.
 
     Nearer than 0.1 m the noise grows as 0.1/distance, at most tenfold.
 
@@ -178,14 +159,10 @@ def bearings_to(landmarks: Sequence[Sequence[float]] | Tensor, state: Tensor, sd
         landmarks: `(K, 2)` m.
         state: `(..., 6)`, x, y and heading first.
         sd: rad.
-
-    Returns:
-        A distribution over `(..., K)` rad.
     """
     places = _on_device(landmarks, state)
     x, y, heading = state[..., 0], state[..., 1], state[..., 2]
-    to_x = places[:, 0] - x.unsqueeze(-1)
-    to_y = places[:, 1] - y.unsqueeze(-1)
+    to_x, to_y = places[:, 0] - x.unsqueeze(-1), places[:, 1] - y.unsqueeze(-1)
     nearness = (to_x * to_x + to_y * to_y).clamp(1e-4, 1e-2).rsqrt() * 0.1
     bearing = torch.atan2(to_y, to_x) - heading.unsqueeze(-1)
     return WrappedNormal(bearing, sd * nearness).to_event(1)
@@ -204,17 +181,26 @@ def _kept_on_device(landmarks: tuple[tuple[float, float], ...], dtype: torch.dty
 
 
 class ExplicitEuler(PlanarVehicle):
-    """A vehicle that takes the explicit Euler step of STEADY's authors, in simulation as well.
+    """A vehicle that takes the explicit Euler step of STEADY's authors, in simulation as well, for the paper's tables.
 
-    For the paper's tables, whose simulated world takes this step; of no other vehicle is it the motion. To be put
-    before a vehicle: `class AuthorsVehicle(ExplicitEuler, Hovercraft)`.
+    It is put before a vehicle: `class AuthorsVehicle(ExplicitEuler, Hovercraft)`.
     """
 
     substeps = 1
     simulated_step = math.inf
 
     def integrate(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
-        return self.integrate_euler(state, acceleration, step)
+        x, y, heading, vx, vy, yaw_rate = state.unbind(-1)
+        forward, lateral, yaw = acceleration.unbind(-1)
+        cos, sin = heading.cos(), heading.sin()
+        return stack(
+            x + vx * step,
+            y + vy * step,
+            heading + yaw_rate * step,
+            vx + (cos * forward - sin * lateral) * step,
+            vy + (sin * forward + cos * lateral) * step,
+            yaw_rate + yaw * step,
+        )
 
     def halfway(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
         return state
@@ -223,9 +209,9 @@ class ExplicitEuler(PlanarVehicle):
 class UnknownMap(PlanarVehicle):
     """A vehicle whose landmarks are not where they were declared: they are learned together with its dynamics.
 
-    To be put before a vehicle that declares them: `class Mine(UnknownMap, Hovercraft)`. Bearings alone leave the frame
-    open, so that a map is learned only with known starts, with two landmarks that are `surveyed`, or where it is said
-    to be relative to where drives begin (`framed_by_start`), which is worth as much as `initial` is narrow.
+    It is put before a vehicle that declares them: `class Mine(UnknownMap, Hovercraft)`. Bearings alone leave the frame
+    open: a map is learned only with known starts, with two `surveyed` landmarks, or relative to where drives begin
+    (`framed_by_start`), which is worth as much as `initial` is narrow.
 
     Attributes:
         surveyed: which landmarks are where they are declared, by index.
@@ -247,13 +233,10 @@ class UnknownMap(PlanarVehicle):
                 "class Mine(UnknownMap, Hovercraft)",
                 site="__init__",
             )
-        beyond = [index for index in self.surveyed if not 0 <= index < len(declared)]
-        if beyond:
-            raise ProgramError(
-                f"program {type(self).__name__}: surveyed names landmark {beyond[0]}, there are 0 to "
-                f"{len(declared) - 1}",
-                site="surveyed",
-            )
+        for index in self.surveyed:
+            if not 0 <= index < len(declared):
+                about = f"surveyed names landmark {index}, there are 0 to {len(declared) - 1}"
+                raise ProgramError(f"program {type(self).__name__}: {about}", site="surveyed")
         stays = torch.zeros(len(declared), 1, dtype=torch.bool)
         stays[list(self.surveyed)] = True
         self.register_buffer("declared", torch.as_tensor(declared, dtype=torch.get_default_dtype()), persistent=False)
@@ -267,15 +250,11 @@ class UnknownMap(PlanarVehicle):
 
     @property
     def surveyed_frame(self) -> bool:
-        """Whether landmarks fix the frame of the map: two of them are where they are declared."""
+        """Whether two landmarks, which fix the map's frame, are where they are declared."""
         return len(set(self.surveyed)) >= 2
 
     def prepare(self, data: Trajectories, known_start: bool) -> None:
-        """Refuse to learn a map whose frame nothing fixes.
-
-        Raises:
-            UsageError: no known starts, fewer than two surveyed landmarks, and no word that `initial` is enough.
-        """
+        """Refuse, by UsageError, to learn a map whose frame nothing fixes."""
         if not (known_start or self.surveyed_frame or self.framed_by_start):
             raise UsageError(
                 f"program {type(self).__name__}: nothing fixes the frame of its map: give known starts "

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, wraps
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 import pyro
 import torch
@@ -62,12 +62,8 @@ def _parsed(declared: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]
 
 def _components(declared: str) -> tuple[property, property]:
     """The names and the units of what a program declares."""
-    return (
-        property(lambda program: names(getattr(program, declared)), doc=f"Names of the `{declared}`, without units."),
-        property(
-            lambda program: units(getattr(program, declared)), doc=f"Units of the `{declared}`, '' where none is."
-        ),
-    )
+    named = property(lambda program: names(getattr(program, declared)), doc=f"Names of the `{declared}`.")
+    return named, property(lambda program: units(getattr(program, declared)), doc=f"Units of the `{declared}`, or ''.")
 
 
 class Program(PyroModule):
@@ -195,9 +191,9 @@ class Program(PyroModule):
         raise ProgramError(f"program {type(self).__name__} lacks the method observe(self, state)", site="observe")
 
     def actuators(self, control: Tensor, time: Tensor) -> Tensor:
-        """The controls as they act, `(rows, trajectories, U)`: what lag, delay and wear make of the commands.
+        """Return the controls as they act, `(rows, trajectories, U)`: what lag, delay and wear make of commands.
 
-        Called with whole trajectories before `transition` sees a row of the result.
+        It is called with whole trajectories before `transition` sees a row of the result.
 
         Args:
             control: the commands, `(rows, trajectories, U)`.
@@ -222,8 +218,8 @@ class Program(PyroModule):
 
     @property
     def axes(self) -> Mapping[str, tuple[str, ...]]:
-        """Channels that one coefficient of a generic effect can belong to, by the name of the group; each channel of
-        `motion` alone unless a program knows better."""
+        """Groups of channels to which one coefficient of a generic effect can belong; each of `motion` alone if not
+        overridden."""
         return {channel: (channel,) for channel in self.motion}
 
     def velocities(self, state: Tensor) -> dict[str, Tensor]:
@@ -247,7 +243,7 @@ class Program(PyroModule):
         return torch.stack(torch.broadcast_tensors(*moved), -1)
 
     def control_index(self, name: str) -> int:
-        """Which column of `control` a control has."""
+        """The column of a control."""
         return self.control_names.index(name)
 
     def chosen_controls(self, chosen: Sequence[str], like: Tensor) -> Tensor:
@@ -259,8 +255,7 @@ class Program(PyroModule):
         return late.with_effect(self, effect, value, **where)
 
     def example_controls(self, time: Tensor) -> Tensor:
-        """Controls of simulated drives, `(rows, trajectories, U)` at `time` of `(rows, trajectories)`; zero unless
-        a program knows better."""
+        """Controls of simulated drives, `(rows, trajectories, U)` at times `(rows, trajectories)`; zero by default."""
         return time.new_zeros((*time.shape, len(self.controls)))
 
     def prepare(self, data: Trajectories, known_start: bool) -> None:
@@ -290,34 +285,28 @@ def for_program(program: Program, data: Trajectories) -> Trajectories:
     if chosen.states is not None and program.resting:
         resting = [program.state_names.index(name) for name in names(program.resting)]
         chosen.states[0][..., resting] = 0.0
-    parameter = next(program.parameters(), None)
-    if parameter is None:
-        return _within(chosen.to(torch.get_default_dtype()))
+    parameter = next(program.parameters(), torch.empty(0, device=data.time.device))
     return _within(chosen.to(parameter.dtype, parameter.device))
 
 
 def _within(data: Trajectories) -> Trajectories:
-    """The same drives, if every number is one in their precision (1e300 is infinite in single) and time is in seconds.
+    """Refuse numbers that are infinite in the drives' precision (as 1e300 in single) and steps that are no seconds."""
 
-    Raises:
-        DataError: naming column, trajectory and row.
-    """
+    def refuse(column: str, drive: int, row: int, said: str) -> NoReturn:
+        label = data.labels[drive]
+        message = f"column {column}, trajectory {label}, its row {row + 1}: {said}"
+        raise DataError(message, column=column, trajectory=label)
+
     blocks = [("u", data.controls, data.control_names), ("y", data.measurements, data.measurement_names)]
     if data.states is not None:
         blocks.append(("x", data.states, data.state_names))
     for prefix, values, columns in blocks:
         for row, drive, index in values.isinf().nonzero()[:1].tolist():
             said = f"the number is beyond {torch.finfo(values.dtype).max:.2g}, the largest"
-            raise _beyond(data, f"{prefix}.{columns[index]}", drive, row, said)
+            refuse(f"{prefix}.{columns[index]}", drive, row, said)
     odd = data.transitions & ((data.steps < MIN_STEP) | (data.steps > MAX_STEP))
     for row, drive in odd.nonzero()[:1].tolist():
         step = float(data.time[row + 1, drive] - data.time[row, drive])
         said = f"time goes on by {step:.3g} s, expected {MIN_STEP:g} to {MAX_STEP:g} s from row to row"
-        raise _beyond(data, "time", drive, row + 1, f"{said}: is it in seconds?")
+        refuse("time", drive, row + 1, f"{said}: is it in seconds?")
     return data
-
-
-def _beyond(data: Trajectories, column: str, drive: int, row: int, said: str) -> DataError:
-    label = data.labels[drive]
-    message = f"column {column}, trajectory {label}, its row {row + 1}: {said}"
-    return DataError(message, column=column, trajectory=label)

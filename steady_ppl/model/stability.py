@@ -30,10 +30,10 @@ _Given = tuple[Tensor, Tensor, Tensor]  # control, time and step
 def divergence(program: Program, data: Trajectories, rows: int | None = None) -> str | None:
     """Say that a program's step is unstable, or return None where it is not.
 
-    The eigenvalues of a row's derivative in the state are compared with those at `FINER` times as many substeps: where
-    a deviation grows at the program's own step alone, the step is what makes it grow. They are looked at where drives
-    begin and where the program comes from there in fine steps without noise: a drag may be too stiff at speed alone.
-    Of each drive of `data`, as returned by `for_program`, its first `rows` are looked at; all when None.
+    A deviation that grows at the program's own step but not at `FINER` times as many substeps, as eigenvalues of a
+    row's derivative in the state say, grows because of the step. These are looked at where drives begin and where the
+    program comes from there in fine steps without noise: a drag may be too stiff at speed alone. Of each drive of
+    `data`, as returned by `for_program`, the first `rows` are looked at; all when None.
     """
     steps = torch.where(data.transitions, data.steps, 0.0)[:rows]
     if not bool(steps.any()):
@@ -66,14 +66,10 @@ def _eigenvalues(program: Program, state: Tensor, given: _Given) -> Tensor | Non
     """Of the row's derivative in the state, `(..., D)` at states `(..., D)`; None where one is no number."""
     size = state.shape[-1]
     columns = []
-    for index in range(size):
-        by = 1e-3 * (1 + state[..., index].abs())
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = state.clone()
-            moved[..., index] += sign * by
-            ends.append(_after(program, moved, given, 0.0).expand(*state.shape))
-        columns.append((ends[0] - ends[1]) / (2 * by.unsqueeze(-1)))
+    for unit in torch.eye(size).to(state):
+        by = 1e-3 * (1 + state.abs()) * unit
+        ends = [_after(program, state + moved, given, 0.0).expand(*state.shape) for moved in (by, -by)]
+        columns.append((ends[0] - ends[1]) / (2 * by.sum(-1, keepdim=True)))
     derivative = torch.stack(columns, -1).double()
     return torch.linalg.eigvals(derivative) if bool(derivative.isfinite().all()) else None
 
@@ -100,10 +96,10 @@ def _visited(finer: Program, data: Trajectories, steps: Tensor) -> tuple[Tensor,
 
 @torch.no_grad()
 def is_step(program: Program, data: Trajectories) -> bool:
-    """Return whether `transition` is a step in `step`: it moves less and less as the step gets shorter.
+    """Return whether `transition` moves less and less as `step` gets shorter, in rows of data for the program.
 
-    A program that holds something within each step (`-w / step`) or that counts rows (`0.8 * state`) is none: in
-    substeps it is another program. It is looked at in rows of `data`, as returned by `for_program`, from its start.
+    A program that holds something within each step (`-w / step`) or counts rows (`0.8 * state`) does not: in substeps
+    it is another program.
     """
     if not bool(data.transitions.any()) or counts_rows(program):
         return False
@@ -122,14 +118,12 @@ def is_step(program: Program, data: Trajectories) -> bool:
 
 @torch.no_grad()
 def counts_rows(program: Program) -> bool:
-    """Return whether `actuators` looks at other rows but not at the time between them.
+    """Return whether `actuators` of one of its classes looks at other rows but not at the time between them.
 
-    A delay that is a number of rows (`control.roll(1, 0)`) is another delay in substeps. Each class that defines
-    `actuators` is looked at, so that a lag on top of such a delay does not hide it.
+    A delay that is a number of rows (`control.roll(1, 0)`) is another delay in substeps.
     """
-    kinds = [kind for kind in type(program).__mro__ if kind is not Program]
-    methods = [vars(kind)["actuators"] for kind in kinds if "actuators" in vars(kind)]
-    if not methods:
+    methods = [vars(kind)["actuators"] for kind in type(program).__mro__ if "actuators" in vars(kind)]
+    if methods == [Program.actuators]:
         return False
     like = next(program.parameters(), torch.zeros(()))
     with seeded("commands"):
@@ -161,12 +155,8 @@ def can_be_cut(program: Program, data: Trajectories) -> bool:
 
 @torch.no_grad()
 def require_convergence(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> None:
-    """Refuse substeps of a program whose rows, given as to `advance`, go apart as they are cut more finely.
-
-    Raises:
-        ProgramError: its result at K and 2 K substeps differs more for large K than for small ones, or its actuators
-            count rows.
-    """
+    """Raise ProgramError for a program whose actuators count rows, or whose rows, given as to `advance`, at K and 2 K
+    substeps differ more for large K than for small ones."""
     if counts_rows(program):
         raise ProgramError(
             f"program {type(program).__name__}: actuators counts rows and not seconds, which is another delay in "
@@ -190,8 +180,7 @@ def require_convergence(program: Program, state: Tensor, control: Tensor, time: 
 
 
 def _some(program: Program, data: Trajectories) -> tuple[Tensor, _Given]:
-    """States from a program's start, `(STATES, R, 1, D)`, and control, time and step of some rows of the longest
-    drive."""
+    """States from a program's start, `(STATES, R, 1, D)`, and what is given in rows of the longest drive."""
     drive = int(data.transitions.sum(0).argmax())
     rows = torch.where(data.transitions[:, drive])[0]
     rows = rows[torch.linspace(0, len(rows) - 1, min(ROWS, len(rows)), device=rows.device).long()]
@@ -199,7 +188,6 @@ def _some(program: Program, data: Trajectories) -> tuple[Tensor, _Given]:
 
 
 def _given(data: Trajectories, drive: int, rows: Tensor | slice) -> _Given:
-    """Control, time and step of some rows of a drive."""
     return data.controls[:, [drive]][rows], data.elapsed[:, [drive]][rows], data.steps[:, [drive]][rows]
 
 

@@ -1,14 +1,13 @@
 """Move a program by one row of a table in several substeps, with one draw of noise a row and channel.
 
-A vehicle moves in continuous time, a program in steps of `transition`. With `substeps = K` a row takes K of them, each
-of a K-th of its time. The first one samples the channels; the others reuse its standardised noise, so that a row still
-has one latent draw a channel. Effects, actuators and user code act in every substep. K = 1 is the program itself.
+With `substeps = K` a row takes K steps of `transition`, each of a K-th of its time. The first one samples the channels;
+the others reuse its standardised noise, so that a row still has one latent draw a channel. Effects, actuators and user
+code act in every substep. K = 1 is the program itself.
 
 A row's channel is what it is on average over the substeps. Its site has the mean of a row without noise. Its standard
-deviation is what one of its own noise, held over the row, changes of that mean: a program that takes noise back leaves
-less of it at the end of a row. A slope in a parameter is then that of a row's average. What is left out is when in the
-row the noise came, and what it does to other channels. Noise that is taken back to less than a tenth, or turned round,
-counts as a tenth.
+deviation is what one of its own noise, held over the row, changes of that mean, a tenth at least: a program that takes
+noise back leaves less of it. A slope in a parameter is then that of a row's average. What is left out is when in the
+row the noise came, and what it does to other channels.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ import copy
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from numbers import Integral
 from typing import Any
 
@@ -34,19 +34,14 @@ from steady_ppl.model.handlers import Recording, as_event, as_vector, unwrapped,
 from steady_ppl.model.program import Program
 
 MAX_SUBSTEPS = 1000  # of a row
-MIN_SHARE_OF_SD = 0.1
-"""Share of a channel's standard deviation in a substep that it has on average over a row, at least."""
-MIN_SHARE_OF_PUSH = 1e-3
-"""Share of a channel's location that is pushed at least, for what it changes to be seen in 32 bits."""
+MIN_SHARE_OF_SD = 0.1  # of a channel in a substep, that it has on average over a row at least
+MIN_SHARE_OF_PUSH = 1e-3  # of a channel's location, that is pushed at least to be seen in 32 bits
 _ROW_ENDS: ContextVar[bool] = ContextVar("row ends", default=True)
+_Part = tuple[tuple[Tensor, Tensor, Tensor], bool]
 
 
 def with_substeps(program: Program, count: int) -> Program:
-    """Return a copy of a program that takes `count` substeps a row.
-
-    Raises:
-        UsageError: the number is not whole, below 1 or above `MAX_SUBSTEPS`.
-    """
+    """Return a copy of a program that takes `count` substeps a row; UsageError unless it `is_count`."""
     if not is_count(count):
         raise UsageError(f"substeps must be a whole number from 1 to {MAX_SUBSTEPS}, got {count!r}")
     changed = copy.deepcopy(program)
@@ -65,7 +60,7 @@ def row_ends() -> bool:
 
 
 def advance(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-    """Move on by one row; handlers meet the channels' sites of the first substep.
+    """Return the state `(..., D)` after a row; handlers meet the channels' sites of the first substep.
 
     Args:
         state: `(..., D)`.
@@ -73,20 +68,17 @@ def advance(program: Program, state: Tensor, control: Tensor, time: Tensor, step
         time: `(...)` s since the trajectory's first row.
         step: `(...)` s, of the row.
 
-    Returns:
-        The next state, `(..., D)`.
-
     Raises:
         ProgramError: with more than one substep, a channel's noise has no location and scale.
     """
     if program.substeps == 1:
         return program.transition(state, control, time, step)
-    parts = list(_parts(program, control, time, step))
+    (first, _), *others = _parts(program, control, time, step)
     seen = Recording()
-    with seen, _at(parts[0]) as given:
-        state = program.transition(state, *given)
+    with seen, within_row():
+        state = program.transition(state, *first)
     noise = {site: standardised(fn, seen.values[site], site) for site, fn in seen.distributions.items()}
-    for after, _ in _through(program, state, parts[1:], noise):
+    for after, _ in _through(program, state, others, noise):
         state = after
     return state
 
@@ -114,8 +106,7 @@ def channel_values(
 ) -> dict[str, Tensor]:
     """Return what channels are, by site as `noise`, along states `(M, T + 1, B, D)` of data for the program.
 
-    Args:
-        noise: site → `(M, T, B, ...)`, in standard deviations.
+    `noise` is site → `(M, T, B, ...)`, in standard deviations.
     """
     given = (states[..., :-1, :, :], acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
     moments = {site: location_and_scale(fn, site) for site, fn in _on_average(program, *given).items()}
@@ -123,10 +114,9 @@ def channel_values(
 
 
 def channel_scales(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-    """Return what channels vary by within a substep, on average over a row without noise, `(..., C)`.
+    """Return by what channels vary within a substep, on average over a row without noise, `(..., C)`; see `advance`.
 
-    A push of this size, held over a row, moves its end as one standard deviation of noise does. Arguments are those of
-    `advance`.
+    A push of this size, held over a row, moves its end as one standard deviation of noise does.
     """
     found = []
     for _, seen in _through(program, state, _parts(program, control, time, step), 0.0):
@@ -143,8 +133,7 @@ def acting_controls(program: Program, data: Trajectories) -> Tensor:
 def acting(program: Program, commands: Tensor, elapsed: Tensor) -> Tensor:
     """Return what actuators make of commands `(rows, B, U)` that are held over a row, at `elapsed` s `(rows, B)`.
 
-    It is `(rows, B, U)`, or where actuators change something within a row the substeps' controls side by side,
-    `(rows, B, K U)`.
+    It is as `commands`, or where actuators change them within a row the substeps' controls side by side, `(…, K U)`.
     """
     count = program.substeps
     if count == 1 or type(program).actuators is Program.actuators or len(elapsed) < 2:
@@ -174,12 +163,11 @@ def within_row(ends: bool = False) -> Iterator[None]:
         _ROW_ENDS.reset(token)
 
 
+@dataclass(eq=False)
 class Held(Messenger):
     """Give channels the noise that a row already has: site → value in scales, or one value for every site."""
 
-    def __init__(self, noise: Mapping[str, Tensor] | float) -> None:
-        super().__init__()
-        self.noise = noise
+    noise: Mapping[str, Tensor] | float
 
     def _pyro_sample(self, message: Any) -> None:
         if message["is_observed"]:
@@ -190,11 +178,7 @@ class Held(Messenger):
 
 
 def location_and_scale(fn: Any, site: str) -> tuple[Tensor, Tensor]:
-    """Return location and scale of a channel's distribution, each `(...)` or `(..., C)`.
-
-    Raises:
-        ProgramError: it has none.
-    """
+    """Return location and scale of a channel's distribution, each `(...)` or `(..., C)`; ProgramError without them."""
     base = unwrapped(fn)
     if not isinstance(base, dist.Normal | dist.StudentT | dist.Laplace | dist.Cauchy):
         raise ProgramError(
@@ -211,23 +195,13 @@ def standardised(fn: Any, value: Tensor, site: str) -> Tensor:
     return (value - loc) / torch.where(scale > 0, scale, torch.ones_like(scale))
 
 
-_Part = tuple[Tensor, Tensor, Tensor, bool]
-
-
 def _parts(program: Program, control: Tensor, time: Tensor, step: Tensor) -> Iterator[_Part]:
-    """Control, time, step and whether the row ends, for every substep."""
+    """Control, time and step of every substep, and whether the row ends with it."""
     count, controls = program.substeps, len(program.controls)
     short = step / count
     held = [control] * count if control.shape[-1] == controls else control.split(controls, -1)
     for index, acting_now in enumerate(held):
-        yield acting_now, time + index * short, short, index == count - 1
-
-
-@contextmanager
-def _at(part: _Part) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    *given, ends = part
-    with within_row(ends):
-        yield tuple(given)  # type: ignore[misc]
+        yield (acting_now, time + index * short, short), index == count - 1
 
 
 def _sample(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> dict[str, Tensor]:
@@ -259,9 +233,9 @@ def _through(
     program: Program, state: Tensor, parts: Iterable[_Part], noise: Mapping[str, Tensor] | float
 ) -> Iterator[tuple[Tensor, Recording]]:
     """The state after each substep with given noise in scales, and what was sampled in it."""
-    for part in parts:
+    for given, ends in parts:
         seen = Recording()
-        with poutine.block(), seen, Held(noise), _at(part) as given:
+        with poutine.block(), seen, Held(noise), within_row(ends):
             state = program.transition(state, *given)
         yield state, seen
 

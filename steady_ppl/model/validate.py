@@ -53,7 +53,7 @@ def probe(program: Program) -> None:
         observing = Observing(measurements, torch.ones_like(measurements, dtype=torch.bool))
         _, seen = _call(name, "observe", lambda: program.observe(state), LEFT, observing)
         density = seen.total()
-        if tuple(density.shape) != LEFT:
+        if density.shape != LEFT:
             raise ProgramError(
                 f"program {name}: the density of observe has shape {tuple(density.shape)}; expected {LEFT} "
                 "(is .to_event(1) missing?)",
@@ -105,9 +105,8 @@ def _misdeclared(program: Program) -> Iterator[str]:
 
 def _check_noise(name: str, noise: Recording) -> None:
     if not noise.values:
-        raise ProgramError(
-            f"program {name}: transition samples nothing: at least one channel must be noisy", site="transition"
-        )
+        about = "transition samples nothing: at least one channel must be noisy"
+        raise ProgramError(f"program {name}: {about}", site="transition")
     for site, value in noise.values.items():
         fn = noise.distributions[site]
         if fn.event_dim > 1 or tuple(value.shape[: value.dim() - fn.event_dim]) != LEFT:
@@ -124,9 +123,8 @@ def _check_sites(name: str, *recordings: Recording) -> None:
     for method, recording in zip(("initial", "transition", "observe"), recordings, strict=True):
         for site in recording.distributions:
             if site in taken:
-                raise ProgramError(
-                    f"program {name}: site {site!r} of {method} has a name that {taken[site]} uses too", site=site
-                )
+                about = f"site {site!r} of {method} has a name that {taken[site]} uses too"
+                raise ProgramError(f"program {name}: {about}", site=site)
             taken[site] = method
 
 
@@ -151,10 +149,9 @@ def _call(
     name: str, method: str, run: Callable[[], Tensor | None], left: tuple[int, ...], *handlers: Messenger
 ) -> tuple[Tensor, Recording]:
     recording = _RecordingOnce()
-    with ExitStack() as stack:
+    with ExitStack() as stack, pyro.settings.context(module_local_params=True):
         for handler in (poutine.block(), Broadcasting(left), recording, *handlers):
             stack.enter_context(handler)
-        stack.enter_context(pyro.settings.context(module_local_params=True))
         try:
             return run(), recording  # type: ignore[return-value]
         except SteadyError as error:
@@ -179,7 +176,7 @@ def _check_state(method: str, state: object, size: int) -> None:
             f"it returned {came}",
             site=method,
         )
-    if method == "transition" and tuple(state.shape[:-1]) != LEFT:
+    if method == "transition" and state.shape[:-1] != LEFT:
         raise ProgramError(
             f"transition returned shape {tuple(state.shape)} for states of shape {(*LEFT, size)}: write it for any "
             "shape on the left, with the component last",

@@ -1,37 +1,38 @@
-"""What of a bag goes into which column of a table: `BagMapping`, from a TOML file, from `--map`, or built in Python.
-
-`docs/import-bag.md` shows a file; `read_bags` says what each key does to the numbers.
-"""
+"""What of a bag goes into which column of a table: `BagMapping`, from a TOML file, from `--map`, or built in Python."""
 
 from __future__ import annotations
 
-import math
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from steady_ppl.data.rosbag.fields import Steps, parse_field
 from steady_ppl.errors import UsageError, labelled
 from steady_ppl.utils.files import require_file
+from steady_ppl.utils.schema import NUMBER, TEXT, mismatch
 
 CHOICES = {
     "between": (None, "hold", "interpolate"),
     "reading": (None, "yaw", "angle"),
     "clock": ("bag", "header", "aligned"),
 }
+FORM = {"topic": TEXT, "field": TEXT, "longest": (NUMBER, None), "late": NUMBER, "scale": NUMBER, "offset": NUMBER}
 MAX_LATE = 1e9  # s; times are whole nanoseconds in 64 bits
+SPELLING = re.compile(r"[A-Za-z_]\w*(\[\d+\])*(\.[A-Za-z_]\w*(\[\d+\])*)*", re.ASCII)  # twist.linear.x, ranges[0]
+Steps = tuple[str | int, ...]  # the names and indices that lead to a field
 
 
 @dataclass(frozen=True)
 class BagColumn:
     """One column of the table and the field of a topic that fills it: a section `[columns."u.speed"]` of the file.
 
+    What cannot be is a UsageError that names the column and the key; `read_bags` says what each key does.
+
     Attributes:
         name: the column, `u.…`, `y.…` or `x.…`.
-        topic: the topic's full name.
-        field: the field within its messages.
+        topic, field: the topic's full name and the field within its messages.
         reading: None for a number, "yaw" for the heading of a quaternion, "angle" for a number that is an angle, rad;
             `as` in TOML.
         between: how a control goes on from message to message, "hold" (None is the same) or "interpolate".
@@ -39,9 +40,6 @@ class BagColumn:
         clock: "bag", "header" or "aligned".
         late: s, subtracted from the time stamps.
         scale, offset: the column's value is `scale * read + offset`.
-
-    Raises:
-        UsageError: naming the column and the key.
     """
 
     name: str
@@ -62,19 +60,14 @@ class BagColumn:
     def _check(self) -> None:
         if self.name[:2] not in ("u.", "y.", "x.") or len(self.name) < 3:
             raise UsageError("expected u.NAME (a control), y.NAME (a measurement) or x.NAME (a known state)")
-        for key in ("topic", "field"):
-            value = getattr(self, key)
-            if not isinstance(value, str) or not value:
-                raise UsageError(f"{key} is {value!r}, expected text")
+        problem = mismatch(vars(self), FORM)
+        if problem or not self.topic:
+            raise UsageError(problem or "topic is '', expected text")
         for key, choices in CHOICES.items():
             value = getattr(self, key)
             if value not in choices:
                 known = " or ".join(f'"{choice}"' for choice in choices if choice)
                 raise UsageError(f"{'as' if key == 'reading' else key} is {value!r}, expected {known}")
-        for key in ("longest", "late", "scale", "offset"):
-            value = getattr(self, key)
-            if not _is_number(value) and not (key == "longest" and value is None):
-                raise UsageError(f"{key} is {value!r}, expected a finite number")
         if self.kind != "u" and (self.between is not None or self.longest is not None):
             key = "between" if self.between is not None else "longest"
             raise UsageError(f"{key} is for controls (u.); measurements and states are not held: leave it out")
@@ -82,7 +75,9 @@ class BagColumn:
             raise UsageError(f"late is {self.late:g} s, expected at most {MAX_LATE:g} s, which are thirty years")
         if self.scale == 0:
             raise UsageError("scale is 0, which leaves nothing of what was read")
-        parse_field(self.field)
+        if not SPELLING.fullmatch(self.field):
+            wanted = "expected names and indices such as linear.x or data[0]"
+            raise UsageError(f"field {self.field!r} is not spelt as one: {wanted}")
 
     @property
     def kind(self) -> str:
@@ -92,7 +87,7 @@ class BagColumn:
     @property
     def steps(self) -> Steps:
         """The names and indices that lead to the field."""
-        return parse_field(self.field)
+        return tuple(int(step) if step.isdigit() else step for step in re.findall(r"\w+", self.field))
 
     @property
     def where(self) -> str:
@@ -102,15 +97,12 @@ class BagColumn:
 
 @dataclass(frozen=True)
 class BagMapping:
-    """The columns of a table and the time between its rows.
+    """The columns of a table and the time between its rows; UsageError for what cannot be.
 
     Attributes:
         columns: in the order in which the table has them, among each of u., y. and x.
         step: s between rows.
         messages: .msg files, or folders of them, that define message types which a bag does not.
-
-    Raises:
-        UsageError: naming what is wrong.
     """
 
     columns: tuple[BagColumn, ...]
@@ -118,7 +110,7 @@ class BagMapping:
     messages: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
-        if not _is_number(self.step) or self.step <= 0:
+        if mismatch(self.step, NUMBER) or self.step <= 0:
             raise UsageError(f"step is {self.step!r}, expected the seconds between two rows, more than 0")
         names = [column.name for column in self.columns]
         for i, column in enumerate(self.columns):
@@ -203,7 +195,3 @@ def _known(said: Mapping[str, Any], keys: Sequence[str], where: str) -> None:
     for key in said:
         if key not in keys:
             raise UsageError(f"{where}unknown key {key}; there are {', '.join(keys)}")
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -2,8 +2,7 @@
 
 A bag has messages at any time; a table has one row every `step` seconds.
 
-- Rows lie on a grid from the first moment at which every control is known to the last measurement. Each trajectory's
-  time starts at zero.
+- Rows lie on a grid, in time from zero, from the first moment at which every control is known to the last measurement.
 - A control is held, or with `between = "interpolate"` on the line between two commands, angles the shorter way round;
   after the last command that one goes on.
 - A measurement is in the row that is nearest to it. It is never interpolated or held, which would make up data. Of
@@ -20,16 +19,14 @@ A bag has messages at any time; a table has one row every `step` seconds.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from steady_ppl.data.rosbag.fields import check_field, has_stamp, stamp_of, value_at
 from steady_ppl.data.rosbag.mapping import BagColumn, BagMapping
-from steady_ppl.data.rosbag.reader import Bag, Say, bag_name, open_bag
+from steady_ppl.data.rosbag.reader import Bag, Say, bag_name, check_field, has_stamp, open_bag, stamp_of, value_at
 from steady_ppl.data.rosbag.resample import Piece, Series, align, held_pauses, in_rows
 from steady_ppl.data.table import from_frame
 from steady_ppl.data.trajectories import Trajectories
@@ -39,15 +36,12 @@ from steady_ppl.utils.text import say as say_aside
 
 
 def read_bags(paths: Sequence[str | Path], mapping: BagMapping, say: Say = say_aside) -> Trajectories:
-    """Read ROS bags into trajectories.
+    """Read ROS bags into trajectories, in the order of the bags, float64, the columns in the order of the mapping.
 
     Args:
         paths: ROS 1 .bag files, ROS 2 folders, or single .mcap or .db3 files.
         mapping: which field becomes which column.
         say: is told what was left out and which clocks were moved; by default on stderr.
-
-    Returns:
-        In the order of the bags, float64, the columns in the order of the mapping.
 
     Raises:
         DataError: naming the bag and, where they apply, the column, the topic and the field.
@@ -76,12 +70,10 @@ def read_bags(paths: Sequence[str | Path], mapping: BagMapping, say: Say = say_a
             'clocks the same? clock = "bag" and "aligned" go by that of the recorder'
         )
     columns = [column.name for column in sorted(mapping.columns, key=lambda column: "uyx".index(column.kind))]
-    blocks = []
-    for name, piece in kept.items():
-        block = pd.DataFrame(piece.cells, columns=columns)
-        block.insert(0, "trajectory", name)
-        block.insert(1, "time", np.arange(piece.rows) * float(mapping.step))
-        blocks.append(block)
+    blocks = [
+        pd.DataFrame(piece.cells, columns=columns).assign(trajectory=name, time=np.arange(piece.rows) * mapping.step)
+        for name, piece in kept.items()
+    ]
     return from_frame(pd.concat(blocks, ignore_index=True), name=", ".join(labels))
 
 
@@ -111,23 +103,15 @@ def _of_topic(bag: Bag, topic: str, columns: list[BagColumn], say: Say) -> list[
     fields = [(column.steps, column.reading == "yaw") for column in columns]
     arrivals: list[int] = []
     headers: list[int] = []
-    values: list[list[float]] = []
-    short = [0] * len(columns)
+    values: list[list[float | None]] = []
     for connection, arrival, raw in bag.messages([topic]):
         message = bag.content(connection, raw)
         arrivals.append(arrival)
         if stamped:
             headers.append(stamp_of(message))
-        cells = []
-        for i, (steps, yaw) in enumerate(fields):
-            try:
-                cells.append(value_at(message, steps, yaw=yaw))
-            except IndexError:
-                short[i] += 1
-                cells.append(math.nan)
-        values.append(cells)
+        values.append([value_at(message, steps, yaw=yaw) for steps, yaw in fields])
     received, stamps = np.array(arrivals, dtype=np.int64), np.array(headers, dtype=np.int64)
-    table = np.array(values, dtype=np.float64).reshape(len(arrivals), len(columns))
+    table = np.array(values, dtype=np.float64).reshape(len(arrivals), len(columns))  # None becomes NaN
     unset = int((stamps == 0).sum())
     if unset:
         what = f"the header.stamp of {unset} of {len(stamps)} messages is zero, nobody set it"
@@ -140,14 +124,15 @@ def _of_topic(bag: Bag, topic: str, columns: list[BagColumn], say: Say) -> list[
         drift = f"{'lost' if moved.drift >= 0 else 'gained'} {abs(moved.drift) * 1e6:.2f} ppm"
         say(f"{bag.name}: {topic}: its clock was {off}, the smallest delay included, and {drift}")
     found = []
-    for column, cells_of, missing in zip(columns, table.T, short, strict=True):
+    for i, column in enumerate(columns):
+        missing = sum(cells[i] is None for cells in values)
         where, among = f"{bag.name}: {column.where}", f"in {missing} of {len(arrivals)} messages"
         if missing and (missing == len(arrivals) or column.kind == "u"):
             raise DataError(f"{where}: the index is out of range {among}, the array is shorter")
         if missing:
             say(f"{where}: the array is shorter {among}, where nothing is taken for measured")
         time = times.get(column.clock, received) - round(column.late * 1e9)
-        found.append(_series(where, column, time, cells_of))
+        found.append(_series(where, column, time, table[:, i]))
     return found
 
 

@@ -1,12 +1,14 @@
-"""A bag as topics and messages, read by the `rosbags` package; and a listing with a mapping to start from.
+"""A bag as topics, messages and their fields, read by `rosbags`; and a listing with a mapping to start from.
 
 ROS 1 bags and most ROS 2 bags define the types of their messages. Where a ROS 2 bag does not (sqlite bags recorded
-before Iron never do), the standard types are those of Humble, and others are read from .msg files.
+before Iron never do), the standard types are those of Humble, and others are read from .msg files. Types are asked
+first, so that a field that does not exist is refused before any message is read.
 """
 
 from __future__ import annotations
 
 import difflib
+import math
 import os
 import re
 import textwrap
@@ -18,15 +20,17 @@ from typing import Any
 
 import numpy as np
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from steady_ppl.data.rosbag.fields import has_stamp, numeric_fields, undefined_type
+from steady_ppl.data.rosbag.mapping import Steps
 from steady_ppl.errors import DataError, SteadyError, UsageError
 from steady_ppl.utils.files import require_file
 from steady_ppl.utils.text import one_line
 
 Say = Callable[[str], None]
 MAX_WIDTH = 110  # characters of a list of fields
+TEXT = ("string", "wstring", "wchar")
 
 
 @dataclass(frozen=True)
@@ -85,11 +89,9 @@ class Bag:
 
 @contextmanager
 def open_bag(path: Path, messages: Sequence[Path] = ()) -> Iterator[Bag]:
-    """Open a ROS 1 .bag, a ROS 2 folder, or a single .mcap or .db3 file.
+    """Open a ROS 1 .bag, a ROS 2 folder, or a single .mcap or .db3 file; DataError for no bag or a damaged one.
 
-    Raises:
-        DataError: it is no bag, or damaged.
-        UsageError: one of `messages`, the .msg files of types that the bag does not define, is missing or wrong.
+    `messages` are .msg files of types that the bag does not define; UsageError where one is missing or wrong.
     """
     name = bag_name(path)
     own = _definitions(messages)
@@ -159,12 +161,136 @@ def _definitions(paths: Sequence[Path]) -> dict[str, Any]:
     return found
 
 
+def check_field(store: Any, type_name: str, steps: Steps, where: str, *, quaternion: bool = False) -> None:
+    """Raise DataError, which begins with `where`, unless a message type has a number, or a quaternion, in a field."""
+    kind: Any = (Nodetype.NAME, type_name)
+    so_far = ""
+    for step in steps:
+        here = so_far or type_name
+        if isinstance(step, int):
+            if kind[0] not in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+                raise DataError(f"{where}: {here} is {_describe(store, kind)}, it takes no index [{step}]")
+            inner, length = kind[1]
+            if kind[0] == Nodetype.ARRAY and step >= length:
+                about = f"{here} has {length} elements: 0 to {length - 1}"
+                raise DataError(f"{where}: index [{step}] is out of range, {about}")
+            kind, so_far = inner, f"{so_far}[{step}]"
+            continue
+        if kind[0] != Nodetype.NAME:
+            raise DataError(f"{where}: {here} is {_describe(store, kind)}, it has no field {step}")
+        fields = dict(store.get_msgdef(kind[1]).fields)
+        if step not in fields:
+            raise DataError(f"{where}: {here} has no field {step}; it has {', '.join(fields) or 'none'}")
+        kind, so_far = fields[step], f"{so_far}.{step}" if so_far else step
+    if quaternion:
+        if kind[0] != Nodetype.NAME or not set("xyzw") <= dict(store.get_msgdef(kind[1]).fields).keys():
+            wanted = "as yaw needs a quaternion with x, y, z and w"
+            raise DataError(f"{where}: {wanted}, {so_far} is {_describe(store, kind)}")
+    elif kind[0] != Nodetype.BASE or kind[1][0] in TEXT:
+        raise DataError(f"{where}: expected a number, {so_far} is {_describe(store, kind)}")
+
+
+def has_stamp(store: Any, type_name: str) -> bool:
+    """Whether messages of a type carry `header.stamp`."""
+    return {"header.stamp.sec", "header.stamp.nanosec"} <= set(numeric_fields(store, type_name))
+
+
+def undefined_type(store: Any, type_name: str, seen: set[str] | None = None) -> str | None:
+    """The first of a type and the types that it is made of that the typestore does not know."""
+    seen = set() if seen is None else seen
+    if type_name in seen:
+        return None
+    seen.add(type_name)
+    if type_name not in store.fielddefs:
+        return type_name
+    for _, kind in store.fielddefs[type_name][1]:
+        node, name = kind if kind[0] in (Nodetype.NAME, Nodetype.BASE) else kind[1][0]
+        missing = undefined_type(store, name, seen) if node == Nodetype.NAME else None
+        if missing:
+            return missing
+    return None
+
+
+def value_at(message: Any, steps: Steps, *, yaw: bool = False) -> float | None:
+    """The number that a message has in a field, or the heading of a quaternion; None in too short an array.
+
+    The heading, −π to π rad, is the rotation about z that comes last in z-y-x angles; NaN for a quaternion of zeros.
+    """
+    for step in steps:
+        if isinstance(step, int) and step >= len(message):
+            return None
+        message = message[step] if isinstance(step, int) else getattr(message, step)
+    if not yaw:
+        return float(message)
+    x, y, z, w = (float(getattr(message, name)) for name in "xyzw")
+    if x == y == z == w == 0:
+        return math.nan
+    return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
+def stamp_of(message: Any) -> int:
+    """`header.stamp` of a message, ns."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def numeric_fields(store: Any, type_name: str, message: Any = None) -> Iterator[str]:
+    """Every field of a type that holds a number; a quaternion comes once more, with what reads its heading.
+
+    An array of three numbers in a message is `gains[0…2]`; without a message, one of no fixed length is `ranges[0…]`.
+    """
+
+    def walk(kind: Any, spelt: str, value: Any) -> Iterator[str]:
+        if kind[0] == Nodetype.BASE:
+            if kind[1][0] not in TEXT:
+                yield spelt
+        elif kind[0] == Nodetype.NAME:
+            fields = dict(store.get_msgdef(kind[1]).fields)
+            if kind[1].rpartition("/")[2] == "Quaternion":
+                yield f'{spelt} (as = "yaw")'
+            for name, inner in fields.items():
+                if name != "structure_needs_at_least_one_member":
+                    yield from walk(inner, f"{spelt}.{name}".lstrip("."), getattr(value, name, None))
+        else:
+            inner, length = kind[1]
+            length = len(value) if value is not None else length if kind[0] == Nodetype.ARRAY else None
+            if length == 0:
+                yield from walk(inner, f"{spelt}[] (empty in the first message)", None)
+                return
+            last = "0…" if length is None else "0" if length == 1 else f"0…{length - 1}"
+            yield from walk(inner, f"{spelt}[{last}]", None if value is None else value[0])
+
+    yield from walk((Nodetype.NAME, type_name), "", message)
+
+
+def _describe(store: Any, kind: Any) -> str:
+    """What a field holds, in words."""
+    if kind[0] == Nodetype.BASE:
+        return "text" if kind[1][0] in TEXT else f"a number ({kind[1][0]})"
+    if kind[0] == Nodetype.NAME:
+        return f"a {kind[1]} with the fields {', '.join(name for name, _ in store.get_msgdef(kind[1]).fields)}"
+    length = f" of {kind[1][1]} elements" if kind[0] == Nodetype.ARRAY else ""
+    return f"an array{length}: name one by its index, such as [0]"
+
+
 def listing(bags: Sequence[Bag]) -> str:
     """Of each bag its topics with type, number of messages, median rate and numeric fields; then a mapping to start
     from, whose sections are comments."""
     sections: dict[tuple[str, str], list[str]] = {}
     lines = [line for bag in bags for line in _of_bag(bag, sections)]
-    return "\n".join(lines + _skeleton(sections))
+    lines += [
+        "",
+        "# A mapping to start from: take the sections that you need out of the comments and name their columns u.NAME",
+        "# (a control), y.NAME (a measurement) or x.NAME (a state that is known).",
+        "step = 0.1  # s between two rows",
+    ]
+    taken: list[str] = []
+    for (topic, field), said in sections.items():
+        name = re.sub(r"\W+", "_", f"{topic}_{field}").strip("_")
+        again = taken.count(name)  # /a/b with c, and /a with b.c
+        taken.append(name)
+        lines += ["#", f'# [columns."y.{name}{f"_{again + 1}" if again else ""}"]', *said]
+    return "\n".join(lines)
 
 
 def _of_bag(bag: Bag, sections: dict[tuple[str, str], list[str]]) -> list[str]:
@@ -204,19 +330,3 @@ def _section(topic: str, fields: list[str], stamped: bool) -> dict[tuple[str, st
     if stamped:
         lines.append('# clock = "aligned"  # its header says when it was made; leave out for the time of arrival')
     return {(topic, field): lines}
-
-
-def _skeleton(sections: dict[tuple[str, str], list[str]]) -> list[str]:
-    lines = [
-        "",
-        "# A mapping to start from: take the sections that you need out of the comments and name their columns u.NAME",
-        "# (a control), y.NAME (a measurement) or x.NAME (a state that is known).",
-        "step = 0.1  # s between two rows",
-    ]
-    taken: list[str] = []
-    for (topic, field), said in sections.items():
-        name = re.sub(r"\W+", "_", f"{topic}_{field}").strip("_")
-        again = taken.count(name)  # /a/b with c, and /a with b.c
-        taken.append(name)
-        lines += ["#", f'# [columns."y.{name}{f"_{again + 1}" if again else ""}"]', *said]
-    return lines

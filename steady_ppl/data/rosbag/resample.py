@@ -45,11 +45,7 @@ class Piece:
 def in_rows(series: Sequence[Series], step: float, name: str = "bag") -> list[Piece]:
     """The pieces between pauses, each with rows from where all controls are known to its last measurement.
 
-    No measurement is in two pieces where a pause, longer than a control's `longest`, takes two steps or more. No series
-    of a control may be empty.
-
-    Raises:
-        DataError: there would be more rows than `MAX_ROWS`; it names the bag.
+    No series of a control may be empty. More rows than `MAX_ROWS` are a DataError that names the bag.
     """
     measured = [one.times for one in series if one.column.kind == "y" and len(one.times)]
     if not measured:
@@ -146,8 +142,7 @@ def _times(rows: np.ndarray, start: int, spacing: float) -> np.ndarray:
 def _interpolated(one: Series, time: np.ndarray, most: float | None) -> np.ndarray:
     """On the line between the messages before and after; NaN where one is missing or they are over `most` ns apart.
 
-    Without `most` the first and the last message go on for ever. Angles take the shorter way round and come back
-    continuous, the first between −π and π.
+    Without `most` the first and the last message go on for ever.
     """
     kept = np.append(one.times[1:] > one.times[:-1], True)[: len(one.times)]  # of messages at one time the last
     times, values = one.times[kept], one.values[kept]
@@ -181,12 +176,10 @@ class Alignment:
 def align(stamps: np.ndarray, received: np.ndarray) -> Alignment:
     """Move header stamps onto the clock on which they were received, `(messages,)` int64 ns each, at least one.
 
-    A bag keeps when a message arrived at the recorder; its header may keep when it was made, on the clock of the
-    machine that made it. That clock is off by an offset and drifts, and what arrives has been on its way for a delay
-    that is never negative. Of all lines offset + drift · stamp below the points (stamp, received − stamp), the nearest
-    to them, summed over the points, is the edge of their lower convex hull over the mean of the stamps. Stamps moved by
-    that line are when messages were made, all late by the smallest delay that occurs. Stamps that are all alike have no
-    drift.
+    A header's clock is off by an offset and drifts, and a message is on its way for a delay that is never negative. Of
+    all lines offset + drift · stamp below the points (stamp, received − stamp), the nearest to them, summed over the
+    points, is the edge of their lower convex hull over the mean of the stamps. Stamps moved by that line are when
+    messages were made, all late by the smallest delay that occurs. Stamps that are all alike have no drift.
 
     Sue B. Moon, Paul Skelly and Don Towsley. Estimation and removal of clock skew from network delay measurements.
     INFOCOM 1999.

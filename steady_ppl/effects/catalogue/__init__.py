@@ -1,4 +1,1 @@
-"""The effects that everybody has, by what they act on; `registry` reads each file's list.
-
-A file here declares effects and does nothing else.
-"""
+"""The effects that everybody has, by what they act on; `registry` reads each file's list."""

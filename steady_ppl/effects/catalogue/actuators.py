@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -11,31 +10,33 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.effects.catalogue.planar_forces import not_planar
-from steady_ppl.effects.declaration import Effect, declare, power_of_two_below
+from steady_ppl.effects.catalogue.forces import PLANAR
+from steady_ppl.effects.declaration import Choices, Effect, Names, Need, declare, needs, power_of_two_below
 from steady_ppl.model.actuation import delayed, lagged
 from steady_ppl.model.program import Program
 
+CONTROLS: Need = (lambda program: program.controls, "the program has no controls")
+THRUSTERS: Need = (
+    lambda program: {"left", "right"} <= set(program.control_names),
+    "there are no controls left and right",
+)
+NO_TWO_THRUSTS: Need = (
+    lambda program: {"left", "right"} != set(program.control_names),
+    "of two thrusts it is the asymmetry, up to mass and inertia",
+)
 
-def _no_thrusters(program: Program) -> str | None:
-    return None if {"left", "right"} <= set(program.control_names) else "there are no controls left and right"
 
-
-def _no_controls(program: Program) -> str | None:
-    return None if program.controls else "the program has no controls"
-
-
-def _each(program: Program, data: Trajectories | None = None) -> Sequence[Mapping[str, Any]]:
+def _each(program: Program, data: Trajectories | None = None) -> Choices:
     return [{"controls": (name,), "at": name} for name in program.control_names]
 
 
-def _everywhere(program: Program, data: Trajectories | None = None) -> Sequence[Mapping[str, Any]]:
+def _everywhere(program: Program, data: Trajectories | None = None) -> Choices:
     """All controls together and, where their units differ, each alone."""
     alone = _each(program) if len(set(program.control_units)) > 1 else []
     return [{"controls": program.control_names}, *alone]
 
 
-def _per_unit(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+def _per_unit(program: Program, data: Trajectories | None) -> Choices:
     """The coefficient has a control's unit: together where they share one, else each alone."""
     together, *alone = _everywhere(program)
     choices = []
@@ -45,12 +46,12 @@ def _per_unit(program: Program, data: Trajectories | None) -> Sequence[Mapping[s
     return choices
 
 
-def _magnitudes(data: Trajectories, controls: Sequence[str]) -> Tensor:
+def _magnitudes(data: Trajectories, controls: Names) -> Tensor:
     columns = [data.control_names.index(name) for name in controls]
     return data.controls[..., columns][data.rows].abs()
 
 
-def _knees(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+def _knees(program: Program, data: Trajectories | None) -> Choices:
     choices = []
     for group in _per_unit(program, data):
         knees = [0.6]
@@ -62,19 +63,13 @@ def _knees(program: Program, data: Trajectories | None) -> Sequence[Mapping[str,
     return choices
 
 
-def _lacks_single(program: Program) -> str | None:
-    if {"left", "right"} == set(program.control_names):
-        return "of two thrusts it is the asymmetry, up to mass and inertia"
-    return _no_controls(program)
-
-
 ACTUATORS: list[Effect] = []
 _on_commands = partial(declare, ACTUATORS, "history")
-_on_controls = partial(_on_commands, lacks=_no_controls)
+_on_controls = partial(_on_commands, lacks=needs(CONTROLS))
 _on_time = partial(_on_controls, limit=2.0, sign=1, between=(0.0, math.inf), choices=_everywhere)
 
 
-@_on_commands("1", typical=0.05, limit=0.5, lacks=_no_thrusters)
+@_on_commands("1", typical=0.05, limit=0.5, lacks=needs(THRUSTERS))
 def thrust_asymmetry(self: Any, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     r"""right → (1 + c) right
 
@@ -85,8 +80,8 @@ def thrust_asymmetry(self: Any, control: Tensor, time: Tensor, c: Tensor) -> Ten
     return control * (1 + c * self.chosen_controls(("right",), control))
 
 
-@_on_commands("1", typical=0.08, limit=1.0, choices=_each, lacks=_lacks_single)
-def gain_error(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Sequence[str]) -> Tensor:
+@_on_commands("1", typical=0.08, limit=1.0, choices=_each, lacks=needs(NO_TWO_THRUSTS, CONTROLS))
+def gain_error(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Names) -> Tensor:
     r"""u → (1 + c) u of one control
 
     equation: u \to (1 + c)\,u
@@ -96,7 +91,7 @@ def gain_error(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Se
     return control * (1 + c * self.chosen_controls(controls, control))
 
 
-@declare(ACTUATORS, "command", "s/m", typical=0.1, limit=1.0, lacks=not_planar)
+@declare(ACTUATORS, "command", "s/m", typical=0.1, limit=1.0, lacks=needs(PLANAR))
 def speed_dependent_gain(self: Any, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     r"""u → (1 - c |v|) u
 
@@ -110,7 +105,7 @@ def speed_dependent_gain(self: Any, state: Tensor, control: Tensor, time: Tensor
 
 
 @_on_controls("1", typical=0.45, limit=1.0, sign=1, profiled=("knee",), choices=_knees)
-def thrust_saturation(self: Any, control: Tensor, *_: Tensor, c: Tensor, controls: Sequence[str], knee: Any) -> Tensor:
+def thrust_saturation(self: Any, control: Tensor, *_: Tensor, c: Tensor, controls: Names, knee: Any) -> Tensor:
     r"""u → u - c sign(u) max(|u| - knee, 0)
 
     equation: u \to u - c\,\mathrm{sign}(u)\max(|u| - u_0, 0)
@@ -122,7 +117,7 @@ def thrust_saturation(self: Any, control: Tensor, *_: Tensor, c: Tensor, control
 
 
 @_on_controls("of the control", typical=0.2, limit=1.0, sign=1, probes=(0.05, 0.15, 0.3), choices=_per_unit)
-def dead_zone(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Sequence[str]) -> Tensor:
+def dead_zone(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Names) -> Tensor:
     r"""u → sign(u) max(|u| - c, 0)
 
     equation: u \to \mathrm{sign}(u)\max(|u| - c, 0)
@@ -134,7 +129,7 @@ def dead_zone(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Seq
 
 
 @_on_time("s", typical=0.25, probes=(0.1, 0.3, 0.6))
-def actuator_lag(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Sequence[str]) -> Tensor:
+def actuator_lag(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Names) -> Tensor:
     r"""du_acting/dt = (u - u_acting) / c
 
     equation: \dot u_\mathrm{acting} = (u - u_\mathrm{acting}) / c
@@ -145,7 +140,7 @@ def actuator_lag(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: 
 
 
 @_on_time("s", typical=0.2, probes=(0.1, 0.2, 0.4))
-def actuator_delay(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Sequence[str]) -> Tensor:
+def actuator_delay(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Names) -> Tensor:
     r"""u_acting(t) = u(t - c)
 
     equation: u_\mathrm{acting}(t) = u(t - c)

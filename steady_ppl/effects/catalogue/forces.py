@@ -1,8 +1,10 @@
-"""Forces that any program can lack: drag, friction, offsets and springs on the channels of one axis."""
+"""Forces that a program can lack: on the channels of one axis of any program, and on a vehicle in the plane."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+import math
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -10,48 +12,87 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.effects.declaration import Effect, declare
+from steady_ppl.effects.declaration import Choices, Effect, Means, Names, Need, Pushes, declare, needs
+from steady_ppl.model.handlers import broadcast_event, running
+from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.model.program import Program
+from steady_ppl.utils.random import seeded
+
+STARTS = 500  # drawn, where nothing else says where a vehicle goes
+
+AXES: Need = (lambda program: program.axes, "the program does not say which channels move what (`motion`)")
+SPRINGS: Need = (lambda program: any(p for p, _ in program.motion.values()), "no channel has a position (`motion`)")
+BODY: Need = (
+    lambda program: {"forward", "lateral"} <= set(program.axes.get("translation", ())),
+    "it is no planar vehicle",
+)
+ONE_COMPONENT: Need = (lambda program: not BODY[0](program), "it has two components there")
+YAW: Need = (lambda program: "yaw" in program.axes, "there is no yaw channel")
+PLANAR: Need = (lambda program: isinstance(program, PlanarVehicle), "it acts on vehicles in the plane only")
+SLIP: Need = (lambda program: program.slips, "the program holds the lateral velocity at zero")
+THRUSTS: Need = (
+    lambda program: {"left", "right"} <= set(program.control_names),
+    "the controls are not a left and a right thrust",
+)
 
 
-def _each(groups: Mapping[str, Sequence[str]]) -> Sequence[Mapping[str, Any]]:
+def _each(groups: Mapping[str, Names]) -> Choices:
     """Each group of channels, at its name unless there is one only."""
     return [{"channels": channels, **({"at": name} if len(groups) > 1 else {})} for name, channels in groups.items()]
 
 
-def _axes(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+def _axes(program: Program, data: Trajectories | None) -> Choices:
     return _each({name: channels for name, channels in program.axes.items() if name != "yaw"})
 
 
-def _springs(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+def _springs(program: Program, data: Trajectories | None) -> Choices:
     return _each({channel: (channel,) for channel, (position, _) in program.motion.items() if position})
 
 
-def _no_axes(program: Program) -> str | None:
-    return None if program.axes else "the program does not say which channels move what (`motion`)"
+def _drags(program: Program, data: Trajectories | None) -> Choices:
+    return [{"drag": drag} for drag in (0.06, 0.02, 0.2)]
 
 
-def _no_springs(program: Program) -> str | None:
-    return None if any(p for p, _ in program.motion.values()) else "no channel has a position (`motion`)"
+def _leads(program: Program, data: Trajectories | None) -> Choices:
+    return [{"lead": lead} for lead in (0.2, 0.0, 0.5)]
 
 
-def _planar(program: Program) -> bool:
-    return {"forward", "lateral"} <= set(program.axes.get("translation", ()))
+def _limits(program: Program, data: Trajectories | None) -> Choices:
+    return [{"channels": program.axes["translation"]}, {"channels": program.axes["yaw"], "at": "yaw"}]
+
+
+def _places(program: Program, data: Trajectories | None) -> Choices:
+    """Patches on a grid over where the vehicle was, as far as its states, its landmarks or its start say."""
+    if (data is None or data.states is None) and len(program.landmarks):
+        landmarks = torch.as_tensor(program.landmarks).detach().double()
+        low, high = 0.5 * landmarks.amin(0), 0.5 * landmarks.amax(0)
+    else:
+        states = _starts(program) if data is None or data.states is None else data.states
+        places = states[..., :2][torch.isfinite(states[..., :2]).all(-1)].double()
+        low, high = places.quantile(0.05, 0), places.quantile(0.95, 0)
+    radius = float((high - low).max()) / 5
+    steps = [torch.linspace(float(low[i]), float(high[i]), 3).tolist() for i in (0, 1)]
+    return [{"x": x, "y": y, "radius": radius} for x, y in itertools.product(*steps)]
+
+
+@torch.no_grad()
+def _starts(program: Program) -> Tensor:
+    """Drawn from where drives begin, `(1, STARTS, D)`."""
+    with seeded("starts"), running(1, STARTS):
+        return broadcast_event(program.initial(), torch.Size((1, STARTS)), 1)
 
 
 FORCES: list[Effect] = []
 _force = partial(declare, FORCES, "push")
-_on_axes = partial(_force, choices=_axes, lacks=_no_axes)
-_on_yaw = partial(
-    _force,
-    choices=lambda program, data: [{"channels": program.axes["yaw"]}],
-    lacks=lambda program: None if "yaw" in program.axes else "there is no yaw channel",
-)
-_on_springs = partial(_force, choices=_springs, lacks=_no_springs)
+_on_axes = partial(_force, choices=_axes, lacks=needs(AXES))
+_on_yaw = partial(_force, choices=lambda program, data: [{"channels": program.axes["yaw"]}], lacks=needs(YAW))
+_on_springs = partial(_force, choices=_springs, lacks=needs(SPRINGS))
+_where_it_slips = partial(_force, lacks=needs(PLANAR, SLIP))
+_on_any = partial(_force, lacks=needs(PLANAR))
 
 
 @_on_axes("1/s", typical=0.12, limit=1.0, sign=1)
-def linear_drag(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Sequence[str]) -> dict[str, Tensor]:
+def linear_drag(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""a = -c v
 
     equation: a = -c\,v
@@ -64,7 +105,7 @@ def linear_drag(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Seque
 
 
 @_on_axes("1/m", typical=0.06, limit=0.5, sign=1)
-def quadratic_drag(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Sequence[str]) -> dict[str, Tensor]:
+def quadratic_drag(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""a = -c v |v| per axis
 
     equation: a = -c\,v\,|v|
@@ -76,7 +117,7 @@ def quadratic_drag(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Se
 
 
 @_on_axes("m/s²", typical=0.1, limit=1.0, sign=1)
-def coulomb_friction(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Sequence[str]) -> dict[str, Tensor]:
+def coulomb_friction(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""a = -c v / sqrt(v² + 0.05²)
 
     equation: a = -c\,v / \sqrt{v^2 + 0.05^2}
@@ -88,7 +129,7 @@ def coulomb_friction(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: 
 
 
 @_on_yaw("1/s", typical=0.15, limit=2.0, sign=1)
-def yaw_linear_drag(self: Any, *given: Tensor, c: Tensor, channels: Sequence[str]) -> dict[str, Tensor]:
+def yaw_linear_drag(self: Any, *given: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""a_yaw = -c ω
 
     equation: a_\mathrm{yaw} = -c\,\omega
@@ -99,7 +140,7 @@ def yaw_linear_drag(self: Any, *given: Tensor, c: Tensor, channels: Sequence[str
 
 
 @_on_yaw("1/rad", typical=0.25, limit=3.0, sign=1)
-def yaw_quadratic_drag(self: Any, *given: Tensor, c: Tensor, channels: Sequence[str]) -> dict[str, Tensor]:
+def yaw_quadratic_drag(self: Any, *given: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""a_yaw = -c ω |ω|
 
     equation: a_\mathrm{yaw} = -c\,\omega\,|\omega|
@@ -110,7 +151,7 @@ def yaw_quadratic_drag(self: Any, *given: Tensor, c: Tensor, channels: Sequence[
 
 
 @_on_yaw("rad/s²", typical=0.04, limit=0.5)
-def yaw_bias(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Sequence[str]) -> dict[str, Tensor]:
+def yaw_bias(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""a_yaw = c
 
     equation: a_\mathrm{yaw} = c
@@ -120,14 +161,8 @@ def yaw_bias(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Sequence
     return dict.fromkeys(channels, c + torch.zeros_like(state[..., 0]))
 
 
-@_force(
-    "m/s²",
-    typical=0.05,
-    limit=0.5,
-    choices=_axes,
-    lacks=lambda program: "it has two components there" if _planar(program) else _no_axes(program),
-)
-def acceleration_bias(self: Any, *given: Tensor, c: Tensor, channels: Sequence[str]) -> dict[str, Tensor]:
+@_force("m/s²", typical=0.05, limit=0.5, choices=_axes, lacks=needs(ONE_COMPONENT, AXES))
+def acceleration_bias(self: Any, *given: Tensor, c: Tensor, channels: Names) -> Pushes:
     """a = c in the body frame
 
     equation: a = c
@@ -138,14 +173,9 @@ def acceleration_bias(self: Any, *given: Tensor, c: Tensor, channels: Sequence[s
 
 
 @_force(
-    "m/s²",
-    name="acceleration_bias",
-    typical=(0.05, 0.0),
-    limit=0.5,
-    components=("forward", "lateral"),
-    lacks=lambda program: None if _planar(program) else "it is no planar vehicle",
+    "m/s²", name="acceleration_bias", typical=(0.05, 0), limit=0.5, components=("forward", "lateral"), lacks=needs(BODY)
 )
-def planar_acceleration_bias(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> dict[str, Tensor]:
+def planar_acceleration_bias(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""(a_forward, a_lateral) = (c₁, c₂)
 
     equation: (a_\mathrm{forward}, a_\mathrm{lateral}) = (c_1, c_2)
@@ -157,7 +187,7 @@ def planar_acceleration_bias(self: Any, state: Tensor, *_: Tensor, c: Tensor) ->
 
 
 @_on_springs("1/s²", typical=2.0, limit=50.0)
-def stiffness(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Sequence[str]) -> dict[str, Tensor]:
+def stiffness(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""a = -c x
 
     equation: a = -c\,x
@@ -169,7 +199,7 @@ def stiffness(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Sequenc
 
 
 @_on_springs("1/(m² s²)", typical=3.0, limit=100.0)
-def cubic_stiffness(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Sequence[str]) -> dict[str, Tensor]:
+def cubic_stiffness(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""a = -c x³
 
     equation: a = -c\,x^3
@@ -178,3 +208,119 @@ def cubic_stiffness(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: S
     """
     position = self.positions(state)
     return {channel: -c * position[channel] ** 3 for channel in channels}
+
+
+@_where_it_slips("m/s²", typical=(0.05, -0.03), limit=0.5, components=("x", "y"))
+def slope(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
+    r"""world-frame acceleration (c₁, c₂)
+
+    equation: \dot v_\mathrm{world} = (c_1, c_2)
+    feels: drifts the same way over ground, wherever it points
+    occurs: ramps and floors that are not level; what a current does to a boat that is slow to drift with it
+    """
+    x, y = c.unbind(-1)
+    cos, sin = state[..., 2].cos(), state[..., 2].sin()
+    return {"forward": cos * x + sin * y, "lateral": cos * y - sin * x}
+
+
+@_where_it_slips("m/s", typical=(1.0, 0.5), limit=10.0, components=("x", "y"), profiled=("drag",), choices=_drags)
+def wind(self: Any, state: Tensor, *_: Tensor, c: Tensor, drag: Any) -> Pushes:
+    r"""a = -k (v-w)|v-w| + k v|v| per axis, w the world-frame wind (c₁, c₂) in the body frame
+
+    equation: a = -k\,(v - w)\,|v - w| + k\,v\,|v|,\quad w = R^\top(c_1, c_2)
+    feels: slower one way than the other, and more so when fast
+    occurs: boats in a current (w is the current, its drag found with it), multirotors and airships in wind, air tables
+        with a draught
+    """
+    x, y = c.unbind(-1)
+    cos, sin = state[..., 2].cos(), state[..., 2].sin()
+    forward, lateral, _ = self.body_velocity(state)
+    along, across = forward - cos * x - sin * y, lateral - cos * y + sin * x
+    return {
+        "forward": -drag * (along * along.abs() - forward * forward.abs()),
+        "lateral": -drag * (across * across.abs() - lateral * lateral.abs()),
+    }
+
+
+@_force("1/kg", typical=0.2, limit=1.0, lacks=needs(THRUSTS, PLANAR))
+def lateral_coupling(self: Any, state: Tensor, control: Tensor, *_: Tensor, c: Tensor) -> Pushes:
+    r"""a_lateral = c (left - right)
+
+    equation: a_\mathrm{lateral} = c\,(u_\mathrm{left} - u_\mathrm{right})
+    feels: steps sideways when it is told to turn
+    occurs: propellers whose wash hits a skeg, a stern that swings, the paddle-wheel effect of a single screw
+    """
+    left, right = control[..., self.control_index("left")], control[..., self.control_index("right")]
+    return {"lateral": c * (left - right)}
+
+
+@_where_it_slips("rad/m²", typical=0.1, limit=1.0)
+def weathervane(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
+    r"""a_yaw = -c v_x v_y
+
+    equation: a_\mathrm{yaw} = -c\,v_x v_y
+    feels: turns its nose into (or out of) the way it slides
+    occurs: airframes with fins (positive) and hulls without (the Munk moment, negative)
+    """
+    forward, lateral, _ = self.body_velocity(state)
+    return {"yaw": -c * forward * lateral}
+
+
+@_on_any("1", typical=0.15, limit=2.0)
+def magnus(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
+    r"""a_lateral = -c v_x ω
+
+    equation: a_\mathrm{lateral} = -c\,v_x\,\omega
+    feels: curves carry it to the inside (or outside)
+    occurs: spinning hulls and balls; the centripetal term of a program that forgot that its frame turns
+    """
+    forward, _, yaw_rate = self.body_velocity(state)
+    return {"lateral": -c * forward * yaw_rate}
+
+
+@_where_it_slips("m", typical=0.15, limit=1.0)
+def lever_arm(self: Any, state: Tensor, *_: Tensor, c: Tensor, mean: Means) -> Pushes:
+    r"""a_forward = c ω², a_lateral = -c a_yaw
+
+    equation: a_\mathrm{forward} = c\,\omega^2,\quad a_\mathrm{lateral} = -c\,a_\mathrm{yaw}
+    feels: the tracked point swings around another one when turning
+    occurs: a camera, a tag or a GPS antenna that is mounted away from the centre of mass
+    """
+    yaw_rate = state[..., 5]
+    return {"forward": c * yaw_rate**2, "lateral": -c * mean["yaw"]}
+
+
+@_where_it_slips("1/s", typical=0.2, limit=5.0, sign=1, profiled=("lead",), choices=_leads)
+def side_slip(self: Any, state: Tensor, *_: Tensor, c: Tensor, lead: Any) -> Pushes:
+    r"""a_lateral = -c (v_y - k ω)
+
+    equation: a_\mathrm{lateral} = -c\,(v_y - k\,\omega)
+    feels: sideways motion dies out, that of forward motion does not
+    occurs: keels, wheels and skids, which let forward motion go on and sideways motion die out
+    """
+    _, lateral, yaw_rate = self.body_velocity(state)
+    return {"lateral": -c * (lateral - lead * yaw_rate)}
+
+
+@_on_any("1/s", typical=0.5, limit=3.0, sign=1, profiled=("x", "y", "radius"), choices=_places)
+def sticky_patch(self: Any, state: Tensor, *_: Tensor, c: Tensor, x: Any, y: Any, radius: Any) -> Pushes:
+    r"""a = -c v exp(-d²/2r²), d the distance from a place
+
+    equation: a = -c\,v\,\exp(-d^2 / 2 r^2)
+    feels: is braked at one place of the ground
+    occurs: a carpet, a puddle, mud or a worn place of the floor
+    """
+    forward, lateral, _ = self.body_velocity(state)
+    inside = (-((state[..., 0] - x) ** 2 + (state[..., 1] - y) ** 2) / (2 * radius**2)).exp()
+    return {"forward": -c * forward * inside, "lateral": -c * lateral * inside}
+
+
+@_on_any("m/s²", typical=0.6, limit=10.0, sign=1, null=math.inf, probes=(0.1, 0.2, 0.4, 0.8, 1.6, 3.2), choices=_limits)
+def acceleration_limit(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names, mean: Means) -> Pushes:
+    r"""|a| ≤ c
+
+    equation: |a| \le c
+    feels: never jumps off the line, whatever it is told
+    occurs: motor drivers with a ramp or a current limit, tyres at the limit of grip
+    """
+    return {channel: torch.minimum(torch.maximum(mean[channel], -c), c) - mean[channel] for channel in channels}

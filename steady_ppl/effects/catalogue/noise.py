@@ -1,43 +1,36 @@
-"""What the noise can be besides normal, constant and white."""
+"""What noise can be besides normal, constant and white."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.effects.catalogue.planar_forces import no_bearings
-from steady_ppl.effects.catalogue.wheels import needs_commanded_speed
-from steady_ppl.effects.declaration import Effect, declare
+from steady_ppl.effects.catalogue.forces import PLANAR
+from steady_ppl.effects.catalogue.sensors import BEARINGS
+from steady_ppl.effects.catalogue.wheels import COMMANDED
+from steady_ppl.effects.declaration import Choices, Effect, Names, Need, Pushes, declare, needs
 from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.model.program import Program
 
+CHANNELS: Need = (lambda program: program.channels, "the program has no noise channels")
+MOTION: Need = (
+    lambda program: isinstance(program, PlanarVehicle) or program.motion,
+    "the program does not say which channels move what (`motion`)",
+)
+MEASURED: Need = (lambda program: program.measurements, "the program measures nothing")
 
-def _groups(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+
+def _groups(program: Program, data: Trajectories | None) -> Choices:
     if len(program.axes) <= 1:
         return [{"channels": program.channel_names}]
     return [{"channels": channels, "at": name} for name, channels in program.axes.items()]
 
 
-def _no_channels(program: Program) -> str | None:
-    return None if program.channels else "the program has no noise channels"
-
-
-def _no_states_left(program: Program) -> str | None:
-    if isinstance(program, PlanarVehicle) or program.motion:
-        return None
-    return "the program does not say which channels move what (`motion`)"
-
-
-def _nothing_measured(program: Program) -> str | None:
-    return None if program.measurements else "the program measures nothing"
-
-
-NOISES: list[Effect] = []
-_noise = partial(declare, NOISES)
+NOISE: list[Effect] = []
+_noise = partial(declare, NOISE)
 
 
 @_noise("tails", "1", typical=1 / 3, limit=0.5, sign=1, between=(0.0, 0.49))
@@ -51,7 +44,7 @@ def heavy_tails(self: Any, c: Tensor) -> Tensor:
     return c.clamp(0.005, 0.49)
 
 
-@_noise("blur", "1", typical=1.5, limit=2.0, sign=1, null=1.0, lacks=_nothing_measured)
+@_noise("blur", "1", typical=1.5, limit=2.0, sign=1, null=1.0, lacks=needs(MEASURED))
 def measurement_noise(self: Any, state: Tensor, c: Tensor) -> Tensor:
     r"""σ → c σ of every measurement
 
@@ -62,7 +55,7 @@ def measurement_noise(self: Any, state: Tensor, c: Tensor) -> Tensor:
     return c.expand(*state.shape[:-1], len(self.measurements))
 
 
-@_noise("blur", "1/m", typical=0.1, limit=1.0, sign=1, lacks=no_bearings)
+@_noise("blur", "1/m", typical=0.1, limit=1.0, sign=1, lacks=needs(PLANAR, BEARINGS))
 def range_dependent_noise(self: Any, state: Tensor, c: Tensor) -> Tensor:
     r"""σ → σ (1 + c r), r the distance
 
@@ -73,8 +66,8 @@ def range_dependent_noise(self: Any, state: Tensor, c: Tensor) -> Tensor:
     return (1 + c * self.ranges(state)).clamp(min=0.05)
 
 
-@_noise("spread", "1", typical=2.0, limit=2.0, sign=1, null=1.0, choices=_groups, lacks=_no_channels)
-def process_noise(self: Any, *_: Tensor, c: Tensor, channels: Sequence[str]) -> dict[str, Tensor]:
+@_noise("spread", "1", typical=2.0, limit=2.0, sign=1, null=1.0, choices=_groups, lacks=needs(CHANNELS))
+def process_noise(self: Any, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""σ → c σ of a channel
 
     equation: \sigma \to c\,\sigma
@@ -84,8 +77,8 @@ def process_noise(self: Any, *_: Tensor, c: Tensor, channels: Sequence[str]) -> 
     return dict.fromkeys(channels, c)
 
 
-@_noise("spread", "s/m", typical=1.0, limit=5.0, sign=1, lacks=needs_commanded_speed)
-def command_noise(self: Any, state: Tensor, control: Tensor, *_: Tensor, c: Tensor) -> dict[str, Tensor]:
+@_noise("spread", "s/m", typical=1.0, limit=5.0, sign=1, lacks=needs(COMMANDED, PLANAR))
+def command_noise(self: Any, state: Tensor, control: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""σ → σ (1 + c |command - state|)
 
     equation: \sigma \to \sigma\,(1 + c\,|u - v|)
@@ -98,8 +91,8 @@ def command_noise(self: Any, state: Tensor, control: Tensor, *_: Tensor, c: Tens
     return {"forward": (1 + c * slow).clamp(min=0.05), "yaw": (1 + c * askew).clamp(min=0.05)}
 
 
-@_noise("colour", "1", typical=0.6, limit=0.9, between=(-0.99, 0.99), choices=_groups, lacks=_no_states_left)
-def coloured_noise(self: Any, c: Tensor, channels: Sequence[str]) -> dict[str, Tensor]:
+@_noise("colour", "1", typical=0.6, limit=0.9, between=(-0.99, 0.99), choices=_groups, lacks=needs(MOTION))
+def coloured_noise(self: Any, c: Tensor, channels: Names) -> Pushes:
     r"""noise(t+1) = c noise(t) + sqrt(1 - c²) σ ε
 
     equation: n_{t+1} = c\,n_t + \sqrt{1 - c^2}\,\sigma\,\varepsilon

@@ -1,61 +1,52 @@
-"""What lies between the vehicle and its measurements: offsets, scales, clocks."""
+"""What lies between the vehicle and its measurements."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.effects.catalogue.planar_forces import no_bearings
-from steady_ppl.effects.declaration import Effect, declare, power_of_two_below
+from steady_ppl.effects.catalogue.forces import PLANAR
+from steady_ppl.effects.declaration import Choices, Effect, Need, declare, needs, power_of_two_below
 from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.model.program import Program
 
+BEARINGS: Need = (
+    lambda program: program.sees_bearings,
+    "it acts on bearings to landmarks, and the program measures something else",
+)
+LANDMARKS: Need = (lambda program: len(program.measurements) != 1, "there is one landmark: its bias is that of all")
+OTHER_SENSORS: Need = (
+    lambda program: not (isinstance(program, PlanarVehicle) and program.sees_bearings),
+    "of bearings to landmarks it is bearing_bias or landmark_bias",
+)
+ONE_UNIT: Need = (lambda program: len(set(program.measurement_units)) == 1, "the measurements have different units")
+RATES: Need = (
+    lambda program: program.derivatives,
+    "no state component is known to be the velocity of another (`motion`)",
+)
 
-def _each(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
+
+def _each(program: Program, data: Trajectories | None) -> Choices:
     return [{"component": index, "at": name} for index, name in enumerate(program.measurement_names)]
 
 
-def _each_of_its_size(program: Program, data: Trajectories | None) -> Sequence[Mapping[str, Any]]:
-    return [{**choice, "scale": _spread(data, choice["component"])} for choice in _each(program, data)]
-
-
-def _spread(data: Trajectories | None, component: int) -> float:
-    """Of a measurement, over all drives."""
-    if data is None:
-        return 1.0
-    values = data.measurements[..., component][data.observed[..., component]].double()
-    return power_of_two_below(float(values.std()) if len(values) > 1 else 0.0)
-
-
-def _one_landmark(program: Program) -> str | None:
-    if isinstance(program, PlanarVehicle) and len(program.measurements) == 1:
-        return "there is one landmark: its bias is that of all"
-    return no_bearings(program)
-
-
-def _bearings(program: Program) -> str | None:
-    seen = isinstance(program, PlanarVehicle) and program.sees_bearings
-    return "of bearings to landmarks it is bearing_bias or landmark_bias" if seen else None
-
-
-def _units_differ(program: Program) -> str | None:
-    same = len(set(program.measurement_units)) == 1
-    return None if same else "the measurements have different units"
-
-
-def _no_motion(program: Program) -> str | None:
-    return None if program.derivatives else "no state component is known to be the velocity of another (`motion`)"
+def _each_of_its_size(program: Program, data: Trajectories | None) -> Choices:
+    choices = []
+    for index, choice in enumerate(_each(program, data)):
+        seen = torch.empty(0) if data is None else data.measurements[..., index][data.observed[..., index]].double()
+        choices.append({**choice, "scale": power_of_two_below(float(seen.std()) if len(seen) > 1 else 0.0)})
+    return choices
 
 
 SENSORS: list[Effect] = []
 _on_readings = partial(declare, SENSORS, "measured")
 
 
-@_on_readings("rad", typical=0.035, limit=0.5, lacks=no_bearings)
+@_on_readings("rad", typical=0.035, limit=0.5, lacks=needs(PLANAR, BEARINGS))
 def bearing_bias(self: Any, state: Tensor, measured: Tensor, c: Tensor) -> Tensor:
     r"""y → y + c, every bearing
 
@@ -66,7 +57,7 @@ def bearing_bias(self: Any, state: Tensor, measured: Tensor, c: Tensor) -> Tenso
     return measured + c
 
 
-@_on_readings("rad", typical=0.06, limit=0.5, choices=_each, lacks=_one_landmark)
+@_on_readings("rad", typical=0.06, limit=0.5, choices=_each, lacks=needs(PLANAR, LANDMARKS, BEARINGS))
 def landmark_bias(self: Any, state: Tensor, measured: Tensor, c: Tensor, component: Any) -> Tensor:
     r"""y_i → y_i + c, one landmark
 
@@ -79,7 +70,7 @@ def landmark_bias(self: Any, state: Tensor, measured: Tensor, c: Tensor, compone
     return measured + c * bias
 
 
-@_on_readings("of the measurement", typical=0.05, limit=1.0, choices=_each_of_its_size, lacks=_bearings)
+@_on_readings("of the measurement", typical=0.05, limit=1.0, choices=_each_of_its_size, lacks=needs(OTHER_SENSORS))
 def sensor_bias(self: Any, state: Tensor, measured: Tensor, c: Tensor, component: Any) -> Tensor:
     r"""y_i → y_i + c, one measurement
 
@@ -90,7 +81,7 @@ def sensor_bias(self: Any, state: Tensor, measured: Tensor, c: Tensor, component
     return landmark_bias(self, state, measured, c, component)
 
 
-@_on_readings("1", typical=0.03, limit=0.3, lacks=_units_differ)
+@_on_readings("1", typical=0.03, limit=0.3, lacks=needs(ONE_UNIT))
 def sensor_scale(self: Any, state: Tensor, measured: Tensor, c: Tensor) -> Tensor:
     r"""y → (1 + c) y
 
@@ -101,7 +92,7 @@ def sensor_scale(self: Any, state: Tensor, measured: Tensor, c: Tensor) -> Tenso
     return measured * (1 + c)
 
 
-@declare(SENSORS, "viewpoint", "s", typical=0.12, limit=1.0, lacks=_no_motion)
+@declare(SENSORS, "viewpoint", "s", typical=0.12, limit=1.0, lacks=needs(RATES))
 def clock_offset(self: Any, state: Tensor, c: Tensor) -> Tensor:
     r"""y(t) → y(t - c)
 

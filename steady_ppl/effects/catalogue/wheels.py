@@ -3,55 +3,40 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from steady_ppl.effects.catalogue.planar_forces import needs_grip, not_planar
-from steady_ppl.effects.declaration import Effect, declare
+from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.effects.catalogue.forces import PLANAR
+from steady_ppl.effects.declaration import Choices, Effect, Means, Names, Need, Pushes, declare, needs
 from steady_ppl.model.program import Program
 
+COMMANDED: Need = (
+    lambda program: {"speed", "turn"} <= set(program.control_names),
+    "the controls are not a speed and a turn rate, which the state could be compared with",
+)
+GRIP: Need = (lambda program: not program.slips, "the lateral velocity is free")
 
-def needs_commanded_speed(program: Program) -> str | None:
-    """Why an effect on vehicles that are told a speed and a turn rate does not apply."""
-    if {"speed", "turn"} <= set(program.control_names):
-        return not_planar(program)
-    return "the controls are not a speed and a turn rate, which the state could be compared with"
 
-
-def _needs_wheels(program: Program) -> str | None:
-    return needs_commanded_speed(program) or needs_grip(program)
+def _each_channel(program: Program, data: Trajectories | None) -> Choices:
+    return [{"channels": (name,), "at": name} for name in program.channel_names]
 
 
 WHEELS: list[Effect] = []
-_force = partial(declare, WHEELS, "push")
-_on_command = partial(declare, WHEELS, "command", lacks=needs_commanded_speed)
-_on_lateral_velocity = partial(_force, lacks=needs_grip)
+_on_command = partial(declare, WHEELS, "command", lacks=needs(COMMANDED, PLANAR))
+_on_lateral_velocity = partial(declare, WHEELS, "push", lacks=needs(PLANAR, GRIP))
+_on_wheels = partial(declare, WHEELS, "push", lacks=needs(COMMANDED, PLANAR, GRIP))
 
 
-@_force(
-    "s",
-    typical=0.2,
-    limit=2.0,
-    sign=1,
-    between=(0.0, math.inf),
-    probes=(0.05, 0.15, 0.4),
-    choices=lambda program, data: [{"channels": (name,), "at": name} for name in program.channel_names],
-    lacks=_needs_wheels,
+@_on_wheels(
+    "s", typical=0.2, limit=2.0, sign=1, between=(0.0, math.inf), probes=(0.05, 0.15, 0.4), choices=_each_channel
 )
 def response_time(
-    self: Any,
-    state: Tensor,
-    control: Tensor,
-    time: Tensor,
-    step: Tensor,
-    c: Tensor,
-    channels: Sequence[str],
-    mean: Mapping[str, Tensor],
-) -> dict[str, Tensor]:
+    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, channels: Names, mean: Means
+) -> Pushes:
     r"""dv/dt = (v_told - v) / (c + τ), τ what the program has (its step where it says nothing)
 
     equation: \dot v = (v_\mathrm{told} - v) / (c + \tau)
@@ -114,9 +99,7 @@ def reverse_steering(self: Any, state: Tensor, control: Tensor, time: Tensor, c:
 
 
 @_on_lateral_velocity("m", typical=0.1, limit=1.0)
-def lever_arm(
-    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Mapping[str, Tensor]
-) -> dict[str, Tensor]:
+def lever_arm(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Means) -> Pushes:
     r"""v_y = c ω
 
     equation: v_y \to c\,\omega
@@ -127,9 +110,7 @@ def lever_arm(
 
 
 @_on_lateral_velocity("rad", typical=0.05, limit=0.5)
-def crab_angle(
-    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Mapping[str, Tensor]
-) -> dict[str, Tensor]:
+def crab_angle(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Means) -> Pushes:
     r"""v_y = c v_x
 
     equation: v_y \to c\,v_x
@@ -142,9 +123,7 @@ def crab_angle(
 
 
 @_on_lateral_velocity("s", typical=0.05, limit=0.5)
-def slip_angle(
-    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Mapping[str, Tensor]
-) -> dict[str, Tensor]:
+def slip_angle(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Means) -> Pushes:
     r"""v_y = -c v_x ω
 
     equation: v_y \to -c\,v_x\,\omega
@@ -156,8 +135,8 @@ def slip_angle(
     return {"lateral": -c * (forward * yaw_rate / self.settles_in(step) + change)}
 
 
-@_force("1/m", typical=0.5, limit=5.0, lacks=_needs_wheels)
-def caster(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> dict[str, Tensor]:
+@_on_wheels("1/m", typical=0.5, limit=5.0)
+def caster(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""a_yaw = -c v_x ω
 
     equation: a_\mathrm{yaw} = -c\,v_x\,\omega
