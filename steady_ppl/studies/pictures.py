@@ -33,21 +33,17 @@ def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
     varied; of shares (true or false) exact 95 % intervals; a horizontal line where a method has no x; a cross at the
     upper edge where a job has failed.
 
-    Args:
-        plan: the study, with a `[picture]`.
-        results: its table.
-
     Raises:
-        UsageError: it has no picture, nothing of it is done yet, or a column is not there or holds no numbers.
+        UsageError: it has no `[picture]`, nothing of it is done yet, or a column is not there or holds no numbers.
     """
     picture = plan.picture
     if picture is None:
         raise UsageError("the study has no [picture]: say there which columns x and y are")
     order = {job.key: place for place, job in enumerate(plan.jobs)}
-    own = results[results["key"].isin(order)] if len(results) else results
-    own = own[~own["method"].isin(picture.leave_out)] if len(own) else own
-    done = own[own["outcome"] == "done"] if len(own) else own
-    if not len(done):
+    own = results[results["key"].isin(order)]
+    if len(own):  # else it may have no other columns
+        own = own[~own["method"].isin(picture.leave_out)]
+    if not len(own) or not (own["outcome"] == "done").any():
         raise UsageError("no job of the study is done yet")
     missing = [name for name in picture.columns if name not in own]
     if missing:
@@ -161,8 +157,7 @@ def _published_look(color: str) -> dict[str, Any]:
 def _failed(
     axes: Axes, rows: pd.DataFrame, x: str, look: Mapping[str, Any], name: str, crosses: Counter[float]
 ) -> None:
-    """A cross at the upper edge for each place where jobs have failed, below those that are there already; one in the
-    legend alone where it is a result that says the place."""
+    """A cross at the upper edge for each place where jobs have failed, below those that are there already."""
     failed = rows[rows["outcome"] == "failed"]
     edge = axes.get_xaxis_transform()
     style: dict[str, Any] = {"ls": "", "marker": "x", "ms": 8, "mew": 2, "color": look["color"]}

@@ -55,8 +55,7 @@ class Job:
     Attributes:
         task: "fit" or "discover".
         method: its name.
-        program: PATH or PATH:CLASS.
-        recipe: of a fit.
+        program, recipe: PATH or PATH:CLASS; empty for a search, or a name or PATH.
         data: its source and what else is said of it.
         settings: of the recipe or of `discover`.
         seed: of data and method.
@@ -81,29 +80,14 @@ class Job:
         """What the table says of it: `data.…` and `settings.…` are the axes, paths are names, lists are JSON."""
         source = {f"data.{name}": without_folder(value) for name, value in self.data.items()}
         chosen = {f"settings.{name}": without_folder(value) for name, value in self.settings.items()}
-        return {
-            "key": self.key,
-            "task": self.task,
-            "method": self.method,
-            "program": without_folder(self.program),
-            "recipe": without_folder(self.recipe),
-            "seed": self.seed,
-            "known_start": self.known_start,
-            **source,
-            **chosen,
-        }
+        files = {"program": without_folder(self.program), "recipe": without_folder(self.recipe)}
+        named = {"key": self.key, "task": self.task, "method": self.method, **files}
+        return named | {"seed": self.seed, "known_start": self.known_start} | source | chosen
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A study.
-
-    Attributes:
-        title: of its picture.
-        task: of its jobs.
-        jobs: all of them, seeds outermost, so that what has come in at any time is whole studies of fewer seeds.
-        picture: what is drawn against what.
-    """
+    """A study: its jobs with seeds outermost, so that what has come in at any time is whole studies of fewer seeds."""
 
     title: str
     task: str
@@ -116,10 +100,9 @@ class Picture:
     """What is drawn of a study.
 
     Attributes:
-        x: a column.
-        y: columns, a panel each.
+        x, y: a column, and columns, a panel each.
         labels: of axes, by their columns, and of methods, by their names.
-        published: of a panel, by the method's name: points that others have found, `(x, y)`.
+        published: of a panel, by the method's name: points `(x, y)` that others have found.
         chosen_by: a column of held-out drives; of a method's settings only the one with its largest mean at each x is
             drawn. All of them when empty.
         leave_out: methods that are in the table alone.
@@ -157,26 +140,19 @@ def undrawable(title: str, picture: Mapping[str, Any]) -> str | None:
 
 
 def record_plan(plan: Plan, folder: Path) -> None:
-    """Write the plan beside its results.
-
-    Raises:
-        RunError: it cannot be written.
-    """
+    """Write the plan beside its results; RunError where it cannot be written."""
     with whole_file(folder / RECORD, RunError) as beside:
         beside.write_text(json.dumps({"format": FORMAT, **asdict(plan)}, indent=1) + "\n")
 
 
 def recorded_plan(folder: Path) -> Plan:
-    """The plan that the results in a folder are of.
-
-    Raises:
-        RunError: there is none, it is damaged, or a newer steady-ppl wrote it.
-    """
+    """The plan that the results in a folder are of; RunError where there is none, it is damaged, or a newer steady-ppl
+    wrote it."""
     content = read_record(folder / RECORD, RECORDED, FORMAT, "a study")
-    if content["picture"] is not None and (problem := undrawable(content["title"], content["picture"])):
-        raise RunError(f"{folder / RECORD} is damaged: {problem}")
     picture = content["picture"]
     if picture is not None:
+        if problem := undrawable(content["title"], picture):
+            raise RunError(f"{folder / RECORD} is damaged: {problem}")
         picture = Picture(**{one.name: picture[one.name] for one in fields(Picture) if one.name in picture})
     jobs = tuple(Job(**{name: job[name] for name in JOB}) for job in content["jobs"])
     return Plan(content["title"], content["task"], jobs, picture)

@@ -39,7 +39,7 @@ from pathlib import Path
 from typing import Any
 
 from steady_ppl.errors import UsageError, labelled
-from steady_ppl.studies.fingerprints import JobFiles, is_program
+from steady_ppl.studies.job import JobFiles, is_program
 from steady_ppl.studies.plan import (
     FIGURES,
     HELD_OUT,
@@ -76,15 +76,8 @@ FORM: dict[str, Any] = {
 
 
 def read_plan(path: Path, data: Path | None = None) -> Plan:
-    """Read a study.
-
-    Args:
-        path: the TOML file.
-        data: the folder of the logs or tables, in place of the one that the file names.
-
-    Raises:
-        UsageError: naming what is wrong, and where.
-    """
+    """Read a study from a TOML file, `data` in place of the folder of logs or tables that it names. UsageError says
+    what is wrong, and where."""
     require_file(path, UsageError)
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -107,14 +100,11 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
         raise UsageError(f"task is {task!r}, expected {' or '.join(TASKS)}")
     if task == "discover" and "simulate" not in content["data"]:
         raise UsageError("task discover needs data that are simulated, of which it knows what is missing")
-    source = source_axes(folder, content["data"], data, task)
+    source = _source_axes(folder, content["data"], data, task)
     if not content["seeds"] or not content["method"]:
         raise UsageError("expected at least one seed and one method")
-    for one in content["method"]:
-        if not one["name"].strip():
-            raise UsageError(f"method.name is {one['name']!r}, expected a name")
-    methods = [method_axes(folder, one, task) for one in content["method"]]
-    cells = len(content["seeds"]) * count(source) * sum(count(one["settings"]) for one in methods)
+    methods = [_method_axes(folder, one, task) for one in content["method"]]
+    cells = len(content["seeds"]) * _cells(source) * sum(_cells(one["settings"]) for one in methods)
     if cells > MOST_JOBS:
         raise UsageError(f"{cells:,} jobs; expected at most {MOST_JOBS:,} of one study")
     files, different = JobFiles(), dict[str, Job]()
@@ -149,11 +139,9 @@ def _surplus(content: Mapping[str, Any]) -> str | None:
 
 def _jobs(content: Mapping[str, Any], task: str, source: Axes, methods: list[dict]) -> Iterator[Job]:
     start = content.get("known_start", False)
-    for seed in content["seeds"]:
-        for data in grid(source):
-            for method in methods:
-                for settings in grid(method["settings"]):
-                    yield Job(**method | {"settings": settings}, task=task, data=data, seed=seed, known_start=start)
+    for seed, data, method in itertools.product(content["seeds"], _grid(source), methods):
+        for settings in _grid(method["settings"]):
+            yield Job(**method | {"settings": settings}, task=task, data=data, seed=seed, known_start=start)
 
 
 def _labelled(jobs: tuple[Job, ...]) -> tuple[Job, ...]:
@@ -204,7 +192,7 @@ def _require_columns(picture: Picture, task: str, jobs: tuple[Job, ...]) -> None
             raise UsageError(f"picture.published: {column} is no panel; y has {', '.join(picture.y)}")
 
 
-def source_axes(folder: Path, given: Mapping[str, Any], instead: Path | None, task: str) -> Axes:
+def _source_axes(folder: Path, given: Mapping[str, Any], instead: Path | None, task: str) -> Axes:
     """The source of the data with its path, and all that is said of it, each a list of values; a search uses no test
     drives."""
     named = [name for name in SOURCES if name in given]
@@ -227,8 +215,7 @@ def source_axes(folder: Path, given: Mapping[str, Any], instead: Path | None, ta
     for name, usual in sayable.items():
         values = _axis(f"data.{name}", given.get(name, usual))
         form = TEXT if name == "effect" else NUMBER if name == "sigma_deg" else WHOLE
-        problem = mismatch(values, [(form, None)], f"data.{name}")
-        if problem is not None:
+        if problem := mismatch(values, [(form, None)], f"data.{name}"):
             raise UsageError(problem)
         for value in values if form != TEXT else ():
             if value is not None and not 0 < value <= MOST_DRIVES:
@@ -238,8 +225,10 @@ def source_axes(folder: Path, given: Mapping[str, Any], instead: Path | None, ta
     return axes
 
 
-def method_axes(folder: Path, given: Mapping[str, Any], task: str) -> dict[str, Any]:
+def _method_axes(folder: Path, given: Mapping[str, Any], task: str) -> dict[str, Any]:
     """A method whose files have their folders and whose settings are lists of values."""
+    if not given["name"].strip():
+        raise UsageError(f"method.name is {given['name']!r}, expected a name")
     if task == "discover" and "recipe" in given:
         raise UsageError(f"method {given['name']}: a recipe means nothing to a search")
     recipe = given.get("recipe", "steady") if task == "fit" else ""
@@ -252,12 +241,11 @@ def method_axes(folder: Path, given: Mapping[str, Any], task: str) -> dict[str, 
     }
 
 
-def count(axes: Axes) -> int:
-    """How many cells there are."""
+def _cells(axes: Axes) -> int:
     return math.prod(map(len, axes.values()))
 
 
-def grid(axes: Axes) -> Iterator[dict[str, Any]]:
+def _grid(axes: Axes) -> Iterator[dict[str, Any]]:
     """Every value of each with every other's."""
     for cell in itertools.product(*axes.values()):
         yield dict(zip(axes, cell, strict=True))
@@ -267,9 +255,9 @@ def _axis(name: str, value: Any) -> list[Any]:
     axis = value if isinstance(value, list) else [value]
     if not axis:
         raise UsageError(f"{name} is an axis without a value")
-    problems = [one for one in axis if one is not None and not _is_plain(one)]
-    if problems:
-        raise UsageError(f"{name} is {shown(repr(problems[0]), 40)}, expected numbers, text, true or false")
+    for one in axis:
+        if one is not None and not _is_plain(one):
+            raise UsageError(f"{name} is {shown(repr(one), 40)}, expected numbers, text, true or false")
     return axis
 
 
