@@ -30,19 +30,12 @@ WIDTH = 100
 
 @dataclass
 class Tour:
-    """Runs commands, tells of them, and remembers what they said.
+    """Runs commands, tells of them, and remembers what they said."""
 
-    Attributes:
-        command: `steady`, as typer makes it.
-        say: told every line.
-        force: the commands overwrite what is there.
-        steps: title, commands, result and seconds of every step.
-    """
-
-    command: Any
+    command: Any  # `steady`, as typer makes it
     say: Callable[[str], None]
-    force: bool = False
-    steps: list[dict[str, Any]] = field(default_factory=list)
+    force: bool = False  # the commands overwrite what is there
+    steps: list[dict[str, Any]] = field(default_factory=list)  # title, commands, result and seconds of each
 
     def step(self, title: str) -> None:
         """Begin a step."""
@@ -69,12 +62,8 @@ class Tour:
 
 
 def run(command: Any, arguments: Sequence[str]) -> str:
-    """What the command `steady ARGUMENTS` prints; its bars are shown on a terminal only.
-
-    Raises:
-        KeyboardInterrupt: it was interrupted.
-        SteadyError: as the command raises it.
-    """
+    """What the command `steady ARGUMENTS` prints; its bars are shown on a terminal only. Raises what the command does,
+    and KeyboardInterrupt where it was interrupted."""
     said = io.StringIO()
     quiet = nullcontext() if sys.stderr.isatty() else redirect_stderr(io.StringIO())
     with redirect_stdout(said), quiet:
@@ -94,12 +83,8 @@ BEGINNING = (
 
 @dataclass(frozen=True)
 class Size:
-    """How much is simulated and fitted.
-
-    Attributes:
-        train, valid, test: drives to fit, to choose by, and locked away until the proof.
-        simulations: sets that calibrate the tests of `check` and `discover`; their own numbers when None.
-    """
+    """How many drives are simulated to fit, to choose by, and to be locked away until the proof; and how many sets
+    calibrate the tests of `check` and `discover`, their own numbers when None."""
 
     train: int = 16
     valid: int = 16
@@ -113,26 +98,17 @@ class Size:
 
 
 def demonstrate(
-    out: Path, command: Any, *, size: Size | None = None, force: bool = False, say: Callable[[str], None] = print
-) -> list[dict[str, Any]]:
+    out: Path, command: Any, *, size: Size = Size(), force: bool = False, say: Callable[[str], None] = print
+) -> None:
     """Go through the loop and keep everything in a folder: tables of drives, programs, runs, figures, pictures.
 
-    Args:
-        out: the folder; an earlier demonstration there is overwritten.
-        command: `steady`, as typer makes it.
-        size: of the job.
-        force: write into a folder that is no demonstration's.
-        say: told every line.
-
-    Returns:
-        Title, commands, result and seconds of every step.
+    An earlier demonstration there is overwritten, and what is none where `force` says so.
 
     Raises:
         RunError: the folder exists and is no demonstration's.
         ComputationError: the search ended with nothing that can be added.
     """
-
-    size, began = size or Size(), time.perf_counter()
+    began = time.perf_counter()
     tour = Tour(command, say, force=out.exists())
     _open(out, force)
     say(textwrap.fill(BEGINNING, WIDTH))
@@ -159,18 +135,15 @@ def demonstrate(
         _write_record({"status": "finished", "seconds": round(time.perf_counter() - began, 1), "steps": tour.steps})
     say(f"\n{out}: report.html; check, discovery and proof as .png, .txt and .json; drives; runs; {grown}")
     say(f"{time.perf_counter() - began:.0f} s in all")
-    return tour.steps
 
 
 def record_drives(tour: Tour, size: Size) -> None:
     """Simulate drives of a hovercraft with drag, and forget its poses."""
-
     tour.step("Record drives, of a hovercraft that does have drag")
-    drives = {"train": size.train, "valid": size.valid, "test": size.test}
-    for seed, (name, count) in enumerate(drives.items(), 1):
+    for seed, (name, count) in enumerate((("train", size.train), ("valid", size.valid), ("test", size.test)), 1):
         tour.steady(f"simulate {TRUTH} --trajectories {count} --seed {seed} --out {name}.csv")
-    for name in ("train", "valid"):
-        st.write_table(st.read_table(f"{name}.csv").without_truth(keep_start=True), Path(f"{name}.csv"))
+    for table in ("train.csv", "valid.csv"):
+        st.write_table(st.read_table(table).without_truth(keep_start=True), table)
     tour.result(
         f"{size.train} drives to fit and {size.valid} to choose by: of both only controls, bearings and the first "
         f"state are kept. {size.test} more are locked away for the proof, with their poses, to judge by. The "
@@ -218,11 +191,11 @@ def prove(tour: Tour) -> None:
     figures = _read("proof.json")
     tour.result(figures["verdict"])
     tour.say("")
-    for line in summary(figures):
+    for line in _summary(figures):
         tour.say(f"     {line}")
 
 
-def summary(figures: Mapping[str, Any]) -> list[str]:
+def _summary(figures: Mapping[str, Any]) -> list[str]:
     """A few columns of the proof's figures, as aligned lines: log p(y), errors of the measurements and of the first
     error group of the states, and the channel whose noise had to be largest for what was missing."""
     rows = figures["rows"]

@@ -15,6 +15,11 @@ def count(help: str, least: int = 1) -> Any:
     return typer.Option(help=help, min=least, max=MAX_COUNT)
 
 
+def moved(which: str) -> Any:
+    """An option that names the programs of several runs."""
+    return typer.Option(help=f"The program, if its file moved or changed; {which}.")
+
+
 Run = Annotated[Path, typer.Argument(help="Run folder.")]
 RunsAndTable = Annotated[
     list[Path],

@@ -17,10 +17,10 @@ PROBED, PUSHES = 200, (1e-3, 1.0, -1e3)  # rows and sizes of a command that is l
 
 
 class Dynamics(nn.Module):
-    """What a program says happens next, as a function of tensors.
+    """What a program says happens next, as a function of tensors; `...` is any shape.
 
-    Nothing of Pyro is seen from outside: it is called like any module, moves with `.to(…)`, is differentiable in
-    states, controls and parameters, and its `state_dict()` is the program's. `...` is any shape.
+    It is called like any module, moves with `.to(…)`, is differentiable in states, controls and parameters, and its
+    `state_dict()` is the program's.
 
     Attributes:
         state_names, control_names, measurement_names: what the last dimensions hold, in this order.
@@ -37,8 +37,7 @@ class Dynamics(nn.Module):
         super().__init__()
         if not step > 0:
             raise UsageError(f"a step of {step} s leads nowhere")
-        self.program = program
-        self.step = step
+        self.program, self.step = program, step
         self.state_names, self.control_names = program.state_names, program.control_names
         self.measurement_names = program.measurement_names
 

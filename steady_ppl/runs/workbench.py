@@ -19,11 +19,7 @@ TRUTH = "models/hovercraft.py:HovercraftTruth"
 
 
 def workbench() -> Path:
-    """The folder with the rooms: the checkout, else the copy that the wheel carries.
-
-    Raises:
-        UsageError: this installation has neither.
-    """
+    """The folder with the rooms: the checkout, else the copy that the wheel carries; UsageError: there is neither."""
     here = Path(__file__).resolve().parents[1]  # the package
     for folder in (here.parent, here / "workbench"):
         if all((folder / room).is_dir() for room in FOLDERS) and (folder / "inference" / "steady.py").is_file():
@@ -34,17 +30,13 @@ def workbench() -> Path:
 
 
 def make_workbench(folder: Path) -> list[Path]:
-    """Copy the rooms into a folder and simulate first tables of drives there.
-
-    Args:
-        folder: is made; may exist if it is empty.
+    """Copy the rooms into a folder, which is made or empty, and simulate first tables of drives there.
 
     Returns:
         The tables, of a hovercraft with drag; of its true states only the test table has more than each first row.
 
     Raises:
         UsageError: the folder has something in it, or cannot be written. What was made by then is removed.
-        DataError: a table cannot be written.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder} exists and is not empty: choose another folder")
@@ -56,11 +48,7 @@ def make_workbench(folder: Path) -> list[Path]:
 @contextmanager
 def empty_again(folder: Path) -> Iterator[None]:
     """Make a folder for the block that fills it. If it fails, what is in the folder is removed where that was missing
-    or empty before, with the folders that were made for it.
-
-    Raises:
-        UsageError: something in it cannot be written.
-    """
+    or empty before, with the folders that were made for it. UsageError: something in it cannot be written."""
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     fresh = bool(made) or not any(folder.iterdir())
     try:
