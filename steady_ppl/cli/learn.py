@@ -220,7 +220,7 @@ def study(
     import joblib
 
     from steady_ppl.studies.executors import Cluster, Local
-    from steady_ppl.studies.plan_file import read_plan
+    from steady_ppl.studies.plan import read_plan
     from steady_ppl.studies.runner import require_runnable, run_study
 
     if workers is not None and cluster is not None:

@@ -24,8 +24,7 @@ from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoo
 
 from steady_ppl.errors import ComputationError, UsageError
 from steady_ppl.runs.fit import packages
-from steady_ppl.studies.job import CHANGED, JobFiles, differing, digest_of, run
-from steady_ppl.studies.plan import Job
+from steady_ppl.studies.job import CHANGED, Job, JobFiles, differing, digest_of, run
 from steady_ppl.utils.cores import ONE_THREAD
 from steady_ppl.utils.text import one_line, shown
 

@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,6 @@ from steady_ppl.model.program import Program, for_program
 from steady_ppl.runs.fit import Fit, packages, sha256
 from steady_ppl.runs.recipes import find_recipe, recipe_file, require_settings, trains
 from steady_ppl.smc.simulate import simulate
-from steady_ppl.studies.plan import HELD_OUT, IN_LIMITS, Job
 from steady_ppl.utils.cores import one_core, one_thread
 from steady_ppl.utils.files import require_file
 from steady_ppl.utils.random import seeded
@@ -47,7 +47,62 @@ LOGS = ("vrpn-pose.csv", "vesc_drive.csv")
 TABLES = (".csv", ".parquet")
 ERRORS = ("forward", "forward_mean", "state_estimation")
 CHANGED = "its program, recipe or table is not what it was when the study was begun: the same command tries it again"
+HELD_OUT = "valid_log_likelihood"  # of validation drives
+IN_LIMITS = "in_limits"  # how large what is missing is, in detection limits
+FIGURES = {
+    "fit": (
+        *("forward.", "forward_mean.", "state_estimation.", "measurement."),
+        *("log_likelihood", HELD_OUT, "fit_seconds", "steps", "seconds", "peak_mib"),
+    ),
+    "discover": ("p_value", "found", "right", "in_class", IN_LIMITS, "seconds", "peak_mib"),
+}
+"""Columns of numbers that a task fills, or how they begin."""
+
 _one_at_a_time = threading.Lock()  # torch's random state and Pyro's parameters are the process's
+
+
+@dataclass(frozen=True)
+class Job:
+    """A cell of the grid, in values that JSON can hold.
+
+    Attributes:
+        task: "fit" or "discover".
+        method: its name.
+        program, recipe: PATH or PATH:CLASS; empty for a search, or a name or PATH.
+        data: its source and what else is said of it.
+        settings: of the recipe or of `discover`.
+        seed: of data and method.
+        known_start: the first state is given.
+        key: a hash of all that is said of it, its method's name too, and of the contents of the files that it reads.
+        label: by which it differs from the others.
+    """
+
+    task: str
+    method: str
+    program: str
+    recipe: str
+    data: dict[str, Any]
+    settings: dict[str, Any]
+    seed: int
+    known_start: bool
+    key: str = ""
+    label: str = ""
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """What the table says of it: `data.…` and `settings.…` are the axes, paths are names, lists are JSON."""
+        source = {f"data.{name}": without_folder(value) for name, value in self.data.items()}
+        chosen = {f"settings.{name}": without_folder(value) for name, value in self.settings.items()}
+        files = {"program": without_folder(self.program), "recipe": without_folder(self.recipe)}
+        named = {"key": self.key, "task": self.task, "method": self.method, **files}
+        return named | {"seed": self.seed, "known_start": self.known_start} | source | chosen
+
+
+def without_folder(value: Any) -> Any:
+    """The name of a file, whose absolute path is one machine's; a list as JSON; anything else as it is."""
+    if isinstance(value, list):
+        return json.dumps([without_folder(one) for one in value])
+    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value
 
 
 class JobFiles:

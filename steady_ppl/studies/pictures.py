@@ -13,11 +13,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
+from pandas.api.types import infer_dtype
 from scipy import stats
 
 from steady_ppl.errors import UsageError
 from steady_ppl.plotting.comparison import COLORS, MARKS
-from steady_ppl.studies.plan import IN_LIMITS, MAX_NUMBER, Picture, Plan
+from steady_ppl.studies.job import IN_LIMITS
+from steady_ppl.studies.plan import MAX_NUMBER, Picture, Plan
+from steady_ppl.studies.table import NUMBERS
 from steady_ppl.utils.text import printable
 
 SIZES = (-1.0, 0.0, *(1.25 ** (place - 0.5) for place in range(-6, 12)), math.inf)
@@ -72,13 +75,12 @@ def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
 
 def _numbers(rows: pd.DataFrame, name: str) -> pd.Series:
     """A column as numbers, or as true and false; NaN where a job has none, and where it is beyond what can be drawn."""
-    values = rows[name].astype(object)
-    there = values[values.notna()]
-    if there.map(lambda value: isinstance(value, bool | np.bool_)).all():
-        return values
-    if not there.map(lambda value: isinstance(value, int | float | np.number)).all():
+    kind = infer_dtype(rows[name])
+    if kind in ("boolean", "empty"):
+        return rows[name].astype(object)
+    if kind not in NUMBERS:
         raise UsageError(f"column {name} of the table holds no numbers")
-    numbers = values.astype(float)
+    numbers = rows[name].astype(float)
     return numbers.where(numbers.abs() <= MAX_NUMBER)
 
 
@@ -197,7 +199,7 @@ def _scale(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str,
 def points(rows: pd.DataFrame, x: str, y: str) -> list[tuple[float, float, float, float]]:
     """What is drawn of a line: places on x, middles and how far bars reach below and above."""
     rows = rows[rows[x].notna() & rows[y].notna()]
-    share = rows[y].map(lambda value: isinstance(value, bool | np.bool_)).all()
+    share = infer_dtype(rows[y]) == "boolean"
     found = []
     for _, part in rows.groupby(pd.cut(rows[x], SIZES), observed=True) if x == IN_LIMITS else rows.groupby(x):
         values = part[y].astype(float)

@@ -13,10 +13,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pyarrow
 import pyarrow.parquet
+from pandas.api.types import infer_dtype
 from pyarrow import types
 
 from steady_ppl.errors import RunError
@@ -26,6 +26,7 @@ from steady_ppl.utils.text import printable
 
 TABLE, EARLIER, ARRIVED = "results.parquet", "earlier.parquet", "arrived"
 KINDS = (types.is_integer, types.is_floating, types.is_boolean, types.is_string, types.is_large_string, types.is_null)
+NUMBERS = ("integer", "floating", "mixed-integer-float")  # as pandas infers them
 ENOUGH = 100  # results for which the table is written anew, at least
 
 
@@ -136,24 +137,14 @@ def _write(frame: pd.DataFrame, file: Path) -> None:
     """Write a table; a column of several kinds of values becomes text, since Parquet's have one."""
     frame = frame.copy(deep=False)
     for name in frame:
-        kinds = {_kind(value) for value in frame[name] if not _is_absent(value)}
-        if len(kinds) > 1 or "other" in kinds:
-            frame[name] = [None if _is_absent(value) else _text(value) for value in frame[name]]
+        if infer_dtype(frame[name]) not in (*NUMBERS, "boolean", "string", "empty"):
+            frame[name] = frame[name].map(_text, na_action="ignore")
     with whole_file(file, RunError) as beside:
         frame.to_parquet(beside, index=False)
         with beside.open("r+b") as written:
             os.fsync(written.fileno())  # before it has its name: no power cut leaves half of it
 
 
-def _kind(value: object) -> str:
-    names = {bool: "truth", np.bool_: "truth", str: "text"}
-    return names.get(type(value), "number" if isinstance(value, int | float | np.number) else "other")
-
-
 def _text(value: object) -> str:
     """A whole number without a fraction, however the column held it: it has one where others are absent."""
     return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
-
-
-def _is_absent(value: object) -> bool:
-    return value is None or (isinstance(value, float) and np.isnan(value))

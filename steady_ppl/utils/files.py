@@ -20,13 +20,8 @@ if TYPE_CHECKING:
 
 @contextmanager
 def whole_file(path: Path, refused: type[SteadyError] = UsageError, beside: Path | None = None) -> Iterator[Path]:
-    """A file beside `path` for the block to write; it takes the place of `path` if the block succeeds, and is removed
-    if not.
-
-    Args:
-        refused: what is raised when the block, or the last step, meets an `OSError`.
-        beside: where the block writes; a hidden file of this process in the same folder when not given.
-    """
+    """A file `beside` for the block to write, by itself a hidden one of this process in the same folder. It takes the
+    place of `path` if the block succeeds, and is removed if not. An `OSError` on the way is raised as `refused`."""
     beside = beside or hidden_beside(path)
     try:
         beside.unlink(missing_ok=True)  # a link in its place would be written through
