@@ -83,15 +83,14 @@ class Dynamics(nn.Module):
                 and `past` is not given.
         """
         _require(state, "(..., {})", self.state_names)
-        for values in (controls, controls[:0] if past is None else past):
-            _require(values, "(rows, ..., {})", self.control_names)
-        if past is None:
-            if self.remembers:
-                raise UsageError(
-                    f"in {type(self.program).__name__} commands act on after their step: give those before as `past`, "
-                    "an empty tensor (0, ..., U) at the start of a drive"
-                )
-            past = controls[:0]
+        _require(controls, "(rows, ..., {})", self.control_names)
+        if past is None and self.remembers:
+            raise UsageError(
+                f"in {type(self.program).__name__} commands act on after their step: give those before as `past`, an "
+                "empty tensor (0, ..., U) at the start of a drive"
+            )
+        past = controls[:0] if past is None else past
+        _require(past, "(rows, ..., {})", self.control_names)
         try:
             shape = broadcast_shapes(state.shape[:-1], controls.shape[1:-1], past.shape[1:-1])
         except RuntimeError:

@@ -104,9 +104,7 @@ def drawn_states(
         values = np.where(inside, path[..., index], np.nan)
         variables[name] = (DIMENSIONS, values, {"units": unit})
     for site, parts in noise.items():
-        values = _draws(torch.cat(parts, 2))
-        missing = np.full((*values.shape[:3], 1, values.shape[-1]), np.nan, values.dtype)
-        values = np.concatenate([values, missing], 3)
+        values = np.pad(_draws(torch.cat(parts, 2)), [(0, 0)] * 3 + [(0, 1), (0, 0)], constant_values=np.nan)
         values[:, :, ~np.roll(inside, -1, 1) | ~inside] = np.nan
         dimension, labels = f"{site}_channel", program.channel_names
         known = len(labels) == values.shape[-1]

@@ -40,8 +40,13 @@ def make_workbench(folder: Path) -> list[Path]:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder} exists and is not empty: choose another folder")
+    bench = workbench()
     with empty_again(folder):
-        _copy_rooms(folder)
+        for file in sorted(file for room in FOLDERS for file in (bench / room).rglob("*") if file.is_file()):
+            place = file.relative_to(bench)
+            if not LEFT_OUT & {*place.parts}:
+                (folder / place).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(file, folder / place)
         return _simulate_tables(folder)
 
 
@@ -66,16 +71,6 @@ def empty_again(folder: Path) -> Iterator[None]:
         if isinstance(error, OSError):
             raise UsageError(f"{folder} cannot be written: {error.strerror or error}") from error
         raise
-
-
-def _copy_rooms(folder: Path) -> None:
-    bench = workbench()
-    files = [file for room in FOLDERS for file in sorted((bench / room).rglob("*")) if file.is_file()]
-    for file in files:
-        place = file.relative_to(bench)
-        if not LEFT_OUT & {*place.parts}:
-            (folder / place).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, folder / place)
 
 
 def _simulate_tables(folder: Path) -> list[Path]:

@@ -157,7 +157,9 @@ class Cluster(Place):
         except (OSError, TimeoutError, ValueError, TypeError) as error:  # the last of an address that needs TLS
             reason = str(error).partition("\n")[0]
             raise UsageError(f"no Dask scheduler answers at {address}: {reason}") from error
-        _silence("distributed", "tornado", "asyncio")
+        for name in list(logging.root.manager.loggerDict):
+            if name.partition(".")[0] in ("distributed", "tornado", "asyncio"):  # a lost connection is said in one line
+                logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         try:
             self.client.wait_for_workers(1, timeout=WORKER_WAIT)
             self._require_alike(address)
@@ -171,8 +173,7 @@ class Cluster(Place):
         self.client.close(timeout=2)
 
     def _require_alike(self, address: str) -> None:
-        several = [name for name, worker in self._workers().items() if worker["nthreads"] > 1]
-        if several:
+        if several := [name for name, worker in self._workers().items() if worker["nthreads"] > 1]:
             raise UsageError(
                 f"workers with several threads, which would take turns: {shown(', '.join(several), 200)}; start them "
                 f"by `dask worker {address} --nthreads 1 --nworkers N`"
@@ -345,10 +346,3 @@ def other_files(digests: Mapping[str, str]) -> list[str]:
         if not same:
             other.append(file)
     return other
-
-
-def _silence(*owners: str) -> None:
-    """What they log of a connection that is lost is said in one line here."""
-    for name in list(logging.root.manager.loggerDict):
-        if name.partition(".")[0] in owners:
-            logging.getLogger(name).setLevel(logging.CRITICAL + 1)

@@ -1,30 +1,8 @@
 """What a study compares with what, from a TOML file or from the record beside its results, and what it draws.
 
-    title = "Observation noise on the truck"
-    task = "fit"                            # or "discover"
-    seeds = [1, 2, 3]                       # of the data, and of what is done with them
-    known_start = true                      # optional
-
-    [data]                                  # one of simulate, alpha_truck and tables
-    alpha_truck = "../logs"                 # a folder with train/, valid/ and test/
-    sigma_deg = [1.25, 2.5, 5, 10, 20]
-
-    [[method]]
-    name = "STEADY"
-    program = "../models/neural_vehicle.py:NeuralTruck"
-    recipe = "steady"
-    settings = {ramp = 3.0, steps = 160}
-
-    [picture]                               # optional
-    x = "data.sigma_deg"                    # a column of the table
-    y = ["forward.total"]                   # a panel each
-    chosen_by = "valid_log_likelihood"      # of settings that were tried only the best at each x is drawn
-    leave_out = []                          # methods that are in the table alone
-    labels = {"data.sigma_deg" = "noise of the bearings [°]"}
-    published = {"forward.total" = {STEADY = [[1.25, 0.434], [5, 0.456]]}}
-
-Every list among the values of `[data]` and of a method's `settings` is an axis of the grid: each of its values is tried
-with each of every other's, and with each seed. Paths are relative to the file.
+`docs/studies.md` shows a file, `studies/` has whole ones. Every list among the values of `[data]` and of a method's
+`settings` is an axis of the grid: each of its values is tried with each of every other's, and with each seed. Paths are
+relative to the file.
 """
 
 from __future__ import annotations
@@ -137,9 +115,7 @@ def read_plan(path: Path, data: Path | None = None) -> Plan:
 
 
 def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
-    problem = mismatch(content, FORM) or _surplus(content)
-    if problem is None and "picture" in content:
-        problem = undrawable(content["title"], content["picture"])
+    problem = mismatch(content, FORM) or _surplus(content) or _undrawable(content["title"], content.get("picture"))
     if problem is not None:
         raise UsageError(problem)
     task = content.get("task", "fit")
@@ -165,9 +141,8 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
             )
         different[key] = replace(job, key=key)
     jobs = _labelled(tuple(different.values()))
-    picture = None
-    if "picture" in content:
-        picture = Picture(**content["picture"])
+    picture = Picture(**content["picture"]) if "picture" in content else None
+    if picture is not None:
         _require_columns(picture, task, jobs)
     return Plan(content["title"], task, jobs, picture)
 
@@ -332,8 +307,10 @@ def _resolved(folder: Path, value: Any) -> Any:
     return _beside(folder, value) if is_program(value) else value
 
 
-def undrawable(title: str, picture: Mapping[str, Any]) -> str | None:
-    """What of a picture of the right form cannot be drawn, in words; None where all can."""
+def _undrawable(title: str, picture: Mapping[str, Any] | None) -> str | None:
+    """What of a picture of the right form cannot be drawn, in words; None where all can, or there is none."""
+    if picture is None:
+        return None
     if not 1 <= len(picture["y"]) <= MOST_PANELS:
         return f"picture.y has {len(picture['y'])} columns, expected 1 to {MOST_PANELS}"
     published = picture.get("published", {})
@@ -361,9 +338,9 @@ def recorded_plan(folder: Path) -> Plan:
     wrote it."""
     content = read_record(folder / RECORD, RECORDED, FORMAT, "a study")
     picture = content["picture"]
+    if problem := _undrawable(content["title"], picture):
+        raise RunError(f"{folder / RECORD} is damaged: {problem}")
     if picture is not None:
-        if problem := undrawable(content["title"], picture):
-            raise RunError(f"{folder / RECORD} is damaged: {problem}")
         picture = Picture(**{one.name: picture[one.name] for one in fields(Picture) if one.name in picture})
     jobs = tuple(Job(**{name: job[name] for name in JOB}) for job in content["jobs"])
     return Plan(content["title"], content["task"], jobs, picture)

@@ -53,9 +53,10 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
         left = {key: job for key, job in wanted.items() if key not in kept}
         if kept:
             say(f"{len(kept)} of {len(wanted)} jobs are there already")
-        others = sorted({_packages(row) for row in rows if row["key"] in kept} - {in_words(packages())})
-        if others:
-            say(f"some of them were computed with {'; '.join(others)}: here is {in_words(packages())}")
+        here = in_words(packages())
+        found = {row.get("packages") for row in rows if row["key"] in kept}  # none of a job that was given up
+        if others := sorted(one for one in found - {here} if isinstance(one, str)):
+            say(f"some of them were computed with {'; '.join(others)}: here is {here}")
         jobs, began = len(left), time.monotonic()
 
         def keep(row: Row) -> None:
@@ -87,12 +88,6 @@ def _require_same_study(plan: Plan, folder: Path) -> None:
         there = recorded_plan(folder)
         if there.title != plan.title and not {job.key for job in there.jobs} & {job.key for job in plan.jobs}:
             raise RunError(f"{folder} holds another study, {there.title!r}: choose another folder")
-
-
-def _packages(row: Row) -> str:
-    """What it was computed with; where nothing says so, as of a job that was given up, what is here."""
-    found = row.get("packages")
-    return found if isinstance(found, str) else in_words(packages())
 
 
 def _time_left(began: float, done: int, left: int) -> str:
