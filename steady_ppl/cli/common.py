@@ -1,7 +1,5 @@
 """What the commands share: programs, runs and their labels, JSON, options, refusals of the system."""
 
-from __future__ import annotations
-
 import errno
 import json
 from collections.abc import Collection, Mapping, Sequence

@@ -3,8 +3,6 @@
 Every step is a command as one could type it. That command is what runs, and the sentence below it is what it found.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import shlex

@@ -1,7 +1,5 @@
 """`steady check`, `prove`, `evaluate`, `states` and `report`: what runs say of drives."""
 
-from __future__ import annotations
-
 import os
 import shlex
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`steady fit`, `discover`, `add`, `effects`, `study` and `plot-study`: programs and what they learn."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 from typing import Annotated, Any, Literal

@@ -3,8 +3,6 @@
 Exit codes: 0 done, 1 the computation failed or was interrupted, 2 bad usage or bad input.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import traceback

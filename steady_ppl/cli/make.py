@@ -1,7 +1,5 @@
 """`steady init`, `simulate`, `import-bag` and `data`: folders and tables to work with."""
 
-from __future__ import annotations
-
 import shlex
 from contextlib import ExitStack
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One line on a terminal that says what is being done and about how long it will take."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

@@ -1,7 +1,5 @@
 """Learned dynamics as a plain torch module: for a controller, a simulator, a planner of one's own."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 
 import torch

@@ -1,7 +1,5 @@
 """The folder of a run: its files, its record, and how one is overwritten without losing it to a failed fit."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

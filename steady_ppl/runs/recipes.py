@@ -1,7 +1,5 @@
 """Find a recipe, hand it a program and tables, and keep what it learned in a run folder."""
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import json

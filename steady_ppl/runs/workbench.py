@@ -1,8 +1,6 @@
 """What users edit: programs in `models/`, recipes in `inference/`, tours in `notebooks/`, grids of fits in `studies/`;
 of the checkout, or as the wheel has them."""
 
-from __future__ import annotations
-
 import shutil
 import sysconfig
 from collections.abc import Iterator

@@ -5,8 +5,6 @@ contents of its tables or logs, its program and recipe, programs among its setti
 own folder and from packages in it (`from .sibling import …`). Where files are does not count.
 """
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Pictures of a study: what was found against an axis of it, beside what others have published."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence

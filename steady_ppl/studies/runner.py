@@ -3,8 +3,6 @@
 A result is kept when it comes. A job whose worker dies is tried again; one that kills each of its workers is given up.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from contextlib import closing

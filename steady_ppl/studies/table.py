@@ -5,8 +5,6 @@ hundred, which keeps ten thousand results from being written ten thousand times.
 longer has are in a second table, from which they come back when it has them again.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress

@@ -1,7 +1,5 @@
 """Angles wrapped to one turn, and paths and draws brought to the same turn."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -7,8 +7,6 @@ goes on has the inputs of the one that was killed.
         tensors, numbers = piece(compute)     # read from the folder if it is there, else computed and written
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import shutil

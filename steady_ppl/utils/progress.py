@@ -5,8 +5,6 @@ with stages(("smoothing", 1), ("simulating", 3)) as begin:   # names and their s
     begin(); …                                               # stages inside a stage divide its share
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar

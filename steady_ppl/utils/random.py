@@ -1,7 +1,5 @@
 """Random streams keyed by what they are for, so that a resumed run draws what the uninterrupted one would have."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager

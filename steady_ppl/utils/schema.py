@@ -5,8 +5,6 @@ one of two; `(form, form)` for one of several; `{"key": form, "other?": form}` f
 with a `?` need not be there, and perhaps others; `{str: form}` for any keys; `Paired(form, keys)`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Text for a terminal, which obeys what is written to it; and the command line, for a run's record."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 import unicodedata
