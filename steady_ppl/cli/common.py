@@ -1,4 +1,4 @@
-"""What the commands share: programs, runs and their labels, JSON, options, refusals of the system."""
+"""What the commands share: programs, runs and their labels, JSON, refusals of the system."""
 
 import errno
 import json

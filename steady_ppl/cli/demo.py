@@ -21,6 +21,7 @@ import typer
 import steady_ppl as st
 from steady_ppl.errors import ComputationError, RunError
 from steady_ppl.runs.workbench import TRUTH, empty_again, workbench
+from steady_ppl.utils.files import read_json
 from steady_ppl.utils.text import aligned, tell
 
 WIDTH = 100
@@ -118,7 +119,7 @@ def demonstrate(
         tour.step("Compare: does it explain even the drives that it was fitted to?")
         sets = size.calibration
         tour.steady(f"check runs/before train.csv{sets} --json check.json --picture check.png", keep="check.txt")
-        tour.result(_read("check.json")["verdict"])
+        tour.result(read_json(Path("check.json"), RunError)["verdict"])
         grown = add(tour, discover(tour, size))
         tour.step("Fit again, in the same way, on the same drives; and the true structure, as the yardstick")
         said = _fit(tour, grown, "after")
@@ -159,7 +160,7 @@ def discover(tour: Tour, size: Size) -> list[str]:
         "--json discovery.json --picture discovery.png",
         keep="discovery.txt",
     )
-    sentence = _read("discovery.json")["sentence"]
+    sentence = read_json(Path("discovery.json"), RunError)["sentence"]
     tour.result(sentence)
     effects = read_record(Path("runs/found"))["effects"]
     if not effects:
@@ -186,7 +187,7 @@ def prove(tour: Tour) -> None:
         "--json proof.json --picture proof.png",
         keep="proof.txt",
     )
-    figures = _read("proof.json")
+    figures = read_json(Path("proof.json"), RunError)
     tour.result(figures["verdict"])
     tour.say("")
     for line in _summary(figures):
@@ -232,10 +233,6 @@ def _open(out: Path, force: bool) -> None:
 
 def _write_record(content: Mapping[str, Any]) -> None:
     Path(RECORD).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
-def _read(file: str) -> dict[str, Any]:
-    return json.loads(Path(file).read_text(encoding="utf-8"))
 
 
 def demo(

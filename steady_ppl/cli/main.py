@@ -189,7 +189,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run() -> None:
-    """The console script. Its process has one thread, whatever the environment says; see `utils.threads`."""
+    """The console script. Its process has one thread, whatever the environment says; see `utils.cores`."""
     os.environ.update(ONE_THREAD)  # before torch and numpy load
     sys.exit(main())
 

@@ -1,19 +1,14 @@
 """What a fit and its drives give reason to doubt, in words."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 from pyro.distributions import constraints
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.program import Program
-
-if TYPE_CHECKING:
-    from steady_ppl.runs.fit import Fit
+from steady_ppl.runs.fit import Fit
 
 LOG_RATIO_TO_ZERO = math.log(20.0)  # log ratio by which a positive number falls to next to nothing
 LOG_RATIO_OF_GUESS = math.log(1e3)  # the same of a guess, such as noise

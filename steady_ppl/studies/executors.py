@@ -1,10 +1,9 @@
 """Where the jobs of a study are computed: processes of this machine, or a Dask cluster.
 
 joblib's own way to Dask is not taken: when a job had killed four workers, it waited for ever if there was another such
-job, and otherwise had everything that was left computed twice. A result is let go of when it is here, so that a worker
-that dies later does not have it computed again.
-
-On this machine each process has an executor of its own, as joblib's pools do not say which job a process died of.
+job, and otherwise computed twice what was left. A result is let go of when it is here, so that a worker that dies later
+does not have it computed again. Each process of this machine has an executor of its own: joblib's pools do not say
+which job a process died of.
 """
 
 from __future__ import annotations

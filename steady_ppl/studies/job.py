@@ -295,11 +295,8 @@ def _discover(job: Job) -> dict[str, Any]:
     classes = [name for one in figures["effects"] for name in one["class"]]
     variant, value = planted(job)
     # of the program as its owner has it: beside what was found in its place, hardly any size can be told
-    limits = [
-        one.detection_limit.tolist()
-        for one in first
-        if variant and one.variant.name == variant.name and not one.untestable
-    ]
+    same = [one for one in first if variant and one.variant.name == variant.name and not one.untestable]
+    limit = same[0].detection_limit.tolist() if same else None
     return {
         "p_value": figures["p_value"],
         "verdict": figures["verdict"],
@@ -308,7 +305,7 @@ def _discover(job: Job) -> dict[str, Any]:
         "found": figures["verdict"] != "none",
         "right": named == [variant.name] if variant else None,
         "in_class": variant.name in classes if variant else None,
-        IN_LIMITS: in_limits(value, limits[0] if limits else None),
+        IN_LIMITS: in_limits(value, limit),
     }
 
 

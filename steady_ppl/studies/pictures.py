@@ -26,7 +26,6 @@ SIZES = (-1.0, 0.0, *(1.25 ** (place - 0.5) for place in range(-6, 12)), math.in
 a limit; the first is of drives that lack nothing."""
 SHARES = ("found", "right", "in_class")
 PUBLISHED = "published"  # in the legend
-Points = Sequence[Sequence[float]]
 
 
 def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
@@ -145,7 +144,7 @@ def _look(index: int) -> dict[str, Any]:
     return {"color": COLORS[place], "marker": MARKS[(place + turn) % len(MARKS)], "ls": ("-", "-.")[turn % 2]}
 
 
-def _published(axes: Axes, points: Points, color: str, name: str) -> None:
+def _published(axes: Axes, points: Sequence[Sequence[float]], color: str, name: str) -> None:
     if points:
         axes.plot(*zip(*points, strict=True), label=name, **_published_look(color))
 

@@ -5,8 +5,6 @@
 relative to the file.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
@@ -65,16 +63,6 @@ FORM: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
-class Plan:
-    """A study: its jobs with seeds outermost, so that what has come in at any time is whole studies of fewer seeds."""
-
-    title: str
-    task: str
-    jobs: tuple[Job, ...]
-    picture: Picture | None = None
-
-
-@dataclass(frozen=True)
 class Picture:
     """What is drawn of a study.
 
@@ -98,6 +86,16 @@ class Picture:
     def columns(self) -> tuple[str, ...]:
         """All that is drawn or chosen by, each once."""
         return tuple(dict.fromkeys(name for name in (self.x, *self.y, self.chosen_by) if name))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A study: its jobs with seeds outermost, so that what has come in at any time is whole studies of fewer seeds."""
+
+    title: str
+    task: str
+    jobs: tuple[Job, ...]
+    picture: Picture | None = None
 
 
 def read_plan(path: Path, data: Path | None = None) -> Plan:

@@ -1,8 +1,7 @@
 """How many threads and processes a computation takes: one thread each, on the cores that this process may use.
 
-The engine's tensors are small. Torch's threads wait for one another by spinning, so that on a busy machine two threads
-took 20 to 55 times the CPU time of one, in filters of 20,000 to 500 particles a drive. On quiet cores two threads
-brought a filter of 100,000 particles in plain torch from 3.5 s to 2.5 s, its kernels nothing, and smaller filters lost.
+The engine's tensors are small. Torch's threads wait for one another by spinning: on a busy machine two took 20 to 55
+times the CPU time of one. On quiet cores two helped a filter of 100,000 particles in plain torch alone, 3.5 to 2.5 s.
 
 Coarse jobs run side by side, in processes that are forked: they have what this one has, so that nothing is sent to
 them, and their results come back as safetensors. On other systems than Linux, off the main thread, or where CUDA is in
