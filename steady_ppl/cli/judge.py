@@ -121,8 +121,7 @@ def evaluate(
     present("\n".join(lines), {"runs": rows}, json_file)
     doubts = {doubt: None for fit in fits for doubt in diagnose_units(fit.program, st.for_program(fit.program, drives))}
     used = used_before(labels, fingerprint(drives))
-    for reason in [*incomparable(results, folders), *used, *drives.uneven_steps, *doubts]:
-        say(reason)
+    say(*incomparable(results, folders), *used, *drives.uneven_steps, *doubts)
     for run, result in zip(runs, results, strict=True):
         if result["filter"] != "lookahead":
             say(f"{run}: judged by the filter {result['filter']}")
@@ -164,8 +163,7 @@ def states(
     write_states(posterior, out)
     tell(f"{out}: {len(drives)} drives, {draws} draws of each")
     scarce = few_starts(float(posterior["sample_stats"]["roots"].min()))
-    for doubt in [*diagnose_units(fit.program, st.for_program(fit.program, drives)), *([scarce] if scarce else [])]:
-        say(doubt)
+    say(*diagnose_units(fit.program, st.for_program(fit.program, drives)), *([scarce] if scarce else []))
 
 
 def report(

@@ -69,8 +69,7 @@ def fit(
         force=force,
         progress=not is_quiet(),
     )
-    for note in result.notes:
-        say(note)
+    say(*result.notes)
     tell(f"{out}: {result.program}")
     if result.trained is not None:
         judged = {e["step"]: e["log_likelihood"] for e in result.trained.history if "log_likelihood" in e}
@@ -148,9 +147,7 @@ def discover(
             found.after.save_into(out, begun=used)
             write_json(out / DISCOVERY, figures)
     if out is not None:
-        for note in found.after.notes:
-            say(note)
-        say(f"{out}: {found.after.program}")
+        say(*found.after.notes, f"{out}: {found.after.program}")
     if picture is not None:
         from steady_ppl.plotting.discovery import discovery_picture
 
@@ -183,8 +180,8 @@ def add(
     if not added(grown):
         raise UsageError(f"{source} has no effect that its file does not have: name one, `steady effects` lists them")
     notes = write_program(grown, out, force=force)
-    for note in notes if is_run else []:
-        say(note)
+    if is_run:
+        say(*notes)
     tell(f"{out}: {grown}")
     for variant in added(grown):
         tell(f"{variant.label}: {variant.effect.text}")

@@ -58,8 +58,6 @@ def drawn_states(
     """Draw whole trajectories given all of their measurements.
 
     Args:
-        program: the state-space model.
-        data: drives with the program's columns.
         draws: equally weighted paths for each trajectory, resampled from all surviving lineages.
         particles: N of the filter, for each trajectory; None: see `choose_filter`.
         every: use the measurements of every n-th row only.
@@ -225,7 +223,6 @@ def forecast(
     """Draw what happens, and what is measured, after a moment up to which measurements are used.
 
     Args:
-        program: the state-space model.
         data: drives with the program's columns; rows after the last measurement hold what is planned.
         controls: more of it, `(H, U)` or `(H, B, U)`, see `Trajectories.continued`.
         after: s since each drive's start; later measurements are not used. Each drive's last measured row when None.

@@ -27,7 +27,6 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
 
     Args:
         folder: where its table is.
-        place: where to compute.
         again: try jobs that have failed once more.
         say: hears a line a job.
 
