@@ -254,8 +254,8 @@ def _fit(job: Job) -> dict[str, Any]:
     require_settings(f"recipe {job.recipe}", recipe, job.settings)
     silent = {"progress": False} if trains(recipe) else {}
     began = time.perf_counter()
-    settings = {"known_start": job.known_start, "seed": job.seed, **silent, **told_settings(job)}
-    fitted = recipe(program, data["train"], data["valid"], **settings)
+    settings, start = told_settings(job), job.known_start
+    fitted = recipe(program, data["train"], data["valid"], known_start=start, seed=job.seed, **silent, **settings)
     seconds = time.perf_counter() - began
     if fitted.trained and fitted.trained.interrupted:
         raise RunError("it was interrupted")

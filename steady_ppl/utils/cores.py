@@ -14,7 +14,6 @@ import ctypes
 import json
 import multiprocessing
 import os
-import select
 import signal
 import sys
 import threading
@@ -23,6 +22,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
+from multiprocessing.connection import wait
 from typing import IO, TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -122,7 +122,6 @@ class _Child:
 
     def _run(self, parent: int) -> None:
         """In the child, which ends here."""
-        status = 1
         try:
             from steady_ppl.utils.tensor_files import packed
 
@@ -139,9 +138,8 @@ class _Child:
                     self.file.write(len(content).to_bytes(8, "little") + content)
                 self.file.write(END)
                 self.file.flush()
-                status = 0
         finally:
-            os._exit(status)
+            os._exit(0)
 
     def results(self, patience: float) -> dict[int, Result]:
         """By the jobs' numbers, when it has ended; nothing if it failed, or does not end within so many seconds."""
@@ -149,9 +147,7 @@ class _Child:
 
         if self.file is None or self.handle < 0:
             return {}
-        ended = select.poll()
-        ended.register(self.handle, select.POLLIN)
-        if not ended.poll(1000 * patience):
+        if not wait([self.handle], patience):
             return {}
         size = self.file.seek(0, os.SEEK_END)
         self.file.seek(max(0, size - len(END)))
