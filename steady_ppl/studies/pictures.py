@@ -26,6 +26,7 @@ SIZES = (-1.0, 0.0, *(1.25 ** (place - 0.5) for place in range(-6, 12)), math.in
 a limit; the first is of drives that lack nothing."""
 SHARES = ("found", "right", "in_class")
 PUBLISHED = "published"  # in the legend
+PUBLISHED_LOOK: dict[str, Any] = {"ls": "--", "marker": "*", "ms": 7, "lw": 0.9, "alpha": 0.6}
 
 
 def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
@@ -60,7 +61,7 @@ def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
         _panel(panel, picture, column, lines)
     entries = {str(line.get_label()): line for panel in figure.axes for line in panel.get_legend_handles_labels()[0]}
     if PUBLISHED in entries:  # of every method in its own colour
-        entries[PUBLISHED] = Line2D([], [], **_published_look("0.4"))
+        entries[PUBLISHED] = Line2D([], [], color="0.4", **PUBLISHED_LOOK)
     if entries:
         legend = figure.legend(
             entries.values(), entries, loc="outside lower center", ncols=2 * len(picture.y), fontsize=8
@@ -146,11 +147,7 @@ def _look(index: int) -> dict[str, Any]:
 
 def _published(axes: Axes, points: Sequence[Sequence[float]], color: str, name: str) -> None:
     if points:
-        axes.plot(*zip(*points, strict=True), label=name, **_published_look(color))
-
-
-def _published_look(color: str) -> dict[str, Any]:
-    return {"ls": "--", "marker": "*", "ms": 7, "lw": 0.9, "alpha": 0.6, "color": color}
+        axes.plot(*zip(*points, strict=True), label=name, color=color, **PUBLISHED_LOOK)
 
 
 def _failed(

@@ -8,8 +8,6 @@ them, and their results come back as safetensors. On other systems than Linux, o
 use, no fork is safe, and jobs run one after another. This module loads no torch, which reads `ONE_THREAD` as it loads.
 """
 
-from __future__ import annotations
-
 import ctypes
 import json
 import multiprocessing

@@ -1,7 +1,5 @@
 """Files: written whole or not at all, refused early, read as JSON; pictures."""
 
-from __future__ import annotations
-
 import json
 import os
 import stat
@@ -59,7 +57,7 @@ def require_picture(path: Path | None) -> None:
         raise UsageError(f"{path}: expected a picture's name that ends in one of {', '.join(sorted(formats))}")
 
 
-def write_picture(figure: Figure, path: Path) -> None:
+def write_picture(figure: "Figure", path: Path) -> None:
     """Write a picture whole or not at all; UsageError where it cannot be written."""
     from matplotlib.text import Text
 
