@@ -15,7 +15,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -336,12 +336,9 @@ def computed(job: Job, here: Mapping[str, str], topic: str) -> Answer:
 
 def other_files(digests: Mapping[str, str]) -> list[str]:
     """On a worker: the files that are not there, or are others."""
-    other = []
+    other = dict(digests)
     for file, digest in digests.items():
-        try:
-            same = digest_of(Path(file)) == digest
-        except UsageError:
-            same = False
-        if not same:
-            other.append(file)
-    return other
+        with suppress(UsageError):  # it cannot be read
+            if digest_of(Path(file)) == digest:
+                del other[file]
+    return list(other)
