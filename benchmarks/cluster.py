@@ -35,8 +35,8 @@ from dask_cluster import Dask, wait_for  # noqa: E402
 
 from steady_ppl.runs.fit import packages  # noqa: E402
 from steady_ppl.studies.executors import Cluster, Local, Place, computed  # noqa: E402  # noqa: E402
-from steady_ppl.studies.plan import Job  # noqa: E402
-from steady_ppl.studies.plan_file import read_plan  # noqa: E402
+from steady_ppl.studies.job import Job  # noqa: E402
+from steady_ppl.studies.plan import read_plan  # noqa: E402
 from steady_ppl.studies.runner import run_study  # noqa: E402
 from steady_ppl.studies.table import TABLE, read_results, study_table  # noqa: E402
 

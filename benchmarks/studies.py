@@ -18,8 +18,9 @@ from pathlib import Path
 
 import pandas as pd
 
+from steady_ppl.studies.job import HELD_OUT, IN_LIMITS
 from steady_ppl.studies.pictures import SIZES, chosen, points
-from steady_ppl.studies.plan import HELD_OUT, IN_LIMITS, Picture
+from steady_ppl.studies.plan import Picture
 from steady_ppl.studies.table import TABLE
 
 RESULTS, STUDY_FILES = Path(__file__).parent / "results", Path(__file__).parents[1] / "studies"

@@ -1,6 +1,4 @@
-"""What the commands share: programs, runs and their labels, JSON, options, refusals of the system."""
-
-from __future__ import annotations
+"""What the commands share: programs, runs and their labels, JSON, refusals of the system."""
 
 import errno
 import json
@@ -18,11 +16,7 @@ MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "Storag
 
 
 def fit_or_program(source: str, program: str | None, seed: int = 0, substeps: int | None = None) -> Any:
-    """The fit in a run folder, or else the program of a file.
-
-    Raises:
-        UsageError: a program is named for what is no run.
-    """
+    """The fit in a run folder, or else the program of a file; UsageError: `program` is given for what is no run."""
     from steady_ppl.model.validate import probe
 
     if not Path(source).is_dir():
@@ -51,13 +45,12 @@ def program_from(model: str, seed: int, substeps: int | None = None) -> Any:
 
 def write_json(path: Path, content: Any) -> None:
     """Write a file whole or not at all; a figure that is not finite is an error, JSON has no word for it."""
-    text = as_json(content, str(path)) + "\n"
+    text = _as_json(content, str(path)) + "\n"
     with whole_file(path) as beside:
         beside.write_text(text)
 
 
-def as_json(content: Any, place: str) -> str:
-    """The figures as text; one that is not finite is an error."""
+def _as_json(content: Any, place: str) -> str:
     try:
         return json.dumps(content, indent=1, allow_nan=False)
     except ValueError as error:
@@ -67,11 +60,19 @@ def as_json(content: Any, place: str) -> str:
 def present(text: str, content: Any, json_file: Path | None) -> None:
     """Print the text and write the figures beside it, or print the figures alone if the file is `-`."""
     if json_file is not None and str(json_file) == "-":
-        tell(as_json(content, "the output"))
+        tell(_as_json(content, "the output"))
         return
     tell(text)
     if json_file is not None:
         write_json(json_file, content)
+
+
+def runs_and_table(command: str, arguments: Sequence[Path]) -> tuple[list[Path], Path]:
+    """What a command takes: run folders, and then a table."""
+    *runs, table = arguments
+    if not runs:
+        raise UsageError(f"{command} needs at least one RUN and then a TABLE")
+    return runs, table
 
 
 def run_labels(runs: Sequence[Path], taken: Collection[str] = ()) -> dict[str, Path]:
@@ -88,12 +89,7 @@ def run_labels(runs: Sequence[Path], taken: Collection[str] = ()) -> dict[str, P
 
 
 def load_runs(labels: Mapping[str, Path], programs: Sequence[str] | None) -> dict[str, Any]:
-    """The fits of runs by label, with the programs that `--program` names, one for each, or their own.
-
-    Raises:
-        UsageError: another number of programs than of runs.
-    """
-
+    """The fits of runs by label, with the programs that `--program` names, one for each, or their own."""
     if programs and len(programs) != len(labels):
         raise UsageError(
             f"--program is given {len(programs)} times for {len(labels)} runs: name one for each, in order"

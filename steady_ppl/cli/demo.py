@@ -3,8 +3,6 @@
 Every step is a command as one could type it. That command is what runs, and the sentence below it is what it found.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import shlex
@@ -23,6 +21,7 @@ import typer
 import steady_ppl as st
 from steady_ppl.errors import ComputationError, RunError
 from steady_ppl.runs.workbench import TRUTH, empty_again, workbench
+from steady_ppl.utils.files import read_json
 from steady_ppl.utils.text import aligned, tell
 
 WIDTH = 100
@@ -30,19 +29,12 @@ WIDTH = 100
 
 @dataclass
 class Tour:
-    """Runs commands, tells of them, and remembers what they said.
+    """Runs commands, tells of them, and remembers what they said."""
 
-    Attributes:
-        command: `steady`, as typer makes it.
-        say: told every line.
-        force: the commands overwrite what is there.
-        steps: title, commands, result and seconds of every step.
-    """
-
-    command: Any
+    command: Any  # `steady`, as typer makes it
     say: Callable[[str], None]
-    force: bool = False
-    steps: list[dict[str, Any]] = field(default_factory=list)
+    force: bool = False  # the commands overwrite what is there
+    steps: list[dict[str, Any]] = field(default_factory=list)  # title, commands, result and seconds of each
 
     def step(self, title: str) -> None:
         """Begin a step."""
@@ -69,12 +61,8 @@ class Tour:
 
 
 def run(command: Any, arguments: Sequence[str]) -> str:
-    """What the command `steady ARGUMENTS` prints; its bars are shown on a terminal only.
-
-    Raises:
-        KeyboardInterrupt: it was interrupted.
-        SteadyError: as the command raises it.
-    """
+    """What the command `steady ARGUMENTS` prints; its bars are shown on a terminal only. Raises what the command does,
+    and KeyboardInterrupt where it was interrupted."""
     said = io.StringIO()
     quiet = nullcontext() if sys.stderr.isatty() else redirect_stderr(io.StringIO())
     with redirect_stdout(said), quiet:
@@ -94,12 +82,8 @@ BEGINNING = (
 
 @dataclass(frozen=True)
 class Size:
-    """How much is simulated and fitted.
-
-    Attributes:
-        train, valid, test: drives to fit, to choose by, and locked away until the proof.
-        simulations: sets that calibrate the tests of `check` and `discover`; their own numbers when None.
-    """
+    """How many drives are simulated to fit, to choose by, and to be locked away until the proof; and how many sets
+    calibrate the tests of `check` and `discover`, their own numbers when None."""
 
     train: int = 16
     valid: int = 16
@@ -113,26 +97,17 @@ class Size:
 
 
 def demonstrate(
-    out: Path, command: Any, *, size: Size | None = None, force: bool = False, say: Callable[[str], None] = print
-) -> list[dict[str, Any]]:
+    out: Path, command: Any, *, size: Size = Size(), force: bool = False, say: Callable[[str], None] = print
+) -> None:
     """Go through the loop and keep everything in a folder: tables of drives, programs, runs, figures, pictures.
 
-    Args:
-        out: the folder; an earlier demonstration there is overwritten.
-        command: `steady`, as typer makes it.
-        size: of the job.
-        force: write into a folder that is no demonstration's.
-        say: told every line.
-
-    Returns:
-        Title, commands, result and seconds of every step.
+    An earlier demonstration there is overwritten, and what is none where `force` says so.
 
     Raises:
         RunError: the folder exists and is no demonstration's.
         ComputationError: the search ended with nothing that can be added.
     """
-
-    size, began = size or Size(), time.perf_counter()
+    began = time.perf_counter()
     tour = Tour(command, say, force=out.exists())
     _open(out, force)
     say(textwrap.fill(BEGINNING, WIDTH))
@@ -144,7 +119,7 @@ def demonstrate(
         tour.step("Compare: does it explain even the drives that it was fitted to?")
         sets = size.calibration
         tour.steady(f"check runs/before train.csv{sets} --json check.json --picture check.png", keep="check.txt")
-        tour.result(_read("check.json")["verdict"])
+        tour.result(read_json(Path("check.json"), RunError)["verdict"])
         grown = add(tour, discover(tour, size))
         tour.step("Fit again, in the same way, on the same drives; and the true structure, as the yardstick")
         said = _fit(tour, grown, "after")
@@ -159,18 +134,15 @@ def demonstrate(
         _write_record({"status": "finished", "seconds": round(time.perf_counter() - began, 1), "steps": tour.steps})
     say(f"\n{out}: report.html; check, discovery and proof as .png, .txt and .json; drives; runs; {grown}")
     say(f"{time.perf_counter() - began:.0f} s in all")
-    return tour.steps
 
 
 def record_drives(tour: Tour, size: Size) -> None:
     """Simulate drives of a hovercraft with drag, and forget its poses."""
-
     tour.step("Record drives, of a hovercraft that does have drag")
-    drives = {"train": size.train, "valid": size.valid, "test": size.test}
-    for seed, (name, count) in enumerate(drives.items(), 1):
+    for seed, (name, count) in enumerate((("train", size.train), ("valid", size.valid), ("test", size.test)), 1):
         tour.steady(f"simulate {TRUTH} --trajectories {count} --seed {seed} --out {name}.csv")
-    for name in ("train", "valid"):
-        st.write_table(st.read_table(f"{name}.csv").without_truth(keep_start=True), Path(f"{name}.csv"))
+    for table in ("train.csv", "valid.csv"):
+        st.write_table(st.read_table(table).without_truth(keep_start=True), table)
     tour.result(
         f"{size.train} drives to fit and {size.valid} to choose by: of both only controls, bearings and the first "
         f"state are kept. {size.test} more are locked away for the proof, with their poses, to judge by. The "
@@ -188,7 +160,7 @@ def discover(tour: Tour, size: Size) -> list[str]:
         "--json discovery.json --picture discovery.png",
         keep="discovery.txt",
     )
-    sentence = _read("discovery.json")["sentence"]
+    sentence = read_json(Path("discovery.json"), RunError)["sentence"]
     tour.result(sentence)
     effects = read_record(Path("runs/found"))["effects"]
     if not effects:
@@ -215,14 +187,14 @@ def prove(tour: Tour) -> None:
         "--json proof.json --picture proof.png",
         keep="proof.txt",
     )
-    figures = _read("proof.json")
+    figures = read_json(Path("proof.json"), RunError)
     tour.result(figures["verdict"])
     tour.say("")
-    for line in summary(figures):
+    for line in _summary(figures):
         tour.say(f"     {line}")
 
 
-def summary(figures: Mapping[str, Any]) -> list[str]:
+def _summary(figures: Mapping[str, Any]) -> list[str]:
     """A few columns of the proof's figures, as aligned lines: log p(y), errors of the measurements and of the first
     error group of the states, and the channel whose noise had to be largest for what was missing."""
     rows = figures["rows"]
@@ -261,10 +233,6 @@ def _open(out: Path, force: bool) -> None:
 
 def _write_record(content: Mapping[str, Any]) -> None:
     Path(RECORD).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
-def _read(file: str) -> dict[str, Any]:
-    return json.loads(Path(file).read_text(encoding="utf-8"))
 
 
 def demo(

@@ -1,7 +1,5 @@
 """`steady check`, `prove`, `evaluate`, `states` and `report`: what runs say of drives."""
 
-from __future__ import annotations
-
 import os
 import shlex
 from pathlib import Path
@@ -11,7 +9,7 @@ import typer
 
 import steady_ppl as st
 from steady_ppl.cli import options
-from steady_ppl.cli.common import load_runs, present, program_from, run_labels, used_before
+from steady_ppl.cli.common import load_runs, present, program_from, run_labels, runs_and_table, used_before
 from steady_ppl.errors import UsageError
 from steady_ppl.utils.files import require_picture, require_place, write_picture
 from steady_ppl.utils.text import say, tell
@@ -63,18 +61,13 @@ def prove(
     oracle: Annotated[Path | None, typer.Option(help="A run of the true structure, fitted like the others.")] = None,
     json_file: options.Json = None,
     picture: Annotated[Path | None, typer.Option(help="Draw the errors into this file, for example .png.")] = None,
-    program: Annotated[
-        list[str] | None,
-        typer.Option(help="The program, if its file moved or changed; once for each RUN and the oracle, in order."),
-    ] = None,
+    program: Annotated[list[str] | None, options.moved("once for each RUN and the oracle, in order")] = None,
     seed: options.Seed = 0,
 ) -> None:
     """Prove that runs are better than the first one: log p(y), open-loop errors and noise, with paired intervals."""
     from steady_ppl.runs.recipes import fingerprint
 
-    *runs, table = arguments
-    if not runs:
-        raise UsageError("prove needs at least one RUN and then a TABLE")
+    runs, table = runs_and_table("prove", arguments)
     require_picture(picture)
     require_place(json_file)
     labels = run_labels(runs, taken={"oracle", "truth"}) | ({"oracle": oracle} if oracle else {})
@@ -102,12 +95,7 @@ def evaluate(
         str | None,
         typer.Option("--map", help="The same vehicle with the true landmarks, for runs that learned theirs."),
     ] = None,
-    program: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="The program, if its file moved or changed; with several RUNs once for each, in their order."
-        ),
-    ] = None,
+    program: Annotated[list[str] | None, options.moved("with several RUNs once for each, in their order")] = None,
 ) -> None:
     """The paper's errors where true states exist; errors in measurement space always."""
     from steady_ppl.comparison.evaluate import evaluate_all, incomparable, table_of
@@ -115,10 +103,8 @@ def evaluate(
     from steady_ppl.runs.recipes import fingerprint
     from steady_ppl.smc.genealogy import FEW
 
-    if len(arguments) < 2:
-        raise UsageError("evaluate needs at least one RUN and then a TABLE")
+    runs, table = runs_and_table("evaluate", arguments)
     require_place(json_file)
-    *runs, table = arguments
     labels = run_labels(runs)
     fits = list(load_runs(labels, program).values())
     drives = st.read_table(table)
@@ -134,13 +120,8 @@ def evaluate(
     rows = [{"run": folder, **result} for folder, result in zip(folders, results, strict=True)]
     present("\n".join(lines), {"runs": rows}, json_file)
     doubts = {doubt: None for fit in fits for doubt in diagnose_units(fit.program, st.for_program(fit.program, drives))}
-    for reason in [
-        *incomparable(results, folders),
-        *used_before(labels, fingerprint(drives)),
-        *drives.uneven_steps,
-        *doubts,
-    ]:
-        say(reason)
+    used = used_before(labels, fingerprint(drives))
+    say(*incomparable(results, folders), *used, *drives.uneven_steps, *doubts)
     for run, result in zip(runs, results, strict=True):
         if result["filter"] != "lookahead":
             say(f"{run}: judged by the filter {result['filter']}")
@@ -182,8 +163,7 @@ def states(
     write_states(posterior, out)
     tell(f"{out}: {len(drives)} drives, {draws} draws of each")
     scarce = few_starts(float(posterior["sample_stats"]["roots"].min()))
-    for doubt in [*diagnose_units(fit.program, st.for_program(fit.program, drives)), *([scarce] if scarce else [])]:
-        say(doubt)
+    say(*diagnose_units(fit.program, st.for_program(fit.program, drives)), *([scarce] if scarce else []))
 
 
 def report(
@@ -195,9 +175,7 @@ def report(
     ] = None,
     title: Annotated[str | None, typer.Option(help="Of the page; the runs' names when not given.")] = None,
     simulations: Annotated[int, options.count("Simulated sets for the bands.", least=20)] = SIMULATIONS,
-    program: Annotated[
-        list[str] | None, typer.Option(help="The program, if its file moved or changed; once for each RUN, in order.")
-    ] = None,
+    program: Annotated[list[str] | None, options.moved("once for each RUN, in order")] = None,
     seed: options.Seed = 0,
 ) -> None:
     """Write one page of HTML: verdict, measured against predicted, where it fails, what is missing, before and after.
@@ -207,9 +185,7 @@ def report(
     from steady_ppl.runs.folder import read_discovery
     from steady_ppl.runs.recipes import fingerprint
 
-    *runs, table = arguments
-    if not runs:
-        raise UsageError("report needs at least one RUN and then a TABLE")
+    runs, table = runs_and_table("report", arguments)
     if out.suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"{out}: expected a page's name that ends in .html")
     require_place(out)

@@ -1,7 +1,5 @@
 """`steady fit`, `discover`, `add`, `effects`, `study` and `plot-study`: programs and what they learn."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -71,8 +69,7 @@ def fit(
         force=force,
         progress=not is_quiet(),
     )
-    for note in result.notes:
-        say(note)
+    say(*result.notes)
     tell(f"{out}: {result.program}")
     if result.trained is not None:
         judged = {e["step"]: e["log_likelihood"] for e in result.trained.history if "log_likelihood" in e}
@@ -150,9 +147,7 @@ def discover(
             found.after.save_into(out, begun=used)
             write_json(out / DISCOVERY, figures)
     if out is not None:
-        for note in found.after.notes:
-            say(note)
-        say(f"{out}: {found.after.program}")
+        say(*found.after.notes, f"{out}: {found.after.program}")
     if picture is not None:
         from steady_ppl.plotting.discovery import discovery_picture
 
@@ -185,8 +180,8 @@ def add(
     if not added(grown):
         raise UsageError(f"{source} has no effect that its file does not have: name one, `steady effects` lists them")
     notes = write_program(grown, out, force=force)
-    for note in notes if is_run else []:
-        say(note)
+    if is_run:
+        say(*notes)
     tell(f"{out}: {grown}")
     for variant in added(grown):
         tell(f"{variant.label}: {variant.effect.text}")
@@ -220,7 +215,7 @@ def study(
     import joblib
 
     from steady_ppl.studies.executors import Cluster, Local
-    from steady_ppl.studies.plan_file import read_plan
+    from steady_ppl.studies.plan import read_plan
     from steady_ppl.studies.runner import require_runnable, run_study
 
     if workers is not None and cluster is not None:

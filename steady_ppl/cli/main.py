@@ -3,8 +3,6 @@
 Exit codes: 0 done, 1 the computation failed or was interrupted, 2 bad usage or bad input.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import traceback
@@ -34,11 +32,7 @@ class Command:
 
     def __init__(self, function: Callable[..., None], about: str, *examples: str, hidden: bool = False) -> None:
         self.function, self.about, self.examples, self.hidden = function, about, examples, hidden
-
-    @property
-    def name(self) -> str:
-        """As it is typed."""
-        return self.function.__name__.replace("_", "-")
+        self.name = function.__name__.replace("_", "-")
 
 
 COMMANDS = (
@@ -171,8 +165,7 @@ def main(arguments: list[str] | None = None) -> int:
         try:
             code = command.main(arguments, prog_name="steady", standalone_mode=False) or 0
             if code == INTERRUPTED:
-                say("interrupted", always=True)
-                return 1
+                raise KeyboardInterrupt
             return code
         except KeyboardInterrupt:
             say("interrupted", always=True)

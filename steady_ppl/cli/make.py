@@ -1,7 +1,5 @@
 """`steady init`, `simulate`, `import-bag` and `data`: folders and tables to work with."""
 
-from __future__ import annotations
-
 import shlex
 from contextlib import ExitStack
 from pathlib import Path
@@ -66,8 +64,9 @@ def import_bag(
     require_table_file(out)
     data = st.read_bags(bags, mapping)
     st.write_table(data, out)
-    rows, many = int(data.lengths.sum()), len(data)
-    tell(f"{out}: {many} trajector{'y' if many == 1 else 'ies'}, {rows} rows, {_share(data)}")
+    rows, many, counts = int(data.lengths.sum()), len(data), data.observed.sum((0, 1)).tolist()
+    seen = ", ".join(f"y.{name} in {count}" for name, count in zip(data.measurement_names, counts, strict=True))
+    tell(f"{out}: {many} trajector{'y' if many == 1 else 'ies'}, {rows} rows, {seen}")
 
 
 def _mapping(file: Path | None, maps: list[str], step: float | None) -> Any:
@@ -77,8 +76,7 @@ def _mapping(file: Path | None, maps: list[str], step: float | None) -> Any:
     content: dict[str, Any] = read_toml(file) if file else {}
     if step is not None:
         content["step"] = step
-    columns = content.get("columns", {})
-    added: dict[str, Any] = {}
+    columns, added = content.get("columns", {}), dict[str, Any]()
     for text in maps:
         name, said = parse_map(text)
         if name in added or (isinstance(columns, dict) and name in columns):
@@ -87,12 +85,6 @@ def _mapping(file: Path | None, maps: list[str], step: float | None) -> Any:
     if added and isinstance(columns, dict):
         content["columns"] = columns | added
     return BagMapping.parse(content, file.name if file else "--map")
-
-
-def _share(data: Any) -> str:
-    """How much of each measurement there is."""
-    counts = data.observed.sum((0, 1)).tolist()
-    return ", ".join(f"y.{name} in {count}" for name, count in zip(data.measurement_names, counts, strict=True))
 
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)

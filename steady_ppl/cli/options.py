@@ -1,7 +1,5 @@
 """Arguments and options that several commands have."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,6 +11,11 @@ MAX_COUNT = 10**9
 def count(help: str, least: int = 1) -> Any:
     """An option that says how many, `least` or more."""
     return typer.Option(help=help, min=least, max=MAX_COUNT)
+
+
+def moved(which: str) -> Any:
+    """An option that names the programs of several runs."""
+    return typer.Option(help=f"The program, if its file moved or changed; {which}.")
 
 
 Run = Annotated[Path, typer.Argument(help="Run folder.")]

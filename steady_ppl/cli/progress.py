@@ -1,7 +1,5 @@
 """One line on a terminal that says what is being done and about how long it will take."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time
@@ -68,19 +66,11 @@ def progress_line() -> Iterator[Callable[[str, float], None]]:
 
 
 def in_words(doing: str, share: float, until_now: float, elapsed: float) -> str:
-    """What is being done, and the time left if all of it goes on as fast as its stages have until now.
-
-    Args:
-        doing: the stage.
-        share: of the whole, done when the stage began.
-        until_now: s from the beginning until then.
-        elapsed: s from the beginning.
-    """
+    """What is being done, and the time left if all of it goes on as fast as its stages have until now: a share of the
+    whole was done, `until_now` s after its beginning, when the stage began, and now `elapsed` s have gone by."""
     if share < 0.02:
         return f"{doing} … {elapsed:.0f} s so far"
     left = until_now / share - elapsed
-    return f"{doing} … " + ("about to end" if left < 1 else f"about {_rounded(left)} left")
-
-
-def _rounded(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+    if left < 1:
+        return f"{doing} … about to end"
+    return f"{doing} … about " + (f"{left:.0f} s left" if left < 90 else f"{left / 60:.0f} min left")

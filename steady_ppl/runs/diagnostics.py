@@ -1,19 +1,14 @@
 """What a fit and its drives give reason to doubt, in words."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
 
 from pyro.distributions import constraints
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.program import Program
-
-if TYPE_CHECKING:
-    from steady_ppl.runs.fit import Fit
+from steady_ppl.runs.fit import Fit
 
 LOG_RATIO_TO_ZERO = math.log(20.0)  # log ratio by which a positive number falls to next to nothing
 LOG_RATIO_OF_GUESS = math.log(1e3)  # the same of a guess, such as noise
@@ -29,12 +24,8 @@ TURNS = 5 * math.pi  # rad; beyond it a reading on a circle looks like degrees
 
 
 def diagnose_fit(fit: Fit, declared: Mapping[str, Tensor]) -> list[str]:
-    """That it had not converged, or that it has all but taken away what the program declares.
-
-    Args:
-        fit: as its recipe returned it.
-        declared: `state_dict()` of the program before, copied.
-    """
+    """That it had not converged, or that it has all but taken away what the program `declared`: a copy of its
+    `state_dict()` before."""
     found, trained = [], fit.trained
     if trained is not None and trained.still_rising is not None:
         steps = fit.settings.get("steps")
@@ -48,10 +39,10 @@ def diagnose_fit(fit: Fit, declared: Mapping[str, Tensor]) -> list[str]:
         if not _is_positive(fit.program, short):
             continue
         guessed = short.startswith(tuple(fit.program.guesses))
-        why = COLLAPSED if guessed else HIDDEN
-        now = dict(fit.program.state_dict())[name]
+        most, why = (LOG_RATIO_OF_GUESS, COLLAPSED) if guessed else (LOG_RATIO_TO_ZERO, HIDDEN)
+        now = fit.program.state_dict()[name]
         for index, (then, value) in enumerate(zip(before.flatten().tolist(), now.flatten().tolist(), strict=True)):
-            if then - value > (LOG_RATIO_OF_GUESS if guessed else LOG_RATIO_TO_ZERO):
+            if then - value > most:
                 label = f"{short}[{index}]" if before.numel() > 1 else short
                 found.append(f"{label} fell from {math.exp(then):.3g} to {math.exp(value):.2g}: {why}")
     return found
@@ -61,10 +52,8 @@ def diagnose_units(program: Program, data: Trajectories) -> list[str]:
     """What is read as radians and looks like degrees: beyond several turns, and all within a circle's degrees.
 
     Of measurements all are looked at, of known angles those of the first rows alone, since later ones may have counted
-    turns, and of the controls of a program with a heading those that are angles or turn rates.
-
-    Args:
-        data: as returned by `for_program`.
+    turns, and of the controls of a program with a heading those that are angles or turn rates; `data` are as
+    `for_program` returns them.
     """
     found = []
     for index, (name, unit) in enumerate(zip(program.measurement_names, program.measurement_units, strict=True)):
@@ -90,9 +79,7 @@ def _degrees(column: str, unit: str, seen: Tensor) -> list[str]:
 
 def _is_positive(program: Program, name: str) -> bool:
     """Whether a parameter is learned as its logarithm."""
-    owner: Any = program
-    *owners, name = name.split(".")
-    for word in owners:
-        owner = getattr(owner, word)
+    path, _, name = name.rpartition(".")
+    owner = program.get_submodule(path)
     constraint = getattr(owner, "_pyro_params", {}).get(name, (None,))[0]  # a copy's is not the same object
     return isinstance(constraint, type(constraints.positive)) and constraint.lower_bound == 0

@@ -1,7 +1,5 @@
 """Learned dynamics as a plain torch module: for a controller, a simulator, a planner of one's own."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 
 import torch
@@ -17,10 +15,10 @@ PROBED, PUSHES = 200, (1e-3, 1.0, -1e3)  # rows and sizes of a command that is l
 
 
 class Dynamics(nn.Module):
-    """What a program says happens next, as a function of tensors.
+    """What a program says happens next, as a function of tensors; `...` is any shape.
 
-    Nothing of Pyro is seen from outside: it is called like any module, moves with `.to(…)`, is differentiable in
-    states, controls and parameters, and its `state_dict()` is the program's. `...` is any shape.
+    It is called like any module, moves with `.to(…)`, is differentiable in states, controls and parameters, and its
+    `state_dict()` is the program's.
 
     Attributes:
         state_names, control_names, measurement_names: what the last dimensions hold, in this order.
@@ -37,8 +35,7 @@ class Dynamics(nn.Module):
         super().__init__()
         if not step > 0:
             raise UsageError(f"a step of {step} s leads nowhere")
-        self.program = program
-        self.step = step
+        self.program, self.step = program, step
         self.state_names, self.control_names = program.state_names, program.control_names
         self.measurement_names = program.measurement_names
 
@@ -84,15 +81,14 @@ class Dynamics(nn.Module):
                 and `past` is not given.
         """
         _require(state, "(..., {})", self.state_names)
-        for values in (controls, controls[:0] if past is None else past):
-            _require(values, "(rows, ..., {})", self.control_names)
-        if past is None:
-            if self.remembers:
-                raise UsageError(
-                    f"in {type(self.program).__name__} commands act on after their step: give those before as `past`, "
-                    "an empty tensor (0, ..., U) at the start of a drive"
-                )
-            past = controls[:0]
+        _require(controls, "(rows, ..., {})", self.control_names)
+        if past is None and self.remembers:
+            raise UsageError(
+                f"in {type(self.program).__name__} commands act on after their step: give those before as `past`, an "
+                "empty tensor (0, ..., U) at the start of a drive"
+            )
+        past = controls[:0] if past is None else past
+        _require(past, "(rows, ..., {})", self.control_names)
         try:
             shape = broadcast_shapes(state.shape[:-1], controls.shape[1:-1], past.shape[1:-1])
         except RuntimeError:

@@ -39,10 +39,7 @@ class Fit(Displayed):
     """A program with fitted parameters.
 
     Attributes:
-        program: the program, its parameters the fitted ones.
-        recipe: the name of the recipe.
-        settings: what the recipe was called with.
-        seed: of the fit.
+        recipe, settings, seed: by name, what it was called with, and its random seed.
         known_start: whether the true first state was given.
         trained: the history; None for a recipe that does not train.
         notes: anything that was rescued, replaced or left out on the way.
@@ -93,11 +90,8 @@ class Fit(Displayed):
         return Dynamics(copy.deepcopy(self.program), self.program.step if step is None else step)
 
     def save(self, folder: str | Path, *, train: Trajectories | None = None, force: bool = False) -> None:
-        """Write parameters, record and, with the training drives, posterior draws to a run folder.
-
-        Raises:
-            RunError: the folder exists (and is not `force`d) or cannot be written.
-        """
+        """Write parameters, record and, with the training drives, posterior draws to a run folder; RunError where it
+        exists (and is not `force`d) or cannot be written."""
         with run_folder(folder, force=force) as opened:
             self.save_into(opened, train)
 
@@ -135,11 +129,7 @@ class Fit(Displayed):
 
     @classmethod
     def load(cls, folder: str | Path, program: str | Path | Program | None = None) -> Fit:
-        """Read a run folder.
-
-        Args:
-            folder: written by `save`.
-            program: the program, or where its file is now; the recorded place when not given.
+        """Read a run folder, with the program, or where its file is now; the recorded place when not given.
 
         Raises:
             RunError: the folder is no finished run, its program moved, changed, came with a run, or has other
@@ -159,10 +149,9 @@ class Fit(Displayed):
             raise RunError(f"{folder / RECORD} is damaged: {substeps} substeps a row")
         program.substeps = substeps
         tensors, _ = read_tensors(folder / PARAMETERS)
-        have = {name: tuple(value.shape) for name, value in program.state_dict().items()}
-        found = {name: tuple(value.shape) for name, value in tensors.items()}
+        have, found = ({(name, value.shape) for name, value in of.items()} for of in (program.state_dict(), tensors))
         if have != found:
-            differing = sorted(name for name in have.keys() | found.keys() if have.get(name) != found.get(name))
+            differing = sorted({name for name, _ in have ^ found})
             raise RunError(
                 f"{folder}: the parameters do not fit program {type(program).__name__}: {', '.join(differing)}"
             )
@@ -177,15 +166,8 @@ class Fit(Displayed):
         trained = None
         if record["kept_step"] is not None:
             trained = Trained(record["history"], record["kept_step"], record["status"] == "interrupted")
-        return cls(
-            program=program,
-            recipe=record["recipe"],
-            settings=record["settings"],
-            seed=record["seed"],
-            known_start=record["known_start"],
-            trained=trained,
-            notes=record["notes"],
-        )
+        kept = {name: record[name] for name in ("recipe", "settings", "seed", "known_start", "notes")}
+        return cls(program, trained=trained, **kept)
 
 
 def program_source(program: Program, folder: Path) -> dict[str, str] | None:
@@ -197,11 +179,8 @@ def program_source(program: Program, folder: Path) -> dict[str, str] | None:
         file = None
     if file is None or not Path(file).is_file() or "." in program_class.__qualname__:
         return None
-    return {
-        "class": program_class.__qualname__,
-        "file": os.path.relpath(file, folder.resolve()),
-        "sha256": sha256(Path(file)),
-    }
+    place = os.path.relpath(file, folder.resolve())
+    return {"class": program_class.__qualname__, "file": place, "sha256": sha256(Path(file))}
 
 
 def sha256(file: Path) -> str:

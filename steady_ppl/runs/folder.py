@@ -1,7 +1,5 @@
 """The folder of a run: its files, its record, and how one is overwritten without losing it to a failed fit."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -92,7 +90,9 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         with only_writer(folder):
-            _refuse_links(folder)
+            for name in (ASIDE, JOURNAL):
+                if (folder / name).is_symlink():  # out of the run, to files that are somebody else's to remove
+                    raise RunError(f"{folder}: {name} in it is a link: remove the link, or choose another folder")
             if not resume:
                 _put_aside(folder)
             try:
@@ -105,7 +105,9 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
                 _remove(folder / ASIDE)
                 (folder / ASIDE).rmdir()
     finally:
-        _remove_empty(made)
+        for place in made:
+            if place.is_dir() and not any(place.iterdir()):
+                place.rmdir()
 
 
 @contextmanager
@@ -125,13 +127,6 @@ def only_writer(folder: Path) -> Iterator[None]:
     finally:
         (folder / LOCK).unlink(missing_ok=True)
         lock.release()
-
-
-def _refuse_links(folder: Path) -> None:
-    """Folders in a run that are links lead out of it, to files that are somebody else's to remove."""
-    for name in (ASIDE, JOURNAL):
-        if (folder / name).is_symlink():
-            raise RunError(f"{folder}: {name} in it is a link: remove the link, or choose another folder")
 
 
 def _put_aside(folder: Path) -> None:
@@ -167,15 +162,6 @@ def _clean_up(folder: Path) -> None:
     aside.rmdir()
 
 
-def _remove_empty(folders: list[Path]) -> None:
-    """The innermost first, up to one that holds something."""
-    for folder in folders:
-        if folder.is_dir():
-            if any(folder.iterdir()):
-                return
-            folder.rmdir()
-
-
 def _remove(folder: Path, files: Sequence[str] = FILES) -> None:
     """Remove files of a run, and the journal of a search."""
     for name in files:
@@ -191,11 +177,7 @@ def write_record(folder: Path, record: dict[str, Any]) -> None:
 
 
 def require_same(folder: Path, begun: Mapping[str, Any]) -> None:
-    """Refuse to go on with a run whose inputs were others.
-
-    Raises:
-        RunError: naming the first that was.
-    """
+    """Refuse to go on with a run whose inputs were others; the RunError names the first that was."""
     before = read_record(folder)
     inputs = {"program": "program", "table_sha256": "training table", "valid_sha256": "--valid table"}
     for key, what in inputs.items():
@@ -212,11 +194,7 @@ def require_same(folder: Path, begun: Mapping[str, Any]) -> None:
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Read `run.json`.
-
-    Raises:
-        RunError: there is none, it is damaged, or a newer steady-ppl wrote it.
-    """
+    """Read `run.json`; RunError where there is none, it is damaged, or a newer steady-ppl wrote it."""
     record = schema.read_record(folder / RECORD, BEGUN_RECORD, FORMAT, "a run")
     if record["status"] in FINISHED and (problem := mismatch(record, FINISHED_RECORD)):
         raise RunError(f"{folder / RECORD} is damaged: {problem}")
@@ -224,17 +202,13 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def read_discovery(source: Path) -> dict[str, Any] | None:
-    """What `discover` said when it made this run, or in this file; None where there is nothing.
-
-    Raises:
-        RunError: the file is damaged.
-    """
+    """What `discover` said when it made this run, or in this file; None where there is nothing. RunError: the file is
+    damaged."""
     file = source / DISCOVERY if source.is_dir() else source
     if not file.is_file():
         return None
     found = read_json(file, RunError)
-    problem = mismatch(found, FOUND) or _unlike(found)
-    if problem is not None:
+    if problem := mismatch(found, FOUND) or _unlike(found):
         raise RunError(f"{file} is not what `steady discover` writes: {problem}")
     return found
 

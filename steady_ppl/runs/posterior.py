@@ -58,8 +58,6 @@ def drawn_states(
     """Draw whole trajectories given all of their measurements.
 
     Args:
-        program: the state-space model.
-        data: drives with the program's columns.
         draws: equally weighted paths for each trajectory, resampled from all surviving lineages.
         particles: N of the filter, for each trajectory; None: see `choose_filter`.
         every: use the measurements of every n-th row only.
@@ -71,8 +69,7 @@ def drawn_states(
         a trajectory's end (the noise of row t acts from t to t + 1); an angle whose start is not known is on one turn
         in all draws, beginning between −π and π in the first; `sample_stats`: how many particles the filter had
         in effect in each row, and how many of the first row's have descendants; `observed_data`: the measurements
-        used; `constant_data`: time, controls and, where known, the true states. Units are in each variable's
-        attributes.
+        used; `constant_data`: time, controls and, where known, the true states. Attributes say the units.
     """
     run = for_program(program, data).observed_every(every)
     refuse_long(run)
@@ -105,26 +102,21 @@ def drawn_states(
         values = np.where(inside, path[..., index], np.nan)
         variables[name] = (DIMENSIONS, values, {"units": unit})
     for site, parts in noise.items():
-        values = _draws(torch.cat(parts, 2))
-        missing = np.full((*values.shape[:3], 1, values.shape[-1]), np.nan, values.dtype)
-        values = np.concatenate([values, missing], 3)
+        values = np.pad(_draws(torch.cat(parts, 2)), [(0, 0)] * 3 + [(0, 1), (0, 0)], constant_values=np.nan)
         values[:, :, ~np.roll(inside, -1, 1) | ~inside] = np.nan
-        dimension = f"{site}_channel"
-        labels = program.channel_names
+        dimension, labels = f"{site}_channel", program.channel_names
         known = len(labels) == values.shape[-1]
         coordinates[dimension] = list(labels) if known else [f"{site}_{i}" for i in range(values.shape[-1])]
         attributes = {"units": list(program.channel_units)} if known else {}
         variables[site if site not in variables else f"{site}_noise"] = ((*DIMENSIONS, dimension), values, attributes)
-    measured = program.measurement_names, program.measurement_units
+    measured = torch.where(run.observed, run.measurements, torch.nan)
+    observed = _columns("measured_", program.measurement_names, program.measurement_units, measured)
     about = {"program": type(program).__name__, "particles": choice.particles, "filter": choice.name}
     return {
         "posterior": xarray.Dataset(variables, coordinates, about),
-        "sample_stats": _health(run, coordinates, torch.cat(sizes, 1), torch.cat(roots)),
-        "observed_data": xarray.Dataset(
-            _columns("measured_", *measured, torch.where(run.observed, run.measurements, torch.nan)),
-            {name: coordinates[name] for name in OF_ROW},
-        ),
-        "constant_data": _constants(program, run, coordinates, torch.cat(evidence)),
+        "sample_stats": _dataset(_health(run, torch.cat(sizes, 1), torch.cat(roots)), coordinates, ("chain", *OF_ROW)),
+        "observed_data": _dataset(observed, coordinates, OF_ROW),
+        "constant_data": _dataset(_constants(program, run, torch.cat(evidence)), coordinates, OF_ROW),
     }
 
 
@@ -150,30 +142,30 @@ def _columns(prefix: str, names: Sequence[str], units: Sequence[str], values: Te
     }
 
 
-def _health(data: Trajectories, coordinates: dict, sizes: Tensor, roots: Tensor) -> xarray.Dataset:
+def _dataset(variables: Mapping[str, tuple], coordinates: Mapping, names: Sequence[str]) -> xarray.Dataset:
+    return xarray.Dataset(variables, {name: coordinates[name] for name in names})
+
+
+def _health(data: Trajectories, sizes: Tensor, roots: Tensor) -> dict[str, tuple]:
     """Of the filter, over the one chain."""
     inside = torch.where(data.rows, sizes.to(torch.float64), torch.nan).t().numpy(force=True)
-    variables = {
+    return {
         "effective_size": (("chain", *OF_ROW), inside[None], {"units": "particles"}),
         "roots": (("chain", "trajectory"), roots.double().numpy(force=True)[None], {"units": "particles"}),
     }
-    return xarray.Dataset(variables, {name: coordinates[name] for name in ("chain", *OF_ROW)})
 
 
-def _constants(program: Program, data: Trajectories, coordinates: dict, evidence: Tensor) -> xarray.Dataset:
+def _constants(program: Program, data: Trajectories, evidence: Tensor) -> dict[str, tuple]:
     variables = _columns("", ("time",), ("s",), data.elapsed.unsqueeze(-1))
     variables["log_likelihood"] = ("trajectory",), evidence.numpy(force=True), {"units": "nat"}
     variables |= _columns("control_", program.control_names, program.control_units, data.controls)
     if data.states is not None:
         variables |= _columns("true_", program.state_names, program.state_units, data.states)
-    return xarray.Dataset(variables, {name: coordinates[name] for name in OF_ROW})
+    return variables
 
 
 def states_frame(posterior: Groups) -> pd.DataFrame:
-    """Median and 90 % interval of every state, a row a trajectory and time step.
-
-    Args:
-        posterior: of `Fit.posterior`, or `drawn_states`.
+    """Median and 90 % interval of every state of `Fit.posterior` or `drawn_states`, a row a trajectory and time step.
 
     Returns:
         Columns `trajectory`, `time` (s) and for each state component `name`, `name_low`, `name_high`, in its unit.
@@ -191,21 +183,14 @@ def states_frame(posterior: Groups) -> pd.DataFrame:
 
 
 def require_states_file(path: Path) -> None:
-    """Refuse a file that states cannot be written to.
-
-    Raises:
-        UsageError: another suffix than those of a table or of netCDF.
-    """
+    """Raise UsageError for another suffix than those of a table or of netCDF."""
     if path.suffix.lower() not in SUFFIXES:
         raise UsageError(f"{path}: states are written as {', '.join(SUFFIXES)}")
 
 
 def write_states(posterior: Groups, path: Path) -> None:
-    """Write a posterior whole or not at all: a table of medians and intervals, or all draws as netCDF.
-
-    Raises:
-        UsageError: another suffix, or the file cannot be written.
-    """
+    """Write a posterior whole or not at all: a table of medians and intervals, or all draws as netCDF. UsageError:
+    another suffix, or the file cannot be written."""
     require_states_file(path)
     with whole_file(path) as beside:
         if path.suffix.lower() == ".nc":
@@ -238,7 +223,6 @@ def forecast(
     """Draw what happens, and what is measured, after a moment up to which measurements are used.
 
     Args:
-        program: the state-space model.
         data: drives with the program's columns; rows after the last measurement hold what is planned.
         controls: more of it, `(H, U)` or `(H, B, U)`, see `Trajectories.continued`.
         after: s since each drive's start; later measurements are not used. Each drive's last measured row when None.
@@ -290,6 +274,6 @@ def forecast(
         about = {"units": unit, "circular": int(circular[index])}
         variables[f"measured_{name}"] = (DIMENSIONS, np.where(there, values[None], np.nan), about)
     coordinates = found["posterior"].coords
-    found["predictions"] = xarray.Dataset(variables, {name: coordinates[name] for name in DIMENSIONS})
-    found["predictions_constant_data"] = xarray.Dataset(constants, {name: coordinates[name] for name in OF_ROW})
+    found["predictions"] = _dataset(variables, coordinates, DIMENSIONS)
+    found["predictions_constant_data"] = _dataset(constants, coordinates, OF_ROW)
     return _for_arviz(found)

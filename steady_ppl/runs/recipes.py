@@ -1,7 +1,5 @@
 """Find a recipe, hand it a program and tables, and keep what it learned in a run folder."""
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import json
@@ -34,11 +32,7 @@ def recipe_folder() -> Path:
 
 
 def recipe_file(name: str) -> Path:
-    """Where a recipe is: `fit-truth` is `inference/fit_truth.py`, others are paths.
-
-    Raises:
-        UsageError: there is no such recipe.
-    """
+    """Where a recipe is: `fit-truth` is `inference/fit_truth.py`, others are paths. UsageError: there is none."""
     if name.endswith(".py"):
         if not Path(name).is_file():
             raise UsageError(f"no recipe file {name}")
@@ -51,11 +45,7 @@ def recipe_file(name: str) -> Path:
 
 
 def find_recipe(name: str) -> Recipe:
-    """The `fit` function of a recipe: a name (`fit-truth` is `inference/fit_truth.py`) or a path.
-
-    Raises:
-        UsageError: there is no such recipe, or its file has no function `fit`.
-    """
+    """The `fit` function of a recipe, by name or path; UsageError where there is no such recipe or function."""
     file = recipe_file(name)
     found = getattr(run_file(file), "fit", None)
     if not callable(found):
@@ -64,11 +54,8 @@ def find_recipe(name: str) -> Recipe:
 
 
 def require_settings(name: str, recipe: Callable[..., Any], options: Mapping[str, Any]) -> None:
-    """Refuse what is no setting of a recipe, or of `discover`, or of another kind than its annotation says.
-
-    Raises:
-        UsageError: naming it, and the settings that there are.
-    """
+    """Refuse what is no setting of a recipe, or of `discover`, or of another kind than its annotation says; the
+    UsageError names it, and the settings that there are."""
     settings = {
         setting: parameter
         for setting, parameter in list(inspect.signature(recipe).parameters.items())[3:]
@@ -92,21 +79,12 @@ def trains(recipe: Recipe) -> bool:
 
 
 def suited_recipe(
-    program: Program,
-    table: Trajectories,
-    options: Mapping[str, Any],
-    *,
-    known_start: bool = False,
-    device: str = "cpu",
+    program: Program, table: Trajectories, options: Mapping[str, Any], *, known_start: bool = False, device: str = "cpu"
 ) -> tuple[str, str]:
     """The recipe for a program where none is named, and why, in words.
 
-    `likelihood` takes some dozens of learnable numbers and noise that can be linearised; `steady` takes any program.
-
-    Args:
-        program, table, known_start: what is to be fitted.
-        options: settings that are given; those that `likelihood` has not ask for `steady`.
-        device: "cpu" or "cuda".
+    `likelihood` takes some dozens of learnable numbers and noise that can be linearised; `steady` takes any program,
+    and settings (`options`) that `likelihood` has not ask for it.
     """
     own = inspect.signature(find_recipe("likelihood")).parameters
     foreign = [name for name in options if name not in own]
@@ -117,8 +95,7 @@ def suited_recipe(
     count = sum(value.numel() for value in program.parameters() if value.requires_grad)
     if not 0 < count <= MAX_PARAMETERS:
         return "steady", f"{count} learnable numbers, where likelihood takes 1 to {MAX_PARAMETERS}"
-    problem = Problem.of_table(program, table, known_start)
-    why = problem.why_not_linear()
+    why = Problem.of_table(program, table, known_start).why_not_linear()
     if why is not None:
         return "steady", f"likelihood needs a program that can be linearised: {why.split(': looking')[0]}"
     return "likelihood", f"{count} learnable numbers and noise that can be linearised; --recipe steady takes any"
@@ -145,7 +122,6 @@ def run_recipe(
     Args:
         name: the recipe; the one that suits the program when None, see `suited_recipe`, or that of the run on `resume`.
         options: its own keyword arguments; one that it does not take is an error.
-        folder: the run.
         device: "cpu" or "cuda".
         resume: go on from the run's checkpoint; program, table, options and seed must be those of the run.
 

@@ -1,8 +1,6 @@
 """What users edit: programs in `models/`, recipes in `inference/`, tours in `notebooks/`, grids of fits in `studies/`;
 of the checkout, or as the wheel has them."""
 
-from __future__ import annotations
-
 import shutil
 import sysconfig
 from collections.abc import Iterator
@@ -19,11 +17,7 @@ TRUTH = "models/hovercraft.py:HovercraftTruth"
 
 
 def workbench() -> Path:
-    """The folder with the rooms: the checkout, else the copy that the wheel carries.
-
-    Raises:
-        UsageError: this installation has neither.
-    """
+    """The folder with the rooms: the checkout, else the copy that the wheel carries; UsageError: there is neither."""
     here = Path(__file__).resolve().parents[1]  # the package
     for folder in (here.parent, here / "workbench"):
         if all((folder / room).is_dir() for room in FOLDERS) and (folder / "inference" / "steady.py").is_file():
@@ -34,33 +28,30 @@ def workbench() -> Path:
 
 
 def make_workbench(folder: Path) -> list[Path]:
-    """Copy the rooms into a folder and simulate first tables of drives there.
-
-    Args:
-        folder: is made; may exist if it is empty.
+    """Copy the rooms into a folder, which is made or empty, and simulate first tables of drives there.
 
     Returns:
         The tables, of a hovercraft with drag; of its true states only the test table has more than each first row.
 
     Raises:
         UsageError: the folder has something in it, or cannot be written. What was made by then is removed.
-        DataError: a table cannot be written.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder} exists and is not empty: choose another folder")
+    bench = workbench()
     with empty_again(folder):
-        _copy_rooms(folder)
+        for file in sorted(file for room in FOLDERS for file in (bench / room).rglob("*") if file.is_file()):
+            place = file.relative_to(bench)
+            if not LEFT_OUT & {*place.parts}:
+                (folder / place).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(file, folder / place)
         return _simulate_tables(folder)
 
 
 @contextmanager
 def empty_again(folder: Path) -> Iterator[None]:
     """Make a folder for the block that fills it. If it fails, what is in the folder is removed where that was missing
-    or empty before, with the folders that were made for it.
-
-    Raises:
-        UsageError: something in it cannot be written.
-    """
+    or empty before, with the folders that were made for it. UsageError: something in it cannot be written."""
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     fresh = bool(made) or not any(folder.iterdir())
     try:
@@ -78,16 +69,6 @@ def empty_again(folder: Path) -> Iterator[None]:
         if isinstance(error, OSError):
             raise UsageError(f"{folder} cannot be written: {error.strerror or error}") from error
         raise
-
-
-def _copy_rooms(folder: Path) -> None:
-    bench = workbench()
-    files = [file for room in FOLDERS for file in sorted((bench / room).rglob("*")) if file.is_file()]
-    for file in files:
-        place = file.relative_to(bench)
-        if not LEFT_OUT & {*place.parts}:
-            (folder / place).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, folder / place)
 
 
 def _simulate_tables(folder: Path) -> list[Path]:

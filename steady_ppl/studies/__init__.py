@@ -1,5 +1,5 @@
 """Grids of independent jobs, on local processes or a Dask cluster, whose results are one Parquet table.
 
-`plan_file` reads what is compared with what from TOML into a `plan`, `job` computes one cell of that grid, `executors`
-say where, `runner` sends jobs there, `table` keeps what has come in, `pictures` draws.
+`plan` reads what is compared with what from TOML, `job` computes one cell of that grid, `executors` say where, `runner`
+sends jobs there, `table` keeps what has come in, `pictures` draws.
 """

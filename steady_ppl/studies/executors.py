@@ -1,10 +1,9 @@
 """Where the jobs of a study are computed: processes of this machine, or a Dask cluster.
 
 joblib's own way to Dask is not taken: when a job had killed four workers, it waited for ever if there was another such
-job, and otherwise had everything that was left computed twice. A result is let go of when it is here, so that a worker
-that dies later does not have it computed again.
-
-On this machine each process has an executor of its own, as joblib's pools do not say which job a process died of.
+job, and otherwise computed twice what was left. A result is let go of when it is here, so that a worker that dies later
+does not have it computed again. Each process of this machine has an executor of its own: joblib's pools do not say
+which job a process died of.
 """
 
 from __future__ import annotations
@@ -16,15 +15,15 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
+from contextlib import AbstractContextManager, suppress
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
 
 from steady_ppl.errors import ComputationError, UsageError
 from steady_ppl.runs.fit import packages
-from steady_ppl.studies import job as work
-from steady_ppl.studies.fingerprints import JobFiles
-from steady_ppl.studies.plan import Job
+from steady_ppl.studies.job import CHANGED, Job, JobFiles, differing, digest_of, run
 from steady_ppl.utils.cores import ONE_THREAD
 from steady_ppl.utils.text import one_line, shown
 
@@ -39,27 +38,18 @@ MIN_REFUSED_JOBS = 4  # jobs whose files are others, at which a worker has been 
 MAX_LOST_JOBS = 10  # jobs that Dask gives up while nothing is begun
 
 
-class Place:
-    """Where jobs are computed.
-
-    Attributes:
-        lost: what `results` raises when there is nothing left to compute on.
-    """
+class Place(AbstractContextManager):
+    """Where jobs are computed."""
 
     lost: tuple[type[BaseException], ...] = ()
-
-    def __enter__(self) -> Place:
-        return self
+    """What `results` raises when there is nothing left to compute on."""
 
     def __exit__(self, *raised: Any) -> None:
         pass
 
     def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
-        """What comes back, in any order; `say` hears of what holds it up.
-
-        Raises:
-            ComputationError: workers die before they begin.
-        """
+        """What comes back, in any order; `say` hears of what holds it up. ComputationError: workers die before they
+        begin."""
         raise NotImplementedError
 
 
@@ -69,12 +59,9 @@ def given_up(job: Job) -> Row:
 
 
 class Local(Place):
-    """Processes of this machine, each with one thread and one job at a time, so that a process that dies takes no other
-    job with it. Its job is tried again when all others have ended, the last time alone: it may need all the memory.
-
-    Args:
-        workers: how many.
-    """
+    """So many processes of this machine, each with one thread and one job at a time, so that one that dies takes no
+    other job with it. Its job is tried again when all others have ended, the last time alone: it may need all the
+    memory."""
 
     def __init__(self, workers: int) -> None:
         self.workers = workers
@@ -100,16 +87,15 @@ class _Process:
         self.died_idle = False
 
     def submit(self, job: Job) -> Future:
-        """What will hold the job's row, or that the process has died."""
+        """The job's row, or that the process has died."""
         try:
-            return self.executor.submit(work.run, job)
+            return self.executor.submit(run, job)
         except BrokenProcessPool as error:
             self.died_idle, dead = True, Future[Row]()
             dead.set_exception(error)
             return dead
 
     def end(self) -> None:
-        """End it, whatever it is doing."""
         self.executor.shutdown(kill_workers=True)
 
 
@@ -151,9 +137,8 @@ class Cluster(Place):
         address: of its scheduler, for example `tcp://10.0.0.1:8786`.
 
     Raises:
-        UsageError: dask.distributed is not installed, nobody answers there, there is no worker, one has several
-            threads, or other versions than this machine; from `results`, one does not see the files of the jobs as
-            they are here.
+        UsageError: dask.distributed is not installed, nobody answers, there is no worker, one has several threads or
+            other versions than this machine; from `results`: one does not see the jobs' files as they are here.
         ComputationError: from `results`: workers die before they begin, or one cannot load what it is to do.
     """
 
@@ -171,7 +156,9 @@ class Cluster(Place):
         except (OSError, TimeoutError, ValueError, TypeError) as error:  # the last of an address that needs TLS
             reason = str(error).partition("\n")[0]
             raise UsageError(f"no Dask scheduler answers at {address}: {reason}") from error
-        _silence("distributed", "tornado", "asyncio")
+        for name in list(logging.root.manager.loggerDict):
+            if name.partition(".")[0] in ("distributed", "tornado", "asyncio"):  # a lost connection is said in one line
+                logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         try:
             self.client.wait_for_workers(1, timeout=WORKER_WAIT)
             self._require_alike(address)
@@ -185,16 +172,14 @@ class Cluster(Place):
         self.client.close(timeout=2)
 
     def _require_alike(self, address: str) -> None:
-        several = [name for name, worker in self._workers().items() if worker["nthreads"] > 1]
-        if several:
+        if several := [name for name, worker in self._workers().items() if worker["nthreads"] > 1]:
             raise UsageError(
                 f"workers with several threads, which would take turns: {shown(', '.join(several), 200)}; start them "
                 f"by `dask worker {address} --nthreads 1 --nworkers N`"
             )
         here = packages()
         for worker, there in self._ask(packages).items():
-            other = work.differing(here, there)
-            if other:
+            if other := differing(here, there):
                 raise UsageError(f"the worker {worker} has {other}: results would not be comparable")
 
     def _workers(self) -> dict[str, Any]:
@@ -253,7 +238,7 @@ class Cluster(Place):
     def _usable(self, answer: Answer, job: Job, sent: _Sent, say: Say) -> Row | None:
         """Its row; None, and the job is sent again, where the worker is unlike this machine."""
         reason = answer.unlike
-        if answer.row.get("reason") == work.CHANGED and JobFiles().is_of(job):
+        if answer.row.get("reason") == CHANGED and JobFiles().is_of(job):
             reason = "other files than there are here"
             sent.attempts.begun[job.key] -= 1  # only its files were looked at
         if not reason:
@@ -268,7 +253,7 @@ class Cluster(Place):
 
 
 class Answer(NamedTuple):
-    """The row of a job, by a worker of an address; empty where the worker has what this machine has not."""
+    """The row of a job by a worker, named by its address; empty where the worker is unlike this machine."""
 
     worker: str
     unlike: str
@@ -294,14 +279,11 @@ class _Sent:
 
 
 class Attempts:
-    """Tells jobs that kill their workers from those that only waited at one that died, which Dask blames as well.
-
-    Attributes:
-        begun: how often each job was, by its key.
-    """
+    """Tells jobs that kill their workers from those that only waited at one that died, which Dask blames as well."""
 
     def __init__(self) -> None:
-        self.begun, self.before, self.in_vain = Counter[str](), dict[str, int](), 0
+        self.begun = Counter[str]()  # how often each job was, by its key
+        self.before, self.in_vain = dict[str, int](), 0
 
     def sent(self, key: str) -> None:
         """It is given to the scheduler."""
@@ -313,11 +295,8 @@ class Attempts:
         self.in_vain = 0
 
     def killed(self, key: str) -> bool:
-        """Dask has given it up: whether it has been begun so often that it is the one that kills.
-
-        Raises:
-            ComputationError: Dask gives up one after the other, and nothing is begun.
-        """
+        """Dask has given it up: whether it has been begun so often that it is the one that kills. ComputationError
+        where Dask gives up one after the other, and nothing is begun."""
         self.in_vain = 0 if self.begun[key] > self.before[key] else self.in_vain + 1
         if self.in_vain > MAX_LOST_JOBS:
             raise ComputationError("workers die before they begin")
@@ -334,17 +313,12 @@ def hold(topic: str) -> None:
 
 
 def computed(job: Job, here: Mapping[str, str], topic: str) -> Answer:
-    """On a worker: the row of a job, unless the worker is unlike the machine that asks.
-
-    Args:
-        job: what to compute.
-        here: versions of the packages there.
-        topic: of the events that say which jobs are begun.
-    """
+    """On a worker: the row of a job, unless the worker has other packages than `here`, where it is asked. An event of
+    the topic says that the job is begun."""
     from distributed import get_worker
 
     worker = get_worker()
-    unlike = work.differing(here, packages())
+    unlike = differing(here, packages())
     if worker.state.nthreads > 1:
         unlike = f"{worker.state.nthreads} threads, which would take turns"
     if unlike or topic in _held:
@@ -352,8 +326,8 @@ def computed(job: Job, here: Mapping[str, str], topic: str) -> Answer:
         hold(topic)
         return Answer(worker.address, unlike or "been refused", {})
     worker.log_event(topic, job.key)
-    row = work.run(job)
-    if row.get("reason") == work.CHANGED:
+    row = run(job)
+    if row.get("reason") == CHANGED:
         _changed[topic] += 1
         if 1 < _changed[topic] <= MIN_REFUSED_JOBS:  # it would get everything before it is refused
             time.sleep(HOLD)
@@ -362,12 +336,9 @@ def computed(job: Job, here: Mapping[str, str], topic: str) -> Answer:
 
 def other_files(digests: Mapping[str, str]) -> list[str]:
     """On a worker: the files that are not there, or are others."""
-    files = JobFiles()
-    return [file for file, digest in digests.items() if files.digest_or_none(file) != digest]
-
-
-def _silence(*owners: str) -> None:
-    """What they log of a connection that is lost is said in one line here."""
-    for name in list(logging.root.manager.loggerDict):
-        if name.partition(".")[0] in owners:
-            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    other = dict(digests)
+    for file, digest in digests.items():
+        with suppress(UsageError):  # it cannot be read
+            if digest_of(Path(file)) == digest:
+                del other[file]
+    return list(other)

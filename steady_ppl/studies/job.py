@@ -1,13 +1,21 @@
-"""One job of a study: what a worker computes, on whichever machine it is."""
+"""One job of a study: the files that it reads, its key, and what a worker computes, on whichever machine it is.
 
-from __future__ import annotations
+The key is a hash of all that the result depends on, but for what is installed: all that is said of the job, the
+contents of its tables or logs, its program and recipe, programs among its settings, and what these import from their
+own folder and from packages in it (`from .sibling import …`). Where files are does not count.
+"""
 
+import ast
+import hashlib
+import json
 import math
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,29 +30,174 @@ from steady_ppl.effects import Variant, chosen_variant, parsed
 from steady_ppl.effects.attach import with_effects
 from steady_ppl.errors import DataError, RunError, UsageError
 from steady_ppl.likelihood.evidence import choose_filter, log_likelihood
-from steady_ppl.model.loading import load_program
+from steady_ppl.model.loading import load_program, program_file
 from steady_ppl.model.program import Program, for_program
-from steady_ppl.runs.fit import Fit, packages
-from steady_ppl.runs.recipes import find_recipe, require_settings, trains
+from steady_ppl.runs.fit import Fit, packages, sha256
+from steady_ppl.runs.recipes import find_recipe, recipe_file, require_settings, trains
 from steady_ppl.smc.simulate import simulate
-from steady_ppl.studies.fingerprints import PARTS, TABLES, JobFiles, is_program
-from steady_ppl.studies.plan import HELD_OUT, IN_LIMITS, Job
 from steady_ppl.utils.cores import one_core, one_thread
+from steady_ppl.utils.files import require_file
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import one_line
 
+PARTS = ("train", "valid", "test")
+LOGS = ("vrpn-pose.csv", "vesc_drive.csv")
+TABLES = (".csv", ".parquet")
 ERRORS = ("forward", "forward_mean", "state_estimation")
 CHANGED = "its program, recipe or table is not what it was when the study was begun: the same command tries it again"
+HELD_OUT = "valid_log_likelihood"  # of validation drives
+IN_LIMITS = "in_limits"  # how large what is missing is, in detection limits
+FIGURES = {
+    "fit": (
+        *("forward.", "forward_mean.", "state_estimation.", "measurement."),
+        *("log_likelihood", HELD_OUT, "fit_seconds", "steps", "seconds", "peak_mib"),
+    ),
+    "discover": ("p_value", "found", "right", "in_class", IN_LIMITS, "seconds", "peak_mib"),
+}
+"""Columns of numbers that a task fills, or how they begin."""
+
 _one_at_a_time = threading.Lock()  # torch's random state and Pyro's parameters are the process's
+
+
+@dataclass(frozen=True)
+class Job:
+    """A cell of the grid, in values that JSON can hold.
+
+    Attributes:
+        task: "fit" or "discover".
+        program, recipe: PATH or PATH:CLASS; empty for a search, or a name or PATH.
+        data: its source and what else is said of it.
+        settings: of the recipe or of `discover`.
+        seed: of data and method.
+        key: a hash of all that is said of it, its method's name too, and of the contents of the files that it reads.
+        label: by which it differs from the others.
+    """
+
+    task: str
+    method: str
+    program: str
+    recipe: str
+    data: dict[str, Any]
+    settings: dict[str, Any]
+    seed: int
+    known_start: bool
+    key: str = ""
+    label: str = ""
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """What the table says of it: `data.…` and `settings.…` are the axes, paths are names, lists are JSON."""
+        source = {f"data.{name}": without_folder(value) for name, value in self.data.items()}
+        chosen = {f"settings.{name}": without_folder(value) for name, value in self.settings.items()}
+        files = {"program": without_folder(self.program), "recipe": without_folder(self.recipe)}
+        named = {"key": self.key, "task": self.task, "method": self.method, **files}
+        return named | {"seed": self.seed, "known_start": self.known_start} | source | chosen
+
+
+def without_folder(value: Any) -> Any:
+    """The name of a file, whose absolute path is one machine's; a list as JSON; anything else as it is."""
+    if isinstance(value, list):
+        return json.dumps([without_folder(one) for one in value])
+    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value
+
+
+class JobFiles:
+    """The files that the jobs of a study read; each is looked at once. Its methods raise UsageError where a file cannot
+    be read, or is none, and where there is no such recipe."""
+
+    def __init__(self) -> None:
+        self.digest_of, self._with_siblings = cache(digest_of), cache(_with_siblings)
+
+    def of(self, job: Job) -> list[Path]:
+        """All that a job reads: tables or logs, and programs and its recipe with what these import."""
+        files = [program_file(name) for name in _texts([job.program, job.data, job.settings]) if is_program(name)]
+        if job.recipe:
+            files.append(recipe_file(job.recipe))
+        return [*_data_files(job.data), *(one for file in files for one in self._with_siblings(file))]
+
+    def key(self, job: Job) -> str:
+        """The hash that is a job's key."""
+        said = json.dumps({name: value for name, value in job.columns.items() if name != "key"}, sort_keys=True)
+        said += "".join(f" {name} is a list" for name, one in job.settings.items() if isinstance(one, list))
+        return hashlib.sha256("\n".join([said, *map(self.digest_of, self.of(job))]).encode()).hexdigest()[:16]
+
+    def is_of(self, job: Job) -> bool:
+        """Whether its files are there, and as they were when its key was made."""
+        try:
+            return self.key(job) == job.key
+        except UsageError:
+            return False
+
+    def digests_of(self, jobs: Sequence[Job]) -> dict[str, str]:
+        """Hashes of all that jobs read, by the files' paths."""
+        return {str(file): self.digest_of(file) for job in jobs for file in self.of(job)}
+
+
+def digest_of(file: Path) -> str:
+    """A file's name and hash; UsageError where it cannot be read, or is none."""
+    require_file(file, UsageError)
+    try:
+        return f"{file.name} {sha256(file)}"
+    except OSError as error:
+        raise UsageError(f"{file} cannot be read: {error.strerror}") from error
+
+
+def is_program(value: Any) -> bool:
+    """Whether it names a Python file, or a class of one."""
+    return isinstance(value, str) and (value.endswith(".py") or ".py:" in value)
+
+
+def _texts(value: Any) -> Iterator[str]:
+    inner = value.values() if isinstance(value, Mapping) else value if isinstance(value, list) else ()
+    if isinstance(value, str):
+        yield value
+    for one in inner:
+        yield from _texts(one)
+
+
+def _data_files(data: Mapping[str, Any]) -> list[Path]:
+    """The tables or logs of a job that are there; none where its drives are simulated."""
+    files: list[Path] = []
+    if "tables" in data:
+        files = [Path(data["tables"]) / f"{part}{ending}" for part in PARTS for ending in TABLES]
+    if "alpha_truck" in data:
+        files = [Path(data["alpha_truck"]) / part / log for part in PARTS for log in LOGS]
+    return [file for file in files if file.exists()]
+
+
+def _with_siblings(file: Path) -> list[Path]:
+    """A Python file, and those that it imports relatively, and that these import."""
+    found, left = dict[Path, None](), [file]
+    while left:
+        one = left.pop()
+        if one not in found:
+            found[one] = None
+            left += [name for name in _imported(one) if name.is_file()]
+    return list(found)
+
+
+def _imported(file: Path) -> Iterator[Path]:
+    require_file(file, UsageError)
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (OSError, SyntaxError, ValueError, RecursionError):
+        return  # who loads it says so
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            place = file.parents[node.level - 1] if node.level <= len(file.parents) else file.parent
+            for part in node.module.split(".") if node.module else ():
+                place /= part
+                yield from (place.with_suffix(".py"), place / "__init__.py")
+            for alias in node.names:
+                yield from (place / f"{alias.name}.py", place / alias.name / "__init__.py")
 
 
 def run(job: Job) -> dict[str, Any]:
     """Compute a job, on one thread; whatever goes wrong is its outcome, in one line.
 
-    Returns:
-        Columns of the table: those of the job, `outcome` ("done" or "failed"), `reason`, `seconds`, `peak_mib` (the
-        most memory that this process took: on Linux during the job, else until its end), `packages` with their
-        versions and the figures.
+    Returns columns of the table: those of the job, `outcome` ("done" or "failed"), `reason`, `seconds`, `peak_mib` (the
+    most memory that this process took: on Linux during the job, else until its end), `packages` with their versions and
+    the figures.
     """
     with _one_at_a_time, one_thread(), one_core():
         began = time.perf_counter()
@@ -62,8 +215,7 @@ def run(job: Job) -> dict[str, Any]:
 
 
 def _forget_peak() -> None:
-    """Count the most memory that this process takes from here on, where the system can do that (Linux, but for some
-    containers)."""
+    """Count the most memory from here on, where the system can do that (Linux, but for some containers)."""
     if sys.platform == "linux":
         with suppress(OSError):  # then it is counted from the process's beginning
             Path("/proc/self/clear_refs").write_text("5")
@@ -102,15 +254,8 @@ def _fit(job: Job) -> dict[str, Any]:
     require_settings(f"recipe {job.recipe}", recipe, job.settings)
     silent = {"progress": False} if trains(recipe) else {}
     began = time.perf_counter()
-    fitted = recipe(
-        program,
-        data["train"],
-        data["valid"],
-        known_start=job.known_start,
-        seed=job.seed,
-        **silent,
-        **told_settings(job),
-    )
+    settings, start = told_settings(job), job.known_start
+    fitted = recipe(program, data["train"], data["valid"], known_start=start, seed=job.seed, **silent, **settings)
     seconds = time.perf_counter() - began
     if fitted.trained and fitted.trained.interrupted:
         raise RunError("it was interrupted")
@@ -129,15 +274,11 @@ def _fit(job: Job) -> dict[str, Any]:
 
 def _held_out(fitted: Fit, valid: Trajectories, seed: int) -> float:
     """log p(y) of a validation drive at 1 Hz, as that of the test drives: what settings may be chosen by."""
-    data = for_program(fitted.program, valid)
-    choice = choose_filter(fitted.program, data, known_start=fitted.known_start)
+    program, data, start = fitted.program, for_program(fitted.program, valid), fitted.known_start
+    choice = choose_filter(program, data, known_start=start)
     with seeded(seed, "valid"):
         found = log_likelihood(
-            fitted.program,
-            data,
-            particles=choice.particles,
-            look_ahead=choice.look_ahead,
-            known_start=fitted.known_start,
+            program, data, particles=choice.particles, look_ahead=choice.look_ahead, known_start=start
         )
     return float(found.mean())
 
@@ -145,24 +286,15 @@ def _held_out(fitted: Fit, valid: Trajectories, seed: int) -> float:
 def _discover(job: Job) -> dict[str, Any]:
     """Whether what is missing is named, and how surely."""
     data = drives(job)
-    searched = discover(
-        told(load_program(job.program), job),
-        data["train"],
-        data["valid"],
-        known_start=job.known_start,
-        seed=job.seed,
-        **job.settings,
-    )
+    program, start = told(load_program(job.program), job), job.known_start
+    searched = discover(program, data["train"], data["valid"], known_start=start, seed=job.seed, **job.settings)
     figures, first = searched.figures, searched.search.rounds[0].screening.tests.tested
     named = [one["effect"] for one in figures["effects"]]
     classes = [name for one in figures["effects"] for name in one["class"]]
     variant, value = planted(job)
     # of the program as its owner has it: beside what was found in its place, hardly any size can be told
-    limits = [
-        one.detection_limit.tolist()
-        for one in first
-        if variant and one.variant.name == variant.name and not one.untestable
-    ]
+    same = [one for one in first if variant and one.variant.name == variant.name and not one.untestable]
+    limit = same[0].detection_limit.tolist() if same else None
     return {
         "p_value": figures["p_value"],
         "verdict": figures["verdict"],
@@ -171,7 +303,7 @@ def _discover(job: Job) -> dict[str, Any]:
         "found": figures["verdict"] != "none",
         "right": named == [variant.name] if variant else None,
         "in_class": variant.name in classes if variant else None,
-        IN_LIMITS: in_limits(value, limits[0] if limits else None),
+        IN_LIMITS: in_limits(value, limit),
     }
 
 
@@ -179,27 +311,16 @@ TASKS = {"fit": _fit, "discover": _discover}
 
 
 def in_limits(value: Sequence[float], limit: Sequence[float] | None) -> float:
-    """How large an effect is, in detection limits, by the component that has the most of its own: 0 where none was
-    planted, NaN where the tests do not have it.
-
-    Args:
-        value: how far each component of the coefficient is from where the effect is absent.
-        limit: of each of its components.
-    """
+    """How large an effect is, in detection limits, by the component that has the most of its own; `value` is how far
+    each component is from where the effect is absent. 0 where none was planted, NaN where the tests do not have it."""
     if not any(value):
         return 0.0
     return math.nan if limit is None else max(abs(one) / least for one, least in zip(value, limit, strict=True))
 
 
-Split = dict[str, Trajectories]
-
-
-def drives(job: Job) -> Split:
-    """Train, valid and test drives, with their true states where there are any; no test drives for a search.
-
-    Raises:
-        DataError: there are none, or they are damaged.
-    """
+def drives(job: Job) -> dict[str, Trajectories]:
+    """Train, valid and test drives, with their true states where there are any; no test drives for a search. DataError
+    where there are none, or they are damaged."""
     said = job.data
     if "tables" in said:
         return {part: read_table(_table(Path(said["tables"]), part)) for part in PARTS}

@@ -1,7 +1,5 @@
 """Pictures of a study: what was found against an axis of it, beside what others have published."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -13,11 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
+from pandas.api.types import infer_dtype
 from scipy import stats
 
 from steady_ppl.errors import UsageError
 from steady_ppl.plotting.comparison import COLORS, MARKS
-from steady_ppl.studies.plan import IN_LIMITS, MAX_NUMBER, Picture, Plan
+from steady_ppl.studies.job import IN_LIMITS
+from steady_ppl.studies.plan import MAX_NUMBER, Picture, Plan
+from steady_ppl.studies.table import NUMBERS
 from steady_ppl.utils.text import printable
 
 SIZES = (-1.0, 0.0, *(1.25 ** (place - 0.5) for place in range(-6, 12)), math.inf)
@@ -25,7 +26,7 @@ SIZES = (-1.0, 0.0, *(1.25 ** (place - 0.5) for place in range(-6, 12)), math.in
 a limit; the first is of drives that lack nothing."""
 SHARES = ("found", "right", "in_class")
 PUBLISHED = "published"  # in the legend
-Points = Sequence[Sequence[float]]
+PUBLISHED_LOOK: dict[str, Any] = {"ls": "--", "marker": "*", "ms": 7, "lw": 0.9, "alpha": 0.6}
 
 
 def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
@@ -33,21 +34,17 @@ def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
     varied; of shares (true or false) exact 95 % intervals; a horizontal line where a method has no x; a cross at the
     upper edge where a job has failed.
 
-    Args:
-        plan: the study, with a `[picture]`.
-        results: its table.
-
     Raises:
-        UsageError: it has no picture, nothing of it is done yet, or a column is not there or holds no numbers.
+        UsageError: it has no `[picture]`, nothing of it is done yet, or a column is not there or holds no numbers.
     """
     picture = plan.picture
     if picture is None:
         raise UsageError("the study has no [picture]: say there which columns x and y are")
     order = {job.key: place for place, job in enumerate(plan.jobs)}
-    own = results[results["key"].isin(order)] if len(results) else results
-    own = own[~own["method"].isin(picture.leave_out)] if len(own) else own
-    done = own[own["outcome"] == "done"] if len(own) else own
-    if not len(done):
+    own = results[results["key"].isin(order)]
+    if len(own):  # else it may have no other columns
+        own = own[~own["method"].isin(picture.leave_out)]
+    if not len(own) or not (own["outcome"] == "done").any():
         raise UsageError("no job of the study is done yet")
     missing = [name for name in picture.columns if name not in own]
     if missing:
@@ -64,7 +61,7 @@ def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
         _panel(panel, picture, column, lines)
     entries = {str(line.get_label()): line for panel in figure.axes for line in panel.get_legend_handles_labels()[0]}
     if PUBLISHED in entries:  # of every method in its own colour
-        entries[PUBLISHED] = Line2D([], [], **_published_look("0.4"))
+        entries[PUBLISHED] = Line2D([], [], color="0.4", **PUBLISHED_LOOK)
     if entries:
         legend = figure.legend(
             entries.values(), entries, loc="outside lower center", ncols=2 * len(picture.y), fontsize=8
@@ -76,13 +73,12 @@ def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
 
 def _numbers(rows: pd.DataFrame, name: str) -> pd.Series:
     """A column as numbers, or as true and false; NaN where a job has none, and where it is beyond what can be drawn."""
-    values = rows[name].astype(object)
-    there = values[values.notna()]
-    if there.map(lambda value: isinstance(value, bool | np.bool_)).all():
-        return values
-    if not there.map(lambda value: isinstance(value, int | float | np.number)).all():
+    kind = infer_dtype(rows[name])
+    if kind in ("boolean", "empty"):
+        return rows[name].astype(object)
+    if kind not in NUMBERS:
         raise UsageError(f"column {name} of the table holds no numbers")
-    numbers = values.astype(float)
+    numbers = rows[name].astype(float)
     return numbers.where(numbers.abs() <= MAX_NUMBER)
 
 
@@ -149,20 +145,15 @@ def _look(index: int) -> dict[str, Any]:
     return {"color": COLORS[place], "marker": MARKS[(place + turn) % len(MARKS)], "ls": ("-", "-.")[turn % 2]}
 
 
-def _published(axes: Axes, points: Points, color: str, name: str) -> None:
+def _published(axes: Axes, points: Sequence[Sequence[float]], color: str, name: str) -> None:
     if points:
-        axes.plot(*zip(*points, strict=True), label=name, **_published_look(color))
-
-
-def _published_look(color: str) -> dict[str, Any]:
-    return {"ls": "--", "marker": "*", "ms": 7, "lw": 0.9, "alpha": 0.6, "color": color}
+        axes.plot(*zip(*points, strict=True), label=name, color=color, **PUBLISHED_LOOK)
 
 
 def _failed(
     axes: Axes, rows: pd.DataFrame, x: str, look: Mapping[str, Any], name: str, crosses: Counter[float]
 ) -> None:
-    """A cross at the upper edge for each place where jobs have failed, below those that are there already; one in the
-    legend alone where it is a result that says the place."""
+    """A cross at the upper edge for each place where jobs have failed, below those that are there already."""
     failed = rows[rows["outcome"] == "failed"]
     edge = axes.get_xaxis_transform()
     style: dict[str, Any] = {"ls": "", "marker": "x", "ms": 8, "mew": 2, "color": look["color"]}
@@ -202,7 +193,7 @@ def _scale(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str,
 def points(rows: pd.DataFrame, x: str, y: str) -> list[tuple[float, float, float, float]]:
     """What is drawn of a line: places on x, middles and how far bars reach below and above."""
     rows = rows[rows[x].notna() & rows[y].notna()]
-    share = rows[y].map(lambda value: isinstance(value, bool | np.bool_)).all()
+    share = infer_dtype(rows[y]) == "boolean"
     found = []
     for _, part in rows.groupby(pd.cut(rows[x], SIZES), observed=True) if x == IN_LIMITS else rows.groupby(x):
         values = part[y].astype(float)

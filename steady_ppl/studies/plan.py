@@ -1,32 +1,29 @@
-"""What a study consists of: its jobs, and what is drawn of them; the record of both beside the results."""
+"""What a study compares with what, from a TOML file or from the record beside its results, and what it draws.
 
-from __future__ import annotations
+`docs/studies.md` shows a file, `studies/` has whole ones. Every list among the values of `[data]` and of a method's
+`settings` is an axis of the grid: each of its values is tried with each of every other's, and with each seed. Paths are
+relative to the file.
+"""
 
+import itertools
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+import math
+import os
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from steady_ppl.errors import RunError
-from steady_ppl.utils.files import whole_file
-from steady_ppl.utils.schema import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, read_record
+from steady_ppl.errors import RunError, UsageError, labelled
+from steady_ppl.studies.job import FIGURES, HELD_OUT, TASKS, Job, JobFiles, is_program, without_folder
+from steady_ppl.utils.files import require_file, whole_file
+from steady_ppl.utils.schema import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, mismatch, read_record
 from steady_ppl.utils.text import shown
-
-HELD_OUT = "valid_log_likelihood"  # of validation drives
-IN_LIMITS = "in_limits"  # how large what is missing is, in detection limits
-TASKS = ("fit", "discover")
-FIGURES = {
-    "fit": (
-        *("forward.", "forward_mean.", "state_estimation.", "measurement."),
-        *("log_likelihood", HELD_OUT, "fit_seconds", "steps", "seconds", "peak_mib"),
-    ),
-    "discover": ("p_value", "found", "right", "in_class", IN_LIMITS, "seconds", "peak_mib"),
-}
-"""Columns of numbers that a task fills, or how they begin."""
 
 MOST_PANELS, MOST_PUBLISHED, LONGEST = 12, 100, 1000  # of a picture; characters of its title and labels
 MAX_NUMBER = 1e100  # a number beyond cannot be drawn
+MOST_JOBS, MOST_DRIVES = 100_000, 1_000_000
 
 FORMAT = 1
 RECORD = "study.json"
@@ -47,68 +44,22 @@ JOB: dict[str, Any] = {
 }
 RECORDED = {"title": TEXT, "task": TEXT, "jobs": [JOB], "picture": (PICTURE, None)}
 
-
-@dataclass(frozen=True)
-class Job:
-    """A cell of the grid, in values that JSON can hold.
-
-    Attributes:
-        task: "fit" or "discover".
-        method: its name.
-        program: PATH or PATH:CLASS.
-        recipe: of a fit.
-        data: its source and what else is said of it.
-        settings: of the recipe or of `discover`.
-        seed: of data and method.
-        known_start: the first state is given.
-        key: a hash of all that is said of it, its method's name too, and of the contents of the files that it reads.
-        label: by which it differs from the others.
-    """
-
-    task: str
-    method: str
-    program: str
-    recipe: str
-    data: dict[str, Any]
-    settings: dict[str, Any]
-    seed: int
-    known_start: bool
-    key: str = ""
-    label: str = ""
-
-    @property
-    def columns(self) -> dict[str, Any]:
-        """What the table says of it: `data.…` and `settings.…` are the axes, paths are names, lists are JSON."""
-        source = {f"data.{name}": without_folder(value) for name, value in self.data.items()}
-        chosen = {f"settings.{name}": without_folder(value) for name, value in self.settings.items()}
-        return {
-            "key": self.key,
-            "task": self.task,
-            "method": self.method,
-            "program": without_folder(self.program),
-            "recipe": without_folder(self.recipe),
-            "seed": self.seed,
-            "known_start": self.known_start,
-            **source,
-            **chosen,
-        }
-
-
-@dataclass(frozen=True)
-class Plan:
-    """A study.
-
-    Attributes:
-        title: of its picture.
-        task: of its jobs.
-        jobs: all of them, seeds outermost, so that what has come in at any time is whole studies of fewer seeds.
-        picture: what is drawn against what.
-    """
-
-    title: str
-    task: str
-    jobs: tuple[Job, ...]
-    picture: Picture | None = None
+Axes = dict[str, list[Any]]
+SOURCES: dict[str, dict[str, Any]] = {
+    "simulate": {"train": 16, "valid": 16, "test": 32, "effect": "", "sigma_deg": None},
+    "alpha_truck": {"sigma_deg": 5.0},
+    "tables": {},
+}
+METHOD: dict[str, Any] = {"name": TEXT, "program": TEXT, "recipe?": TEXT, "settings?": {str: ANYTHING}}
+FORM: dict[str, Any] = {
+    "title": TEXT,
+    "task?": TEXT,
+    "seeds": [WHOLE],
+    "known_start?": TRUTH,
+    "data": {str: ANYTHING},
+    "picture?": PICTURE,
+    "method": [METHOD],
+}
 
 
 @dataclass(frozen=True)
@@ -116,10 +67,9 @@ class Picture:
     """What is drawn of a study.
 
     Attributes:
-        x: a column.
-        y: columns, a panel each.
+        x, y: a column, and columns, a panel each.
         labels: of axes, by their columns, and of methods, by their names.
-        published: of a panel, by the method's name: points that others have found, `(x, y)`.
+        published: of a panel, by the method's name: points `(x, y)` that others have found.
         chosen_by: a column of held-out drives; of a method's settings only the one with its largest mean at each x is
             drawn. All of them when empty.
         leave_out: methods that are in the table alone.
@@ -138,8 +88,227 @@ class Picture:
         return tuple(dict.fromkeys(name for name in (self.x, *self.y, self.chosen_by) if name))
 
 
-def undrawable(title: str, picture: Mapping[str, Any]) -> str | None:
-    """What of a picture of the right form cannot be drawn, in words; None where all can."""
+@dataclass(frozen=True)
+class Plan:
+    """A study: its jobs with seeds outermost, so that what has come in at any time is whole studies of fewer seeds."""
+
+    title: str
+    task: str
+    jobs: tuple[Job, ...]
+    picture: Picture | None = None
+
+
+def read_plan(path: Path, data: Path | None = None) -> Plan:
+    """Read a study from a TOML file, `data` in place of the folder of logs or tables that it names. UsageError says
+    what is wrong, and where."""
+    require_file(path, UsageError)
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UsageError(f"there is no study {path}") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise UsageError(f"{path} cannot be read as TOML: {error}") from error
+    with labelled(str(path)):
+        return _plan(content, path.parent, data)
+
+
+def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
+    problem = mismatch(content, FORM) or _surplus(content) or _undrawable(content["title"], content.get("picture"))
+    if problem is not None:
+        raise UsageError(problem)
+    task = content.get("task", "fit")
+    if task not in TASKS:
+        raise UsageError(f"task is {task!r}, expected {' or '.join(TASKS)}")
+    if task == "discover" and "simulate" not in content["data"]:
+        raise UsageError("task discover needs data that are simulated, of which it knows what is missing")
+    source = _source_axes(folder, content["data"], data, task)
+    if not content["seeds"] or not content["method"]:
+        raise UsageError("expected at least one seed and one method")
+    methods = [_method_axes(folder, one, task) for one in content["method"]]
+    cells = len(content["seeds"]) * _cells(source) * sum(_cells(one["settings"]) for one in methods)
+    if cells > MOST_JOBS:
+        raise UsageError(f"{cells:,} jobs; expected at most {MOST_JOBS:,} of one study")
+    files, different = JobFiles(), dict[str, Job]()
+    for job in _jobs(content, task, source, methods):
+        with labelled(f"method {job.method}"):
+            key = files.key(job)
+        if key in different:
+            raise UsageError(
+                f"{job.method} with seed {job.seed} is there twice: methods need names of their own, and seeds and "
+                "other lists values that differ"
+            )
+        different[key] = replace(job, key=key)
+    jobs = _labelled(tuple(different.values()))
+    picture = Picture(**content["picture"]) if "picture" in content else None
+    if picture is not None:
+        _require_columns(picture, task, jobs)
+    return Plan(content["title"], task, jobs, picture)
+
+
+def _surplus(content: Mapping[str, Any]) -> str | None:
+    """A name that means nothing, so that one that is misspelt does not pass for a default."""
+    places = [("", content, FORM), *(("method.", one, METHOD) for one in content["method"])]
+    places += [("picture.", content["picture"], PICTURE)] if "picture" in content else []
+    for place, given, form in places:
+        known = [key.rstrip("?") for key in form]
+        for name in given:
+            if name not in known:
+                return f"{place}{name} means nothing here; there are {', '.join(known)}"
+    return None
+
+
+def _jobs(content: Mapping[str, Any], task: str, source: Axes, methods: list[dict]) -> Iterator[Job]:
+    start = content.get("known_start", False)
+    for seed, data, method in itertools.product(content["seeds"], _grid(source), methods):
+        for settings in _grid(method["settings"]):
+            yield Job(**method | {"settings": settings}, task=task, data=data, seed=seed, known_start=start)
+
+
+def _labelled(jobs: tuple[Job, ...]) -> tuple[Job, ...]:
+    """By their methods and by the values of the axes."""
+    seen: dict[str, set[str]] = {}
+    for job in jobs:
+        for name, value in (job.data | job.settings).items():
+            seen.setdefault(name, set()).add(repr(value))
+    varied = {name for name, values in seen.items() if len(values) > 1}
+
+    def label(job: Job) -> str:
+        said = (job.data | job.settings).items()
+        axes = [f"{name}={without_folder(value)}" for name, value in said if name in varied]
+        return " ".join([job.method, *axes, f"seed={job.seed}"])
+
+    return tuple(replace(job, label=label(job)) for job in jobs)
+
+
+def _require_columns(picture: Picture, task: str, jobs: tuple[Job, ...]) -> None:
+    """What would otherwise be met when everything has been computed."""
+    if picture.chosen_by not in ("", HELD_OUT):
+        raise UsageError(f"picture: chosen_by is {picture.chosen_by}, expected {HELD_OUT}: of drives that are held out")
+    if picture.chosen_by and not picture.x.startswith("data."):
+        raise UsageError(f"picture: chosen_by picks settings for the same data; x is {picture.x}, expected data.…")
+    said: dict[str, list[Any]] = {}
+    for job in jobs:
+        for name, value in job.columns.items():
+            said.setdefault(name, []).append(value)
+    for name in picture.columns:
+        known = any(name == figure or (figure.endswith(".") and name.startswith(figure)) for figure in FIGURES[task])
+        if name in said and not all(isinstance(value, int | float) for value in said[name]):
+            raise UsageError(f"picture: column {name} is no number")
+        if name not in said and not known:
+            figures = [f"{figure}…" if figure.endswith(".") else figure for figure in FIGURES[task]]
+            there = ", ".join([*(one for one in said if one.startswith(("data.", "settings."))), *figures])
+            raise UsageError(f"picture: there will be no column {name}; there will be {there}")
+    methods = {job.method: None for job in jobs}
+    for name in picture.leave_out:
+        if name not in methods:
+            raise UsageError(f"picture.leave_out: {name} is no method; there are {', '.join(methods)}")
+    others = {name for lines in picture.published.values() for name in lines}
+    for name in picture.labels:
+        if name not in {*picture.columns, *methods, *others}:
+            there = ", ".join([*picture.columns, *methods])
+            raise UsageError(f"picture.labels: {name} is not in the picture; there are {there}")
+    for column in picture.published:
+        if column not in picture.y:
+            raise UsageError(f"picture.published: {column} is no panel; y has {', '.join(picture.y)}")
+
+
+def _source_axes(folder: Path, given: Mapping[str, Any], instead: Path | None, task: str) -> Axes:
+    """The source of the data with its path, and all that is said of it, each a list of values; a search uses no test
+    drives."""
+    named = [name for name in SOURCES if name in given]
+    if len(named) != 1:
+        raise UsageError(f"data has {' and '.join(named) or 'no source'}, expected one of {', '.join(SOURCES)}")
+    (kind,) = named
+    sayable = {name: usual for name, usual in SOURCES[kind].items() if (task, name) != ("discover", "test")}
+    surplus = [name for name in given if name not in {kind, *sayable}]
+    if surplus:
+        known = ", ".join(sayable) or "nothing else"
+        raise UsageError(f"data.{surplus[0]} means nothing beside {kind}; there is {known}")
+    if not isinstance(given[kind], str):
+        raise UsageError(f"data.{kind} is {given[kind]!r}, expected a path")
+    if instead is not None and kind == "simulate":
+        raise UsageError("its data are simulated, --data is for logs and tables")
+    place = _beside(folder, given[kind]) if instead is None else _beside(Path(), str(instead))
+    if kind != "simulate" and not Path(place).is_dir():
+        raise UsageError(f"there is no folder {place} (data.{kind}); --data names another")
+    axes: Axes = {kind: [place]}
+    for name, usual in sayable.items():
+        values = _axis(f"data.{name}", given.get(name, usual))
+        form = TEXT if name == "effect" else NUMBER if name == "sigma_deg" else WHOLE
+        if problem := mismatch(values, [(form, None)], f"data.{name}"):
+            raise UsageError(problem)
+        for value in values if form != TEXT else ():
+            if value is not None and not 0 < value <= MOST_DRIVES:
+                raise UsageError(f"data.{name} is {value}, expected more than 0 and at most {MOST_DRIVES:,}")
+        if values != [None]:
+            axes[name] = values
+    return axes
+
+
+def _method_axes(folder: Path, given: Mapping[str, Any], task: str) -> dict[str, Any]:
+    """A method whose files have their folders and whose settings are lists of values."""
+    if not given["name"].strip():
+        raise UsageError(f"method.name is {given['name']!r}, expected a name")
+    if task == "discover" and "recipe" in given:
+        raise UsageError(f"method {given['name']}: a recipe means nothing to a search")
+    recipe = given.get("recipe", "steady") if task == "fit" else ""
+    axes = {name: _axis(name, value) for name, value in given.get("settings", {}).items()}
+    return {
+        "method": given["name"],
+        "program": _beside(folder, given["program"]),
+        "recipe": _beside(folder, recipe) if recipe.endswith(".py") else recipe,
+        "settings": {name: [_resolved(folder, one) for one in axis] for name, axis in axes.items()},
+    }
+
+
+def _cells(axes: Axes) -> int:
+    return math.prod(map(len, axes.values()))
+
+
+def _grid(axes: Axes) -> Iterator[dict[str, Any]]:
+    """Every value of each with every other's."""
+    for cell in itertools.product(*axes.values()):
+        yield dict(zip(axes, cell, strict=True))
+
+
+def _axis(name: str, value: Any) -> list[Any]:
+    axis = value if isinstance(value, list) else [value]
+    if not axis:
+        raise UsageError(f"{name} is an axis without a value")
+    for one in axis:
+        if one is not None and not _is_plain(one):
+            raise UsageError(f"{name} is {shown(repr(one), 40)}, expected numbers, text, true or false")
+    return axis
+
+
+def _is_plain(value: Any, depth: int = 0) -> bool:
+    """Whether a table can hold it: finite numbers that are no larger than any use, text, truth, and lists of them."""
+    if isinstance(value, list):
+        return depth < 2 and all(_is_plain(one, depth + 1) for one in value)
+    if isinstance(value, bool | str):
+        return True
+    if isinstance(value, int):
+        return abs(value) < 2**63
+    return isinstance(value, float) and math.isfinite(value) and abs(value) <= MAX_NUMBER
+
+
+def _beside(folder: Path, name: str) -> str:
+    if "\0" in name:
+        raise UsageError(f"{name!r} is no path: it has a character 0")
+    return str((folder / os.path.expanduser(name)).resolve())
+
+
+def _resolved(folder: Path, value: Any) -> Any:
+    """Settings that name programs are paths as well."""
+    if isinstance(value, list):
+        return [_resolved(folder, one) for one in value]
+    return _beside(folder, value) if is_program(value) else value
+
+
+def _undrawable(title: str, picture: Mapping[str, Any] | None) -> str | None:
+    """What of a picture of the right form cannot be drawn, in words; None where all can, or there is none."""
+    if picture is None:
+        return None
     if not 1 <= len(picture["y"]) <= MOST_PANELS:
         return f"picture.y has {len(picture['y'])} columns, expected 1 to {MOST_PANELS}"
     published = picture.get("published", {})
@@ -157,33 +326,19 @@ def undrawable(title: str, picture: Mapping[str, Any]) -> str | None:
 
 
 def record_plan(plan: Plan, folder: Path) -> None:
-    """Write the plan beside its results.
-
-    Raises:
-        RunError: it cannot be written.
-    """
+    """Write the plan beside its results; RunError where it cannot be written."""
     with whole_file(folder / RECORD, RunError) as beside:
         beside.write_text(json.dumps({"format": FORMAT, **asdict(plan)}, indent=1) + "\n")
 
 
 def recorded_plan(folder: Path) -> Plan:
-    """The plan that the results in a folder are of.
-
-    Raises:
-        RunError: there is none, it is damaged, or a newer steady-ppl wrote it.
-    """
+    """The plan that the results in a folder are of; RunError where there is none, it is damaged, or a newer steady-ppl
+    wrote it."""
     content = read_record(folder / RECORD, RECORDED, FORMAT, "a study")
-    if content["picture"] is not None and (problem := undrawable(content["title"], content["picture"])):
-        raise RunError(f"{folder / RECORD} is damaged: {problem}")
     picture = content["picture"]
+    if problem := _undrawable(content["title"], picture):
+        raise RunError(f"{folder / RECORD} is damaged: {problem}")
     if picture is not None:
         picture = Picture(**{one.name: picture[one.name] for one in fields(Picture) if one.name in picture})
     jobs = tuple(Job(**{name: job[name] for name in JOB}) for job in content["jobs"])
     return Plan(content["title"], content["task"], jobs, picture)
-
-
-def without_folder(value: Any) -> Any:
-    """The name of a file, whose absolute path is one machine's; a list as JSON; anything else as it is."""
-    if isinstance(value, list):
-        return json.dumps([without_folder(one) for one in value])
-    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value

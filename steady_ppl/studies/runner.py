@@ -3,13 +3,10 @@
 A result is kept when it comes. A job whose worker dies is tried again; one that kills each of its workers is given up.
 """
 
-from __future__ import annotations
-
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 from steady_ppl.comparison.evaluate import OPEN_LOOP
 from steady_ppl.discovery.discover import discover
@@ -29,9 +26,7 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
     """Compute what of a study is not there yet.
 
     Args:
-        plan: the study.
         folder: where its table is.
-        place: where to compute.
         again: try jobs that have failed once more.
         say: hears a line a job.
 
@@ -48,13 +43,17 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
         table.keep(wanted)
         record_plan(plan, folder)
         rows = read_results(folder).to_dict("records")
-        kept = {row["key"]: row["outcome"] for row in rows if not _is_tried_again(row, again)}
+        tried_again = {
+            row["key"] for row in rows if row["outcome"] == "failed" and (again or row.get("reason") == CHANGED)
+        }
+        kept = {row["key"]: row["outcome"] for row in rows if row["key"] not in tried_again}
         left = {key: job for key, job in wanted.items() if key not in kept}
         if kept:
             say(f"{len(kept)} of {len(wanted)} jobs are there already")
-        others = sorted({_packages(row) for row in rows if row["key"] in kept} - {in_words(packages())})
-        if others:
-            say(f"some of them were computed with {'; '.join(others)}: here is {in_words(packages())}")
+        here = in_words(packages())
+        found = {row.get("packages") for row in rows if row["key"] in kept}  # none of a job that was given up
+        if others := sorted(one for one in found - {here} if isinstance(one, str)):
+            say(f"some of them were computed with {'; '.join(others)}: here is {here}")
         jobs, began = len(left), time.monotonic()
 
         def keep(row: Row) -> None:
@@ -81,21 +80,11 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
 
 
 def _require_same_study(plan: Plan, folder: Path) -> None:
-    """Its results are not to be put aside for those of another."""
+    """Keep its results from being put aside for those of another."""
     if (folder / RECORD).exists():
         there = recorded_plan(folder)
         if there.title != plan.title and not {job.key for job in there.jobs} & {job.key for job in plan.jobs}:
             raise RunError(f"{folder} holds another study, {there.title!r}: choose another folder")
-
-
-def _packages(row: Row) -> str:
-    """What it was computed with; where nothing says so, as of a job that was given up, what is here."""
-    found = row.get("packages")
-    return found if isinstance(found, str) else in_words(packages())
-
-
-def _is_tried_again(row: Mapping[str, Any], again: bool) -> bool:
-    return row["outcome"] == "failed" and (again or row.get("reason") == CHANGED)
 
 
 def _time_left(began: float, done: int, left: int) -> str:
@@ -109,11 +98,7 @@ def _time_left(began: float, done: int, left: int) -> str:
 
 def require_runnable(plan: Plan) -> None:
     """Load every program, plant every effect, look at every method's settings, read every log or table once, hand every
-    program a drive and look for the columns of the picture.
-
-    Raises:
-        SteadyError: naming the method.
-    """
+    program a drive and look for the columns of the picture. A SteadyError names the method."""
     programs: list[tuple[str, Program]] = []
     for job in {(job.method, repr(job.settings)): job for job in plan.jobs}.values():
         with labelled(f"method {job.method}"):
@@ -128,10 +113,10 @@ def require_runnable(plan: Plan) -> None:
             truth(job)
     first = plan.jobs[0]
     with labelled("data"):
-        # an effect changes no column
-        given = (
-            simulate(without_effect(first), 1, seed=first.seed) if "simulate" in first.data else drives(first)["train"]
-        )
+        if "simulate" in first.data:
+            given = simulate(without_effect(first), 1, seed=first.seed)  # an effect changes no column
+        else:
+            given = drives(first)["train"]
     for method, program in programs:
         with labelled(f"method {method}"):
             read = for_program(program, given)

@@ -5,18 +5,16 @@ hundred, which keeps ten thousand results from being written ten thousand times.
 longer has are in a second table, from which they come back when it has them again.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pyarrow
 import pyarrow.parquet
+from pandas.api.types import infer_dtype
 from pyarrow import types
 
 from steady_ppl.errors import RunError
@@ -26,25 +24,19 @@ from steady_ppl.utils.text import printable
 
 TABLE, EARLIER, ARRIVED = "results.parquet", "earlier.parquet", "arrived"
 KINDS = (types.is_integer, types.is_floating, types.is_boolean, types.is_string, types.is_large_string, types.is_null)
+NUMBERS = ("integer", "floating", "mixed-integer-float")  # as pandas infers them
 ENOUGH = 100  # results for which the table is written anew, at least
 
 
 class StudyTable:
-    """The results in a folder, a row a job; of a job that was computed again the later row counts.
-
-    Args:
-        folder: of the study.
-    """
+    """The results in a study's folder, a row a job; of a job that was computed again the later row counts. Its methods
+    raise RunError where a file cannot be written, or one in the folder is damaged."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.waiting, self.rows = folder, 0, 0
 
     def add(self, row: Mapping[str, Any]) -> None:
-        """Keep a result.
-
-        Raises:
-            RunError: it cannot be written.
-        """
+        """Keep a result."""
         seen = {name: printable(value) if isinstance(value, str) else value for name, value in row.items()}
         _write(pd.DataFrame([seen]), self.folder / ARRIVED / f"{row['key']}.parquet")
         self.waiting += 1
@@ -52,17 +44,12 @@ class StudyTable:
             self.merge()
 
     def keep(self, keys: Collection[str]) -> None:
-        """Have the table hold what there is of these jobs, and nothing else.
-
-        Raises:
-            RunError: as `merge`.
-        """
+        """Have the table hold what there is of these jobs, and nothing else."""
         self.merge()
         table, earlier = self.folder / TABLE, self.folder / EARLIER
         now = read_results(self.folder)
         self.rows = len(now)
-        before = _read(earlier) if os.path.lexists(earlier) else now[:0]
-        everything = _joined([before, now])
+        everything = _joined([*_read_if_there(earlier), now])
         own = everything["key"].isin(keys)
         if set(everything["key"][own]) == set(now["key"]):
             return
@@ -71,11 +58,7 @@ class StudyTable:
         _write(everything[~own], earlier)
 
     def merge(self) -> None:
-        """Write the table with all that has come.
-
-        Raises:
-            RunError: it cannot be written, or a file in the folder is damaged.
-        """
+        """Write the table with all that has come."""
         arrived = list((self.folder / ARRIVED).glob("*.parquet"))
         if arrived:
             everything = read_results(self.folder)
@@ -89,11 +72,8 @@ class StudyTable:
 
 @contextmanager
 def study_table(folder: Path) -> Iterator[StudyTable]:
-    """The table of a study for the block that fills it, whole at its end however that comes.
-
-    Raises:
-        RunError: the folder cannot be made, or another process writes to it.
-    """
+    """The table of a study for the block that fills it, whole at its end however that comes; RunError where the folder
+    cannot be made, or another process writes to it."""
     with only_writer(folder):
         arrived = folder / ARRIVED
         if arrived.is_symlink():
@@ -112,27 +92,25 @@ def study_table(folder: Path) -> Iterator[StudyTable]:
 
 
 def read_results(folder: Path) -> pd.DataFrame:
-    """All results that are there, the last of each job; empty where there are none.
-
-    Raises:
-        RunError: a file is damaged.
-    """
-    table = folder / TABLE
-    # before the table: what its writer merges meanwhile is in the table when that is read
-    arrived = []
+    """All results that are there, the last of each job; empty where there are none. RunError: a file is damaged."""
+    arrived = []  # before the table: what its writer merges meanwhile is in the table when that is read
     for file in sorted((folder / ARRIVED).glob("*.parquet")):
         try:
             arrived.append(_read(file))
         except RunError:
             if os.path.lexists(file):
                 raise
-    return _joined([*([_read(table)] if os.path.lexists(table) else []), *arrived])
+    return _joined([*_read_if_there(folder / TABLE), *arrived])
 
 
 def _joined(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
     if not parts:
         return pd.DataFrame({"key": []})
     return pd.concat(parts, ignore_index=True).drop_duplicates("key", keep="last", ignore_index=True)
+
+
+def _read_if_there(file: Path) -> list[pd.DataFrame]:
+    return [_read(file)] if os.path.lexists(file) else []
 
 
 def _read(file: Path) -> pd.DataFrame:
@@ -157,24 +135,14 @@ def _write(frame: pd.DataFrame, file: Path) -> None:
     """Write a table; a column of several kinds of values becomes text, since Parquet's have one."""
     frame = frame.copy(deep=False)
     for name in frame:
-        kinds = {_kind(value) for value in frame[name] if not _is_absent(value)}
-        if len(kinds) > 1 or "other" in kinds:
-            frame[name] = [None if _is_absent(value) else _text(value) for value in frame[name]]
+        if infer_dtype(frame[name]) not in (*NUMBERS, "boolean", "string", "empty"):
+            frame[name] = frame[name].map(_text, na_action="ignore")
     with whole_file(file, RunError) as beside:
         frame.to_parquet(beside, index=False)
         with beside.open("r+b") as written:
             os.fsync(written.fileno())  # before it has its name: no power cut leaves half of it
 
 
-def _kind(value: object) -> str:
-    names = {bool: "truth", np.bool_: "truth", str: "text"}
-    return names.get(type(value), "number" if isinstance(value, int | float | np.number) else "other")
-
-
 def _text(value: object) -> str:
     """A whole number without a fraction, however the column held it: it has one where others are absent."""
     return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
-
-
-def _is_absent(value: object) -> bool:
-    return value is None or (isinstance(value, float) and np.isnan(value))

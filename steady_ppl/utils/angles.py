@@ -1,24 +1,16 @@
 """Angles wrapped to one turn, and paths and draws brought to the same turn."""
 
-from __future__ import annotations
-
-import math
 from collections.abc import Sequence
 
 import numpy as np
 from torch import Tensor
 
-TURN = 2 * np.pi
+TURN = 2 * np.pi  # rad
 
 
 def paths_on_one_turn(paths: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Draws of an angle over time, each moved as a whole by the turns that part it from the first draw, and that to
-    where it begins between −π and π.
-
-    Args:
-        paths: `(M, B, rows)`, each continuous in time.
-        inside: `(B, rows)` which rows count; the first of each drive does.
-    """
+    """Draws of an angle over time, `(M, B, rows)`, each moved as a whole by the turns that part it from the first draw,
+    and that to where it begins between −π and π; `inside`, `(B, rows)`, says which rows count, the first always."""
     first = paths[:1]
     apart = np.nanmedian(np.where(inside, paths - first, np.nan), -1, keepdims=True)
     return paths - TURN * (np.round(apart / TURN) + np.round(first[..., :1] / TURN)).astype(paths.dtype)
@@ -38,7 +30,7 @@ def nearest_turn(angles: np.ndarray, middle: np.ndarray) -> np.ndarray:
 
 def wrap(angle: Tensor) -> Tensor:
     """The same angle in [−π, π]."""
-    return angle - 2 * math.pi * (angle / (2 * math.pi)).round()
+    return angle - TURN * (angle / TURN).round()
 
 
 def wrap_angles(difference: Tensor, angles: Sequence[int]) -> Tensor:

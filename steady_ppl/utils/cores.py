@@ -1,21 +1,17 @@
 """How many threads and processes a computation takes: one thread each, on the cores that this process may use.
 
-The engine's tensors are small. Torch's threads wait for one another by spinning, so that on a busy machine two threads
-took 20 to 55 times the CPU time of one, in filters of 20,000 to 500 particles a drive. On quiet cores two threads
-brought a filter of 100,000 particles in plain torch from 3.5 s to 2.5 s, its kernels nothing, and smaller filters lost.
+The engine's tensors are small. Torch's threads wait for one another by spinning: on a busy machine two took 20 to 55
+times the CPU time of one. On quiet cores two helped a filter of 100,000 particles in plain torch alone, 3.5 to 2.5 s.
 
 Coarse jobs run side by side, in processes that are forked: they have what this one has, so that nothing is sent to
 them, and their results come back as safetensors. On other systems than Linux, off the main thread, or where CUDA is in
 use, no fork is safe, and jobs run one after another. This module loads no torch, which reads `ONE_THREAD` as it loads.
 """
 
-from __future__ import annotations
-
 import ctypes
 import json
 import multiprocessing
 import os
-import select
 import signal
 import sys
 import threading
@@ -24,6 +20,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
+from multiprocessing.connection import wait
 from typing import IO, TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -123,7 +120,6 @@ class _Child:
 
     def _run(self, parent: int) -> None:
         """In the child, which ends here."""
-        status = 1
         try:
             from steady_ppl.utils.tensor_files import packed
 
@@ -140,9 +136,8 @@ class _Child:
                     self.file.write(len(content).to_bytes(8, "little") + content)
                 self.file.write(END)
                 self.file.flush()
-                status = 0
         finally:
-            os._exit(status)
+            os._exit(0)
 
     def results(self, patience: float) -> dict[int, Result]:
         """By the jobs' numbers, when it has ended; nothing if it failed, or does not end within so many seconds."""
@@ -150,9 +145,7 @@ class _Child:
 
         if self.file is None or self.handle < 0:
             return {}
-        ended = select.poll()
-        ended.register(self.handle, select.POLLIN)
-        if not ended.poll(1000 * patience):
+        if not wait([self.handle], patience):
             return {}
         size = self.file.seek(0, os.SEEK_END)
         self.file.seek(max(0, size - len(END)))

@@ -1,7 +1,5 @@
 """Files: written whole or not at all, refused early, read as JSON; pictures."""
 
-from __future__ import annotations
-
 import json
 import os
 import stat
@@ -20,13 +18,8 @@ if TYPE_CHECKING:
 
 @contextmanager
 def whole_file(path: Path, refused: type[SteadyError] = UsageError, beside: Path | None = None) -> Iterator[Path]:
-    """A file beside `path` for the block to write; it takes the place of `path` if the block succeeds, and is removed
-    if not.
-
-    Args:
-        refused: what is raised when the block, or the last step, meets an `OSError`.
-        beside: where the block writes; a hidden file of this process in the same folder when not given.
-    """
+    """A file `beside` for the block to write, by itself a hidden one of this process in the same folder. It takes the
+    place of `path` if the block succeeds, and is removed if not. An `OSError` on the way is raised as `refused`."""
     beside = beside or hidden_beside(path)
     try:
         beside.unlink(missing_ok=True)  # a link in its place would be written through
@@ -64,7 +57,7 @@ def require_picture(path: Path | None) -> None:
         raise UsageError(f"{path}: expected a picture's name that ends in one of {', '.join(sorted(formats))}")
 
 
-def write_picture(figure: Figure, path: Path) -> None:
+def write_picture(figure: "Figure", path: Path) -> None:
     """Write a picture whole or not at all; UsageError where it cannot be written."""
     from matplotlib.text import Text
 

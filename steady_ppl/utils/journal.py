@@ -7,8 +7,6 @@ goes on has the inputs of the one that was killed.
         tensors, numbers = piece(compute)     # read from the folder if it is there, else computed and written
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import shutil
@@ -29,17 +27,13 @@ Piece = tuple[Mapping[str, Tensor], Mapping[str, Any]]
 RANDOM = "random state"  # of torch, after the piece
 SAID = ({"values": {str: ANYTHING}}, {"failed": TEXT})
 
-
 _files: ContextVar[Iterator[Path] | None] = ContextVar("the files of a journal's pieces, in order", default=None)
 
 
 @contextmanager
 def journal(folder: Path) -> Iterator[None]:
     """Keep the pieces of the block in a folder, and read those that are there; the folder goes when all went well.
-
-    Raises:
-        RunError: the folder cannot be written, or a piece in it is damaged.
-    """
+    RunError: it cannot be written, or a piece in it is damaged."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -53,10 +47,8 @@ def journal(folder: Path) -> Iterator[None]:
 
 
 def piece(compute: Callable[[], Piece]) -> Piece:
-    """The next piece: tensors, and what JSON can hold.
-
-    A `FilterError` is a result like any other. Outside of a journal nothing is kept.
-    """
+    """The next piece: tensors, and what JSON can hold. A `FilterError` is a result like any other. Outside of a journal
+    nothing is kept."""
     files = _files.get()
     if files is None:
         return compute()

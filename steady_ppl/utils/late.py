@@ -1,7 +1,5 @@
 """What lower packages call of higher ones. The root, which imports all, puts the functions here."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

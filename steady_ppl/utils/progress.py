@@ -5,8 +5,6 @@ with stages(("smoothing", 1), ("simulating", 3)) as begin:   # names and their s
     begin(); …                                               # stages inside a stage divide its share
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -42,14 +40,8 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def stages(*named: tuple[str, float]) -> Iterator[Callable[[], None]]:
-    """Divide what is going on into stages, one after another.
-
-    Args:
-        named: what each does, and how long it takes relative to the others.
-
-    Yields:
-        What is to be called as each stage begins.
-    """
+    """Divide what is going on into stages, one after another: what each does, and how long it takes relative to the
+    others. Yields what is to be called as each begins."""
     outer = _place.get()
     total, done, remaining = sum(share for _, share in named), 0.0, iter(named)
 

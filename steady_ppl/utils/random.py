@@ -1,7 +1,5 @@
 """Random streams keyed by what they are for, so that a resumed run draws what the uninterrupted one would have."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,11 +10,9 @@ import torch
 
 @contextmanager
 def seeded(*key: int | str) -> Iterator[None]:
-    """Run a block under a torch generator keyed by `key`; the caller's generators are left as they were.
+    """Run a block under a torch generator keyed by, say, `(seed, "step", 17)`; the caller's are left as they were.
 
-    Args:
-        key: for example `(seed, "step", 17)`; equal keys give equal draws. Zeros at the end do not tell keys apart:
-            give every purpose its own name.
+    Equal keys give equal draws. Zeros at the end do not tell keys apart: give every purpose its own name.
     """
     words = [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in key]
     with torch.random.fork_rng():

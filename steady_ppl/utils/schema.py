@@ -5,8 +5,6 @@ one of two; `(form, form)` for one of several; `{"key": form, "other?": form}` f
 with a `?` need not be there, and perhaps others; `{str: form}` for any keys; `Paired(form, keys)`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -29,12 +27,7 @@ class Paired(NamedTuple):
 
 
 def mismatch(content: Any, form: Any, place: str = "") -> str | None:
-    """Return where JSON has another form than expected, in words; None where it has not.
-
-    Args:
-        content: as it was read.
-        form: as the module says.
-        place: what error messages call the content.
+    """Return where JSON has another form than expected, as the module says it, in words; None where it has not.
 
     Example:
         >>> mismatch({"seed": "one"}, {"seed": WHOLE})
@@ -63,11 +56,8 @@ def mismatch(content: Any, form: Any, place: str = "") -> str | None:
 
 
 def read_record(file: Path, form: Any, known: int, what: str) -> Any:
-    """Read JSON of a form, whose `format` is a number up to the one that is known.
-
-    Raises:
-        RunError: there is none, so that its folder is not `what`; it is damaged, or a newer steady-ppl wrote it.
-    """
+    """Read JSON of a form, whose `format` is a number up to the one that is known. RunError: it is damaged, a newer
+    steady-ppl wrote it, or there is none, so that its folder is not `what`."""
     try:
         record = read_json(file, RunError)
     except (FileNotFoundError, NotADirectoryError):

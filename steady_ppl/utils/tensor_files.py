@@ -1,7 +1,5 @@
 """Tensors and a little text in one safetensors file, written beside and renamed. Never pickle."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Text for a terminal, which obeys what is written to it; and the command line, for a run's record."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 import unicodedata
@@ -68,10 +66,10 @@ def is_quiet() -> bool:
     return _quiet.get()
 
 
-def say(line: str, *, always: bool = False) -> None:
-    """A word to the person, beside what a script reads; errors are said `always`."""
-    if always or not is_quiet():
-        lines = [shown(part, MAX_LINE_LENGTH) for part in line.splitlines()]
+def say(*remarks: str, always: bool = False) -> None:
+    """Words to the person, beside what a script reads; errors are said `always`."""
+    for remark in remarks if always or not is_quiet() else ():
+        lines = [shown(part, MAX_LINE_LENGTH) for part in remark.splitlines()]
         tell("\n".join([f"steady: {part}" for part in lines[:1]] + lines[1:]), aside=True)
 
 

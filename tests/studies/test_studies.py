@@ -15,7 +15,7 @@ from steady_ppl.errors import ComputationError
 from steady_ppl.runs.fit import packages
 from steady_ppl.studies import executors
 from steady_ppl.studies.executors import TRIES, Attempts, Local
-from steady_ppl.studies.plan_file import read_plan
+from steady_ppl.studies.plan import read_plan
 from steady_ppl.studies.runner import run_study
 from steady_ppl.studies.table import TABLE, read_results
 

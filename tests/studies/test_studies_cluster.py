@@ -20,7 +20,7 @@ from small import MODELS, steady
 from steady_ppl.errors import UsageError
 from steady_ppl.studies import executors as clusters
 from steady_ppl.studies.executors import Cluster
-from steady_ppl.studies.plan_file import read_plan
+from steady_ppl.studies.plan import read_plan
 from steady_ppl.studies.runner import run_study
 from steady_ppl.studies.table import read_results
 

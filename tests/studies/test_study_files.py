@@ -18,7 +18,7 @@ from steady_ppl.errors import DataError, UsageError
 from steady_ppl.model.loading import load_program
 from steady_ppl.smc.simulate import simulate
 from steady_ppl.studies.job import CHANGED, in_limits, planted, run, told_settings
-from steady_ppl.studies.plan_file import read_plan
+from steady_ppl.studies.plan import read_plan
 from steady_ppl.studies.runner import require_runnable
 
 

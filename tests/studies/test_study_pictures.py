@@ -10,9 +10,9 @@ import pytest
 from small_studies import STUDY, written
 
 from steady_ppl.errors import UsageError
+from steady_ppl.studies.job import IN_LIMITS
 from steady_ppl.studies.pictures import study_picture
-from steady_ppl.studies.plan import IN_LIMITS, Picture
-from steady_ppl.studies.plan_file import read_plan
+from steady_ppl.studies.plan import Picture, read_plan
 
 
 def test_what_failed_is_in_the_picture_and_names_are_no_formulas(tmp_path: Path):

@@ -16,8 +16,7 @@ from small_studies import row, written
 from steady_ppl.errors import RunError
 from steady_ppl.studies.executors import Local
 from steady_ppl.studies.job import CHANGED
-from steady_ppl.studies.plan import RECORD, record_plan, recorded_plan
-from steady_ppl.studies.plan_file import read_plan
+from steady_ppl.studies.plan import RECORD, read_plan, record_plan, recorded_plan
 from steady_ppl.studies.runner import run_study
 from steady_ppl.studies.table import ARRIVED, EARLIER, TABLE, StudyTable, read_results, study_table
 
