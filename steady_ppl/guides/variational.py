@@ -247,7 +247,7 @@ class InferenceNetwork(VariationalGuide):
     ) -> None:
         super().__init__(program, **more)
         require(width >= 1, "width", width, "at least 1")
-        self.centred = centred
+        self.width, self.centred = width, centred
         path = means_as_path(find_and_smooth(program, data, known_start=self.known_start), data)
         states = path.states
         self.angles = program.angle_indices
