@@ -1,5 +1,6 @@
 """One line on a terminal that says what is being done and about how long it will take."""
 
+import os
 import sys
 import threading
 import time
@@ -38,7 +39,7 @@ class _Line:
                 now = time.monotonic()
                 if self.doing and now - self.begun > PATIENCE:
                     said = in_words(self.doing, self.share, self.since - self.begun, now - self.begun)
-                    print(f"{CLEAR}{printable(said)}", end="", file=sys.stderr, flush=True)
+                    print(f"{CLEAR}{_end(printable(said))}", end="", file=sys.stderr, flush=True)
                     self.drawn = True
 
     def clear(self) -> None:
@@ -63,6 +64,15 @@ def progress_line() -> Iterator[Callable[[str, float], None]]:
         line.ended.set()
         thread.join()
         line.clear()
+
+
+def _end(line: str) -> str:
+    """As much of the end of a line as a row of the terminal holds: longer lines leave rows behind."""
+    try:
+        width = os.get_terminal_size(sys.stderr.fileno()).columns or 80
+    except OSError:  # it does not know its width
+        width = 80
+    return line if len(line) < width else f"…{line[2 - width :]}"
 
 
 def in_words(doing: str, share: float, until_now: float, elapsed: float) -> str:

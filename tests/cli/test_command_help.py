@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import json
 import shlex
 import time
@@ -153,3 +154,16 @@ def test_progress_is_drawn_on_a_terminal_only_and_cleared(monkeypatch, is_termin
     assert "first … 0 s so far" in shown or "first … 1 s so far" in shown
     assert "second … about to end" in shown or "second … about 1 s left" in shown
     assert shown.endswith(progress_line.CLEAR)
+
+
+def test_progress_keeps_to_one_row_of_a_narrow_terminal(monkeypatch) -> None:
+    screen = Terminal()
+    screen.fileno = lambda: 2
+    monkeypatch.setattr("sys.stderr", screen)
+    monkeypatch.setattr("os.get_terminal_size", lambda _: os.terminal_size((30, 24)))
+    monkeypatch.setattr(progress_line, "PATIENCE", 0.1)
+    with progress_line.progress_line() as line, listening(line), stages(("a stage whose name is long", 1)) as begin:
+        begin()
+        time.sleep(0.7)
+    drawn = screen.getvalue().split(progress_line.CLEAR)
+    assert max(map(len, drawn)) == 29 and any(said.startswith("…") and said.endswith("s so far") for said in drawn)
