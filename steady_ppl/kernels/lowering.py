@@ -332,7 +332,7 @@ class Translation(TorchDispatchMode):
     _clamp_min = _clamp
 
     def _clamp_max(self, value: Tensor, high: Any) -> Tensor:
-        return self._each("minimum", value, high)
+        return self._clamp(value, high=high)
 
     def _masked_fill(self, value: Tensor, mask: Tensor, other: Any) -> Tensor:
         return self._each("where", mask, other, value)
