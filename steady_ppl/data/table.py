@@ -33,7 +33,9 @@ MAX_ROWS = 20_000  # of a drive that is looked at as a whole
 
 
 def read_table(path: str | Path) -> Trajectories:
-    """Read the trajectories of a `.csv` or `.parquet` file, float64; `states` is None when no `x.` cell is filled.
+    """Read the trajectories of a `.csv` or `.parquet` file, in order of first appearance, float64.
+
+    `states` is None when no `x.` cell is filled.
 
     Raises:
         DataError: naming the file and, where they apply, the column, the trajectory and the row.
@@ -196,7 +198,7 @@ def parse_cells(cells: pd.Series) -> tuple[np.ndarray, np.ndarray]:
             values[i] = float(text or "nan")
         except ValueError:
             bad[i] = True
-        bad[i] |= "_" in text  # which float() takes for a digit separator
+        bad[i] |= "_" in text or not text.isascii()  # float() takes separators, and digits of other scripts
     return values, bad
 
 
@@ -321,6 +323,7 @@ def cut(data: Trajectories, seconds: float) -> Trajectories:
 
     Example:
         >>> import torch
+        >>> from steady_ppl import from_arrays
         >>> time = torch.arange(50) / 10
         >>> cut(from_arrays([{"time": time, "u.push": 0 * time, "y.range": time}]), 2.0).labels
         ('1-1', '1-2', '1-3')

@@ -138,7 +138,10 @@ class Trajectories(Displayed):
 
         Args:
             controls: `(H, U)` for all drives, or `(H, B, U)`; the first acts from each drive's last row on.
-            step: s between the new rows; the median step when None. DataError where it leads nowhere.
+            step: s between the new rows; the median step when None.
+
+        Raises:
+            DataError: other numbers of drives or controls than the table has, or no step forward in time.
         """
         step = self.median_step if step is None else step
         plan = torch.as_tensor(controls).to(self.controls)

@@ -55,8 +55,8 @@ def attach(program: Program, variant: Variant, value: Value | None = None) -> Pr
     program.__class__ = _class_with(type(program), variant)
     with pyro.settings.context(module_local_params=True):
         setattr(program, name, PyroParam(start, _constraint(effect)))
-    prior = effect.prior or dist.Cauchy(1.0 if effect.null == 1 else 0.0, effect.limit)  # as wide as is physical
-    program.priors = {**program.priors, name: prior}  # type: ignore[misc]
+    wide = dist.Cauchy(1.0 if effect.null == 1 else 0.0, effect.limit)  # as wide as is physical
+    program.priors = {**program.priors, name: wide if effect.prior is None else effect.prior}  # type: ignore[misc]
     rate = float(variant.typical.abs().max()) if effect.null == 0 else 1.0  # Adam's steps are of this size in any unit
     program.rates = {name: rate, **program.rates}  # type: ignore[misc]
     return program
@@ -216,6 +216,7 @@ def _under(handler: Callable[..., interventions.Altering], method: str) -> Calla
             with handler(self, partial(variant, self, c=coefficient(self, variant)), *given, **named):
                 return getattr(base, method)(self, *given, **named)
 
+        run.__name__ = method
         return {method: run}
 
     return around

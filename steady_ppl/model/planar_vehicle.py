@@ -98,6 +98,20 @@ class PlanarVehicle(Program):
         in them too."""
         return self.integrate(state, acceleration, 0.5 * step)
 
+    def integrate_euler(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
+        """Move on by one explicit Euler step, with the old pose and velocity; see `ExplicitEuler`."""
+        x, y, heading, vx, vy, yaw_rate = state.unbind(-1)
+        forward, lateral, yaw = acceleration.unbind(-1)
+        cos, sin = heading.cos(), heading.sin()
+        return stack(
+            x + vx * step,
+            y + vy * step,
+            heading + yaw_rate * step,
+            vx + (cos * forward - sin * lateral) * step,
+            vy + (sin * forward + cos * lateral) * step,
+            yaw_rate + yaw * step,
+        )
+
     def body_velocity(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Forward and lateral velocity (m/s) and yaw rate (rad/s), each `(...)`."""
         _, _, heading, vx, vy, yaw_rate = state[..., :6].unbind(-1)
@@ -121,7 +135,7 @@ class PlanarVehicle(Program):
         return step if self.settling is None else self.settling
 
     def carried(self, state: Tensor) -> dict[str, Tensor]:
-        """Accelerations by channel that turn the velocity along with a vehicle that has a `settling`, `(...)` m/s²."""
+        """Accelerations by channel that turn the velocity of a vehicle with a `settling` along, `(...)` m/s², else zero."""
         forward, lateral, yaw_rate = self.body_velocity(state)
         turns = 0.0 if self.settling is None else yaw_rate
         parts = (-lateral * turns, forward * turns, torch.zeros_like(forward))
@@ -141,7 +155,8 @@ def stack(*components: Tensor) -> Tensor:
 def dense(layer: nn.Linear, inputs: Tensor) -> Tensor:
     """Apply a layer to inputs `(..., I)` that are laid out component by component, as its outputs `(..., O)` are.
 
-    The numbers are those of `layer(inputs)` but for rounding, in half the time, their gradients in a third.
+    The numbers are those of `layer(inputs)` but for rounding. Products of few rows and many columns take half the time,
+    their gradients a third.
     """
     if inputs.dim() < 2 or layer.bias is None:
         return layer(inputs)
@@ -190,17 +205,7 @@ class ExplicitEuler(PlanarVehicle):
     simulated_step = math.inf
 
     def integrate(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
-        x, y, heading, vx, vy, yaw_rate = state.unbind(-1)
-        forward, lateral, yaw = acceleration.unbind(-1)
-        cos, sin = heading.cos(), heading.sin()
-        return stack(
-            x + vx * step,
-            y + vy * step,
-            heading + yaw_rate * step,
-            vx + (cos * forward - sin * lateral) * step,
-            vy + (sin * forward + cos * lateral) * step,
-            yaw_rate + yaw * step,
-        )
+        return self.integrate_euler(state, acceleration, step)
 
     def halfway(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
         return state

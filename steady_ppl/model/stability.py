@@ -120,10 +120,12 @@ def is_step(program: Program, data: Trajectories) -> bool:
 def counts_rows(program: Program) -> bool:
     """Return whether `actuators` of one of its classes looks at other rows but not at the time between them.
 
-    A delay that is a number of rows (`control.roll(1, 0)`) is another delay in substeps.
+    A delay that is a number of rows (`control.roll(1, 0)`) is another delay in substeps. Each class that defines
+    `actuators` is looked at, so that a lag on top of such a delay does not hide it.
     """
-    methods = [vars(kind)["actuators"] for kind in type(program).__mro__ if "actuators" in vars(kind)]
-    if methods == [Program.actuators]:
+    kinds = [kind for kind in type(program).__mro__ if kind is not Program]
+    methods = [vars(kind)["actuators"] for kind in kinds if "actuators" in vars(kind)]
+    if not methods:
         return False
     like = next(program.parameters(), torch.zeros(()))
     with seeded("commands"):

@@ -41,7 +41,7 @@ _Part = tuple[tuple[Tensor, Tensor, Tensor], bool]
 
 
 def with_substeps(program: Program, count: int) -> Program:
-    """Return a copy of a program that takes `count` substeps a row; UsageError unless it `is_count`."""
+    """Return a copy of a program that takes `count` substeps a row; UsageError unless it is whole, from 1 to 1000."""
     if not is_count(count):
         raise UsageError(f"substeps must be a whole number from 1 to {MAX_SUBSTEPS}, got {count!r}")
     changed = copy.deepcopy(program)

@@ -149,9 +149,9 @@ class Fit(Displayed):
             raise RunError(f"{folder / RECORD} is damaged: {substeps} substeps a row")
         program.substeps = substeps
         tensors, _ = read_tensors(folder / PARAMETERS)
-        have, found = ({(name, value.shape) for name, value in of.items()} for of in (program.state_dict(), tensors))
-        if have != found:
-            differing = sorted({name for name, _ in have ^ found})
+        expected = {(name, value.shape) for name, value in program.state_dict().items()}
+        found = {(name, value.shape) for name, value in tensors.items()}
+        if differing := sorted({name for name, _ in expected ^ found}):
             raise RunError(
                 f"{folder}: the parameters do not fit program {type(program).__name__}: {', '.join(differing)}"
             )

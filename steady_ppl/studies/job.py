@@ -65,10 +65,13 @@ class Job:
 
     Attributes:
         task: "fit" or "discover".
-        program, recipe: PATH or PATH:CLASS; empty for a search, or a name or PATH.
+        method: its name.
+        program: PATH or PATH:CLASS.
+        recipe: a name or PATH; empty for a search.
         data: its source and what else is said of it.
         settings: of the recipe or of `discover`.
         seed: of data and method.
+        known_start: the first state is given.
         key: a hash of all that is said of it, its method's name too, and of the contents of the files that it reads.
         label: by which it differs from the others.
     """

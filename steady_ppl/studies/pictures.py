@@ -153,7 +153,8 @@ def _published(axes: Axes, points: Sequence[Sequence[float]], color: str, name: 
 def _failed(
     axes: Axes, rows: pd.DataFrame, x: str, look: Mapping[str, Any], name: str, crosses: Counter[float]
 ) -> None:
-    """A cross at the upper edge for each place where jobs have failed, below those that are there already."""
+    """A cross at the upper edge for each place where jobs have failed, below those that are there already; one in the
+    legend alone where it is a result that says the place."""
     failed = rows[rows["outcome"] == "failed"]
     edge = axes.get_xaxis_transform()
     style: dict[str, Any] = {"ls": "", "marker": "x", "ms": 8, "mew": 2, "color": look["color"]}

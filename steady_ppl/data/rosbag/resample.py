@@ -142,7 +142,8 @@ def _times(rows: np.ndarray, start: int, spacing: float) -> np.ndarray:
 def _interpolated(one: Series, time: np.ndarray, most: float | None) -> np.ndarray:
     """On the line between the messages before and after; NaN where one is missing or they are over `most` ns apart.
 
-    Without `most` the first and the last message go on for ever.
+    Without `most` the first and the last message go on for ever. Angles take the shorter way round and come back
+    continuous, the first between −π and π.
     """
     kept = np.append(one.times[1:] > one.times[:-1], True)[: len(one.times)]  # of messages at one time the last
     times, values = one.times[kept], one.values[kept]

@@ -1,4 +1,5 @@
-"""Forces that a program can lack: on the channels of one axis of any program, and on a vehicle in the plane."""
+"""Forces that a program can lack: on the channels of one axis of any program, and on a vehicle in the plane, there in
+its body frame unless said otherwise."""
 
 from __future__ import annotations
 
@@ -173,7 +174,12 @@ def acceleration_bias(self: Any, *given: Tensor, c: Tensor, channels: Names) -> 
 
 
 @_force(
-    "m/s²", name="acceleration_bias", typical=(0.05, 0), limit=0.5, components=("forward", "lateral"), lacks=needs(BODY)
+    "m/s²",
+    name="acceleration_bias",
+    typical=(0.05, 0.0),
+    limit=0.5,
+    components=("forward", "lateral"),
+    lacks=needs(BODY),
 )
 def planar_acceleration_bias(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""(a_forward, a_lateral) = (c₁, c₂)
