@@ -135,7 +135,7 @@ class PlanarVehicle(Program):
         return step if self.settling is None else self.settling
 
     def carried(self, state: Tensor) -> dict[str, Tensor]:
-        """Accelerations by channel that turn the velocity of a vehicle with a `settling` along, `(...)` m/s², else zero."""
+        """Accelerations by channel that turn the velocity with the vehicle, `(...)` m/s²; zero without a `settling`."""
         forward, lateral, yaw_rate = self.body_velocity(state)
         turns = 0.0 if self.settling is None else yaw_rate
         parts = (-lateral * turns, forward * turns, torch.zeros_like(forward))

@@ -47,6 +47,7 @@ def rejected(text: str, folder: Path) -> DataError:
         (5, "x.x", "two", "a", "got 'two', expected a finite number or an empty cell"),
         (3, "time", "noon", "b", "got 'noon', expected a finite number"),
         (2, "y.range", "1_000", "b", "got '1_000'"),
+        (2, "y.range", "１", "b", "got '１'"),
         (2, "y.range", "NA", "b", "got 'NA'"),
         (2, "y.range", "inf", "b", "got 'inf'"),
         (5, "x.x", "-inf", "a", "got '-inf'"),
