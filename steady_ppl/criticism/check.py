@@ -85,7 +85,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         predictions = predict(program, run, real, rows)
         ours = replace(residuals(program, run, real, predictions[1], 1), raw=predictions[1].error.numpy(force=True))
         ours, theirs = _in_own_spreads(ours, made.residuals)
-        scores = scored(directions(program, run, real), made.directions, made.sets)
+        scores, parameters = scored(directions(program, run, real), made.directions, made.sets)
         time, dispersion = run.elapsed[:-1].numpy(force=True), scores.dispersion.mean(-1)
         acting = run.controls[:-1]
         controls = {name: acting[..., i].double().numpy(force=True) for i, name in enumerate(program.control_names)}
@@ -95,7 +95,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     notes += run.uneven_steps + diagnose_units(program, run)
     notes += [f"refitted to these drives, {step.note}"] if step.note else []
     notes += [step.uncompared] if step.uncompared else []
-    if not scores.parameter_names:
+    if not parameters.names:
         notes.append("the program's own parameters were not looked at one by one: it has none, or a network's")
     return Check(
         program=program,
@@ -108,7 +108,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         held=last_measurement(program, run, real.smoothed, rows),
         step=step,
         misfit=misfit,
-        blame=attribute(scores, _scatter(ours, theirs), misfit.p_value),
+        blame=attribute(scores, parameters, _scatter(ours, theirs), misfit.p_value),
         residuals=list(ours.names),
         standardised=ours,
         stuck=frozen_stretches(data),

@@ -6,8 +6,8 @@ drives': three hundred drives and a hundred sets at once would take fourteen gig
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -45,36 +45,6 @@ class SimulatedSets:
     residuals: Residuals
     directions: list[Direction]  # with the scores of all M · B drives
 
-    def as_result(self) -> Result:
-        """The same as tensors and what JSON can hold."""
-        arrays = {f"floor {horizon}": value for horizon, value in self.floor.items()}
-        arrays |= {f"variable {name}": value for name, value in self.residuals.variables.items()}
-        arrays |= {"values": self.residuals.values, "there": self.residuals.there}
-        tensors = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
-        tensors |= {f"scores {index}": one.scores for index, one in enumerate(self.directions)}
-        words = [[one.kind, one.name] for one in self.directions]
-        names, variables = list(self.residuals.names), list(self.residuals.variables)
-        said = {"sets": self.sets, "names": names, "variables": variables, "directions": words}
-        return tensors, said | {"horizons": list(self.floor)}
-
-    @classmethod
-    def of_result(cls, tensors: Mapping[str, Tensor], said: Mapping[str, Any]) -> SimulatedSets:
-        """What `as_result` returned."""
-
-        def array(name: str) -> np.ndarray:
-            return tensors[name].numpy()
-
-        variables = {name: array(f"variable {name}") for name in said["variables"]}
-        return cls(
-            said["sets"],
-            {horizon: array(f"floor {horizon}") for horizon in said["horizons"]},
-            Residuals(said["names"], array("values"), array("there"), variables),
-            [
-                Direction(kind, name, tensors[f"scores {index}"])
-                for index, (kind, name) in enumerate(said["directions"])
-            ],
-        )
-
 
 @torch.no_grad()
 def simulate_sets(
@@ -95,40 +65,54 @@ def simulate_sets(
 
     def simulate(number: int, block: Tensor) -> Result:
         with seeded(seed + number, "block"):
-            made = _block(program, data, block, channels, horizons, known_start)
-        return ({}, {}) if made is None else made.as_result()
+            return _block(program, data, block, channels, horizons, known_start)
 
     jobs = [partial(simulate, number, block) for number, block in enumerate(starts.split(at_once))]
-    found = [SimulatedSets.of_result(*result) for result in side_by_side(jobs) if result[0]]
-    lost = len(starts) - sum(one.sets for one in found)
-    if len(starts) - lost < MIN_SETS:
-        what = f"{lost} of {len(starts)} simulated sets blew up"
+    blocks = [(tensors, said) for tensors, said in side_by_side(jobs) if tensors]
+    sets = sum(len(tensors["values"]) for tensors, _ in blocks)
+    if sets < MIN_SETS:
+        what = f"{len(starts) - sets} of {len(starts)} simulated sets blew up"
         raise FilterError(f"{what}: the fitted program does not even explain drives of its own")
-    return _joined(found)
+
+    def joined(name: str) -> Tensor:
+        return torch.cat([tensors[name] for tensors, _ in blocks])
+
+    _, said = blocks[0]
+    variables = {name: joined(f"variable {name}").numpy() for name in said["variables"]}
+    in_all = [one for one in said["directions"] if all(one in others["directions"] for _, others in blocks)]
+    return SimulatedSets(
+        sets,
+        {horizon: joined(f"floor {horizon}").numpy() for horizon in said["horizons"]},
+        Residuals(said["names"], joined("values").numpy(), joined("there").numpy(), variables),
+        [Direction(kind, name, joined(f"scores {name}")) for kind, name in in_all],
+    )
 
 
 def _block(
     program: Program, data: Trajectories, starts: Tensor, channels: int, horizons: Sequence[int], known_start: bool
-) -> SimulatedSets | None:
-    """None where every set blew up."""
+) -> Result:
+    """What `SimulatedSets` has of some sets, each tensor with the sets or their drives in front, and the names in it;
+    nothing where every set blew up."""
     sets = len(starts)
     again, truth = simulate_again(program, data, starts, channels)
     near, copies = _tracked(program, again, truth, known_start)
     whole = torch.isfinite(copies.log_likelihood).view(sets, -1).all(1)
     if not bool(whole.all()):
         if not bool(whole.any()):
-            return None
+            return {}, {}
         kept = whole.repeat_interleave(len(data)).nonzero().flatten()
         again, sets = again.subset(kept), int(whole.sum())
         near = ReferencePath(near.states[:, kept], near.noise[:, kept])
         copies = track(program, again, near, known_start=known_start, passes=1)
     simulated = predict(program, again, copies, horizons, bands=[1])
-    return SimulatedSets(
-        sets,
-        {horizon: _rmse_of_sets(ahead, sets) for horizon, ahead in simulated.items()},
-        residuals(program, again, copies, simulated[1], sets),
-        directions(program, again, copies),
-    )
+    errors, scores = residuals(program, again, copies, simulated[1], sets), directions(program, again, copies)
+    arrays = {"values": errors.values, "there": errors.there}
+    arrays |= {f"variable {name}": value for name, value in errors.variables.items()}
+    arrays |= {f"floor {horizon}": _rmse_of_sets(ahead, sets) for horizon, ahead in simulated.items()}
+    tensors = {name: torch.from_numpy(value) for name, value in arrays.items()}
+    said = {"names": errors.names, "variables": list(errors.variables), "horizons": list(simulated)}
+    said["directions"] = [[one.kind, one.name] for one in scores]
+    return tensors | {f"scores {one.name}": one.scores for one in scores}, said
 
 
 def _tracked(
@@ -155,21 +139,6 @@ def _starts_elsewhere(tracked: Tracked, near: ReferencePath) -> Tensor:
     away = wrap_angles(tracked.smoothed[0] - begin, tracked.linearization.angles).abs()
     sd = tracked.covariances[0].diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
     return ~(away <= REST_TOLERANCE * sd + ROUNDING * (1 + begin.abs())).all(-1)
-
-
-def _joined(blocks: Sequence[SimulatedSets]) -> SimulatedSets:
-    """As one; directions that are not in every block are left out."""
-    scores = [{one.name: one.scores for one in block.directions} for block in blocks]
-    return SimulatedSets(
-        sum(block.sets for block in blocks),
-        {horizon: np.concatenate([block.floor[horizon] for block in blocks]) for horizon in blocks[0].floor},
-        Residuals.joined([block.residuals for block in blocks]),
-        [
-            replace(one, scores=torch.cat([block[one.name] for block in scores]))
-            for one in blocks[0].directions
-            if all(one.name in block for block in scores)
-        ],
-    )
 
 
 def residuals(program: Program, data: Trajectories, tracked: Tracked, ahead: Prediction, sets: int) -> Residuals:
@@ -204,4 +173,4 @@ def _rmse_of_sets(prediction: Prediction, sets: int) -> np.ndarray:
 
 def _by_set(values: Tensor, sets: int) -> np.ndarray:
     """`(T, M · B, ...)` to `(M, T, B, ...)`."""
-    return values.unflatten(1, (sets, -1)).transpose(0, 1).numpy(force=True)
+    return values.unflatten(1, (sets, -1)).transpose(0, 1).contiguous().numpy(force=True)

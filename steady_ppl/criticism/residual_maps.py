@@ -88,7 +88,6 @@ class Misfit:
 
     cells: list[Cell]
     z: Array  # one a cell
-    p_values: Array  # one a cell
     significant: list[SignificantCell]  # at a false-discovery rate of 5 %, strongest first
     p_value: float  # of the hypothesis that there is nothing, by Simes' test, calibrated on the simulated sets
     simulated: Array  # the same of each simulated set, (M,)
@@ -129,14 +128,14 @@ def judge(
     z, freedom = standardise(average)
     z /= widened
     p_values = 2 * special.stdtr(freedom, -np.abs(z))
-    simes = np.array([_simes(row) for row in p_values])
+    rates = np.stack([_adjusted(row) for row in p_values])
+    simes = rates.min(1)
     level = min(ALPHA, float(np.quantile(simes[1:], ALPHA, method="lower")))  # the tails of t are a model, too
-    chosen = np.flatnonzero(_adjusted(p_values[0]) <= level)
+    chosen = np.flatnonzero(rates[0] <= level)
     findings = [SignificantCell(cells[i], float(z[0, i]), float(p_values[0, i])) for i in chosen]
     return Misfit(
         cells=cells,
         z=z[0],
-        p_values=p_values[0],
         significant=sorted(findings, key=lambda finding: -abs(finding.z)),
         p_value=max(float(simes[0]), tail_p_value(-np.log(np.maximum(simes, 1e-300)))),
         simulated=simes[1:],
@@ -179,11 +178,6 @@ def _adjusted(p_values: Array) -> Array:
     found = np.empty(count)
     found[order] = np.minimum.accumulate(rates[::-1])[::-1].clip(max=1.0)
     return found
-
-
-def _simes(p_values: Array) -> float:
-    ordered = np.sort(p_values)
-    return float((ordered * len(ordered) / np.arange(1, len(ordered) + 1)).min())
 
 
 def _all_cells(
