@@ -89,7 +89,8 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         time, dispersion = run.elapsed[:-1].numpy(force=True), scores.dispersion.mean(-1)
         acting = run.controls[:-1]
         controls = {name: acting[..., i].double().numpy(force=True) for i, name in enumerate(program.control_names)}
-        misfit = judge(ours, theirs, time, controls, _pairs(program, ours), dispersion)
+        both = Residuals.joined([ours, theirs])
+        misfit = judge(both, time, controls, _pairs(program, ours), dispersion)
     notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
     notes += in_plain_torch(why)
     notes += run.uneven_steps + diagnose_units(program, run)
@@ -108,7 +109,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         held=last_measurement(program, run, real.smoothed, rows),
         step=step,
         misfit=misfit,
-        blame=attribute(scores, parameters, _scatter(ours, theirs), misfit.p_value),
+        blame=attribute(scores, parameters, _scatter(both), misfit.p_value),
         residuals=list(ours.names),
         standardised=ours,
         stuck=frozen_stretches(data),
@@ -159,13 +160,11 @@ def _pairs(program: Program, residuals: Residuals) -> list[tuple[str, str]]:
     return [pair for pair in dict.fromkeys(chosen) if all(name in residuals.variables for name in pair)]
 
 
-def _scatter(real: Residuals, simulated: Residuals) -> dict[str, np.ndarray]:
+def _scatter(both: Residuals) -> dict[str, np.ndarray]:
     """Mean squares of every residual, and the fourth power of the measurements' as a sign of tails; of every set."""
-    both = Residuals.joined([real, simulated])
-    values, count = both.values, np.maximum(both.there.sum((1, 2)), 1)
-    squares = (values**2).sum((1, 2)) / count
-    told = [i for i in range(len(real.names)) if real.there[..., i].any()]
-    found = {f"{SCATTER}{real.names[i]}": squares[:, i] for i in told}
-    fourth = (values**4).sum((1, 2)) / count
+    squares, count = both.mean_squares, np.maximum(both.there.sum((1, 2)), 1)
+    told = {i: name for i, name in enumerate(both.names) if both.there[0, ..., i].any()}
+    fourth = (both.values**4).sum((1, 2)) / count
     tails = np.log(fourth / np.maximum(squares, 1e-12) ** 2 + 1e-12)
-    return found | {f"tails of {real.names[i]}": tails[:, i] for i in told}
+    found = {f"{SCATTER}{name}": squares[:, i] for i, name in told.items()}
+    return found | {f"tails of {name}": tails[:, i] for i, name in told.items()}

@@ -51,6 +51,11 @@ class Residuals:
             found.append((at, values[at]))
         return found
 
+    @cached_property
+    def mean_squares(self) -> Array:
+        """Of each residual in each set, `(M, R)`."""
+        return (self.values**2).sum((1, 2)) / np.maximum(self.there.sum((1, 2)), 1)
+
     @staticmethod
     def joined(parts: Sequence[Residuals]) -> Residuals:
         """The sets of all parts, one part after another."""
@@ -98,12 +103,11 @@ class Misfit:
         return [(cell, float(z)) for cell, z in zip(self.cells, self.z, strict=True) if cell.map == name]
 
 
-def judge(
-    real: Residuals, simulated: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence, unexplained: Array
-) -> Misfit:
+def judge(both: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence, unexplained: Array) -> Misfit:
     """Compare every cell of one real set with those of many simulated ones.
 
     Args:
+        both: the real set first.
         time: s since each drive's first row, `(T, B)`.
         controls: `(T, B)` each; they sort the intervals and are correlated with the residuals.
         pairs: names of variables that make a map together.
@@ -113,15 +117,14 @@ def judge(
     Raises:
         DataError: too few residuals to average anywhere.
     """
-    both = Residuals.joined([real, simulated])
     found = list(_all_cells(both, time, controls, pairs))
     cells = [cell for cell, _ in found]
     if not cells:
-        rows, drives = real.values.shape[1:3]
+        rows, drives = time.shape
         what = f"{drives} drives of at most {rows} intervals hold no place, time or regime"
         raise DataError(f"{what} with enough residuals to average: take more drives, or longer ones")
     average = np.stack([average for _, average in found], -1)  # (1 + M, cells)
-    squares = (both.values**2).sum((1, 2)) / np.maximum(both.there.sum((1, 2)), 1)
+    squares = both.mean_squares
     typical = squares[1:].mean(0)
     dispersion = np.divide(squares, typical, out=np.full_like(squares, np.nan), where=typical > 0)
     widened = np.sqrt(np.minimum(dispersion, unexplained[:, None]).clip(1.0))[:, [cell.residual for cell in cells]]

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from steady_ppl.criticism.residual_maps import Cell
-from steady_ppl.criticism.result import Check, place, sentence, subject
+from steady_ppl.criticism.result import Check, place, subject
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.program import Program, names, units
 from steady_ppl.plotting.check import band, measured, strips
@@ -26,20 +26,8 @@ PATHS = 8  # draws in the plane
 Place = tuple[int, float, float]  # drive, and from when to when
 
 
-def maps(found: Check) -> dict[str, Any]:
-    """The strips (residual × drive × time), the regimes (residual × range) and the findings, strongest first."""
-    return {
-        "residuals": [subject(found, i) for i in range(len(found.residuals))],
-        "strips": _strips(found),
-        "regimes": _regimes(found),
-        "findings": [
-            {"text": sentence(found, one), "z": one.z, "place": where_to_look(found, one.cell)}
-            for one in found.misfit.significant
-        ],
-    }
-
-
 def _strips(found: Check) -> dict[str, Any] | None:
+    """Residual × drive × time."""
     times, z = strips(found)
     if not times:
         return None
@@ -186,8 +174,8 @@ def given(found: Check, shown: Shown) -> dict[str, Any]:
 
 
 def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: int, seed: int) -> dict[str, Any]:
-    """Measurements, predictions with their bands, quantiles of the posterior of the states given all measurements and,
-    where the table has it, the truth; a run's components are its program's, in their order."""
+    """Measurements, predictions with their bands, quantiles of the posterior of the states given all measurements, the
+    truth, where the table has it, and the maps of misfit; a run's components are its program's, in their order."""
     bands = {name: map(shown.of, band(found, name)) for name in ("one step", list(found.horizons)[-1])}
     data = found.data.subset(shown.drives)
     posterior = drawn_states(fit.program, data, draws=draws, known_start=fit.known_start, seed=seed)["posterior"]
@@ -210,6 +198,9 @@ def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: 
         "posterior": {"low": low, "middle": middle, "high": high},
         "plane": plane(found.program),
         "paths": all_of_them.of(np.stack(paths, -1)),
+        "residuals": [subject(found, i) for i in range(len(found.residuals))],
+        "strips": _strips(found),
+        "regimes": _regimes(found),
     }
 
 

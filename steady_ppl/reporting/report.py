@@ -11,7 +11,7 @@ from steady_ppl.criticism.check import check
 from steady_ppl.criticism.result import Check
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import SteadyError, UsageError
-from steady_ppl.reporting.drives import chosen, given, maps, of_run
+from steady_ppl.reporting.drives import chosen, given, of_run
 from steady_ppl.reporting.html import Report
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.cores import one_thread
@@ -67,8 +67,7 @@ def report(
         drawn = []
         for label, fit in runs.items():
             begin()
-            there = of_run(checks[label], fit, data, shown, draws=draws, seed=seed)
-            drawn.append({"label": label, **there, **maps(checks[label])})
+            drawn.append({"label": label, **of_run(checks[label], fit, data, shown, draws=draws, seed=seed)})
         begin()
         proof = _proof(runs, checks, data, seed)
     drives = given(next(iter(checks.values())), shown) | {"runs": drawn}
