@@ -161,8 +161,7 @@ def attribute(scores: Scored, parameters: Scored, noise: dict[str, Array], maps_
     """Decide who is at fault.
 
     Args:
-        scores: what the parameters' leave of the others'.
-        parameters: their own scores.
+        scores, parameters: as of `scored`.
         noise: name of a mean square or the like → its value in the real and every simulated set, `(1 + M,)`.
         maps_p_value: of the hypothesis that the maps hold nothing.
     """

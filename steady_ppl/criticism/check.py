@@ -25,12 +25,10 @@ from steady_ppl.data.frozen_sensors import frozen_stretches
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
-from steady_ppl.gaussian.kalman import track
-from steady_ppl.gaussian.linearize import why_not_linear
 from steady_ppl.gaussian.predict import named_horizons, predict
-from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.kernels.rows import in_plain_torch, without_kernels
-from steady_ppl.model.program import Program, for_program
+from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.program import Program
 from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.cores import one_thread
@@ -38,8 +36,7 @@ from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
 SECONDS = (1.0, 3.0)
-MAX_RESIDUAL_SD = 4.0
-"""Standard deviations of a single residual; beside a landmark the linearised program knows no more."""
+MAX_RESIDUAL_SD = 4.0  # of a single residual; beside a landmark the linearised program knows no more
 
 
 @one_thread()
@@ -64,23 +61,24 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         >>> print(st.check(st.Fit.load("runs/learned"), st.read_table("test.csv")))  # doctest: +SKIP
     """
     program = fit.program
-    run = for_program(program, data).without_truth(keep_start=fit.known_start)
-    _require(program, run, fit.known_start, simulations)
+    problem = Problem.of_table(program, data, fit.known_start)
+    run = problem.data
+    _require(problem, simulations)
     horizons = named_horizons(run, SECONDS)
     parts = (("finding paths", 1), ("comparing time steps", 1), ("simulating drives", 2), ("judging", 2))
     with stages(*parts) as begin:
         begin()
         with seeded(seed, "check"), without_kernels() as why:
-            ahead = find_and_smooth(program, run, known_start=fit.known_start)
-            real = track(program, run, ahead.linearization.path, known_start=fit.known_start, passes=1)
+            ahead = problem.find_and_smooth()
+            path = ahead.linearization.path
+            real = problem.track(path, passes=1)
             _, drawn, _ = ahead.draws(simulations)
             starts = run.known_start.expand(simulations, -1, -1) if fit.known_start else drawn[:, 0]
             begin()
-            step = check_step(program, run, ahead.linearization.path, known_start=fit.known_start)
+            step = check_step(program, run, path, known_start=fit.known_start)
             begin()
             rows = list(horizons.values())
-            channels = real.noise.shape[-1]
-            made = simulate_sets(program, run, starts, channels, rows, known_start=fit.known_start)
+            made = simulate_sets(problem, starts, real.noise.shape[-1], rows)
         begin()
         predictions = predict(program, run, real, rows)
         ours = replace(residuals(program, run, real, predictions[1], 1), raw=predictions[1].error.numpy(force=True))
@@ -101,11 +99,11 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     return Check(
         program=program,
         data=run,
-        path=ahead.linearization.path,
+        path=path,
         horizons=horizons,
         predictions=predictions,
         floor=made.floor,
-        reference=constant_velocity(program, run, real, rows, known_start=fit.known_start),
+        reference=constant_velocity(problem, real, rows),
         held=last_measurement(program, run, real.smoothed, rows),
         step=step,
         misfit=misfit,
@@ -117,15 +115,14 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     )
 
 
-def _require(program: Program, data: Trajectories, known_start: bool, simulations: int) -> None:
+def _require(problem: Problem, simulations: int) -> None:
+    data = problem.data
     if simulations < MIN_SETS:
         raise UsageError(f"got {simulations} simulations: bands need at least {MIN_SETS}, and 100 are better")
     if data.time.shape[0] < 2 or not bool(data.observed[1:].any()):
         raise DataError("nothing to compare: no trajectory has a measurement after its first row")
     refuse_long(data)
-    if known_start:
-        _ = data.known_start
-    why = why_not_linear(program, data, known_start=known_start)
+    why = problem.why_not_linear()
     if why is not None:
         raise UsageError(f"check needs a program that can be linearised: {why.split(': looking')[0]}")
 

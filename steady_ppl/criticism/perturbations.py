@@ -78,11 +78,9 @@ class _Scores:
 
     def of_parameters(self) -> Named:
         """The program's own parameters, where they move the mean."""
-        if sum(value.numel() for value in self.program.parameters()) > MAX_PARAMETERS:
+        if not 0 < sum(value.numel() for value in self.program.parameters()) <= MAX_PARAMETERS:
             return
         parts = elements(self.program, frozen=True)
-        if not parts:
-            return
         for part, score in zip(parts, (self._pushed_by(parts) + self._shifted_by(parts)).unbind(-1), strict=True):
             if bool((score != 0).any()):
                 yield part.name, score
@@ -105,11 +103,8 @@ class _Scores:
     def _shifted_by(self, parts: Sequence[Element]) -> Tensor:
         """The same of what the program measures."""
         program, data, states = self.program, self.data, self.path.states
-
-        def reading(state: Tensor) -> Tensor:
-            return measured(program, state).reading
-
-        slopes = slopes_on_all_rows(program, "reading", reading, {"state": states}, parts)
+        given = {"state": states}
+        slopes = slopes_on_all_rows(program, "reading", lambda state: measured(program, state).reading, given, parts)
         if isinstance(slopes, Slopes):
             return slopes.weighted(torch.where(data.observed, self.reading, 0.0))
         scores = []

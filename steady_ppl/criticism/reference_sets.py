@@ -7,9 +7,8 @@ drives': three hundred drives and a hundred sets at once would take fourteen gig
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,10 +18,11 @@ from steady_ppl.criticism.perturbations import Direction, directions
 from steady_ppl.criticism.residual_maps import Residuals
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
-from steady_ppl.gaussian.kalman import Tracked, track
+from steady_ppl.gaussian.kalman import Tracked
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, predict, simulate_again
-from steady_ppl.gaussian.smoother import REST_TOLERANCE, means_as_path, smooth
+from steady_ppl.gaussian.smoother import REST_TOLERANCE, means_as_path
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.angles import wrap_angles
 from steady_ppl.utils.cores import Result, side_by_side
@@ -31,9 +31,7 @@ from steady_ppl.utils.random import seeded
 MIN_SETS = 20  # sets
 MAX_ROWS_OF_BLOCK = 100_000  # of all drives of a block: the memory of larger arrays takes longer to get than to fill
 ROUNDING = 1e-5  # of a state, in single precision
-LINEARISATIONS = 4
-"""Linearisations of drives that need them: beside a landmark the truth is far from the mode, where the measured drives'
-paths lie."""
+LINEARISATIONS = 4  # of drives that need them: beside a landmark the truth is far from the mode
 
 
 @dataclass(frozen=True)
@@ -47,13 +45,11 @@ class SimulatedSets:
 
 
 @torch.no_grad()
-def simulate_sets(
-    program: Program, data: Trajectories, starts: Tensor, channels: int, horizons: Sequence[int], *, known_start: bool
-) -> SimulatedSets:
+def simulate_sets(problem: Problem, starts: Tensor, channels: int, horizons: Sequence[int]) -> SimulatedSets:
     """Simulate, track and predict.
 
     Args:
-        data: `B` drives, as returned by `for_program`.
+        problem: a program and `B` drives.
         starts: `(M, B, D)`, where each drive of each set begins.
         channels: C, how many numbers a step's noise has.
         horizons: rows ahead, one row among them.
@@ -61,11 +57,11 @@ def simulate_sets(
     Raises:
         FilterError: too many sets blew up.
     """
-    at_once, seed = max(1, MAX_ROWS_OF_BLOCK // data.time.numel()), int(torch.randint(2**31, ()))
+    at_once, seed = max(1, MAX_ROWS_OF_BLOCK // problem.data.time.numel()), int(torch.randint(2**31, ()))
 
     def simulate(number: int, block: Tensor) -> Result:
         with seeded(seed + number, "block"):
-            return _block(program, data, block, channels, horizons, known_start)
+            return _block(problem, block, channels, horizons)
 
     jobs = [partial(simulate, number, block) for number, block in enumerate(starts.split(at_once))]
     blocks = [(tensors, said) for tensors, said in side_by_side(jobs) if tensors]
@@ -88,24 +84,23 @@ def simulate_sets(
     )
 
 
-def _block(
-    program: Program, data: Trajectories, starts: Tensor, channels: int, horizons: Sequence[int], known_start: bool
-) -> Result:
+def _block(problem: Problem, starts: Tensor, channels: int, horizons: Sequence[int]) -> Result:
     """What `SimulatedSets` has of some sets, each tensor with the sets or their drives in front, and the names in it;
     nothing where every set blew up."""
-    sets = len(starts)
-    again, truth = simulate_again(program, data, starts, channels)
-    near, copies = _tracked(program, again, truth, known_start)
-    whole = torch.isfinite(copies.log_likelihood).view(sets, -1).all(1)
+    program, sets = problem.program, len(starts)
+    again, truth = simulate_again(program, problem.data, starts, channels)
+    copies = replace(problem, data=again)
+    near, tracked = _tracked(copies, truth)
+    whole = torch.isfinite(tracked.log_likelihood).view(sets, -1).all(1)
     if not bool(whole.all()):
         if not bool(whole.any()):
             return {}, {}
-        kept = whole.repeat_interleave(len(data)).nonzero().flatten()
-        again, sets = again.subset(kept), int(whole.sum())
-        near = ReferencePath(near.states[:, kept], near.noise[:, kept])
-        copies = track(program, again, near, known_start=known_start, passes=1)
-    simulated = predict(program, again, copies, horizons, bands=[1])
-    errors, scores = residuals(program, again, copies, simulated[1], sets), directions(program, again, copies)
+        kept = whole.repeat_interleave(len(problem.data)).nonzero().flatten()
+        copies, sets = copies.subset(kept), int(whole.sum())
+        tracked = copies.track(ReferencePath(near.states[:, kept], near.noise[:, kept]), passes=1)
+    again = copies.data
+    simulated = predict(program, again, tracked, horizons, bands=[1])
+    errors, scores = residuals(program, again, tracked, simulated[1], sets), directions(program, again, tracked)
     arrays = {"values": errors.values, "there": errors.there}
     arrays |= {f"variable {name}": value for name, value in errors.variables.items()}
     arrays |= {f"floor {horizon}": _rmse_of_sets(ahead, sets) for horizon, ahead in simulated.items()}
@@ -115,21 +110,18 @@ def _block(
     return tensors | {f"scores {one.name}": one.scores for one in scores}, said
 
 
-def _tracked(
-    program: Program, data: Trajectories, truth: ReferencePath, known_start: bool
-) -> tuple[ReferencePath, Tracked]:
+def _tracked(problem: Problem, truth: ReferencePath) -> tuple[ReferencePath, Tracked]:
     """Paths near the posterior's modes, and the drives along them. Drives whose path is still on its way after a single
     step from the truth take more."""
-    given: dict[str, Any] = {"known_start": known_start}
-    near = means_as_path(smooth(program, data, truth, passes=1, **given), data)
-    tracked = track(program, data, near, passes=1, **given)
+    near = means_as_path(problem.smooth(truth, passes=1), problem.data)
+    tracked = problem.track(near, passes=1)
     far = ~((tracked.noise - near.noise).abs().amax((0, 2)) <= REST_TOLERANCE) | _starts_elsewhere(tracked, near)
     if bool(far.any()):
         index = far.nonzero().flatten()
         begin = ReferencePath(truth.states[:, index], truth.noise[:, index])
-        path = smooth(program, data.subset(index), begin, passes=LINEARISATIONS, **given).linearization.path
+        path = problem.subset(index).smooth(begin, passes=LINEARISATIONS).linearization.path
         near.states[:, index], near.noise[:, index] = path.states, path.noise
-        tracked = track(program, data, near, passes=1, **given)
+        tracked = problem.track(near, passes=1)
     return near, tracked
 
 

@@ -147,14 +147,8 @@ def judge(both: Residuals, time: Array, controls: dict[str, Array], pairs: Seque
 
 
 def standardise(values: Array) -> tuple[Array, int]:
-    """Each row against the simulated ones, all rows but the first; a simulated row is compared with the others.
-
-    Args:
-        values: `(1 + M, ...)`; NaN where a set has no value, which counts as nothing found.
-
-    Returns:
-        The same shape, in standard deviations, and the degrees of freedom.
-    """
+    """Each row of `(1 + M, ...)` against the simulated ones, all but the first, in standard deviations, and the degrees
+    of freedom. A simulated row is compared with the others; NaN, where a set has no value, counts as nothing found."""
     simulated = values[1:]
     count = np.maximum(np.isfinite(simulated).sum(0), 3)
     mean, variance = np.nanmean(simulated, 0), np.nanvar(simulated, 0) * count / (count - 1)

@@ -218,8 +218,6 @@ def _most_clearly(blame: Attribution) -> str:
         close = sorted(blame.explained, key=lambda kind: -blame.explained[kind])[:2]
         alike = len(close) == 2 and min(blame.explained[kind] for kind in close) > 3
         return f" ({close[0]} and {close[1]} explain them nearly alike)" if alike else ""
-    if not blame.evidence:
-        return ""
     _, name, z = blame.evidence[0]
     return f", most clearly the {name} (score {z:+.1f} standard deviations)"
 
@@ -268,8 +266,8 @@ def place(found: Check, cell: Cell) -> str:
         elif key == "time":
             words.append(f"between {value[0]:.1f} and {value[1]:.1f} s")
         else:
-            word = "while" if not any(w.startswith("while") for w in words) else "and"
-            words.append(f"{word} {key} is between {value[0]:.3g} and {value[1]:.3g} {unit_of(found, key)}".rstrip())
+            span = f"{key} is between {value[0]:.3g} and {value[1]:.3g} {unit_of(found, key)}".rstrip()
+            words.append(f"{'and' if words else 'while'} {span}")
     return "".join(f" {word}" for word in words)
 
 

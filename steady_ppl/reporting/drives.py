@@ -82,13 +82,11 @@ def _rows(found: Check, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
     variables = {name: values[0] for name, values in residuals.variables.items()}
     for i, name in enumerate(found.program.control_names):
         variables[name] = data.controls[:-1, :, i].double().numpy(force=True)
-    variables["time"] = data.elapsed[:-1].numpy(force=True)
     there = residuals.there[0, ..., cell.residual].copy()
+    variables |= {"time": data.elapsed[:-1].numpy(force=True), "drive": np.arange(there.shape[1])}
     for name, value in cell.where.items():
-        if name == "drive":
-            there &= np.arange(there.shape[1]) == value
-        else:
-            there &= (variables[name] >= value[0]) & (variables[name] <= value[1])
+        low, high = (value, value) if name == "drive" else value
+        there &= (variables[name] >= low) & (variables[name] <= high)
     return there, residuals.values[0, ..., cell.residual]
 
 
@@ -185,7 +183,6 @@ def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: 
     )
     quantiles = quantiles.swapaxes(1, 2)  # (3, rows, B, D)
     all_of_them = Shown(list(range(len(data))), shown.every, len(data))
-    low, middle, high = map(all_of_them.of, quantiles)
     across = [states[i] for i in plane(found.program)]
     paths = [posterior[name].values[0, draw].T for draw in range(min(PATHS, draws)) for name in across]
     truth = _truth(found.program, table.subset(shown.drives), quantiles[1])
@@ -195,7 +192,7 @@ def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: 
         "truth": None if truth is None else all_of_them.of(truth),
         "predictions": [{"ahead": name, "middle": middle, "half": half} for name, (middle, half) in bands.items()],
         "states": _components(found.program.states),
-        "posterior": {"low": low, "middle": middle, "high": high},
+        "posterior": dict(zip(("low", "middle", "high"), map(all_of_them.of, quantiles), strict=True)),
         "plane": plane(found.program),
         "paths": all_of_them.of(np.stack(paths, -1)),
         "residuals": [subject(found, i) for i in range(len(found.residuals))],
