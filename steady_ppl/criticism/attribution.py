@@ -158,13 +158,8 @@ def _dispersion(each: Array, correlation: Array) -> Array:
 
 
 def attribute(scores: Scored, parameters: Scored, noise: dict[str, Array], maps_p_value: float) -> Attribution:
-    """Decide who is at fault.
-
-    Args:
-        scores, parameters: as of `scored`.
-        noise: name of a mean square or the like → its value in the real and every simulated set, `(1 + M,)`.
-        maps_p_value: of the hypothesis that the maps hold nothing.
-    """
+    """Decide who is at fault by the two of `scored`, by mean squares and the like, of the real and every simulated set
+    `(1 + M,)`, and by the p-value of the hypothesis that the maps hold nothing."""
     scatter = np.stack([values / values[1:].mean() for name, values in noise.items() if name.startswith(SCATTER)])
     widest = scatter.max(0)[:, None]  # wrong noise scatters no score wider
     squares, _ = standardise(np.stack(list(noise.values()), -1))

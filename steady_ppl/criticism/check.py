@@ -122,8 +122,7 @@ def _require(problem: Problem, simulations: int) -> None:
     if data.time.shape[0] < 2 or not bool(data.observed[1:].any()):
         raise DataError("nothing to compare: no trajectory has a measurement after its first row")
     refuse_long(data)
-    why = problem.why_not_linear()
-    if why is not None:
+    if (why := problem.why_not_linear()) is not None:
         raise UsageError(f"check needs a program that can be linearised: {why.split(': looking')[0]}")
 
 

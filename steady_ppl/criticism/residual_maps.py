@@ -111,8 +111,7 @@ def judge(both: Residuals, time: Array, controls: dict[str, Array], pairs: Seque
         time: s since each drive's first row, `(T, B)`.
         controls: `(T, B)` each; they sort the intervals and are correlated with the residuals.
         pairs: names of variables that make a map together.
-        unexplained: dispersion that no effect on the mean explains, of every set, the real one first; no band is
-            widened by more.
+        unexplained: dispersion of every set that no effect on the mean explains; no band is widened by more.
 
     Raises:
         DataError: too few residuals to average anywhere.
@@ -161,15 +160,13 @@ def standardise(values: Array) -> tuple[Array, int]:
 
 
 def tail_p_value(values: Array) -> float:
-    """How often a maximum is as large as the first value, by Gumbel's distribution with the moments of the others, the
-    simulated ones."""
+    """How often a maximum is as large as the first value, by Gumbel's distribution with the moments of the others."""
     scale = max(float(values[1:].std(ddof=1)), 1e-12) * math.sqrt(6) / math.pi
     return -math.expm1(-math.exp(min(-(float(values[0] - values[1:].mean()) / scale) - np.euler_gamma, 700.0)))
 
 
 def _adjusted(p_values: Array) -> Array:
-    """The false-discovery rates at which each is just found (Benjamini and Hochberg 1995). `scipy.stats`, which has the
-    same, takes half a second to load."""
+    """The false-discovery rates at which each is just found; those of `scipy.stats` take half a second to load."""
     order, count = np.argsort(p_values), len(p_values)
     rates = p_values[order] * count / np.arange(1, count + 1)
     found = np.empty(count)

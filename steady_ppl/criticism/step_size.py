@@ -50,8 +50,6 @@ class StepTrial:
 
     def shift(self, other: StepTrial) -> float:
         """Nats that the other trial's watched parameters lie below this one's maximum, to second order."""
-        if not self.names:
-            return 0.0
         change = other.values - self.values
         return 0.5 * float(change @ torch.linalg.pinv(self.covariance) @ change)
 
@@ -274,16 +272,11 @@ def _uncompared(found: StepCheck, failure: str | None) -> str | None:
 
 
 def _trial(program: Program, maximum: Maximum, watched: Sequence[str]) -> StepTrial:
-    parts = elements(program)
-    chosen = [index for index, part in enumerate(parts) if part.name.split("[")[0] in watched]
-    covariance = torch.linalg.pinv(maximum.information) if chosen else torch.zeros(0, 0, dtype=torch.float64)
-    return StepTrial(
-        program.substeps,
-        float(maximum.log_likelihood.sum()),
-        maximum.decrement or 0.0,
-        program,
-        maximum.path,
-        tuple(parts[index].name for index in chosen),
-        values_of([parts[index] for index in chosen]),
-        covariance[chosen][:, chosen],
-    )
+    likely, decrement = float(maximum.log_likelihood.sum()), maximum.decrement or 0.0
+    found = StepTrial(program.substeps, likely, decrement, program, maximum.path)
+    chosen = {i: part for i, part in enumerate(elements(program)) if part.name.split("[")[0] in watched}
+    if not chosen:
+        return found
+    at, parts = list(chosen), list(chosen.values())
+    covariance = torch.linalg.pinv(maximum.information)[at][:, at]
+    return replace(found, names=tuple(part.name for part in parts), values=values_of(parts), covariance=covariance)

@@ -214,8 +214,7 @@ def _components(declared: Any) -> list[dict[str, str]]:
 
 
 def _truth(program: Program, table: Trajectories, middle: np.ndarray) -> np.ndarray | None:
-    """The true states `(rows, B, D)`, angles on the turn of the posterior's median; None where the table has no more
-    than starts."""
+    """The true states `(rows, B, D)`, angles on the turn of the posterior's median; None where there are but starts."""
     truth = table.select(program.control_names, program.measurement_names, program.state_names).states
     if truth is None or not bool(torch.isfinite(truth[1:]).any()):
         return None

@@ -67,13 +67,15 @@ class Report:
         )
         templates.filters |= {"number": number, "signed": signed, "interval": interval, "spread": spread, "said": said}
         figures = {label: one.figures for label, one in self.checks.items()}
+        curves = {} if isinstance(self.proof, str) else _curves(self.proof)
+        drawn = ("candidates", "effects", "shape")  # the rest of a discovery is in the text
+        discovery = {name: self.discovery[name] for name in drawn} if self.discovery else None
         content = {
             "title": self.title,
             "notes": self.notes,
             "checks": figures,
             "strongest": {label: _linked(one["findings"], self, label) for label, one in figures.items()},
             "proof": self.proof if isinstance(self.proof, str) else self.proof.figures,
-            "curves": {} if isinstance(self.proof, str) else _curves(self.proof),
             "discovery": self.discovery,
             "programs": [_program(label, fit) for label, fit in self.fits.items()],
             "shown": self.shown.note,
@@ -82,10 +84,8 @@ class Report:
             "style": _asset("page.css"),
             "script": Markup("\n").join(_asset(name) for name in SCRIPTS),
             "plotly": Markup(get_plotlyjs().replace("</script", "<\\/script")),
+            "data": _data({**self.drives, "discovery": discovery, "curves": curves}),
         }
-        drawn = ("candidates", "effects", "shape")  # the rest of a discovery is in the text
-        discovery = {name: self.discovery[name] for name in drawn} if self.discovery else None
-        content["data"] = _data({**self.drives, "discovery": discovery, "curves": content["curves"]})
         return templates.get_template("page.html").render(content)
 
     def write(self, path: str | Path) -> None:
@@ -182,12 +182,11 @@ def _program(label: str, fit: Fit) -> dict[str, Any]:
         text = inspect.getsource(kind)
     except (TypeError, OSError):
         text = ""
-    effects = [(one.label, _equation(one.effect), one.effect.feels) for one in attached(fit.program)]
     return {
         "label": label,
         "name": kind.__name__,
         "about": inspect.cleandoc(kind.__doc__ or ""),
-        "effects": effects,
+        "effects": [(one.label, _equation(one.effect), one.effect.feels) for one in attached(fit.program)],
         "parameters": parameter_rows(fit.program),
         "text": text,
         "fit": fit,
