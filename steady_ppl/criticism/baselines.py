@@ -11,7 +11,6 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, on_a_circle, predict
@@ -115,18 +114,16 @@ def constant_velocity(problem: Problem, tracked: Tracked, horizons: Sequence[int
 
 
 @torch.no_grad()
-def last_measurement(
-    program: Program, data: Trajectories, states: Tensor, horizons: Sequence[int]
-) -> dict[int, tuple[Tensor, Tensor]]:
+def last_measurement(problem: Problem, states: Tensor, horizons: Sequence[int]) -> dict[int, tuple[Tensor, Tensor]]:
     """Measured less the component's last value up to `horizon` rows before, and where both exist, `(·, B, K)`."""
-    circle = on_a_circle(program, data, states)
-    held, known = [data.measurements[0]], [data.observed[0]]
-    for value, there in zip(data.measurements[1:], data.observed[1:], strict=True):
-        held.append(torch.where(there, value, held[-1]))
-        known.append(there | known[-1])
+    data = problem.data
+    circle = on_a_circle(problem.program, data, states)
+    rows = torch.arange(len(data.time), device=data.time.device)[:, None, None]
+    last = torch.where(data.observed, rows, -1).cummax(0).values  # the row in which a component was last measured
+    held, known = data.measurements.gather(0, last.clamp(min=0)), last >= 0
     found = {}
     for horizon in horizons:
-        error = (data.measurements[horizon:] - torch.stack(held)[: len(held) - horizon]).double()
+        error = (data.measurements[horizon:] - held[: len(held) - horizon]).double()
         error = torch.where(circle, wrap(error), error)
-        found[horizon] = error, data.observed[horizon:] & torch.stack(known)[: len(known) - horizon]
+        found[horizon] = error, data.observed[horizon:] & known[: len(known) - horizon]
     return found

@@ -63,12 +63,18 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     program = fit.program
     problem = Problem.of_table(program, data, fit.known_start)
     run = problem.data
-    _require(problem, simulations)
+    if simulations < MIN_SETS:
+        raise UsageError(f"got {simulations} simulations: bands need at least {MIN_SETS}, and 100 are better")
+    if run.time.shape[0] < 2 or not bool(run.observed[1:].any()):
+        raise DataError("nothing to compare: no trajectory has a measurement after its first row")
+    refuse_long(run)
+    if (why := problem.why_not_linear()) is not None:
+        raise UsageError(f"check needs a program that can be linearised: {why.split(': looking')[0]}")
     horizons = named_horizons(run, SECONDS)
     parts = (("finding paths", 1), ("comparing time steps", 1), ("simulating drives", 2), ("judging", 2))
     with stages(*parts) as begin:
         begin()
-        with seeded(seed, "check"), without_kernels() as why:
+        with seeded(seed, "check"), without_kernels() as uncompiled:
             ahead = problem.find_and_smooth()
             path = ahead.linearization.path
             real = problem.track(path, passes=1)
@@ -90,7 +96,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         both = Residuals.joined([ours, theirs])
         misfit = judge(both, time, controls, _pairs(program, ours), dispersion)
     notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
-    notes += in_plain_torch(why)
+    notes += in_plain_torch(uncompiled)
     notes += run.uneven_steps + diagnose_units(program, run)
     notes += [f"refitted to these drives, {step.note}"] if step.note else []
     notes += [step.uncompared] if step.uncompared else []
@@ -104,7 +110,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         predictions=predictions,
         floor=made.floor,
         reference=constant_velocity(problem, real, rows),
-        held=last_measurement(program, run, real.smoothed, rows),
+        held=last_measurement(problem, real.smoothed, rows),
         step=step,
         misfit=misfit,
         blame=attribute(scores, parameters, _scatter(both), misfit.p_value),
@@ -113,17 +119,6 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         stuck=frozen_stretches(data),
         notes=notes,
     )
-
-
-def _require(problem: Problem, simulations: int) -> None:
-    data = problem.data
-    if simulations < MIN_SETS:
-        raise UsageError(f"got {simulations} simulations: bands need at least {MIN_SETS}, and 100 are better")
-    if data.time.shape[0] < 2 or not bool(data.observed[1:].any()):
-        raise DataError("nothing to compare: no trajectory has a measurement after its first row")
-    refuse_long(data)
-    if (why := problem.why_not_linear()) is not None:
-        raise UsageError(f"check needs a program that can be linearised: {why.split(': looking')[0]}")
 
 
 def _in_own_spreads(real: Residuals, simulated: Residuals) -> tuple[Residuals, Residuals]:

@@ -66,9 +66,8 @@ class _Scores:
         self.arrival, self.noise, self.reading = tracked.arrival[1:], tracked.noise, tracked.reading
         self.controls = acting_controls(program, data)
         self.commands = row_controls(program, self.controls).double()
-        channels = range(self.noise.shape[-1])
-        declared = len(program.channels) == len(channels)
-        self.channels = program.channel_names if declared else [f"{i + 1}" for i in channels]
+        count = self.noise.shape[-1]
+        self.channels = program.channel_names if len(program.channels) == count else [f"{i + 1}" for i in range(count)]
 
     def over_rows(self, score: Tensor) -> Tensor:
         return torch.where(self.data.transitions, score, 0.0).sum(0)

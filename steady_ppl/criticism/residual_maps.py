@@ -78,6 +78,9 @@ class Cell:
     mean: float | None = None  # of the residuals, in their unit; None where they have none
 
 
+Averaged = Iterator[tuple[Cell, Array]]  # each with its statistic in each set, (1 + M,)
+
+
 @dataclass(frozen=True)
 class SignificantCell:
     """A cell whose average lies outside the simulated band."""
@@ -174,18 +177,15 @@ def _adjusted(p_values: Array) -> Array:
     return found
 
 
-def _all_cells(
-    data: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence
-) -> Iterator[tuple[Cell, Array]]:
-    """Every cell with its statistic in each set, `(1 + M,)`: the sum over the root of the count."""
+def _all_cells(data: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence) -> Averaged:
+    """Every cell; its statistic is the sum over the root of the count."""
     inside = data.there[0].any(-1)
-    everything = np.zeros(time.shape, int)
     drives = np.broadcast_to(np.arange(time.shape[1]), time.shape)
     edges = np.linspace(0, time[inside].max() * (1 + 1e-9) + 1e-9, min(STRIPS, max(1, len(time) // 5)) + 1)
     strip = np.clip(np.searchsorted(edges, time, side="right") - 1, 0, len(edges) - 2)
     strips = [{"time": (float(a), float(b))} for a, b in itertools.pairwise(edges)]
     each = [{"drive": drive} for drive in range(time.shape[1])]
-    yield from _sums(data, "all", everything, [{}])
+    yield from _sums(data, "all", np.zeros(time.shape, int), [{}])
     yield from _sums(data, "drive", drives, each)
     if len(strips) > 1:
         yield from _sums(data, "time", strip, strips)
@@ -217,7 +217,7 @@ def _binned(values: Array, inside: Array, bins: int) -> tuple[Array, list[tuple[
     return np.asarray(labels), ranges if edges[0, 0] < edges[-1, 0] else []
 
 
-def _sums(data: Residuals, kind: str, labels: Array, where: list[dict[str, Any]]) -> Iterator[tuple[Cell, Array]]:
+def _sums(data: Residuals, kind: str, labels: Array, where: list[dict[str, Any]]) -> Averaged:
     sets = len(data.values)
     index = np.broadcast_to(labels, data.there.shape[:-1]) + len(where) * np.arange(sets)[:, None, None]
     size, flat = sets * len(where), index.ravel()
@@ -237,7 +237,7 @@ def _sums(data: Residuals, kind: str, labels: Array, where: list[dict[str, Any]]
                 yield Cell(kind, residual, place, int(count[0, cell]), mean[cell]), average[:, cell]
 
 
-def _correlations(data: Residuals, inside: Array, controls: dict[str, Array]) -> Iterator[tuple[Cell, Array]]:
+def _correlations(data: Residuals, inside: Array, controls: dict[str, Array]) -> Averaged:
     """With the controls, with their changes and with the residual itself, some rows before."""
     regressors = {}
     for name, values in controls.items():

@@ -121,9 +121,8 @@ class Check(Displayed):
                 label = f"{name} [{component['unit']}]" if component["unit"] else name
                 table.append([label, horizon, *cells, f"{row['coverage_90']:.1%}"])
         lines = [content["verdict"], "", *aligned(table, left=(0, 1))]
-        scatter = content["evidence"]["scatter"]
-        lines += ["", "mean squares over those of simulated drives (nearly blind to a missing effect): "]
-        lines[-1] += ", ".join(f"{name} {value:.2f}" for name, value in scatter.items())
+        ratios = ", ".join(f"{name} {value:.2f}" for name, value in content["evidence"]["scatter"].items())
+        lines += ["", f"mean squares over those of simulated drives (nearly blind to a missing effect): {ratios}"]
         total, cells = len(content["findings"]), content["cells"]
         lines += ["", f"{total} of {cells} cells are outside their simulated bands (false discoveries held at 5 %)"]
         lines += [f"  {finding['z']:+6.1f} sd  {finding['text']}" for finding in strongest(content["findings"])]

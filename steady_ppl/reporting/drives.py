@@ -143,11 +143,7 @@ def chosen(checks: list[Check], numbers: int = MAX_NUMBERS) -> Shown:
     columns = sum(_columns(one) for one in checks) + 1 + len(first.program.control_names)
     every = max(1, -(-rows * columns // numbers))
     room = max(1, numbers // (-(-rows // every) * columns))
-    worst = np.zeros(count)
-    for one in checks:
-        for cell, z in one.misfit.of_map("drive and time"):
-            drive = cell.where["drive"]
-            worst[drive] = max(worst[drive], abs(z))
+    worst = np.max([np.abs(np.nan_to_num(strips(one)[1])).max((0, 2), initial=0.0) for one in checks], 0)
     order = np.argsort(-worst, kind="stable")[:room]
     return Shown(sorted(int(i) for i in order), every, count)
 
@@ -178,10 +174,8 @@ def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: 
     data = found.data.subset(shown.drives)
     posterior = drawn_states(fit.program, data, draws=draws, known_start=fit.known_start, seed=seed)["posterior"]
     states = found.program.state_names
-    quantiles = np.stack(
-        [posterior[name].quantile(QUANTILES, ("chain", "draw"), skipna=False).values for name in states], -1
-    )
-    quantiles = quantiles.swapaxes(1, 2)  # (3, rows, B, D)
+    by_state = [posterior[name].quantile(QUANTILES, ("chain", "draw"), skipna=False).values for name in states]
+    quantiles = np.stack(by_state, -1).swapaxes(1, 2)  # (3, rows, B, D)
     all_of_them = Shown(list(range(len(data))), shown.every, len(data))
     across = [states[i] for i in plane(found.program)]
     paths = [posterior[name].values[0, draw].T for draw in range(min(PATHS, draws)) for name in across]

@@ -144,11 +144,9 @@ def _data(content: Mapping[str, Any]) -> Markup:
 
 def number(value: Any, digits: int = 3) -> str:
     """A figure with so many digits, a list of them, or a dash."""
-    if value is None:
-        return "–"
     if isinstance(value, list | tuple):
         return ", ".join(number(one, digits) for one in value)
-    return (f"{value:.{digits}g}" if math.isfinite(value) else "–").replace("-", "−")
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}g}".replace("-", "−")
 
 
 def signed(value: float | None, digits: int = 1) -> str:

@@ -8,7 +8,6 @@ from typing import Any
 from steady_ppl.comparison.prove import prove, unfinished
 from steady_ppl.comparison.result import Proof
 from steady_ppl.criticism.check import check
-from steady_ppl.criticism.result import Check
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import SteadyError, UsageError
 from steady_ppl.reporting.drives import chosen, given, of_run
@@ -69,7 +68,12 @@ def report(
             begin()
             drawn.append({"label": label, **of_run(checks[label], fit, data, shown, draws=draws, seed=seed)})
         begin()
-        proof = _proof(runs, checks, data, seed)
+        proof: Proof | str = "There is one run only: name the run before and the one after to compare them."
+        if len(runs) > 1:
+            try:
+                proof = prove(runs, data, paths={label: one.path for label, one in checks.items()}, seed=seed)
+            except SteadyError as error:
+                proof = f"The runs cannot be compared: {error}."
     drives = given(next(iter(checks.values())), shown) | {"runs": drawn}
     return Report(
         title=title,
@@ -82,12 +86,3 @@ def report(
         how=list(how),
         notes=[*notes, *unfinished(runs)],
     )
-
-
-def _proof(runs: Mapping[str, Fit], checks: Mapping[str, Check], data: Trajectories, seed: int) -> Proof | str:
-    if len(runs) < 2:
-        return "There is one run only: name the run before and the one after to compare them."
-    try:
-        return prove(runs, data, paths={label: one.path for label, one in checks.items()}, seed=seed)
-    except SteadyError as error:
-        return f"The runs cannot be compared: {error}."
