@@ -75,7 +75,7 @@ def simulate_sets(problem: Problem, starts: Tensor, channels: int, horizons: Seq
 
     _, said = blocks[0]
     variables = {name: joined(f"variable {name}").numpy() for name in said["variables"]}
-    in_all = [one for one in said["directions"] if all(one in others["directions"] for _, others in blocks)]
+    in_all = [one for one in said["directions"] if all(f"scores {one[1]}" in tensors for tensors, _ in blocks)]
     return SimulatedSets(
         sets,
         {horizon: joined(f"floor {horizon}").numpy() for horizon in said["horizons"]},

@@ -126,8 +126,7 @@ def judge(both: Residuals, time: Array, controls: dict[str, Array], pairs: Seque
         what = f"{drives} drives of at most {rows} intervals hold no place, time or regime"
         raise DataError(f"{what} with enough residuals to average: take more drives, or longer ones")
     average = np.stack([average for _, average in found], -1)  # (1 + M, cells)
-    squares = both.mean_squares
-    typical = squares[1:].mean(0)
+    squares, typical = both.mean_squares, both.mean_squares[1:].mean(0)
     dispersion = np.divide(squares, typical, out=np.full_like(squares, np.nan), where=typical > 0)
     widened = np.sqrt(np.minimum(dispersion, unexplained[:, None]).clip(1.0))[:, [cell.residual for cell in cells]]
     z, freedom = standardise(average)

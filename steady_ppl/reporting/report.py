@@ -74,7 +74,6 @@ def report(
                 proof = prove(runs, data, paths={label: one.path for label, one in checks.items()}, seed=seed)
             except SteadyError as error:
                 proof = f"The runs cannot be compared: {error}."
-    drives = given(next(iter(checks.values())), shown) | {"runs": drawn}
     return Report(
         title=title,
         fits=dict(runs),
@@ -82,7 +81,7 @@ def report(
         proof=proof,
         discovery=discovery,
         shown=shown,
-        drives=drives,
+        drives=given(next(iter(checks.values())), shown) | {"runs": drawn},
         how=list(how),
         notes=[*notes, *unfinished(runs)],
     )
