@@ -17,7 +17,7 @@ from steady_ppl.criticism.baselines import ConstantVelocity, constant_velocity
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, UsageError
 from steady_ppl.gaussian.information_filter import Lookahead
-from steady_ppl.gaussian.kalman import Tracked, track
+from steady_ppl.gaussian.kalman import Tracked
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, named_horizons, predict, simulate_again, states_ahead
 from steady_ppl.likelihood.evidence import neglected
@@ -149,15 +149,15 @@ def judge_program(
 
 def judge(problem: Problem, ahead: Lookahead, kernels: bool | None = None) -> Judged:
     """Track along a path that was found and compare what is predicted from every row with measurements and truth."""
-    program, data, unseen = problem.program, problem.data, problem.without_truth().data
-    tracked = track(program, unseen, ahead.linearization.path, known_start=problem.known_start, kernels=kernels)
+    program, data, unseen = problem.program, problem.data, problem.without_truth()
+    tracked = unseen.track(ahead.linearization.path, kernels=kernels)
     named = named_horizons(data, SECONDS)
     longest, states = max(named.values()), dict[tuple[str, int], tuple[Tensor, Tensor]]()
     horizons = {round(rows) for rows in np.geomspace(1, longest, DRAWN).tolist()} | set(named.values())
     bands = [named[name] for name in BANDS if name in named]
-    predictions = predict(program, unseen, tracked, sorted(horizons), bands=bands)
+    predictions = predict(program, unseen.data, tracked, sorted(horizons), bands=bands)
     if data.states is not None and has_truth(data):
-        for horizon, state in states_ahead(program, unseen, tracked, longest):
+        for horizon, state in states_ahead(program, unseen.data, tracked, longest):
             if horizon in horizons:
                 truth = data.states[horizon:]
                 for group, squares in squared_errors(program, state, truth).items():
@@ -169,13 +169,12 @@ def judge(problem: Problem, ahead: Lookahead, kernels: bool | None = None) -> Ju
 def keeping_velocity(before: Judged) -> Judged | str:
     """A program without any acceleration but noise, of the size under which the measurements are most likely."""
     unseen = before.problem.without_truth()
-    program, data, known_start = unseen.program, unseen.data, unseen.known_start
-    found = constant_velocity(program, data, before.tracked, [1], known_start=known_start)
+    found = constant_velocity(unseen, before.tracked, [1])
     if isinstance(found, str):
         return found
-    coasting = ConstantVelocity(program, found.scales)
-    coasting.error_groups = program.error_groups  # type: ignore[misc]
-    path = before.tracked.path(data)
+    coasting = ConstantVelocity(unseen.program, found.scales)
+    coasting.error_groups = unseen.program.error_groups  # type: ignore[misc]
+    path = before.tracked.path(unseen.data)
     still = ReferencePath(path.states, torch.zeros_like(path.noise))
     ahead = replace(unseen, program=coasting).smooth(still, kernels=False)
     if not bool(torch.isfinite(ahead.log_likelihood).all()):

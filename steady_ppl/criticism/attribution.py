@@ -20,7 +20,7 @@ from steady_ppl.criticism.residual_maps import ALPHA, standardise, tail_p_value
 
 Array = np.ndarray[Any, Any]
 KINDS = ("sensor", "actuator", "dynamics")
-TEST_COUNT = 4  # of the mean, the parameters, the scatter and the maps; each at a fourth of the level
+LEVEL_OF_TEST = ALPHA / 4  # of the mean, the parameters, the noise and the maps together at the level (Bonferroni)
 MIN_GAIN_OF_KIND = 3.0  # nats of log p(y) between the best kind and the next
 SCATTER = "scatter of "  # begins the names of mean squares
 STEPS = 4
@@ -35,45 +35,53 @@ class Attribution:
 
     kind: str  # "sensor", "actuator", "dynamics", "parameters", "noise", "cannot tell" or "nothing found"
     p_value: float  # of the hypothesis that the program is right, all tests together (Bonferroni)
-    mean_p_value: float  # of the hypothesis that no direction is wrong, the program's own parameters let free
-    noise_p_value: float  # of the hypothesis that the scatter is right
-    parameters_p_value: float  # of the hypothesis that the program's parameters suit these drives
+    p_values: dict[str, float]  # of "mean", "parameters", "noise" and "maps": that nothing is wrong with them
     explained: dict[str, float]  # nats that the best directions of each kind explain
     evidence: list[tuple[str, str, float]]  # the directions picked, best first: (kind, name, z)
     parameters: dict[str, float]  # z of each parameter's score
     noise: dict[str, float]  # z of each mean square
     dispersion: float  # how much more than simulated drives the drives differ in their scores
 
-    @property
-    def parameters_misfit(self) -> bool:
-        """Whether the program's parameters do not suit these drives, whatever else is wrong."""
-        return self.parameters_p_value <= ALPHA / TEST_COUNT
-
-    @property
-    def closest_parameters(self) -> list[tuple[str, float]]:
-        """The parameter that explains most alone, and those that explain nearly as much, with their z."""
-        order = sorted(self.parameters.items(), key=lambda item: -abs(item[1]))
-        least = order[0][1] ** 2 - 2 * MIN_GAIN_OF_KIND * max(1.0, self.dispersion) if order else 0.0
-        return [(name, z) for name, z in order if z**2 >= least]
-
 
 @dataclass(frozen=True)
 class Scored:
-    """Scores made comparable: of the `J` directions that the `P` parameters do not explain, and of the parameters."""
+    """Scores of `J` directions, made comparable."""
 
     kinds: list[str]
     names: list[str]
     z: Array  # (1 + M, J), the real set first
     correlation: Array  # (J, J)
     dispersion: Array  # (1 + M, J): how much more than simulated drives the drives of a set differ
-    parameters: Array  # (1 + M, P), their z
-    parameters_dispersion: Array  # (1 + M, P)
-    parameters_correlation: Array  # (P, P)
-    parameter_names: list[str]
+
+    def p_value(self, widest: Array) -> float:
+        """Of the hypothesis that no direction is wrong; wrong noise scatters scores no wider than `widest`."""
+        z = self.z / np.sqrt(np.minimum(self.dispersion, widest).clip(1.0))
+        return tail_p_value(np.abs(z).max(-1)) if self.names else 1.0
+
+    def explaining(self, kind: str, widened: float) -> tuple[list[int], float]:
+        """Some directions of a kind, picked one after the other, and the nats that they explain, less their price."""
+        z, correlation = self.z[0] / widened, self.correlation
+        members = np.array([own == kind for own in self.kinds])
+        picked: list[int] = []
+        nats: list[float] = []
+        for step in range(min(STEPS, len(z))):
+            spread = correlation.diagonal()
+            left = np.where(members & (spread > 0.02), z**2 / np.maximum(spread, 0.02), 0.0)
+            j = int(left.argmax())
+            gain = 0.5 * float(left[j]) - (MIN_GAIN_OF_DIRECTION if step else 0.0)
+            if gain <= 0:
+                break
+            picked.append(j)
+            nats.append(gain)
+            column = correlation[:, j] / max(float(spread[j]), 1e-12)
+            z = z - column * z[j]
+            correlation = correlation - np.outer(column, correlation[j])
+        return picked, sum(nats)
 
 
-def scored(real: Sequence[Direction], simulated: Sequence[Direction], sets: int) -> Scored:
-    """Take the parameters' scores out of all others, of `B` real and `sets` · `B` simulated drives, and standardise."""
+def scored(real: Sequence[Direction], simulated: Sequence[Direction], sets: int) -> tuple[Scored, Scored]:
+    """Standardise scores of `B` real and `sets` · `B` simulated drives: what the parameters' leave of the others', and
+    the parameters' own."""
     order = {direction.name: direction for direction in real}
     simulated = [direction for direction in simulated if direction.name in order]
     real = [order[direction.name] for direction in simulated]
@@ -86,22 +94,20 @@ def scored(real: Sequence[Direction], simulated: Sequence[Direction], sets: int)
     parts = [fit.split(each[0], free)]
     for values in each[1:]:  # compared with the others, as the real set is: what fits itself looks small
         away = values * sets / (sets - 1)
-        others = _Fitted((covariance * (sets - 1) - values.T @ away) / (sets - 2), own)
-        parts.append(others.split(away, free))
+        without = _Fitted((covariance * (sets - 1) - values.T @ away) / (sets - 2), own)
+        parts.append(without.split(away, free))
     parameters, rest = (np.stack(part) for part in zip(*parts, strict=True))
     sd = fit.spread(free)
     left = fit.left[np.ix_(free, free)] / np.outer(sd, sd)
-    return Scored(
-        kinds=[real[j].kind for j in np.flatnonzero(free)],
-        names=[real[j].name for j in np.flatnonzero(free)],
-        z=rest.sum(1),
-        correlation=left,
-        dispersion=_dispersion(rest, left),
-        parameters=parameters.sum(1),
-        parameters_dispersion=_dispersion(each / fit.scale, fit.correlation)[:, own],
-        parameters_correlation=fit.correlation[np.ix_(own, own)],
-        parameter_names=[real[j].name for j in np.flatnonzero(own)],
-    )
+    of_parameters = _dispersion(each / fit.scale, fit.correlation)[:, own]
+
+    def of(chosen: Array, scores: Array, correlation: Array, dispersion: Array) -> Scored:
+        members = [real[j] for j in np.flatnonzero(chosen)]
+        kinds, names = [one.kind for one in members], [one.name for one in members]
+        return Scored(kinds, names, scores.sum(1), correlation, dispersion)
+
+    others = of(free, rest, left, _dispersion(rest, left))
+    return others, of(own, parameters, fit.correlation[np.ix_(own, own)], of_parameters)
 
 
 class _Fitted:
@@ -151,71 +157,42 @@ def _dispersion(each: Array, correlation: Array) -> Array:
     return (squares / np.maximum(squares[1:].mean(0), 1e-300)) @ weight / np.maximum(weight.sum(0), 1e-300)
 
 
-def attribute(scores: Scored, noise: dict[str, Array], maps_p_value: float) -> Attribution:
-    """Decide who is at fault.
-
-    Args:
-        noise: name of a mean square or the like → its value in the real and every simulated set, `(1 + M,)`.
-        maps_p_value: of the hypothesis that the maps hold nothing.
-    """
+def attribute(scores: Scored, parameters: Scored, noise: dict[str, Array], maps_p_value: float) -> Attribution:
+    """Decide who is at fault by the two of `scored`, by mean squares and the like, of the real and every simulated set
+    `(1 + M,)`, and by the p-value of the hypothesis that the maps hold nothing."""
     scatter = np.stack([values / values[1:].mean() for name, values in noise.items() if name.startswith(SCATTER)])
     widest = scatter.max(0)[:, None]  # wrong noise scatters no score wider
-    z = scores.z / np.sqrt(np.minimum(scores.dispersion, widest).clip(1.0))
-    mean_p = tail_p_value(np.abs(z).max(-1))
     squares, _ = standardise(np.stack(list(noise.values()), -1))
-    noise_p = tail_p_value(np.abs(squares).max(-1))
-    own = scores.parameters / np.sqrt(np.minimum(scores.parameters_dispersion, widest).clip(1.0))
-    own_p = tail_p_value(np.abs(own).max(-1)) if scores.parameter_names else 1.0
-    widened = math.sqrt(min(max(1.0, float(scores.dispersion[0].mean())), float(widest[0, 0])))
-    by_kind = {
-        kind: _explaining(scores.z[0] / widened, scores.correlation, [own == kind for own in scores.kinds])
-        for kind in KINDS
-        if kind in scores.kinds
+    p_values = {
+        "mean": scores.p_value(widest),
+        "parameters": parameters.p_value(widest),
+        "noise": tail_p_value(np.abs(squares).max(-1)),
+        "maps": maps_p_value,
     }
-    explained = {kind: sum(nats) for kind, (_, nats) in by_kind.items()}
+    dispersion = float(scores.dispersion[0].mean())
+    widened = math.sqrt(min(max(1.0, dispersion), float(widest[0, 0])))
+    by_kind = {kind: scores.explaining(kind, widened) for kind in KINDS if kind in scores.kinds}
+    explained = {kind: nats for kind, (_, nats) in by_kind.items()}
     best = max(explained, key=lambda kind: explained[kind])
     others = [nats for kind, nats in explained.items() if kind != best]
-    every = [True] * len(scores.parameter_names)
-    of_own = sum(_explaining(scores.parameters[0] / widened, scores.parameters_correlation, every)[1])
-    each = ALPHA / TEST_COUNT
-    if own_p <= each and (mean_p > each or of_own > explained[best]):
+    _, of_own = parameters.explaining("parameter", widened)
+    wrong = {what for what, p_value in p_values.items() if p_value <= LEVEL_OF_TEST}
+    if "parameters" in wrong and ("mean" not in wrong or of_own > explained[best]):
         kind = "parameters"
-    elif mean_p <= each:
+    elif "mean" in wrong:
         near = np.abs(scores.z[0]).max() <= MAX_INFORMATIVE_SD
         kind = best if near and explained[best] - max(others, default=0.0) >= MIN_GAIN_OF_KIND else "cannot tell"
-    elif noise_p <= each:
+    elif "noise" in wrong:
         kind = "noise"
     else:
-        kind = "cannot tell" if maps_p_value <= each else "nothing found"
+        kind = "cannot tell" if "maps" in wrong else "nothing found"
     return Attribution(
         kind=kind,
-        p_value=min(1.0, TEST_COUNT * min(mean_p, own_p, noise_p, maps_p_value)),
-        mean_p_value=mean_p,
-        noise_p_value=noise_p,
-        parameters_p_value=own_p,
+        p_value=min(1.0, len(p_values) * min(p_values.values())),
+        p_values=p_values,
         explained=explained,
         evidence=[(scores.kinds[j], scores.names[j], float(scores.z[0, j])) for j in by_kind[best][0]],
-        parameters=dict(zip(scores.parameter_names, scores.parameters[0].tolist(), strict=True)),
+        parameters=dict(zip(parameters.names, parameters.z[0].tolist(), strict=True)),
         noise=dict(zip(noise, squares[0].tolist(), strict=True)),
-        dispersion=float(scores.dispersion[0].mean()),
+        dispersion=dispersion,
     )
-
-
-def _explaining(z: Array, correlation: Array, members: Sequence[bool]) -> tuple[list[int], list[float]]:
-    """Some directions, picked one after the other, and the nats that each explains, less its price."""
-    picked: list[int] = []
-    nats: list[float] = []
-    for step in range(min(STEPS, len(z))):
-        spread = correlation.diagonal()
-        free = np.array(members) & (spread > 0.02)
-        left = np.where(free, z**2 / np.maximum(spread, 0.02), 0.0)
-        j = int(left.argmax())
-        gain = 0.5 * float(left[j]) - (MIN_GAIN_OF_DIRECTION if step else 0.0)
-        if gain <= 0:
-            break
-        picked.append(j)
-        nats.append(gain)
-        column = correlation[:, j] / max(float(spread[j]), 1e-12)
-        z = z - column * z[j]
-        correlation = correlation - np.outer(column, correlation[j])
-    return picked, nats

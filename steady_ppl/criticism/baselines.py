@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.gaussian.kalman import Tracked, track
+from steady_ppl.gaussian.kalman import Tracked
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, on_a_circle, predict
-from steady_ppl.model.handlers import AtMean, ByColumn, Recording, Standardised, as_vector, normal_moments, running
+from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.handlers import AtMean, ByColumn, Recording, Standardised, as_event, normal_moments, running
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, advance, sample_channels
+from steady_ppl.model.substeps import acting_controls, advance, joined, sample_channels
 from steady_ppl.utils.angles import wrap
 
 MULTIPLES = (0.5, 1.0, 2.0, 4.0, 8.0)
@@ -39,9 +39,8 @@ class Coasting(ByColumn):
             return
         fn = message["fn"]
         zero = torch.zeros_like(normal_moments(fn, message["name"])[0])
-        scale = zero.new_tensor(self.scales[self.take(fn)])
-        scaled = dist.Normal(zero, scale.expand_as(zero) if fn.event_dim else scale[0])
-        message["fn"] = scaled.to_event(1) if fn.event_dim else scaled
+        scale = as_event(zero.new_tensor(self.scales[self.take(fn)]), fn.event_dim)
+        message["fn"] = dist.Normal(zero, scale.expand_as(zero)).to_event(fn.event_dim)
 
 
 class ConstantVelocity(Program):
@@ -78,26 +77,24 @@ class Reference:
 
 
 @torch.no_grad()
-def constant_velocity(
-    program: Program, data: Trajectories, tracked: Tracked, horizons: Sequence[int], *, known_start: bool
-) -> Reference | str:
+def constant_velocity(problem: Problem, tracked: Tracked, horizons: Sequence[int]) -> Reference | str:
     """Scan the channel noise of `ConstantVelocity` by log p(y) and predict with the best; or why there is none.
 
-    The scan begins where the program was tracked. The horizons count rows; `data` is as returned by `for_program`.
+    The scan begins where the program was tracked. The horizons count rows.
     """
+    program, data = problem.program, problem.data
     path = tracked.path(data)
     inputs = acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps
-    seen = Recording()
-    with running(*path.noise.shape[:-1]), seen, Standardised(path.noise):
+    left, seen = path.noise.shape[:-1], Recording()
+    with running(*left), seen, Standardised(path.noise):
         sample_channels(program, path.states[:-1], *inputs)
-    sites = seen.distributions
-    values = torch.cat([as_vector(value, sites[site].event_dim) for site, value in seen.values.items()], -1)
-    spreads = [as_vector(normal_moments(fn, site)[1], fn.event_dim) for site, fn in sites.items()]
-    spread = torch.cat([part.expand(*values.shape[:-1], part.shape[-1]) for part in spreads], -1)
+    values = joined(seen.values, seen.distributions, left)
+    spreads = {site: normal_moments(fn, site)[1] for site, fn in seen.distributions.items()}
+    spread = joined(spreads, seen.distributions, left)
     sizes = (values.double().square() + spread.double().square())[data.transitions].mean(0).sqrt()
     if not bool((sizes > 0).all() and torch.isfinite(sizes).all()):
         return "a channel of the program never moves"
-    with running(*path.noise.shape[:-1]), AtMean():
+    with running(*left), AtMean():
         moved = advance(program, path.states[:-1], *inputs)
         coasted = advance(ConstantVelocity(program, sizes.tolist()), path.states[:-1], *inputs)
     if torch.allclose(moved, coasted, rtol=1e-6, atol=1e-7):
@@ -106,7 +103,7 @@ def constant_velocity(
     for multiple in MULTIPLES:
         coasting = ConstantVelocity(program, (multiple * sizes).tolist())
         start = ReferencePath(path.states, (values / (multiple * sizes)).to(values.dtype))
-        found = track(coasting, data, start, known_start=known_start, passes=3, kernels=False)
+        found = replace(problem, program=coasting).track(start, passes=3, kernels=False)
         likely = float(found.log_likelihood.sum())
         if math.isfinite(likely) and (best is None or likely > best[0]):
             best = likely, coasting, found
@@ -117,18 +114,16 @@ def constant_velocity(
 
 
 @torch.no_grad()
-def last_measurement(
-    program: Program, data: Trajectories, states: Tensor, horizons: Sequence[int]
-) -> dict[int, tuple[Tensor, Tensor]]:
+def last_measurement(problem: Problem, states: Tensor, horizons: Sequence[int]) -> dict[int, tuple[Tensor, Tensor]]:
     """Measured less the component's last value up to `horizon` rows before, and where both exist, `(·, B, K)`."""
-    circle = on_a_circle(program, data, states)
-    held, known = [data.measurements[0]], [data.observed[0]]
-    for value, there in zip(data.measurements[1:], data.observed[1:], strict=True):
-        held.append(torch.where(there, value, held[-1]))
-        known.append(there | known[-1])
+    data = problem.data
+    circle = on_a_circle(problem.program, data, states)
+    rows = torch.arange(len(data.time), device=data.time.device)[:, None, None]
+    last = torch.where(data.observed, rows, -1).cummax(0).values  # the row in which a component was last measured
+    held, known = data.measurements.gather(0, last.clamp(min=0)), last >= 0
     found = {}
     for horizon in horizons:
-        error = (data.measurements[horizon:] - torch.stack(held)[: len(held) - horizon]).double()
+        error = (data.measurements[horizon:] - held[: len(held) - horizon]).double()
         error = torch.where(circle, wrap(error), error)
-        found[horizon] = error, data.observed[horizon:] & torch.stack(known)[: len(known) - horizon]
+        found[horizon] = error, data.observed[horizon:] & known[: len(known) - horizon]
     return found

@@ -25,12 +25,10 @@ from steady_ppl.data.frozen_sensors import frozen_stretches
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
-from steady_ppl.gaussian.kalman import track
-from steady_ppl.gaussian.linearize import why_not_linear
 from steady_ppl.gaussian.predict import named_horizons, predict
-from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.kernels.rows import in_plain_torch, without_kernels
-from steady_ppl.model.program import Program, for_program
+from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.program import Program
 from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.cores import one_thread
@@ -38,8 +36,7 @@ from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
 SECONDS = (1.0, 3.0)
-MAX_RESIDUAL_SD = 4.0
-"""Standard deviations of a single residual; beside a landmark the linearised program knows no more."""
+MAX_RESIDUAL_SD = 4.0  # of a single residual; beside a landmark the linearised program knows no more
 
 
 @one_thread()
@@ -64,69 +61,64 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         >>> print(st.check(st.Fit.load("runs/learned"), st.read_table("test.csv")))  # doctest: +SKIP
     """
     program = fit.program
-    run = for_program(program, data).without_truth(keep_start=fit.known_start)
-    _require(program, run, fit.known_start, simulations)
+    problem = Problem.of_table(program, data, fit.known_start)
+    run = problem.data
+    if simulations < MIN_SETS:
+        raise UsageError(f"got {simulations} simulations: bands need at least {MIN_SETS}, and 100 are better")
+    if run.time.shape[0] < 2 or not bool(run.observed[1:].any()):
+        raise DataError("nothing to compare: no trajectory has a measurement after its first row")
+    refuse_long(run)
+    if (why := problem.why_not_linear()) is not None:
+        raise UsageError(f"check needs a program that can be linearised: {why.split(': looking')[0]}")
     horizons = named_horizons(run, SECONDS)
     parts = (("finding paths", 1), ("comparing time steps", 1), ("simulating drives", 2), ("judging", 2))
     with stages(*parts) as begin:
         begin()
-        with seeded(seed, "check"), without_kernels() as why:
-            ahead = find_and_smooth(program, run, known_start=fit.known_start)
-            real = track(program, run, ahead.linearization.path, known_start=fit.known_start, passes=1)
+        with seeded(seed, "check"), without_kernels() as uncompiled:
+            ahead = problem.find_and_smooth()
+            path = ahead.linearization.path
+            real = problem.track(path, passes=1)
             _, drawn, _ = ahead.draws(simulations)
             starts = run.known_start.expand(simulations, -1, -1) if fit.known_start else drawn[:, 0]
             begin()
-            step = check_step(program, run, ahead.linearization.path, known_start=fit.known_start)
+            step = check_step(program, run, path, known_start=fit.known_start)
             begin()
             rows = list(horizons.values())
-            channels = real.noise.shape[-1]
-            made = simulate_sets(program, run, starts, channels, rows, known_start=fit.known_start)
+            made = simulate_sets(problem, starts, real.noise.shape[-1], rows)
         begin()
         predictions = predict(program, run, real, rows)
         ours = replace(residuals(program, run, real, predictions[1], 1), raw=predictions[1].error.numpy(force=True))
         ours, theirs = _in_own_spreads(ours, made.residuals)
-        scores = scored(directions(program, run, real), made.directions, made.sets)
+        scores, parameters = scored(directions(program, run, real), made.directions, made.sets)
         time, dispersion = run.elapsed[:-1].numpy(force=True), scores.dispersion.mean(-1)
         acting = run.controls[:-1]
         controls = {name: acting[..., i].double().numpy(force=True) for i, name in enumerate(program.control_names)}
-        misfit = judge(ours, theirs, time, controls, _pairs(program, ours), dispersion)
+        both = Residuals.joined([ours, theirs])
+        misfit = judge(both, time, controls, _pairs(program, ours), dispersion)
     notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
-    notes += in_plain_torch(why)
+    notes += in_plain_torch(uncompiled)
     notes += run.uneven_steps + diagnose_units(program, run)
     notes += [f"refitted to these drives, {step.note}"] if step.note else []
     notes += [step.uncompared] if step.uncompared else []
-    if not scores.parameter_names:
+    if not parameters.names:
         notes.append("the program's own parameters were not looked at one by one: it has none, or a network's")
     return Check(
         program=program,
         data=run,
-        path=ahead.linearization.path,
+        path=path,
         horizons=horizons,
         predictions=predictions,
         floor=made.floor,
-        reference=constant_velocity(program, run, real, rows, known_start=fit.known_start),
-        held=last_measurement(program, run, real.smoothed, rows),
+        reference=constant_velocity(problem, real, rows),
+        held=last_measurement(problem, real.smoothed, rows),
         step=step,
         misfit=misfit,
-        blame=attribute(scores, _scatter(ours, theirs), misfit.p_value),
+        blame=attribute(scores, parameters, _scatter(both), misfit.p_value),
         residuals=list(ours.names),
         standardised=ours,
         stuck=frozen_stretches(data),
         notes=notes,
     )
-
-
-def _require(program: Program, data: Trajectories, known_start: bool, simulations: int) -> None:
-    if simulations < MIN_SETS:
-        raise UsageError(f"got {simulations} simulations: bands need at least {MIN_SETS}, and 100 are better")
-    if data.time.shape[0] < 2 or not bool(data.observed[1:].any()):
-        raise DataError("nothing to compare: no trajectory has a measurement after its first row")
-    refuse_long(data)
-    if known_start:
-        _ = data.known_start
-    why = why_not_linear(program, data, known_start=known_start)
-    if why is not None:
-        raise UsageError(f"check needs a program that can be linearised: {why.split(': looking')[0]}")
 
 
 def _in_own_spreads(real: Residuals, simulated: Residuals) -> tuple[Residuals, Residuals]:
@@ -159,13 +151,11 @@ def _pairs(program: Program, residuals: Residuals) -> list[tuple[str, str]]:
     return [pair for pair in dict.fromkeys(chosen) if all(name in residuals.variables for name in pair)]
 
 
-def _scatter(real: Residuals, simulated: Residuals) -> dict[str, np.ndarray]:
+def _scatter(both: Residuals) -> dict[str, np.ndarray]:
     """Mean squares of every residual, and the fourth power of the measurements' as a sign of tails; of every set."""
-    both = Residuals.joined([real, simulated])
-    values, count = both.values, np.maximum(both.there.sum((1, 2)), 1)
-    squares = (values**2).sum((1, 2)) / count
-    told = [i for i in range(len(real.names)) if real.there[..., i].any()]
-    found = {f"{SCATTER}{real.names[i]}": squares[:, i] for i in told}
-    fourth = (values**4).sum((1, 2)) / count
+    squares, count = both.mean_squares, np.maximum(both.there.sum((1, 2)), 1)
+    told = {i: name for i, name in enumerate(both.names) if both.there[0, ..., i].any()}
+    fourth = (both.values**4).sum((1, 2)) / count
     tails = np.log(fourth / np.maximum(squares, 1e-12) ** 2 + 1e-12)
-    return found | {f"tails of {real.names[i]}": tails[:, i] for i in told}
+    found = {f"{SCATTER}{name}": squares[:, i] for i, name in told.items()}
+    return found | {f"tails of {name}": tails[:, i] for i, name in told.items()}

@@ -58,7 +58,7 @@ def directions(program: Program, data: Trajectories, tracked: Tracked) -> list[D
 
 
 class _Scores:
-    """Scores of pushes on the states `(T, B, D)`, by the channels `(T, B)`, and of shifts `(T + 1, B, K)`."""
+    """Scores of pushes on the states and by the channels, row by row `(T, B)`, and of shifts `(T + 1, B, K)`."""
 
     def __init__(self, program: Program, data: Trajectories, tracked: Tracked) -> None:
         self.program, self.data, self.path = program, data, tracked.path(data)
@@ -66,26 +66,20 @@ class _Scores:
         self.arrival, self.noise, self.reading = tracked.arrival[1:], tracked.noise, tracked.reading
         self.controls = acting_controls(program, data)
         self.commands = row_controls(program, self.controls).double()
-        channels = range(self.noise.shape[-1])
-        declared = len(program.channels) == len(channels)
-        self.channels = program.channel_names if declared else [f"{i + 1}" for i in channels]
+        count = self.noise.shape[-1]
+        self.channels = program.channel_names if len(program.channels) == count else [f"{i + 1}" for i in range(count)]
 
-    def push(self, change: Tensor) -> Tensor:
-        return torch.where(self.data.transitions, (change * self.arrival).sum(-1), 0.0).sum(0)
-
-    def channel(self, index: int, size: Tensor) -> Tensor:
-        return torch.where(self.data.transitions, size * self.noise[..., index], 0.0).sum(0)
+    def over_rows(self, score: Tensor) -> Tensor:
+        return torch.where(self.data.transitions, score, 0.0).sum(0)
 
     def shift(self, change: Tensor) -> Tensor:
         return (change * self.reading).sum((0, 2))
 
     def of_parameters(self) -> Named:
         """The program's own parameters, where they move the mean."""
-        if sum(value.numel() for value in self.program.parameters()) > MAX_PARAMETERS:
+        if not 0 < sum(value.numel() for value in self.program.parameters()) <= MAX_PARAMETERS:
             return
         parts = elements(self.program, frozen=True)
-        if not parts:
-            return
         for part, score in zip(parts, (self._pushed_by(parts) + self._shifted_by(parts)).unbind(-1), strict=True):
             if bool((score != 0).any()):
                 yield part.name, score
@@ -101,17 +95,15 @@ class _Scores:
             scores, left = slopes.weighted(arrival), of_actuators(program, data, parts)
         for index in left:
             up, down = on_both_sides(parts[index], lambda: self._moved(acting_controls(program, data)))
-            scores[:, index] = self.push(wrap_angles(up - down, self.linear.angles) / (2 * parts[index].step))
+            push = wrap_angles(up - down, self.linear.angles) / (2 * parts[index].step)
+            scores[:, index] = self.over_rows((push * self.arrival).sum(-1))
         return scores
 
     def _shifted_by(self, parts: Sequence[Element]) -> Tensor:
         """The same of what the program measures."""
         program, data, states = self.program, self.data, self.path.states
-
-        def reading(state: Tensor) -> Tensor:
-            return measured(program, state).reading
-
-        slopes = slopes_on_all_rows(program, "reading", reading, {"state": states}, parts)
+        given = {"state": states}
+        slopes = slopes_on_all_rows(program, "reading", lambda state: measured(program, state).reading, given, parts)
         if isinstance(slopes, Slopes):
             return slopes.weighted(torch.where(data.observed, self.reading, 0.0))
         scores = []
@@ -146,9 +138,9 @@ class _Scores:
         for index, (name, answer) in enumerate(zip(self.program.control_names, self.answers, strict=True)):
             if answer is None:
                 continue
-            along = torch.where(self.data.transitions, (answer * self.arrival).sum(-1), 0.0)
+            along = (answer * self.arrival).sum(-1)
             for word, shape in self._other_than(self.commands[:-1, :, index]).items():
-                score = (shape * along).sum(0)
+                score = self.over_rows(shape * along)
                 together.setdefault(word, []).append(score)
                 yield f"{word} {name}", score
         for word, scores in together.items():
@@ -190,32 +182,30 @@ class _Scores:
             shapes |= {f"with the sine of {angle}": value.sin(), f"with the cosine of {angle}": value.cos()}
         for index, channel in enumerate(self.channels):
             for word, shape in shapes.items():
-                yield f"{channel} acceleration {word}", self.channel(index, shape)
+                yield f"{channel} acceleration {word}", self.over_rows(shape * self.noise[..., index])
 
     def of_states(self) -> Named:
         """A constant push on each state component that noise reaches."""
         reached = self.linear.noise.square().sum((0, 1, 3)) > 0
         for index, name in enumerate(self.program.state_names):
             if bool(reached[index]):
-                push = torch.zeros_like(self.arrival)
-                push[..., index] = self.steps
-                yield f"constant push on {name}", self.push(push)
+                yield f"constant push on {name}", self.over_rows(self.steps * self.arrival[..., index])
 
     def of_couplings(self) -> Named:
         """Controls acting on channels that they do not move in the program."""
         name, unit, commands = self.program.control_names, self.program.control_units, self.commands[:-1]
         along = self.linear.noise / self.linear.noise.norm(dim=-2, keepdim=True).clamp(min=1e-300)
-        for channel, called in enumerate(self.channels):
+        for channel, (called, noise) in enumerate(zip(self.channels, self.noise.unbind(-1), strict=True)):
             unmoved = []
             for index, answer in enumerate(self.answers):
                 if answer is None or float((answer * along[..., channel]).sum(-1).norm() / answer.norm()) < 1e-3:
                     unmoved.append(index)
             for one in unmoved:
-                yield f"{called} acceleration with {name[one]}", self.channel(channel, commands[..., one])
+                yield f"{called} acceleration with {name[one]}", self.over_rows(commands[..., one] * noise)
             for one, other in itertools.combinations(unmoved, 2):
                 if unit[one] == unit[other]:
                     word = f"{called} acceleration with {name[one]} − {name[other]}"
-                    yield word, self.channel(channel, commands[..., one] - commands[..., other])
+                    yield word, self.over_rows((commands[..., one] - commands[..., other]) * noise)
 
     @cached_property
     def answers(self) -> list[Tensor | None]:

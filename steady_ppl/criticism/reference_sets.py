@@ -6,10 +6,9 @@ drives': three hundred drives and a hundred sets at once would take fourteen gig
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,10 +18,11 @@ from steady_ppl.criticism.perturbations import Direction, directions
 from steady_ppl.criticism.residual_maps import Residuals
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
-from steady_ppl.gaussian.kalman import Tracked, track
+from steady_ppl.gaussian.kalman import Tracked
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, predict, simulate_again
-from steady_ppl.gaussian.smoother import REST_TOLERANCE, means_as_path, smooth
+from steady_ppl.gaussian.smoother import REST_TOLERANCE, means_as_path
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.angles import wrap_angles
 from steady_ppl.utils.cores import Result, side_by_side
@@ -31,9 +31,7 @@ from steady_ppl.utils.random import seeded
 MIN_SETS = 20  # sets
 MAX_ROWS_OF_BLOCK = 100_000  # of all drives of a block: the memory of larger arrays takes longer to get than to fill
 ROUNDING = 1e-5  # of a state, in single precision
-LINEARISATIONS = 4
-"""Linearisations of drives that need them: beside a landmark the truth is far from the mode, where the measured drives'
-paths lie."""
+LINEARISATIONS = 4  # of drives that need them: beside a landmark the truth is far from the mode
 
 
 @dataclass(frozen=True)
@@ -45,45 +43,13 @@ class SimulatedSets:
     residuals: Residuals
     directions: list[Direction]  # with the scores of all M · B drives
 
-    def as_result(self) -> Result:
-        """The same as tensors and what JSON can hold."""
-        arrays = {f"floor {horizon}": value for horizon, value in self.floor.items()}
-        arrays |= {f"variable {name}": value for name, value in self.residuals.variables.items()}
-        arrays |= {"values": self.residuals.values, "there": self.residuals.there}
-        tensors = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
-        tensors |= {f"scores {index}": one.scores for index, one in enumerate(self.directions)}
-        words = [[one.kind, one.name] for one in self.directions]
-        names, variables = list(self.residuals.names), list(self.residuals.variables)
-        said = {"sets": self.sets, "names": names, "variables": variables, "directions": words}
-        return tensors, said | {"horizons": list(self.floor)}
-
-    @classmethod
-    def of_result(cls, tensors: Mapping[str, Tensor], said: Mapping[str, Any]) -> SimulatedSets:
-        """What `as_result` returned."""
-
-        def array(name: str) -> np.ndarray:
-            return tensors[name].numpy()
-
-        variables = {name: array(f"variable {name}") for name in said["variables"]}
-        return cls(
-            said["sets"],
-            {horizon: array(f"floor {horizon}") for horizon in said["horizons"]},
-            Residuals(said["names"], array("values"), array("there"), variables),
-            [
-                Direction(kind, name, tensors[f"scores {index}"])
-                for index, (kind, name) in enumerate(said["directions"])
-            ],
-        )
-
 
 @torch.no_grad()
-def simulate_sets(
-    program: Program, data: Trajectories, starts: Tensor, channels: int, horizons: Sequence[int], *, known_start: bool
-) -> SimulatedSets:
+def simulate_sets(problem: Problem, starts: Tensor, channels: int, horizons: Sequence[int]) -> SimulatedSets:
     """Simulate, track and predict.
 
     Args:
-        data: `B` drives, as returned by `for_program`.
+        problem: a program and `B` drives.
         starts: `(M, B, D)`, where each drive of each set begins.
         channels: C, how many numbers a step's noise has.
         horizons: rows ahead, one row among them.
@@ -91,61 +57,71 @@ def simulate_sets(
     Raises:
         FilterError: too many sets blew up.
     """
-    at_once, seed = max(1, MAX_ROWS_OF_BLOCK // data.time.numel()), int(torch.randint(2**31, ()))
+    at_once, seed = max(1, MAX_ROWS_OF_BLOCK // problem.data.time.numel()), int(torch.randint(2**31, ()))
 
     def simulate(number: int, block: Tensor) -> Result:
         with seeded(seed + number, "block"):
-            made = _block(program, data, block, channels, horizons, known_start)
-        return ({}, {}) if made is None else made.as_result()
+            return _block(problem, block, channels, horizons)
 
     jobs = [partial(simulate, number, block) for number, block in enumerate(starts.split(at_once))]
-    found = [SimulatedSets.of_result(*result) for result in side_by_side(jobs) if result[0]]
-    lost = len(starts) - sum(one.sets for one in found)
-    if len(starts) - lost < MIN_SETS:
-        what = f"{lost} of {len(starts)} simulated sets blew up"
+    blocks = [(tensors, said) for tensors, said in side_by_side(jobs) if tensors]
+    sets = sum(len(tensors["values"]) for tensors, _ in blocks)
+    if sets < MIN_SETS:
+        what = f"{len(starts) - sets} of {len(starts)} simulated sets blew up"
         raise FilterError(f"{what}: the fitted program does not even explain drives of its own")
-    return _joined(found)
 
+    def joined(name: str) -> Tensor:
+        return torch.cat([tensors[name] for tensors, _ in blocks])
 
-def _block(
-    program: Program, data: Trajectories, starts: Tensor, channels: int, horizons: Sequence[int], known_start: bool
-) -> SimulatedSets | None:
-    """None where every set blew up."""
-    sets = len(starts)
-    again, truth = simulate_again(program, data, starts, channels)
-    near, copies = _tracked(program, again, truth, known_start)
-    whole = torch.isfinite(copies.log_likelihood).view(sets, -1).all(1)
-    if not bool(whole.all()):
-        if not bool(whole.any()):
-            return None
-        kept = whole.repeat_interleave(len(data)).nonzero().flatten()
-        again, sets = again.subset(kept), int(whole.sum())
-        near = ReferencePath(near.states[:, kept], near.noise[:, kept])
-        copies = track(program, again, near, known_start=known_start, passes=1)
-    simulated = predict(program, again, copies, horizons, bands=[1])
+    _, said = blocks[0]
+    variables = {name: joined(f"variable {name}").numpy() for name in said["variables"]}
+    in_all = [one for one in said["directions"] if all(f"scores {one[1]}" in tensors for tensors, _ in blocks)]
     return SimulatedSets(
         sets,
-        {horizon: _rmse_of_sets(ahead, sets) for horizon, ahead in simulated.items()},
-        residuals(program, again, copies, simulated[1], sets),
-        directions(program, again, copies),
+        {horizon: joined(f"floor {horizon}").numpy() for horizon in said["horizons"]},
+        Residuals(said["names"], joined("values").numpy(), joined("there").numpy(), variables),
+        [Direction(kind, name, joined(f"scores {name}")) for kind, name in in_all],
     )
 
 
-def _tracked(
-    program: Program, data: Trajectories, truth: ReferencePath, known_start: bool
-) -> tuple[ReferencePath, Tracked]:
+def _block(problem: Problem, starts: Tensor, channels: int, horizons: Sequence[int]) -> Result:
+    """What `SimulatedSets` has of some sets, each tensor with the sets or their drives in front, and the names in it;
+    nothing where every set blew up."""
+    program, sets = problem.program, len(starts)
+    again, truth = simulate_again(program, problem.data, starts, channels)
+    copies = replace(problem, data=again)
+    near, tracked = _tracked(copies, truth)
+    whole = torch.isfinite(tracked.log_likelihood).view(sets, -1).all(1)
+    if not bool(whole.all()):
+        if not bool(whole.any()):
+            return {}, {}
+        kept = whole.repeat_interleave(len(problem.data)).nonzero().flatten()
+        copies, sets = copies.subset(kept), int(whole.sum())
+        tracked = copies.track(ReferencePath(near.states[:, kept], near.noise[:, kept]), passes=1)
+    again = copies.data
+    simulated = predict(program, again, tracked, horizons, bands=[1])
+    errors, scores = residuals(program, again, tracked, simulated[1], sets), directions(program, again, tracked)
+    arrays = {"values": errors.values, "there": errors.there}
+    arrays |= {f"variable {name}": value for name, value in errors.variables.items()}
+    arrays |= {f"floor {horizon}": _rmse_of_sets(ahead, sets) for horizon, ahead in simulated.items()}
+    tensors = {name: torch.from_numpy(value) for name, value in arrays.items()}
+    said = {"names": errors.names, "variables": list(errors.variables), "horizons": list(simulated)}
+    said["directions"] = [[one.kind, one.name] for one in scores]
+    return tensors | {f"scores {one.name}": one.scores for one in scores}, said
+
+
+def _tracked(problem: Problem, truth: ReferencePath) -> tuple[ReferencePath, Tracked]:
     """Paths near the posterior's modes, and the drives along them. Drives whose path is still on its way after a single
     step from the truth take more."""
-    given: dict[str, Any] = {"known_start": known_start}
-    near = means_as_path(smooth(program, data, truth, passes=1, **given), data)
-    tracked = track(program, data, near, passes=1, **given)
+    near = means_as_path(problem.smooth(truth, passes=1), problem.data)
+    tracked = problem.track(near, passes=1)
     far = ~((tracked.noise - near.noise).abs().amax((0, 2)) <= REST_TOLERANCE) | _starts_elsewhere(tracked, near)
     if bool(far.any()):
         index = far.nonzero().flatten()
         begin = ReferencePath(truth.states[:, index], truth.noise[:, index])
-        path = smooth(program, data.subset(index), begin, passes=LINEARISATIONS, **given).linearization.path
+        path = problem.subset(index).smooth(begin, passes=LINEARISATIONS).linearization.path
         near.states[:, index], near.noise[:, index] = path.states, path.noise
-        tracked = track(program, data, near, passes=1, **given)
+        tracked = problem.track(near, passes=1)
     return near, tracked
 
 
@@ -155,21 +131,6 @@ def _starts_elsewhere(tracked: Tracked, near: ReferencePath) -> Tensor:
     away = wrap_angles(tracked.smoothed[0] - begin, tracked.linearization.angles).abs()
     sd = tracked.covariances[0].diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
     return ~(away <= REST_TOLERANCE * sd + ROUNDING * (1 + begin.abs())).all(-1)
-
-
-def _joined(blocks: Sequence[SimulatedSets]) -> SimulatedSets:
-    """As one; directions that are not in every block are left out."""
-    scores = [{one.name: one.scores for one in block.directions} for block in blocks]
-    return SimulatedSets(
-        sum(block.sets for block in blocks),
-        {horizon: np.concatenate([block.floor[horizon] for block in blocks]) for horizon in blocks[0].floor},
-        Residuals.joined([block.residuals for block in blocks]),
-        [
-            replace(one, scores=torch.cat([block[one.name] for block in scores]))
-            for one in blocks[0].directions
-            if all(one.name in block for block in scores)
-        ],
-    )
 
 
 def residuals(program: Program, data: Trajectories, tracked: Tracked, ahead: Prediction, sets: int) -> Residuals:
@@ -204,4 +165,4 @@ def _rmse_of_sets(prediction: Prediction, sets: int) -> np.ndarray:
 
 def _by_set(values: Tensor, sets: int) -> np.ndarray:
     """`(T, M · B, ...)` to `(M, T, B, ...)`."""
-    return values.unflatten(1, (sets, -1)).transpose(0, 1).numpy(force=True)
+    return values.unflatten(1, (sets, -1)).transpose(0, 1).contiguous().numpy(force=True)

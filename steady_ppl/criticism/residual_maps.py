@@ -51,6 +51,11 @@ class Residuals:
             found.append((at, values[at]))
         return found
 
+    @cached_property
+    def mean_squares(self) -> Array:
+        """Of each residual in each set, `(M, R)`."""
+        return (self.values**2).sum((1, 2)) / np.maximum(self.there.sum((1, 2)), 1)
+
     @staticmethod
     def joined(parts: Sequence[Residuals]) -> Residuals:
         """The sets of all parts, one part after another."""
@@ -73,6 +78,9 @@ class Cell:
     mean: float | None = None  # of the residuals, in their unit; None where they have none
 
 
+Averaged = Iterator[tuple[Cell, Array]]  # each with its statistic in each set, (1 + M,)
+
+
 @dataclass(frozen=True)
 class SignificantCell:
     """A cell whose average lies outside the simulated band."""
@@ -88,7 +96,6 @@ class Misfit:
 
     cells: list[Cell]
     z: Array  # one a cell
-    p_values: Array  # one a cell
     significant: list[SignificantCell]  # at a false-discovery rate of 5 %, strongest first
     p_value: float  # of the hypothesis that there is nothing, by Simes' test, calibrated on the simulated sets
     simulated: Array  # the same of each simulated set, (M,)
@@ -99,44 +106,40 @@ class Misfit:
         return [(cell, float(z)) for cell, z in zip(self.cells, self.z, strict=True) if cell.map == name]
 
 
-def judge(
-    real: Residuals, simulated: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence, unexplained: Array
-) -> Misfit:
+def judge(both: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence, unexplained: Array) -> Misfit:
     """Compare every cell of one real set with those of many simulated ones.
 
     Args:
+        both: the real set first.
         time: s since each drive's first row, `(T, B)`.
         controls: `(T, B)` each; they sort the intervals and are correlated with the residuals.
         pairs: names of variables that make a map together.
-        unexplained: dispersion that no effect on the mean explains, of every set, the real one first; no band is
-            widened by more.
+        unexplained: dispersion of every set that no effect on the mean explains; no band is widened by more.
 
     Raises:
         DataError: too few residuals to average anywhere.
     """
-    both = Residuals.joined([real, simulated])
     found = list(_all_cells(both, time, controls, pairs))
     cells = [cell for cell, _ in found]
     if not cells:
-        rows, drives = real.values.shape[1:3]
+        rows, drives = time.shape
         what = f"{drives} drives of at most {rows} intervals hold no place, time or regime"
         raise DataError(f"{what} with enough residuals to average: take more drives, or longer ones")
     average = np.stack([average for _, average in found], -1)  # (1 + M, cells)
-    squares = (both.values**2).sum((1, 2)) / np.maximum(both.there.sum((1, 2)), 1)
-    typical = squares[1:].mean(0)
+    squares, typical = both.mean_squares, both.mean_squares[1:].mean(0)
     dispersion = np.divide(squares, typical, out=np.full_like(squares, np.nan), where=typical > 0)
     widened = np.sqrt(np.minimum(dispersion, unexplained[:, None]).clip(1.0))[:, [cell.residual for cell in cells]]
     z, freedom = standardise(average)
     z /= widened
     p_values = 2 * special.stdtr(freedom, -np.abs(z))
-    simes = np.array([_simes(row) for row in p_values])
+    rates = np.stack([_adjusted(row) for row in p_values])
+    simes = rates.min(1)
     level = min(ALPHA, float(np.quantile(simes[1:], ALPHA, method="lower")))  # the tails of t are a model, too
-    chosen = np.flatnonzero(_adjusted(p_values[0]) <= level)
+    chosen = np.flatnonzero(rates[0] <= level)
     findings = [SignificantCell(cells[i], float(z[0, i]), float(p_values[0, i])) for i in chosen]
     return Misfit(
         cells=cells,
         z=z[0],
-        p_values=p_values[0],
         significant=sorted(findings, key=lambda finding: -abs(finding.z)),
         p_value=max(float(simes[0]), tail_p_value(-np.log(np.maximum(simes, 1e-300)))),
         simulated=simes[1:],
@@ -145,14 +148,8 @@ def judge(
 
 
 def standardise(values: Array) -> tuple[Array, int]:
-    """Each row against the simulated ones, all rows but the first; a simulated row is compared with the others.
-
-    Args:
-        values: `(1 + M, ...)`; NaN where a set has no value, which counts as nothing found.
-
-    Returns:
-        The same shape, in standard deviations, and the degrees of freedom.
-    """
+    """Each row of `(1 + M, ...)` against the simulated ones, all but the first, in standard deviations, and the degrees
+    of freedom. A simulated row is compared with the others; NaN, where a set has no value, counts as nothing found."""
     simulated = values[1:]
     count = np.maximum(np.isfinite(simulated).sum(0), 3)
     mean, variance = np.nanmean(simulated, 0), np.nanvar(simulated, 0) * count / (count - 1)
@@ -165,15 +162,13 @@ def standardise(values: Array) -> tuple[Array, int]:
 
 
 def tail_p_value(values: Array) -> float:
-    """How often a maximum is as large as the first value, by Gumbel's distribution with the moments of the others, the
-    simulated ones."""
+    """How often a maximum is as large as the first value, by Gumbel's distribution with the moments of the others."""
     scale = max(float(values[1:].std(ddof=1)), 1e-12) * math.sqrt(6) / math.pi
     return -math.expm1(-math.exp(min(-(float(values[0] - values[1:].mean()) / scale) - np.euler_gamma, 700.0)))
 
 
 def _adjusted(p_values: Array) -> Array:
-    """The false-discovery rates at which each is just found (Benjamini and Hochberg 1995). `scipy.stats`, which has the
-    same, takes half a second to load."""
+    """The false-discovery rates at which each is just found; those of `scipy.stats` take half a second to load."""
     order, count = np.argsort(p_values), len(p_values)
     rates = p_values[order] * count / np.arange(1, count + 1)
     found = np.empty(count)
@@ -181,23 +176,15 @@ def _adjusted(p_values: Array) -> Array:
     return found
 
 
-def _simes(p_values: Array) -> float:
-    ordered = np.sort(p_values)
-    return float((ordered * len(ordered) / np.arange(1, len(ordered) + 1)).min())
-
-
-def _all_cells(
-    data: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence
-) -> Iterator[tuple[Cell, Array]]:
-    """Every cell with its statistic in each set, `(1 + M,)`: the sum over the root of the count."""
+def _all_cells(data: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence) -> Averaged:
+    """Every cell; its statistic is the sum over the root of the count."""
     inside = data.there[0].any(-1)
-    everything = np.zeros(time.shape, int)
     drives = np.broadcast_to(np.arange(time.shape[1]), time.shape)
     edges = np.linspace(0, time[inside].max() * (1 + 1e-9) + 1e-9, min(STRIPS, max(1, len(time) // 5)) + 1)
     strip = np.clip(np.searchsorted(edges, time, side="right") - 1, 0, len(edges) - 2)
     strips = [{"time": (float(a), float(b))} for a, b in itertools.pairwise(edges)]
     each = [{"drive": drive} for drive in range(time.shape[1])]
-    yield from _sums(data, "all", everything, [{}])
+    yield from _sums(data, "all", np.zeros(time.shape, int), [{}])
     yield from _sums(data, "drive", drives, each)
     if len(strips) > 1:
         yield from _sums(data, "time", strip, strips)
@@ -229,7 +216,7 @@ def _binned(values: Array, inside: Array, bins: int) -> tuple[Array, list[tuple[
     return np.asarray(labels), ranges if edges[0, 0] < edges[-1, 0] else []
 
 
-def _sums(data: Residuals, kind: str, labels: Array, where: list[dict[str, Any]]) -> Iterator[tuple[Cell, Array]]:
+def _sums(data: Residuals, kind: str, labels: Array, where: list[dict[str, Any]]) -> Averaged:
     sets = len(data.values)
     index = np.broadcast_to(labels, data.there.shape[:-1]) + len(where) * np.arange(sets)[:, None, None]
     size, flat = sets * len(where), index.ravel()
@@ -249,7 +236,7 @@ def _sums(data: Residuals, kind: str, labels: Array, where: list[dict[str, Any]]
                 yield Cell(kind, residual, place, int(count[0, cell]), mean[cell]), average[:, cell]
 
 
-def _correlations(data: Residuals, inside: Array, controls: dict[str, Array]) -> Iterator[tuple[Cell, Array]]:
+def _correlations(data: Residuals, inside: Array, controls: dict[str, Array]) -> Averaged:
     """With the controls, with their changes and with the residual itself, some rows before."""
     regressors = {}
     for name, values in controls.items():

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from steady_ppl.criticism.attribution import Attribution
+from steady_ppl.criticism.attribution import LEVEL_OF_TEST, MIN_GAIN_OF_KIND, Attribution
 from steady_ppl.criticism.baselines import ABOUT, Reference
 from steady_ppl.criticism.residual_maps import Cell, Misfit, Residuals, SignificantCell
 from steady_ppl.criticism.step_size import StepCheck
@@ -23,19 +23,13 @@ from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.text import aligned, number
 
 SHOWN = 8  # findings in the table
-WHO = {
-    "sensor": "the sensor is at fault",
-    "actuator": "the actuators are at fault",
-    "dynamics": "the dynamics are at fault",
-    "noise": "its noise is at fault",
-    "parameters": "its own parameters do not suit these drives",
-    "cannot tell": "these drives cannot tell what is at fault",
-}
-BESIDE = {  # what stands out as well, which is no verdict while the parameters are wrong
-    "sensor": "the sensor stands out",
-    "actuator": "the actuators stand out",
-    "dynamics": "the dynamics stand out",
-    "noise": "its noise stands out",
+WHO = {  # the verdict; and what stands out as well, which is no verdict while the parameters are wrong
+    "sensor": ("the sensor is at fault", "the sensor stands out"),
+    "actuator": ("the actuators are at fault", "the actuators stand out"),
+    "dynamics": ("the dynamics are at fault", "the dynamics stand out"),
+    "noise": ("its noise is at fault", "its noise stands out"),
+    "parameters": ("its own parameters do not suit these drives", ""),
+    "cannot tell": ("these drives cannot tell what is at fault", ""),
 }
 
 
@@ -102,12 +96,7 @@ class Check(Displayed):
             ],
             "cells": len(misfit.cells),
             "evidence": {
-                "p_values": {
-                    "mean": blame.mean_p_value,
-                    "parameters": blame.parameters_p_value,
-                    "noise": blame.noise_p_value,
-                    "maps": misfit.p_value,
-                },
+                "p_values": blame.p_values,
                 "explained_nats": blame.explained,
                 "directions": [{"kind": kind, "direction": name, "z": z} for kind, name, z in blame.evidence],
                 "parameters": blame.parameters,
@@ -132,9 +121,8 @@ class Check(Displayed):
                 label = f"{name} [{component['unit']}]" if component["unit"] else name
                 table.append([label, horizon, *cells, f"{row['coverage_90']:.1%}"])
         lines = [content["verdict"], "", *aligned(table, left=(0, 1))]
-        scatter = content["evidence"]["scatter"]
-        lines += ["", "mean squares over those of simulated drives (nearly blind to a missing effect): "]
-        lines[-1] += ", ".join(f"{name} {value:.2f}" for name, value in scatter.items())
+        ratios = ", ".join(f"{name} {value:.2f}" for name, value in content["evidence"]["scatter"].items())
+        lines += ["", f"mean squares over those of simulated drives (nearly blind to a missing effect): {ratios}"]
         total, cells = len(content["findings"]), content["cells"]
         lines += ["", f"{total} of {cells} cells are outside their simulated bands (false discoveries held at 5 %)"]
         lines += [f"  {finding['z']:+6.1f} sd  {finding['text']}" for finding in strongest(content["findings"])]
@@ -195,6 +183,7 @@ def lost_horizons(found: Check) -> list[str]:
 def verdict(found: Check) -> str:
     """The first line of `steady check`: one sentence, after a first one on the time step where that is too coarse."""
     first, blame = found.step.sentence, found.blame
+    discover = "`steady discover` tests the physical effects by name"
     if first:
         first = f"{first[0].upper()}{first[1:]}: refit at that step first; what follows is of the coarse one. "
     if blame.kind == "nothing found":
@@ -206,37 +195,37 @@ def verdict(found: Check) -> str:
         said += "; `steady discover` says what could not have been seen"
     else:
         said = "The program does not explain these drives: "
-        discover = "`steady discover` tests the physical effects by name"
-        if blame.parameters_misfit:
-            beside = f"; beside them {BESIDE[blame.kind]}{_most_clearly(found)}" if blame.kind in BESIDE else ""
-            said += f"{WHO['parameters']}{_parameters(found)}: fit it again first (more "
-            said += f"--steps, or --recipe likelihood){beside}; if that changes little, {discover}"
+        if blame.p_values["parameters"] <= LEVEL_OF_TEST:
+            (fault, _), (_, beside) = WHO["parameters"], WHO[blame.kind]
+            said += f"{fault}{_parameters(blame)}: fit it again first (more --steps, or --recipe likelihood)"
+            said += f"; beside them {beside}{_most_clearly(blame)}" if beside else ""
+            said += f"; if that changes little, {discover}"
         else:
-            said += f"{WHO[blame.kind]}{_most_clearly(found)}; "
             of_noise = "the effects of kind noise in `steady discover` say in which way"
-            said += of_noise if blame.kind == "noise" else discover
+            said += f"{WHO[blame.kind][0]}{_most_clearly(blame)}; {of_noise if blame.kind == 'noise' else discover}"
     loses = lost_horizons(found)
     if loses:
         said += f"; it predicts worse than a vehicle that just keeps its velocity ({', '.join(loses)} ahead)"
     return f"{first}{said}."
 
 
-def _most_clearly(found: Check) -> str:
-    blame = found.blame
+def _most_clearly(blame: Attribution) -> str:
     if blame.kind == "noise":
         name = max(blame.noise, key=lambda name: abs(blame.noise[name]))
         return f", most clearly the {name}, {'more' if blame.noise[name] > 0 else 'less'} than the program says"
-    if blame.evidence and blame.kind != "cannot tell":
-        _, name, z = blame.evidence[0]
-        return f", most clearly the {name} (score {z:+.1f} standard deviations)"
-    close = sorted(blame.explained, key=lambda kind: -blame.explained[kind])[:2]
-    if blame.kind == "cannot tell" and len(close) == 2 and min(blame.explained[kind] for kind in close) > 3:
-        return f" ({close[0]} and {close[1]} explain them nearly alike)"
-    return ""
+    if blame.kind == "cannot tell":
+        close = sorted(blame.explained, key=lambda kind: -blame.explained[kind])[:2]
+        alike = len(close) == 2 and min(blame.explained[kind] for kind in close) > 3
+        return f" ({close[0]} and {close[1]} explain them nearly alike)" if alike else ""
+    _, name, z = blame.evidence[0]
+    return f", most clearly the {name} (score {z:+.1f} standard deviations)"
 
 
-def _parameters(found: Check) -> str:
-    alike = [f"{name} ({'more' if z > 0 else 'less'} is asked for)" for name, z in found.blame.closest_parameters]
+def _parameters(blame: Attribution) -> str:
+    """The parameter that explains most alone, and those that explain nearly as much."""
+    order = sorted(blame.parameters.items(), key=lambda item: -abs(item[1]))
+    least = order[0][1] ** 2 - 2 * MIN_GAIN_OF_KIND * max(1.0, blame.dispersion)
+    alike = [f"{name} ({'more' if z > 0 else 'less'} is asked for)" for name, z in order if z**2 >= least]
     return f", most clearly {' or '.join(alike)}"
 
 
@@ -276,8 +265,8 @@ def place(found: Check, cell: Cell) -> str:
         elif key == "time":
             words.append(f"between {value[0]:.1f} and {value[1]:.1f} s")
         else:
-            word = "while" if not any(w.startswith("while") for w in words) else "and"
-            words.append(f"{word} {key} is between {value[0]:.3g} and {value[1]:.3g} {unit_of(found, key)}".rstrip())
+            span = f"{key} is between {value[0]:.3g} and {value[1]:.3g} {unit_of(found, key)}".rstrip()
+            words.append(f"{'and' if words else 'while'} {span}")
     return "".join(f" {word}" for word in words)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -49,15 +48,8 @@ class StepTrial:
     values: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))  # (P,)
     covariance: Tensor = field(default_factory=lambda: torch.zeros(0, 0, dtype=torch.float64))  # (P, P)
 
-    @property
-    def reachable(self) -> float:
-        """Log p(y) after another scoring step, as far as the score says."""
-        return self.log_likelihood + self.decrement
-
     def shift(self, other: StepTrial) -> float:
         """Nats that the other trial's watched parameters lie below this one's maximum, to second order."""
-        if not self.names:
-            return 0.0
         change = other.values - self.values
         return 0.5 * float(change @ torch.linalg.pinv(self.covariance) @ change)
 
@@ -106,39 +98,32 @@ class StepCheck:
     @property
     def sentence(self) -> str:
         """What is to be said first where a finer step gains nats or moves parameters far; empty otherwise."""
+        own, suited = self.trials[0], self.suited
         if self.gain > MIN_GAIN:
-            said = f"{self._instead} gain {self.gain:.0f} nats"
-            if self.suited is self.trials[-1]:
-                coarser, last = self.trials[-2:]
-                gain = last.log_likelihood - coarser.log_likelihood
+            said = f"gain {self.gain:.0f} nats"
+            if suited is self.trials[-1]:
+                coarser = self.trials[-2]
+                gain = suited.log_likelihood - coarser.log_likelihood
                 if gain > MIN_GAIN:
                     said += f", the last doubling {gain:.0f} of them: more substeps may gain more"
                 else:
-                    said += f", the last doubling moves {last.farthest(coarser)}: more may move it on"
-        elif self.too_coarse and self.suited.shift(self.trials[0]) > MAX_SHIFT:
-            said = self._moves
+                    said += f", the last doubling moves {suited.farthest(coarser)}: more may move it on"
+        elif self.too_coarse and suited.shift(own) > MAX_SHIFT:
+            said = f"move {suited.farthest(own)}"
         else:
             return ""
-        return f"the program's own time step is too coarse: {said} {self._option}"
+        return f"the program's own time step is too coarse: {self._finer_steps(said)}"
 
     @property
     def note(self) -> str:
         """What is to be noted where a finer step moves parameters a little; empty otherwise."""
         if not self.too_coarse or self.sentence:
             return ""
-        return f"{self._moves} {self._option}"
+        return self._finer_steps(f"move {self.suited.farthest(self.trials[0])}")
 
-    @property
-    def _moves(self) -> str:
-        return f"{self._instead} move {self.suited.farthest(self.trials[0])}"
-
-    @property
-    def _instead(self) -> str:
-        return f"{self.suited.substeps} substeps a row instead of {self.trials[0].substeps}"
-
-    @property
-    def _option(self) -> str:
-        return f"(fit with --substeps {self.suited.substeps})"
+    def _finer_steps(self, effect: str) -> str:
+        finer, own = self.suited.substeps, self.trials[0].substeps
+        return f"{finer} substeps a row instead of {own} {effect} (fit with --substeps {finer})"
 
     @property
     def figures(self) -> dict[str, object]:
@@ -191,13 +176,16 @@ def check_step(
     Raises:
         FilterError: the program cannot be smoothed as it is.
     """
-    refits = _can_refit(program)
+    try:
+        parts = elements(program)
+    except UsageError:  # a network: too many to be refitted by scoring steps
+        parts = None
+    refits = parts is not None
     if isinstance(at, Maximum) and not at.names:  # fitted by draws: nothing is known of its curvature
         at = at.path
     if not is_step(program, data):  # in substeps it is another model, whose parameters are others
         watched = ()
-    elif refits and watched is None:
-        parts = elements(program)
+    elif parts is not None and watched is None:
         wider = widens(program, parts, data)
         watched = [part.name.split("[")[0] for part, noise in zip(parts, wider, strict=True) if not noise]
     names = watched or ()
@@ -239,7 +227,8 @@ def check_step(
         (first,) = trials
         look = trial(2 * own, first.program, first.path, 0)
         moves = look.decrement - first.decrement > min(max_shift, MAX_DECREMENT)
-        if first.decrement < MAX_DECREMENT and look.reachable < first.reachable + 0.5 * MIN_GAIN and not moves:
+        before, after = (one.log_likelihood + one.decrement for one in (first, look))  # a scoring step
+        if first.decrement < MAX_DECREMENT and after < before + 0.5 * MIN_GAIN and not moves:
             return StepCheck((first,), max_shift)
         if not can_be_cut(program, data):
             return StepCheck((first,), max_shift, f"{UNKNOWN}: `transition` is no step in `step`")
@@ -282,25 +271,12 @@ def _uncompared(found: StepCheck, failure: str | None) -> str | None:
     return None
 
 
-def _can_refit(program: Program) -> bool:
-    """Whether a program has few enough learnable numbers to be refitted by scoring steps."""
-    with suppress(UsageError):
-        elements(program)
-        return True
-    return False
-
-
 def _trial(program: Program, maximum: Maximum, watched: Sequence[str]) -> StepTrial:
-    parts = elements(program)
-    chosen = [index for index, part in enumerate(parts) if part.name.split("[")[0] in watched]
-    covariance = torch.linalg.pinv(maximum.information) if chosen else torch.zeros(0, 0, dtype=torch.float64)
-    return StepTrial(
-        program.substeps,
-        float(maximum.log_likelihood.sum()),
-        maximum.decrement or 0.0,
-        program,
-        maximum.path,
-        tuple(parts[index].name for index in chosen),
-        values_of([parts[index] for index in chosen]),
-        covariance[chosen][:, chosen],
-    )
+    likely, decrement = float(maximum.log_likelihood.sum()), maximum.decrement or 0.0
+    found = StepTrial(program.substeps, likely, decrement, program, maximum.path)
+    chosen = {i: part for i, part in enumerate(elements(program)) if part.name.split("[")[0] in watched}
+    if not chosen:
+        return found
+    at, parts = list(chosen), list(chosen.values())
+    covariance = torch.linalg.pinv(maximum.information)[at][:, at]
+    return replace(found, names=tuple(part.name for part in parts), values=values_of(parts), covariance=covariance)

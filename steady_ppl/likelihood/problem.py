@@ -10,6 +10,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import Lookahead
+from steady_ppl.gaussian.kalman import Tracked, track
 from steady_ppl.gaussian.linearize import ReferencePath, why_not_linear
 from steady_ppl.gaussian.smoother import find_and_smooth, find_path, smooth
 from steady_ppl.model.program import Program, for_program
@@ -60,3 +61,7 @@ class Problem:
     def smooth(self, path: ReferencePath, **settings: Any) -> Lookahead:
         """The lookahead along the posterior's mode near a path; see `gaussian.smoother`."""
         return smooth(self.program, self.data, path, known_start=self.known_start, **settings)
+
+    def track(self, path: ReferencePath, **settings: Any) -> Tracked:
+        """The Kalman filter and smoother along a path near the posterior's mode; see `gaussian.kalman`."""
+        return track(self.program, self.data, path, known_start=self.known_start, **settings)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from steady_ppl.criticism.residual_maps import Cell
-from steady_ppl.criticism.result import Check, place, sentence, subject
+from steady_ppl.criticism.result import Check, place, subject
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.program import Program, names, units
 from steady_ppl.plotting.check import band, measured, strips
@@ -26,20 +26,8 @@ PATHS = 8  # draws in the plane
 Place = tuple[int, float, float]  # drive, and from when to when
 
 
-def maps(found: Check) -> dict[str, Any]:
-    """The strips (residual × drive × time), the regimes (residual × range) and the findings, strongest first."""
-    return {
-        "residuals": [subject(found, i) for i in range(len(found.residuals))],
-        "strips": _strips(found),
-        "regimes": _regimes(found),
-        "findings": [
-            {"text": sentence(found, one), "z": one.z, "place": where_to_look(found, one.cell)}
-            for one in found.misfit.significant
-        ],
-    }
-
-
 def _strips(found: Check) -> dict[str, Any] | None:
+    """Residual × drive × time."""
     times, z = strips(found)
     if not times:
         return None
@@ -94,13 +82,11 @@ def _rows(found: Check, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
     variables = {name: values[0] for name, values in residuals.variables.items()}
     for i, name in enumerate(found.program.control_names):
         variables[name] = data.controls[:-1, :, i].double().numpy(force=True)
-    variables["time"] = data.elapsed[:-1].numpy(force=True)
     there = residuals.there[0, ..., cell.residual].copy()
+    variables |= {"time": data.elapsed[:-1].numpy(force=True), "drive": np.arange(there.shape[1])}
     for name, value in cell.where.items():
-        if name == "drive":
-            there &= np.arange(there.shape[1]) == value
-        else:
-            there &= (variables[name] >= value[0]) & (variables[name] <= value[1])
+        low, high = (value, value) if name == "drive" else value
+        there &= (variables[name] >= low) & (variables[name] <= high)
     return there, residuals.values[0, ..., cell.residual]
 
 
@@ -157,11 +143,7 @@ def chosen(checks: list[Check], numbers: int = MAX_NUMBERS) -> Shown:
     columns = sum(_columns(one) for one in checks) + 1 + len(first.program.control_names)
     every = max(1, -(-rows * columns // numbers))
     room = max(1, numbers // (-(-rows // every) * columns))
-    worst = np.zeros(count)
-    for one in checks:
-        for cell, z in one.misfit.of_map("drive and time"):
-            drive = cell.where["drive"]
-            worst[drive] = max(worst[drive], abs(z))
+    worst = np.max([np.abs(np.nan_to_num(strips(one)[1])).max((0, 2), initial=0.0) for one in checks], 0)
     order = np.argsort(-worst, kind="stable")[:room]
     return Shown(sorted(int(i) for i in order), every, count)
 
@@ -186,18 +168,15 @@ def given(found: Check, shown: Shown) -> dict[str, Any]:
 
 
 def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: int, seed: int) -> dict[str, Any]:
-    """Measurements, predictions with their bands, quantiles of the posterior of the states given all measurements and,
-    where the table has it, the truth; a run's components are its program's, in their order."""
+    """Measurements, predictions with their bands, quantiles of the posterior of the states given all measurements, the
+    truth, where the table has it, and the maps of misfit; a run's components are its program's, in their order."""
     bands = {name: map(shown.of, band(found, name)) for name in ("one step", list(found.horizons)[-1])}
     data = found.data.subset(shown.drives)
     posterior = drawn_states(fit.program, data, draws=draws, known_start=fit.known_start, seed=seed)["posterior"]
     states = found.program.state_names
-    quantiles = np.stack(
-        [posterior[name].quantile(QUANTILES, ("chain", "draw"), skipna=False).values for name in states], -1
-    )
-    quantiles = quantiles.swapaxes(1, 2)  # (3, rows, B, D)
+    by_state = [posterior[name].quantile(QUANTILES, ("chain", "draw"), skipna=False).values for name in states]
+    quantiles = np.stack(by_state, -1).swapaxes(1, 2)  # (3, rows, B, D)
     all_of_them = Shown(list(range(len(data))), shown.every, len(data))
-    low, middle, high = map(all_of_them.of, quantiles)
     across = [states[i] for i in plane(found.program)]
     paths = [posterior[name].values[0, draw].T for draw in range(min(PATHS, draws)) for name in across]
     truth = _truth(found.program, table.subset(shown.drives), quantiles[1])
@@ -207,9 +186,12 @@ def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: 
         "truth": None if truth is None else all_of_them.of(truth),
         "predictions": [{"ahead": name, "middle": middle, "half": half} for name, (middle, half) in bands.items()],
         "states": _components(found.program.states),
-        "posterior": {"low": low, "middle": middle, "high": high},
+        "posterior": dict(zip(("low", "middle", "high"), map(all_of_them.of, quantiles), strict=True)),
         "plane": plane(found.program),
         "paths": all_of_them.of(np.stack(paths, -1)),
+        "residuals": [subject(found, i) for i in range(len(found.residuals))],
+        "strips": _strips(found),
+        "regimes": _regimes(found),
     }
 
 
@@ -226,8 +208,7 @@ def _components(declared: Any) -> list[dict[str, str]]:
 
 
 def _truth(program: Program, table: Trajectories, middle: np.ndarray) -> np.ndarray | None:
-    """The true states `(rows, B, D)`, angles on the turn of the posterior's median; None where the table has no more
-    than starts."""
+    """The true states `(rows, B, D)`, angles on the turn of the posterior's median; None where there are but starts."""
     truth = table.select(program.control_names, program.measurement_names, program.state_names).states
     if truth is None or not bool(torch.isfinite(truth[1:]).any()):
         return None

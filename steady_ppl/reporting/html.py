@@ -23,7 +23,7 @@ from steady_ppl.criticism.result import Check, strongest
 from steady_ppl.effects import Effect, attached, written_class
 from steady_ppl.errors import ComputationError
 from steady_ppl.plotting.notebook import parameter_rows
-from steady_ppl.reporting.drives import Shown
+from steady_ppl.reporting.drives import Shown, where_to_look
 from steady_ppl.runs.fit import Fit, versions
 from steady_ppl.utils.files import whole_file
 
@@ -67,13 +67,15 @@ class Report:
         )
         templates.filters |= {"number": number, "signed": signed, "interval": interval, "spread": spread, "said": said}
         figures = {label: one.figures for label, one in self.checks.items()}
+        curves = {} if isinstance(self.proof, str) else _curves(self.proof)
+        drawn = ("candidates", "effects", "shape")  # the rest of a discovery is in the text
+        discovery = {name: self.discovery[name] for name in drawn} if self.discovery else None
         content = {
             "title": self.title,
             "notes": self.notes,
             "checks": figures,
             "strongest": {label: _linked(one["findings"], self, label) for label, one in figures.items()},
             "proof": self.proof if isinstance(self.proof, str) else self.proof.figures,
-            "curves": {} if isinstance(self.proof, str) else _curves(self.proof),
             "discovery": self.discovery,
             "programs": [_program(label, fit) for label, fit in self.fits.items()],
             "shown": self.shown.note,
@@ -82,8 +84,8 @@ class Report:
             "style": _asset("page.css"),
             "script": Markup("\n").join(_asset(name) for name in SCRIPTS),
             "plotly": Markup(get_plotlyjs().replace("</script", "<\\/script")),
+            "data": _data({**self.drives, "discovery": discovery, "curves": curves}),
         }
-        content["data"] = _data({**_drawn(self), "curves": content["curves"]})
         return templates.get_template("page.html").render(content)
 
     def write(self, path: str | Path) -> None:
@@ -100,24 +102,16 @@ class Report:
         return f'<iframe title="{title}" srcdoc="{page}" style="width:100%;height:40em;border:0"></iframe>'
 
 
-def _drawn(found: Report) -> dict[str, Any]:
-    """What the page's scripts read; findings and the rest of a discovery are in its text."""
-    runs = [{name: part for name, part in run.items() if name != "findings"} for run in found.drives["runs"]]
-    kept = ("candidates", "effects", "shape")
-    discovery = {name: found.discovery[name] for name in kept} if found.discovery else None
-    return {**found.drives, "runs": runs, "discovery": discovery}
-
-
 def _linked(findings: list[dict[str, Any]], found: Report, label: str) -> list[dict[str, Any]]:
     """The strongest findings of a run, each with the address of its place on the page."""
-    run = list(found.checks).index(label)
-    places = [row["place"] for row in found.drives["runs"][run]["findings"]]
+    check, run = found.checks[label], list(found.checks).index(label)
+    places = [where_to_look(check, one.cell) for one in check.misfit.significant]
     rows = []
     for finding in strongest([{**one, "place": place} for one, place in zip(findings, places, strict=True)]):
         link = drive = None
         if finding["place"] is not None:
             number, start, end = finding["place"]
-            drive = found.checks[label].data.labels[number]
+            drive = check.data.labels[number]
             if number in found.shown.drives:
                 link = f"#run={run}&drive={found.shown.drives.index(number)}&from={start:.2f}&to={end:.2f}"
         rows.append({**finding, "link": link, "drive": drive})
@@ -150,11 +144,9 @@ def _data(content: Mapping[str, Any]) -> Markup:
 
 def number(value: Any, digits: int = 3) -> str:
     """A figure with so many digits, a list of them, or a dash."""
-    if value is None:
-        return "–"
     if isinstance(value, list | tuple):
         return ", ".join(number(one, digits) for one in value)
-    return (f"{value:.{digits}g}" if math.isfinite(value) else "–").replace("-", "−")
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}g}".replace("-", "−")
 
 
 def signed(value: float | None, digits: int = 1) -> str:
@@ -188,12 +180,11 @@ def _program(label: str, fit: Fit) -> dict[str, Any]:
         text = inspect.getsource(kind)
     except (TypeError, OSError):
         text = ""
-    effects = [(one.label, _equation(one.effect), one.effect.feels) for one in attached(fit.program)]
     return {
         "label": label,
         "name": kind.__name__,
         "about": inspect.cleandoc(kind.__doc__ or ""),
-        "effects": effects,
+        "effects": [(one.label, _equation(one.effect), one.effect.feels) for one in attached(fit.program)],
         "parameters": parameter_rows(fit.program),
         "text": text,
         "fit": fit,

@@ -8,10 +8,9 @@ from typing import Any
 from steady_ppl.comparison.prove import prove, unfinished
 from steady_ppl.comparison.result import Proof
 from steady_ppl.criticism.check import check
-from steady_ppl.criticism.result import Check
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import SteadyError, UsageError
-from steady_ppl.reporting.drives import chosen, given, maps, of_run
+from steady_ppl.reporting.drives import chosen, given, of_run
 from steady_ppl.reporting.html import Report
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.cores import one_thread
@@ -67,11 +66,14 @@ def report(
         drawn = []
         for label, fit in runs.items():
             begin()
-            there = of_run(checks[label], fit, data, shown, draws=draws, seed=seed)
-            drawn.append({"label": label, **there, **maps(checks[label])})
+            drawn.append({"label": label, **of_run(checks[label], fit, data, shown, draws=draws, seed=seed)})
         begin()
-        proof = _proof(runs, checks, data, seed)
-    drives = given(next(iter(checks.values())), shown) | {"runs": drawn}
+        proof: Proof | str = "There is one run only: name the run before and the one after to compare them."
+        if len(runs) > 1:
+            try:
+                proof = prove(runs, data, paths={label: one.path for label, one in checks.items()}, seed=seed)
+            except SteadyError as error:
+                proof = f"The runs cannot be compared: {error}."
     return Report(
         title=title,
         fits=dict(runs),
@@ -79,16 +81,7 @@ def report(
         proof=proof,
         discovery=discovery,
         shown=shown,
-        drives=drives,
+        drives=given(next(iter(checks.values())), shown) | {"runs": drawn},
         how=list(how),
         notes=[*notes, *unfinished(runs)],
     )
-
-
-def _proof(runs: Mapping[str, Fit], checks: Mapping[str, Check], data: Trajectories, seed: int) -> Proof | str:
-    if len(runs) < 2:
-        return "There is one run only: name the run before and the one after to compare them."
-    try:
-        return prove(runs, data, paths={label: one.path for label, one in checks.items()}, seed=seed)
-    except SteadyError as error:
-        return f"The runs cannot be compared: {error}."

@@ -146,7 +146,7 @@ def test_a_single_drive_beside_few_simulated_ones_accuses_nobody_either():
     accused = 0
     for seed in range(seeds):
         result = st.check(fitted(program, known_start=False), table(program, 1, 61, seed), simulations=20, seed=seed)
-        accused += result.blame.mean_p_value < 0.05
+        accused += result.blame.p_values["mean"] < 0.05
     assert accused <= 4  # one in 400
 
 

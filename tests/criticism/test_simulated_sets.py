@@ -16,6 +16,7 @@ from steady_ppl.criticism.residual_maps import _adjusted
 from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.kernels import rows as rows_by_kernels
+from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import for_program
 from steady_ppl.utils import cores
 from steady_ppl.utils.cores import one_core
@@ -24,7 +25,7 @@ from steady_ppl.utils.random import seeded
 
 def made(program, data, starts, known_start: bool = True):
     with seeded(0, "sets"):
-        return simulated.simulate_sets(program, data, starts, 1, [1, 5], known_start=known_start)
+        return simulated.simulate_sets(Problem(program, data, known_start), starts, 1, [1, 5])
 
 
 def arrays(sets) -> dict[str, np.ndarray]:
@@ -93,7 +94,7 @@ def test_paths_are_those_of_more_linearisations(known_start):
     data.lengths[2] = 23
     with seeded(1, "again"):
         again, truth = simulate_again(program, data, data.known_start.expand(4, -1, -1), 3)
-    _, tracked = simulated._tracked(program, again, truth, known_start)
+    _, tracked = simulated._tracked(Problem(program, again, known_start), truth)
     rested = smooth(program, again, truth, known_start=known_start, passes=simulated.LINEARISATIONS)
     means, noise = rested.means()
     inside = again.transitions[..., None]
@@ -107,7 +108,7 @@ def test_scores_of_parameters_by_kernels_are_those_by_differences(monkeypatch):
     data = drives(program, 5, 41)
     with seeded(1, "again"):
         again, truth = simulate_again(program, data, data.known_start.expand(2, -1, -1), 3)
-    _, tracked = simulated._tracked(program, again, truth, known_start=True)
+    _, tracked = simulated._tracked(Problem(program, again, known_start=True), truth)
     found = []
     for rows in (1, 10**9):
         monkeypatch.setattr(rows_by_kernels, "ROWS_WORTH_COMPILING", rows)
