@@ -3,8 +3,6 @@
 Programming errors stay ordinary Python errors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

@@ -3,8 +3,6 @@
 The paper's errors are those of STEADY (IROS 2022), section V, as its authors' code computes them.
 """
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence

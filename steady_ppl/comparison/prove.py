@@ -4,8 +4,6 @@ Everything goes by the linearised program: log p(y) by its smoother, predictions
 particle filter says how far its log p(y) is from the program's own.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 

@@ -1,7 +1,5 @@
 """What `prove` found, as one sentence, as a plain dict and as tables of text."""
 
-from __future__ import annotations
-
 import itertools
 import textwrap
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The lines of a proof: one program's figures on drives, as sums over each drive, and paired intervals."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

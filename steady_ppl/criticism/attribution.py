@@ -5,8 +5,6 @@ direction j moves the expected scores by its column j times β. So what one dire
 others, and the kind of direction that leaves least is the one to blame, if the next kind is clearly worse.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What a program has to beat: a vehicle that keeps its velocity, and a measurement that stays as it was."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ Nothing here needs the truth. Whatever is computed of the drives is computed in 
 program makes of the same controls, so that every figure has a band.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace

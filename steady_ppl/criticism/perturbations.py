@@ -5,8 +5,6 @@ the derivative of log p(y) by that size. The directions here are coarse and belo
 tests physical effects by name.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Sets are simulated, smoothed and judged a block at a time, so that memory does n
 drives': three hundred drives and a hundred sets at once would take fourteen gigabytes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """What `check` found, in words, as a plain dict and as a table of text."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -4,8 +4,6 @@ A real sensor scatters: no twelve rows of it lie on a line to one part in a mill
 known state that keeps its value is left alone: the vehicle may have stood still.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -7,8 +7,6 @@ Columns: `trajectory`, `time` (s), `u.<control>`, `y.<measurement>` and, where k
 - The rows of a trajectory follow one another, two at least, with strictly increasing time.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Mapping, Sequence

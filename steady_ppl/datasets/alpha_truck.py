@@ -8,8 +8,6 @@ Known flaws, kept so that results compare with the published ones: motion captur
 of the 12th training trajectory, and the motion interpolated there is not the truck's.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -5,8 +5,6 @@ knots, with a Gaussian-process prior (a normal over the heights at the knots, wh
 distance), so that it bends only where the drives ask for it.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Mapping, Sequence

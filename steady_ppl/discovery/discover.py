@@ -1,7 +1,5 @@
 """Learn which physical effect a program lacks, after a look at what the search needs; a search can be resumed."""
 
-from __future__ import annotations
-
 import copy
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence

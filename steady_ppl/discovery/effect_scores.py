@@ -1,7 +1,5 @@
 """The score of every effect of the catalogue at a program that has none of them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial

@@ -1,7 +1,5 @@
 """What a search amounts to: an effect with its class, confidence and interval, or a curve; and what to drive next."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

@@ -9,8 +9,6 @@ noise that the sensors nearly hide. Fitted to them alone it may vanish, and then
 of nats, whatever its physics.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Sequence

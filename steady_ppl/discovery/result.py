@@ -1,7 +1,5 @@
 """What `discover` found as a plain dict and as text."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections.abc import Sequence

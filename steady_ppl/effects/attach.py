@@ -1,7 +1,5 @@
 """A program with an effect: the same three methods, around which the effect acts."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -3,8 +3,6 @@
 The file lists the effects and says in its docstring what they are; `attach` does the rest.
 """
 
-from __future__ import annotations
-
 import inspect
 import os
 import textwrap

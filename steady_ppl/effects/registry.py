@@ -1,7 +1,5 @@
 """Which effects there are, which of them a program could lack, how users name them, and the page of them."""
 
-from __future__ import annotations
-
 import difflib
 import math
 from dataclasses import replace

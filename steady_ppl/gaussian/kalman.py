@@ -12,8 +12,6 @@ The notation is that of `linearize`: δ' = F δ + offset + G ε, and a measureme
 precision, zero where it is missing.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ A processor multiplies all eight in one or two instructions; one trajectory's ma
 recursions does not see what changes here: remove `__pycache__` after an edit.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

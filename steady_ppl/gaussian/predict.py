@@ -1,7 +1,5 @@
 """Measurements predicted from the rows before them, some rows ahead, and drives simulated to compare with."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace

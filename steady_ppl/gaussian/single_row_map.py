@@ -5,8 +5,6 @@ itself, by Levenberg and Marquardt's method from several places at once. The pri
 the program would visit, unobserved, from its `initial`. How it moves there says nothing; no true state is looked at.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -5,8 +5,6 @@ which the lookahead filter is steered; its draws are an E step of their own (Bri
 Roweis 1999).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -6,8 +6,6 @@ States are `(N, B, D)` and noise `(N, B, C)`. What the lookahead holds of the ro
 inverse `(B, C, C)`, upper triangular.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Guides at given paths, filtered or known, and schedules of the observation weight."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable

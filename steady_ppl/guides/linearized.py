@@ -1,7 +1,5 @@
 """Guides that linearise the program along a path of every trajectory: drawn from it, steered by it, or begun at it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ States follow from the start and the channel noise, differentiable from end to e
 every other guide. Kingma and Welling (2014); Krishnan, Shalit and Sontag (2017).
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -3,8 +3,6 @@
 Each instruction works on `LANES` particles at once; what does not differ between them is computed once a trajectory.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import contextmanager
 from typing import Any

@@ -7,8 +7,6 @@ with torch and is handed to the kernel as numbers. Long vectors, a network's hid
 Derivatives that are zero are never written, so that a kernel of the Jacobian costs as much as what depends on what.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce

@@ -1,7 +1,5 @@
 """Trace a function of a program, compile it, keep it, and check it against torch."""
 
-from __future__ import annotations
-
 import ctypes
 import hashlib
 import itertools

@@ -1,8 +1,6 @@
 """From what torch does in a method to scalars: tensors of values become tensors of scalars' numbers. What it computes
 of a program's tensors alone is noted on a tape, to be computed again when they have changed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partialmethod

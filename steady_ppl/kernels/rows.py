@@ -1,7 +1,5 @@
 """Functions of a program on all rows of all trajectories, by kernels: values, Jacobians, slopes in its parameters."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -6,8 +6,6 @@ folder is `steady-ppl/kernels` in the user's cache folder, or what the environme
 "off" keeps nothing. Where nothing can be kept, every command compiles anew: that is no error.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import secrets

@@ -4,8 +4,6 @@ A filter that looks ahead needs some hundred particles where the bootstrap filte
 which only a broad prior is known; it needs normal noise (see `linearize`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """What comes of a command on its way: lag and delay of controls that are held from row to row."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

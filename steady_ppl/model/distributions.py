@@ -1,7 +1,5 @@
 """Distributions of angles."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Effect handlers that run a program's sites: condition, temper, replay, record."""
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Iterator, Mapping, Sequence

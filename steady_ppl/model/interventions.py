@@ -4,8 +4,6 @@ with pushed(self, {"forward": -c * velocity}):
     return super().transition(state, control, time, step)
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """The joint density of one program over whole trajectories: what the M step and SVI differentiate."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 
 import pyro

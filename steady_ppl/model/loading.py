@@ -1,7 +1,5 @@
 """Programs and recipes from files, run afresh under private names, so that no file's neighbours are in the way."""
 
-from __future__ import annotations
-
 import importlib.util
 import inspect
 import itertools

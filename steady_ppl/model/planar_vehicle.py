@@ -1,7 +1,5 @@
 """Vehicles in the plane that see bearings to landmarks."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Check that `transition` is a consistent and a stable time step."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

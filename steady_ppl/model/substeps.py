@@ -10,8 +10,6 @@ noise back leaves less of it. A slope in a parameter is then that of a row's ave
 row the noise came, and what it does to other channels.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Run a program once on made-up shapes and explain what does not fit, before anything long starts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from typing import Any

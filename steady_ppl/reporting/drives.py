@@ -1,7 +1,5 @@
 """What the page shows of drives: maps of misfit, and some drives row by row, packed."""
 
-from __future__ import annotations
-
 import base64
 from dataclasses import dataclass
 from typing import Any

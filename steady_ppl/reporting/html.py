@@ -1,7 +1,5 @@
 """The page as one file of HTML; nothing is loaded from anywhere when it is read."""
 
-from __future__ import annotations
-
 import html
 import inspect
 import json

@@ -1,7 +1,5 @@
 """Gather what a page says: of every run a check, of two or more a proof, and what `discover` found."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

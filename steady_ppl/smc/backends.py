@@ -1,7 +1,5 @@
 """How a filter runs a program's methods on its particles: as they are written, here, or compiled (`compiled`)."""
 
-from __future__ import annotations
-
 import math
 from contextlib import nullcontext
 from typing import Any

@@ -5,8 +5,6 @@ With a twist the noise is proposed with a view to the later measurements (Guarni
 Densities live in the channels: a particle is a start and its channel noise, its states follow.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext

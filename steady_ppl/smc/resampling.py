@@ -4,8 +4,6 @@ Chopin and Papaspiliopoulos (2020), chapter 9, compare the three resamplers. All
 on average. Systematic resampling takes one uniform a trajectory, stratified one a stratum, multinomial one a draw.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Run a program forward in time without measurements."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Checkpoints: tensors and a little text in one safetensors file, written beside and renamed. Never pickle."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field

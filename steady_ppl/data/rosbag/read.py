@@ -17,8 +17,6 @@ A bag has messages at any time; a table has one row every `step` seconds.
 - Every bag is a trajectory named after its file, or several, `name-1`, `name-2`, … where it pauses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

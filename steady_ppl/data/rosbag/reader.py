@@ -5,8 +5,6 @@ before Iron never do), the standard types are those of Humble, and others are re
 first, so that a field that does not exist is refused before any message is read.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 import os

@@ -3,8 +3,6 @@
 Times are whole nanoseconds throughout, so that a command at the very time of a row is known there.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What lies between the command and the force: gains, knees, delays, wear."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from typing import Any

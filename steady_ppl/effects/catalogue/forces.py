@@ -1,8 +1,6 @@
 """Forces that a program can lack: on the channels of one axis of any program, and on a vehicle in the plane, there in
 its body frame unless said otherwise."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """What noise can be besides normal, constant and white."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What lies between the vehicle and its measurements."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

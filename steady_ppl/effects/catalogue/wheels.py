@@ -1,7 +1,5 @@
 """Vehicles on wheels that are told a speed and a turn rate, as programs without slip have them."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from typing import Any
