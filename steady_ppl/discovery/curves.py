@@ -127,7 +127,7 @@ def by_height(values: Tensor, weights: Tensor, knots: Sequence[float], circular:
     """The derivative in the heights of the sum of a curve's values times `weights`, `(..., B)`; `(B, K)`."""
     drives, count = values.shape[-1], len(knots)
     found = np.zeros((2, drives, count))
-    at, by = (part.reshape(-1, drives).numpy() for part in (values, weights.expand_as(values)))
+    at, by = (part.detach().reshape(-1, drives).numpy() for part in (values, weights.expand_as(values)))
     grid = np.array([knots[0], knots[1] - knots[0]], at.dtype)
     _add_by_height(at, by, grid, np.arange(count + 1).astype(at.dtype), circular, found)
     return torch.from_numpy(found[0] + found[1])

@@ -212,7 +212,8 @@ def _moments(program: Program, data: Trajectories, path: ReferencePath) -> tuple
 def _starts(terms: Sequence[Term], maxima: Sequence[Maximum]) -> tuple[Tensor, list[Tensor]]:
     """The information of all numbers, and where to begin: at the maximum of the sum of parabolas, and at the means."""
     count = 1 + max(max(term.columns) for term in terms)
-    information, (pull, sums, weights) = torch.zeros(count, count).double(), torch.zeros(3, count).double()
+    information = torch.zeros(count, count).double()
+    pull, sums, weights = torch.zeros(3, count).double()
     for term, maximum in zip(terms, maxima, strict=True):
         index, values = torch.tensor(term.columns), values_of(term.parts)
         information[index[:, None], index] += maximum.information

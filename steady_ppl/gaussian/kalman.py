@@ -13,7 +13,7 @@ precision, zero where it is missing.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from steady_ppl.gaussian.linearize import LinearArrays, Linearization, Reference
 from steady_ppl.model.program import Program
 
 
-class Filtered(NamedTuple):
+class FilteredMoments(NamedTuple):
     """The states given the measurements up to each row, and what each measured component changes, given those before
     it; zero, one and zero where it is missing."""
 
@@ -73,9 +73,10 @@ def track(
 ) -> Tracked:
     """Linearise along a path near the posterior's mode, filter and smooth, and again along what was smoothed, in so
     many passes; the other arguments are those of `linearize`."""
-    for _ in range(passes):
-        tracked = filter_and_smooth(linearize(program, data, path, known_start=known_start, kernels=kernels))
-        path = tracked.path(data)
+    given: dict[str, Any] = {"known_start": known_start, "kernels": kernels}
+    tracked = filter_and_smooth(linearize(program, data, path, **given))
+    for _ in range(passes - 1):
+        tracked = filter_and_smooth(linearize(program, data, tracked.path(data), **given))
     return tracked
 
 
@@ -83,7 +84,7 @@ def filter_and_smooth(linear: Linearization) -> Tracked:
     """Run the recursions along a linearization."""
     rows, drives, components, dimension = linear.measurement.shape
     shapes = (dimension,), (dimension, dimension), (components,), (components,), (components, dimension)
-    given, filtered = linear.arrays(), Filtered(*(np.empty((rows, drives, *shape)) for shape in shapes))
+    given, filtered = linear.arrays(), FilteredMoments(*(np.empty((rows, drives, *shape)) for shape in shapes))
     forward(given, filtered)
     arrival, smoothed = np.empty_like(filtered.means), np.empty_like(filtered.means)
     reading = np.empty_like(filtered.innovation)
@@ -106,7 +107,7 @@ def filter_and_smooth(linear: Linearization) -> Tracked:
 
 
 @njit(cache=True, error_model="numpy")
-def forward(given: LinearArrays, filtered: Filtered) -> None:
+def forward(given: LinearArrays, filtered: FilteredMoments) -> None:
     """Kalman (1960), a measurement component at a time. Fills `filtered`."""
     rows, trajectories, _ = filtered.means.shape
     for t in range(rows):  # outside, as the arrays lie in memory
@@ -124,7 +125,7 @@ def forward(given: LinearArrays, filtered: Filtered) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _update(given: LinearArrays, filtered: Filtered, t: int, b: int) -> None:
+def _update(given: LinearArrays, filtered: FilteredMoments, t: int, b: int) -> None:
     """Condition the mean and the covariance, in place, on a row's components, one after the other."""
     components, dimension = given.measurement.shape[2:]
     mean, covariance = filtered.means[t, b], filtered.covariances[t, b]
@@ -148,7 +149,7 @@ def _update(given: LinearArrays, filtered: Filtered, t: int, b: int) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def backward(given: LinearArrays, filtered: Filtered, arrival: Array, reading: Array, smoothed: Array) -> None:
+def backward(given: LinearArrays, filtered: FilteredMoments, arrival: Array, reading: Array, smoothed: Array) -> None:
     """Fill the scores of log p(y), `arrival` and `reading`, and the posterior means `smoothed`; see `Tracked`.
 
     De Jong (1989): what is left of later innovations, carried back. Gᵀ arrival is the posterior mean of the noise.

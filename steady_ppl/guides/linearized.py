@@ -141,7 +141,7 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
         particles: N, for each trajectory.
         resample_below: share of N under which the effective sample size triggers resampling.
         untwisted, tempered: see `Twist`.
-        more: of `LinearizedGuide`.
+        program, draws, tempering, known_start, passes, search_again: see `LinearizedGuide`.
     """
 
     def __init__(
@@ -153,9 +153,13 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
         resample_below: float = 0.5,
         untwisted: float = 0.01,
         tempered: float = 1.0,
-        **more: Any,
+        tempering: Tempering | None = None,
+        known_start: bool = False,
+        passes: int = 1,
+        search_again: float = 0.2,
     ) -> None:
-        super().__init__(program, draws=draws, **more)
+        more: dict[str, Any] = {"passes": passes, "search_again": search_again}
+        super().__init__(program, draws=draws, tempering=tempering, known_start=known_start, **more)
         require(particles >= 1, "particles", particles, "at least 1")
         self.particles, self.resample_below = particles, resample_below
         self.untwisted, self.tempered = untwisted, tempered

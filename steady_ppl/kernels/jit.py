@@ -2,6 +2,7 @@
 
 import ctypes
 import hashlib
+import inspect
 import itertools
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
@@ -82,7 +83,7 @@ def _compiling() -> Iterator[None]:
         raise NotCompilable(f"it cannot be compiled: {one_line(error)}") from error
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Number:
     """One learnable number."""
 
@@ -286,7 +287,11 @@ def _settings(module: nn.Module) -> Iterator[tuple[str, Any]]:
     yield from ((name, value) for name, value in own.items() if name not in OF_MODULES)
     if kind not in _NAMES:
         _NAMES[kind] = _names_of(kind)
-    yield from ((name, getattr(kind, name)) for name in _NAMES[kind] if name not in own and hasattr(kind, name))
+    absent = object()  # descriptors are looked at, not run
+    for name in _NAMES[kind]:
+        value = inspect.getattr_static(kind, name, absent)
+        if name not in own and value is not absent:
+            yield name, value
 
 
 def _names_of(kind: type[nn.Module]) -> list[str]:

@@ -57,7 +57,7 @@ def machine_code(key: str, text: Callable[[], str]) -> Any:
         engine = binding.create_mcjit_compiler(module, machine)
         engine.set_object_cache(lambda _, code: made.append(code), lambda _: kept)
         engine.finalize_object()
-        if folder is not None and made:
+        if folder is not None and kept is None and made:
             _write(folder, name, made.pop())
             if name.startswith(SWEEPS):
                 _forget(folder)

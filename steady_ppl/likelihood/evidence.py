@@ -31,11 +31,14 @@ def run_filter(
     particles: int,
     known_start: bool,
     look_ahead: bool = False,
-    **settings: Any,
+    keep_history: bool = True,
+    kernels: bool | None = None,
 ) -> Filtered:
-    """The particle filter, bootstrap or looking ahead; more settings and the errors are those of `particle_filter`."""
+    """The particle filter at observation weight 1, bootstrap or looking ahead; settings and errors are those of
+    `particle_filter`."""
     proposal = Twist(Problem(program, data, known_start).find_and_smooth()) if look_ahead else None
-    return particle_filter(program, data, particles=particles, known_start=known_start, proposal=proposal, **settings)
+    more: dict[str, Any] = {"proposal": proposal, "keep_history": keep_history, "kernels": kernels}
+    return particle_filter(program, data, particles=particles, known_start=known_start, **more)
 
 
 @dataclass(frozen=True)

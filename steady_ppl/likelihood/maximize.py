@@ -69,7 +69,10 @@ def maximise(
     path: ReferencePath | None = None,
     *,
     known_start: bool = False,
-    **settings: Any,
+    information: Tensor | None = None,
+    steps: int = 25,
+    precision: float = 0.02,
+    hopeless: float = -math.inf,
 ) -> Maximum:
     """Move a program's parameters, in place, to where log p(y) of the linearised program plus the log prior is largest.
 
@@ -78,14 +81,16 @@ def maximise(
         data: as returned by `for_program`.
         path: of the drives, near their posterior means; found from the measurements when None.
         known_start: the first state is certain.
-        settings: `information`, `(P, P)` of the learnable numbers, where it is known; `steps`, scoring steps at most;
-            `precision`, stop when another step would gain less, nats; `hopeless`, give up after six steps where log
-            p(y) would not reach this were it to rise on as it has lately. Their defaults are those of `climb`.
+        information: of the learnable numbers, `(P, P)`, where it is known.
+        steps: scoring steps at most.
+        precision: stop when another step would gain less, nats.
+        hopeless: give up after six steps where log p(y) would not reach this were it to rise on as it has lately.
 
     Raises:
         FilterError: the program cannot be smoothed at its initial parameters.
     """
-    return maximum_of(Problem(program, data, known_start), path, **settings)
+    settings: dict[str, Any] = {"information": information, "precision": precision, "hopeless": hopeless}
+    return maximum_of(Problem(program, data, known_start), path, steps=steps, **settings)
 
 
 def maximum_of(problem: Problem, path: ReferencePath | None = None, **settings: Any) -> Maximum:

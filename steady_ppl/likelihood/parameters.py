@@ -18,7 +18,7 @@ MIN_RELATIVE_MOVE = 1e-3  # of a number, by which differences move it at least: 
 Result = TypeVar("Result")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Element(Number):
     """One number among a program's parameters, in the unconstrained space in which it is learned."""
 

@@ -44,7 +44,7 @@ def posterior_trajectories(
         shown: draw at most so many paths.
 
     Raises:
-        UsageError: the program has no such states.
+        UsageError: there is no such trajectory, or the program has no such states.
     """
     _, draws, true = _drawn(posterior, trajectory, plane)
     axes = axes if axes is not None else plt.subplots(figsize=(5, 5))[1]
@@ -78,7 +78,7 @@ def posterior_states(
     """State components over time, one axes each: median and 90 % of the draws, and the truth where it is known.
 
     Raises:
-        UsageError: the program has no such states.
+        UsageError: there is no such trajectory, or the program has no such states.
     """
     time, draws, true = _drawn(posterior, trajectory, components)
     called = [with_unit(name, one) for name, one in zip(components, draws, strict=True)]
@@ -96,7 +96,7 @@ def posterior_velocities(
     """Longitudinal and lateral velocity of a planar vehicle in the body frame, on two axes, as in `posterior_states`.
 
     Raises:
-        UsageError: the program has not the states heading, vx and vy.
+        UsageError: there is no such trajectory, or the program has not the states heading, vx and vy.
     """
     time, draws, true = _drawn(posterior, trajectory, ("heading", "vx", "vy"))
     called = [with_unit(name, draws[1]) for name in ("longitudinal", "lateral")]
@@ -105,7 +105,7 @@ def posterior_velocities(
 
 
 def effective_sizes(posterior: arviz.InferenceData, trajectory: str, *, axes: Axes | None = None) -> Axes:
-    """How many particles the filter had in effect in each row, of N."""
+    """How many particles the filter had in effect in each row, of N; a UsageError where there is no such trajectory."""
     time = _time(posterior, trajectory)
     axes = axes if axes is not None else plt.subplots(figsize=(6, 3), layout="constrained")[1]
     sizes = posterior["sample_stats"]["effective_size"].sel(trajectory=trajectory, chain=0)
@@ -127,7 +127,7 @@ def forecast_band(
         of: a state component or a measurement; `measured_…` for a measurement that is called like a state.
 
     Raises:
-        UsageError: nothing of that name was forecast.
+        UsageError: there is no such trajectory, or nothing of that name was forecast.
     """
     time = _time(found, trajectory)
     variables, later = found["predictions"], found["predictions_constant_data"]

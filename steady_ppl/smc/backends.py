@@ -148,7 +148,7 @@ class CompiledStepping(Stepping):
         """Memory for a row's results, out of a block of several rows by numpy.
 
         A filter keeps its history. Rows of their own by torch go back to the system, and its fresh pages take a third
-        of the filter's time; these blocks are used again.
+        of the filter's time; these blocks are used again. A row that is kept keeps its block, at most 4 MiB.
         """
         if not self._rows or self._rows[-1].shape != shape:
             rows = max(1, min(len(self.moved), BLOCK // (4 * math.prod(shape))))

@@ -25,13 +25,21 @@ def event_dims(*seen: Recording) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Paths:
-    """Equally weighted draws of whole trajectories, with everything that the joint density needs."""
+    """Equally weighted draws of whole trajectories, with everything that the joint density needs.
 
-    states: Tensor  # (M, T + 1, B, D)
-    start: dict[str, Tensor]  # value of each site of `initial`, (M, 1, B, ...)
-    noise: dict[str, Tensor]  # value of each site of `transition`, (M, T, B, ...)
-    event_dims: dict[str, int]  # event dimension of each of these sites, and of "states"
-    in_plain_torch: str | None = None  # why no kernels served in drawing them; None where they did or were not needed
+    Attributes:
+        states: `(M, T + 1, B, D)`.
+        start: value of each site of `initial`, `(M, 1, B, ...)`.
+        noise: value of each site of `transition`, `(M, T, B, ...)`.
+        event_dims: event dimension of each of these sites, and of "states".
+        in_plain_torch: why no kernels served in drawing them; None where they did or were not needed.
+    """
+
+    states: Tensor
+    start: dict[str, Tensor]
+    noise: dict[str, Tensor]
+    event_dims: dict[str, int]
+    in_plain_torch: str | None = None
 
     def channels(self, program: Program, data: Trajectories) -> dict[str, Any]:
         """Each channel's distribution along the paths of `data`, given the noise of those before it."""
@@ -56,21 +64,35 @@ class Paths:
 
 @dataclass(frozen=True)
 class Filtered:
-    """What a filter leaves behind. The particles' history has a tensor a row, and is empty when it was not kept."""
+    """What a filter leaves behind. The particles' history has a tensor a row, and is empty when it was not kept.
 
-    log_likelihood: Tensor  # (B,) the estimate of log p(y), whose exponential is unbiased at observation weight 1
-    log_weights: Tensor  # (N, B) of the last row's particles, normalised
-    effective_sizes: Tensor  # (T + 1, B) ESS after each observed row (each row when looking ahead), or N
-    roots: Tensor  # (B,) how many of the first row's particles still have descendants at the end
-    blown_up: Tensor  # (B,) how many weights were not numbers, summed over rows; they count as zero
-    states: list[Tensor]  # history, (N, B, D) each
-    start: dict[str, Tensor]  # value of each site of `initial`, (N, B, ...)
-    noise: dict[str, list[Tensor]]  # history of each site of `transition`, (N, B, ...) each
-    ancestors: list[Tensor | None]  # history, (N, B) each; None where each particle moved on
-    event_dims: dict[str, int]  # event dimension of each site, and of "states"
-    in_plain_torch: str | None = None  # why no kernels served; None where they did or were not asked for
+    Attributes:
+        log_likelihood: `(B,)` the estimate of log p(y), whose exponential is unbiased at observation weight 1.
+        log_weights: `(N, B)` of the last row's particles, normalised.
+        effective_sizes: `(T + 1, B)` ESS after each observed row (each row when looking ahead), or N.
+        roots: `(B,)` how many of the first row's particles still have descendants at the end.
+        blown_up: `(B,)` how many weights were not numbers, summed over rows; they count as zero.
+        states: history, `(N, B, D)` each.
+        start: value of each site of `initial`, `(N, B, ...)`.
+        noise: history of each site of `transition`, `(N, B, ...)` each.
+        ancestors: history, `(N, B)` each; None where each particle moved on.
+        event_dims: event dimension of each site, and of "states".
+        in_plain_torch: why no kernels served; None where they did or were not asked for.
+        channels: where `noise` is standardised, its sites' values, of states `(M, T + 1, B, D)` and their noise.
+    """
+
+    log_likelihood: Tensor
+    log_weights: Tensor
+    effective_sizes: Tensor
+    roots: Tensor
+    blown_up: Tensor
+    states: list[Tensor]
+    start: dict[str, Tensor]
+    noise: dict[str, list[Tensor]]
+    ancestors: list[Tensor | None]
+    event_dims: dict[str, int]
+    in_plain_torch: str | None = None
     channels: Callable[[Tensor, dict[str, Tensor]], dict[str, Tensor]] | None = None
-    """Where `noise` is standardised: the sites' values, of states `(M, T + 1, B, D)` and of the noise along them."""
 
     def scarce(self, data: Trajectories) -> Tensor:
         """Share of each trajectory's measured rows after which fewer than `FEW` particles were in effect, `(B,)`."""
