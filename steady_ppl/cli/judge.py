@@ -101,7 +101,7 @@ def evaluate(
     from steady_ppl.comparison.evaluate import evaluate_all, incomparable, table_of
     from steady_ppl.runs.diagnostics import diagnose_units
     from steady_ppl.runs.recipes import fingerprint
-    from steady_ppl.smc.genealogy import FEW
+    from steady_ppl.smc.genealogy import MIN_EFFECTIVE_SIZE
 
     runs, table = runs_and_table("evaluate", arguments)
     require_place(json_file)
@@ -128,8 +128,9 @@ def evaluate(
         share, count, drive = (result["scarce"][key] for key in ("share", "particles", "trajectory"))
         if share > OFTEN:
             say(
-                f"{run}: after {share:.0%} of drive {drive}'s measured rows fewer than {FEW} of the filter's {count} "
-                "particles were in effect: its log p(y) scatters and is mostly too low, raise --particles"
+                f"{run}: after {share:.0%} of drive {drive}'s measured rows fewer than {MIN_EFFECTIVE_SIZE} of the "
+                f"filter's {count} particles were in effect: its log p(y) scatters and is mostly too low, "
+                "raise --particles"
             )
 
 

@@ -33,8 +33,8 @@ from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
 
-COASTING = "constant velocity"
-FAR_OFF = 2.0  # nats of a drive's log p(y) between a particle filter and the linearised program
+CONSTANT_VELOCITY = "constant velocity"
+MAX_NEGLECTED = 2.0  # nats of a drive's log p(y) between a particle filter and the linearised program
 
 
 @one_thread()
@@ -98,9 +98,10 @@ def prove(
         before, true = judged[reference], judged.get(truth or "")
         coasting = keeping_velocity(before) if with_constant_velocity else None
     if isinstance(coasting, Judged):
-        judged[COASTING] = coasting
+        judged[CONSTANT_VELOCITY] = coasting
     floor = noise_floor(true, seed) if true else None
-    notes += [f"no row {name!r}: {why}" for name, why in ((COASTING, coasting), (FLOOR, floor)) if isinstance(why, str)]
+    absent = {CONSTANT_VELOCITY: coasting, FLOOR: floor}
+    notes += [f"no row {name!r}: {why}" for name, why in absent.items() if isinstance(why, str)]
     counted = _counted(judged.values())
     found = {name: as_row(row, counted) for name, row in judged.items()}
     if isinstance(floor, Judged):
@@ -133,7 +134,7 @@ def _require(programs: Mapping[str, Program], reference: str, truth: str | None,
     for name in (reference, truth):
         if name is not None and name not in programs:
             raise UsageError(f"there is no row {name!r}; the rows are {', '.join(programs)}")
-    for taken in {FLOOR, COASTING} & programs.keys():
+    for taken in {FLOOR, CONSTANT_VELOCITY} & programs.keys():
         raise UsageError(f"a row cannot be called {taken!r}: that is the name of a row of its own")
     ours = programs[reference].measurement_names
     for name, program in programs.items():
@@ -178,7 +179,7 @@ def far_off(rows: Mapping[str, Row], data: Trajectories) -> list[str]:
         if not isinstance(row.neglected, Tensor):
             continue
         size = row.neglected.abs().nan_to_num(torch.inf)
-        worst, count = int(size.argmax()), int((size > FAR_OFF).sum())
+        worst, count = int(size.argmax()), int((size > MAX_NEGLECTED).sum())
         if not count:
             continue
         by = float(row.neglected[worst])

@@ -19,13 +19,13 @@ from steady_ppl.model.substeps import acting_controls, advance, joined, sample_c
 from steady_ppl.utils.angles import wrap
 
 MULTIPLES = (0.5, 1.0, 2.0, 4.0, 8.0)
-ABOUT = (
+DEFINITION = (
     "the program with every channel's mean replaced by zero, so that it ignores the controls and keeps its velocity; "
     "its channel noise is the one of a scan under which these measurements are most likely"
 )
 
 
-class Coasting(ByColumn):
+class ZeroMeanChannels(ByColumn):
     """Give latent sites mean zero and each channel another standard deviation, in the order in which they are met."""
 
     def __init__(self, scales: Sequence[float]) -> None:
@@ -55,7 +55,7 @@ class ConstantVelocity(Program):
         return self.of.initial()
 
     def transition(self, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-        with Coasting(self.scales):
+        with ZeroMeanChannels(self.scales):
             return self.of.transition(state, control, time, step)
 
     def observe(self, state: Tensor) -> None:

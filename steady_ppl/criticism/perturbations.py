@@ -25,8 +25,8 @@ from steady_ppl.model.substeps import acting_controls, row_controls
 from steady_ppl.utils.angles import wrap, wrap_angles
 
 LAG = 0.3  # s
-DEAD, KNEE = 0.2, 0.6  # of the largest command
-ALONE = ("offset of", "curvature in")  # in the controls' own units
+DEAD_ZONE, SATURATION_KNEE = 0.2, 0.6  # of the largest command
+NOT_SUMMED = ("offset of", "curvature in")  # in the controls' own units
 MAX_PARAMETERS = 40  # parameters; a network's are not looked at one by one
 
 
@@ -142,7 +142,7 @@ class _Scores:
                 together.setdefault(word, []).append(score)
                 yield f"{word} {name}", score
         for word, scores in together.items():
-            if len(scores) > 1 and word not in ALONE:
+            if len(scores) > 1 and word not in NOT_SUMMED:
                 yield f"{word} all controls", torch.stack(scores).sum(0)
 
     def _other_than(self, command: Tensor) -> dict[str, Tensor]:
@@ -154,8 +154,8 @@ class _Scores:
             "drift of the gain of": command * time,
             "curvature in": command * command.abs(),
             "offset of": torch.ones_like(command),
-            "dead zone of": -command.clamp(-DEAD * most, DEAD * most),
-            "saturation of": command.clamp(-KNEE * most, KNEE * most) - command,
+            "dead zone of": -command.clamp(-DEAD_ZONE * most, DEAD_ZONE * most),
+            "saturation of": command.clamp(-SATURATION_KNEE * most, SATURATION_KNEE * most) - command,
             "delay of": -change,
             "lag of": lagged(command.unsqueeze(-1), time, torch.tensor(LAG)).squeeze(-1) - command,
         }

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.criticism.attribution import LEVEL_OF_TEST, MIN_GAIN_OF_KIND, Attribution
-from steady_ppl.criticism.baselines import ABOUT, Reference
+from steady_ppl.criticism.baselines import DEFINITION, Reference
 from steady_ppl.criticism.residual_maps import Cell, Misfit, Residuals, SignificantCell
 from steady_ppl.criticism.step_size import StepCheck
 from steady_ppl.data.frozen_sensors import Stretch
@@ -20,8 +20,8 @@ from steady_ppl.model.program import Program
 from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.text import aligned, number
 
-SHOWN = 8  # findings in the table
-WHO = {  # the verdict; and what stands out as well, which is no verdict while the parameters are wrong
+MAX_FINDINGS_SHOWN = 8  # findings in the table
+VERDICTS = {  # the verdict; and what stands out as well, which is no verdict while the parameters are wrong
     "sensor": ("the sensor is at fault", "the sensor stands out"),
     "actuator": ("the actuators are at fault", "the actuators stand out"),
     "dynamics": ("the dynamics are at fault", "the dynamics stand out"),
@@ -74,7 +74,7 @@ class Check(Displayed):
         """Everything as a plain dict, ready for JSON; every figure is finite, None where there is none."""
         blame, misfit, reference = self.blame, self.misfit, self.reference
         scatter = zip(self.residuals, misfit.dispersion.tolist(), strict=True)
-        about: dict[str, Any] = {"what": ABOUT, "why_not": reference if isinstance(reference, str) else None}
+        about: dict[str, Any] = {"what": DEFINITION, "why_not": reference if isinstance(reference, str) else None}
         if isinstance(reference, Reference):
             about |= {"noise": list(reference.scales), "log_likelihood": reference.log_likelihood}
         return {
@@ -194,13 +194,14 @@ def verdict(found: Check) -> str:
     else:
         said = "The program does not explain these drives: "
         if blame.p_values["parameters"] <= LEVEL_OF_TEST:
-            (fault, _), (_, beside) = WHO["parameters"], WHO[blame.kind]
+            (fault, _), (_, beside) = VERDICTS["parameters"], VERDICTS[blame.kind]
             said += f"{fault}{_parameters(blame)}: fit it again first (more --steps, or --recipe likelihood)"
             said += f"; beside them {beside}{_most_clearly(blame)}" if beside else ""
             said += f"; if that changes little, {discover}"
         else:
             of_noise = "the effects of kind noise in `steady discover` say in which way"
-            said += f"{WHO[blame.kind][0]}{_most_clearly(blame)}; {of_noise if blame.kind == 'noise' else discover}"
+            next_command = of_noise if blame.kind == "noise" else discover
+            said += f"{VERDICTS[blame.kind][0]}{_most_clearly(blame)}; {next_command}"
     loses = lost_horizons(found)
     if loses:
         said += f"; it predicts worse than a vehicle that just keeps its velocity ({', '.join(loses)} ahead)"
@@ -287,4 +288,4 @@ def strongest(findings: list[dict[str, Any]]) -> list[dict[str, Any]]:
     kept: dict[Any, dict[str, Any]] = {}
     for finding in findings:
         kept.setdefault((finding["map"], finding["residual"], tuple(finding["where"])), finding)
-    return list(kept.values())[:SHOWN]
+    return list(kept.values())[:MAX_FINDINGS_SHOWN]

@@ -24,7 +24,7 @@ from steady_ppl.utils.journal import piece
 from steady_ppl.utils.random import seeded
 
 LEADERS, ALIKE = 6, 0.85  # how many are refitted at least, and whose columns correlate so much with the first
-NATS = 2.0  # of held-out log p(y) within which two candidates cannot be told apart
+TIE_NATS = 2.0  # of held-out log p(y) within which two candidates cannot be told apart
 CLEAR_GAIN = 10.0  # nats of held-out log p(y) for which a test need only be near the family's level
 NEAR_ALPHA = ALPHA / 5  # p-value of a single test that is near it
 MIN_STATISTIC_TO_RETRY = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
@@ -86,7 +86,7 @@ class Candidate:
         """
         if self.total > CLEAR_GAIN:
             return self.tested.p_value <= max(critical, NEAR_ALPHA)
-        return self.total > NATS and self.tested.p_value <= critical
+        return self.total > TIE_NATS and self.tested.p_value <= critical
 
     @property
     def against_its_sign(self) -> bool:

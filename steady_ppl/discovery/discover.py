@@ -12,7 +12,7 @@ import torch
 from steady_ppl.comparison.prove import far_off, prove
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories, joined
-from steady_ppl.discovery.candidates import NATS
+from steady_ppl.discovery.candidates import TIE_NATS
 from steady_ppl.discovery.finding import findings, next_run, shape_of
 from steady_ppl.discovery.fitting import ByDraws
 from steady_ppl.discovery.refits import Refit
@@ -192,7 +192,7 @@ def _notes(found: Search) -> list[str]:
 def _of_one_drive(found: Found) -> str:
     """Which drive carries a gain alone, if one does."""
     gain, refit = found.candidate.gain, found.candidate.refit
-    if isinstance(refit, str) or found.candidate.total - float(gain.max()) > NATS:
+    if isinstance(refit, str) or found.candidate.total - float(gain.max()) > TIE_NATS:
         return ""
     held_out = [(name, fold.held_out) for name, fold in zip(("validation", "training"), refit.folds, strict=True)]
     drives = [f"{label} of the {name} drives" for name, data in held_out for label in data.labels]

@@ -31,7 +31,7 @@ from steady_ppl.utils.cores import Result, side_by_side
 from steady_ppl.utils.random import seeded
 
 PART = 400  # trajectories at a time
-LEAST_LEFT = 0.8  # share of the simulated sets that must not blow up
+MIN_SHARE_OF_SETS = 0.8  # share of the simulated sets that must not blow up
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ def simulate_scores(
     scores, likely = (torch.cat([one[name] for one in found]) for name in ("scores", "likely"))
     scores = scores.unflatten(0, (sets, len(data)))
     whole = torch.isfinite(scores).all(-1).all(-1) & torch.isfinite(likely.view(sets, len(data))).all(-1)
-    if int(whole.sum()) < LEAST_LEFT * sets:
+    if int(whole.sum()) < MIN_SHARE_OF_SETS * sets:
         raise FilterError(
             f"{int((~whole).sum())} of {sets} simulated sets blew up: the fitted program does not even explain "
             "drives of its own"

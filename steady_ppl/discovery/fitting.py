@@ -37,8 +37,9 @@ from steady_ppl.utils.random import seeded
 
 MAX_LINEARISATION_ERROR = 0.5  # nats a drive by which the linearised log p(y) may be off
 PARTICLES, JUDGING = 100, 400  # of the guide and of the judge: see docs/discovery.md, step 4
-FORMS = ("spread", "colour")  # of effects that are process noise
-MOVED, LIKE = 0.1, 1e-3  # by how much a number is moved, and what its effect on log spreads may vary by from row to row
+NOISE_FORMS = ("spread", "colour")  # of effects that are process noise
+PROBE_MOVE = 0.1  # by how much a number is moved
+ALIKE_TOLERANCE = 1e-3  # what its effect on log spreads may vary by from row to row
 STEPS, PRECISION = 25, 0.01  # scoring steps of the sum at most, and nats that another would gain
 
 
@@ -189,13 +190,13 @@ def noise_numbers(program: Program, data: Trajectories, path: ReferencePath) -> 
     def is_noise(part: Element) -> bool:
         name = part.name.split("[")[0]
         if name in forms:
-            return forms[name] in FORMS
-        with moved(part, MOVED):
+            return forms[name] in NOISE_FORMS
+        with moved(part, PROBE_MOVE):
             mean_there, spread_there = _moments(program, data, path)
         change = (spread_there / spread).log().nan_to_num(0.0, 0.0, 0.0)
-        alike = ((change - change.mean(1, keepdim=True)).abs() < LIKE).all()
-        still = ((mean_there - mean).abs() <= LIKE * spread).all()
-        return bool(alike & still & (change.abs() > LIKE).any())
+        alike = ((change - change.mean(1, keepdim=True)).abs() < ALIKE_TOLERANCE).all()
+        still = ((mean_there - mean).abs() <= ALIKE_TOLERANCE * spread).all()
+        return bool(alike & still & (change.abs() > ALIKE_TOLERANCE).any())
 
     return {index for index, part in enumerate(elements(program)) if is_noise(part)}
 

@@ -15,8 +15,8 @@ from steady_ppl.criticism.step_size import StepCheck, check_step
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.candidates import (
     CLEAR_GAIN,
-    NATS,
     NEAR_ALPHA,
+    TIE_NATS,
     Candidate,
     Screening,
     at_its_best_place,
@@ -37,7 +37,7 @@ from steady_ppl.utils.progress import stages
 MIN_GAIN_OF_CURVE = 3.0  # nats by which a curve must be better than named effects
 MAX_NATS_BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
 MAX_NATS_OF_RIVAL = 12.0  # nats behind the best in its round, with which one is fitted again beside other effects
-SAME = 0.2  # nats within which fits from two starts have ended at the same place
+SAME_MAXIMUM = 0.2  # nats within which fits from two starts have ended at the same place
 MIN_NATS_OF_RUNAWAY = 25.0  # nats above every fit that it is a part of, from which a fit is not to be believed
 MAX_SHIFT_OF_SIZES = 0.08  # nats by which twice the substeps may move what is reported: 0.4 standard deviations
 MAX_SUBSTEPS_OF_FIT = 128  # of a fitted program, at most: what a coarser step leaves would be named as an effect
@@ -90,7 +90,7 @@ class Found:
     def alike(self) -> list[Candidate]:
         """Those that these drives cannot tell from the best, itself first."""
         best = self.candidate.total
-        close = [c for c in self.candidates if c.total >= best - NATS]
+        close = [c for c in self.candidates if c.total >= best - TIE_NATS]
         return [self.candidate, *(c for c in close if c is not self.candidate and not c.against_its_sign)]
 
 
@@ -218,7 +218,7 @@ def _add_best(found: Search, screening: Screening, index: int) -> bool:
     if index == 0 and best is None:
         found.curves = _curves(found)
         if found.curve is None and not found.departed:  # neither can be what the tests found
-            best = next((c for c in able if c.total > NATS and c.tested.p_value <= NEAR_ALPHA), None)
+            best = next((c for c in able if c.total > TIE_NATS and c.tested.p_value <= NEAR_ALPHA), None)
     found.rounds[-1] = Round(screening, candidates, best)
     if best is None:
         return False
@@ -249,7 +249,7 @@ def _threshold(candidates: Sequence[Candidate]) -> Threshold:
     fits = [c.refit for c in candidates if isinstance(c.refit, Refit)]
     drives = [float(fit.maxima[0].log_likelihood.sum()) for fit in fits]
     held_out = [float(fit.held_out_alone[: len(fit.folds[0].held_out)].sum()) for fit in fits]
-    return Threshold(max(drives, default=-math.inf) - MAX_NATS_BEHIND, max(held_out, default=-math.inf) - NATS)
+    return Threshold(max(drives, default=-math.inf) - MAX_NATS_BEHIND, max(held_out, default=-math.inf) - TIE_NATS)
 
 
 def _curves(search: Search) -> list[Candidate]:
@@ -297,7 +297,7 @@ def prune(search: Search) -> None:
         again = _ranked(again)
         best = next((c for c in again if not c.against_its_sign), None)
         place = search.found.index(found)
-        if best is None or best.total <= NATS or isinstance(best.refit, str):
+        if best is None or best.total <= TIE_NATS or isinstance(best.refit, str):
             search.found.pop(place)
             search.final = without
         else:
@@ -315,7 +315,7 @@ def _without(search: Search, found: Found) -> Refit | str:
     if isinstance(afresh, str) or isinstance(near, str):
         return afresh if isinstance(near, str) else judged_fits(near)
     most = max(_objective(search.final), _objective(afresh)) + MIN_NATS_OF_RUNAWAY  # more: it has run away
-    likelier = judged_fits(near) if _objective(afresh) + SAME < _objective(near) < most else afresh
+    likelier = judged_fits(near) if _objective(afresh) + SAME_MAXIMUM < _objective(near) < most else afresh
     return afresh if isinstance(likelier, str) else likelier
 
 

@@ -206,7 +206,7 @@ def _colour(base: Any, variant: Variant) -> Methods:
     return methods | {"states": (*base.states, *deviations), "resting": (*base.resting, *deviations)}
 
 
-def _under(handler: Callable[..., interventions.Altering], method: str) -> Callable[[Any, Variant], Methods]:
+def _under(handler: Callable[..., interventions.Transforming], method: str) -> Callable[[Any, Variant], Methods]:
     """A method under a handler, which is made of the program, its effect and the method's arguments."""
 
     def around(base: Any, variant: Variant) -> Methods:

@@ -21,7 +21,7 @@ from steady_ppl.smc.filter import STEPS_WORTH_COMPILING, Proposal, particle_filt
 from steady_ppl.smc.genealogy import Paths, event_dims
 from steady_ppl.utils.angles import wrap_angles
 
-HUNDREDS = 100  # of E steps are in a training
+TYPICAL_E_STEPS = 100  # of E steps are in a training
 PASSES = 30  # of Gauss and Newton's method
 AT_REST = 1e-9  # of a channel's size and unit, by which noise may still move when it is found
 Tempering = Callable[[float], float]  # a schedule: the observation weight at a share of the training, 0 to 1
@@ -90,7 +90,7 @@ class FilteringGuide(PathGuide):
             known_start=self.known_start,
             resample_below=self.resample_below,
             proposal=proposal,
-            kernels=HUNDREDS * self.particles * data.time.numel() >= STEPS_WORTH_COMPILING,
+            kernels=TYPICAL_E_STEPS * self.particles * data.time.numel() >= STEPS_WORTH_COMPILING,
         )
         self.in_plain_torch = filtered.in_plain_torch or (proposal and self.in_plain_torch) or None
         self.keep(filtered.paths(self.draws), data)
@@ -190,7 +190,7 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
     over_time = (acting_controls(exact, within)[:-1], within.elapsed[:-1], within.steps)
 
     def run(noise: Tensor) -> tuple[Tensor, Recording]:
-        with running(*before.shape[:-1]), Recording() as recording, Taking(noise):
+        with running(*before.shape[:-1]), Recording() as recording, Substituting(noise):
             return sample_row(exact, before, *over_time), recording
 
     channels = torch.eye(step_size(program)).to(before)
@@ -224,7 +224,7 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
     )
 
 
-class Taking(ByColumn):
+class Substituting(ByColumn):
     """Give latent sites the columns of some values, `(..., C)`, in the order in which the sites are met."""
 
     def __init__(self, values: Tensor) -> None:

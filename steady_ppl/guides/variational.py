@@ -20,7 +20,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, require
 from steady_ppl.gaussian.predict import on_a_circle
 from steady_ppl.gaussian.smoother import find_and_smooth, means_as_path
-from steady_ppl.guides.base import Constant, Taking, Tempering, sample_known
+from steady_ppl.guides.base import Constant, Substituting, Tempering, sample_known
 from steady_ppl.likelihood.scores import channel_moments
 from steady_ppl.model.handlers import KnownStart, Recording, Replaying, Standardised, broadcast_event, running
 from steady_ppl.model.program import Program
@@ -116,7 +116,7 @@ class VariationalGuide(nn.Module):
                 noise, density = self.step(row, state)
                 inside = data.transitions[row]
                 later = later + torch.where(inside, density, 0.0).sum(-1)
-                with Recording() as moving, (Taking if self.centred else Standardised)(noise.unsqueeze(1)):
+                with Recording() as moving, (Substituting if self.centred else Standardised)(noise.unsqueeze(1)):
                     moved = sample_row(self.program, state.unsqueeze(1), *given).squeeze(1)
                 state = torch.where(inside[:, None], moved, state)
                 states.append(state)

@@ -23,11 +23,11 @@ from steady_ppl.utils.text import one_line
 
 TRACES = 32  # of one method of programs of one class; each takes some hundredths of a second
 KERNELS = 256  # that are kept in memory
-FEW = 1000  # numbers of a tensor that are looked at one by one
+MAX_NUMBERS_READ = 1000  # numbers of a tensor that are looked at one by one
 KEEPS_CHANGING = "its settings or tensors change from run to run"
 DIFFERENT = "its kernel and its own lines come to different numbers"
 SETTING = bool | int | float | str | tuple | list | dict | np.ndarray | Tensor
-OF_MODULES = vars(nn.Module()).keys() - {"training"}  # attributes in which torch keeps parameters, buffers and hooks
+TORCH_ATTRIBUTES = vars(nn.Module()).keys() - {"training"}  # where torch keeps parameters, buffers and hooks
 Value = TypeVar("Value")
 Array = np.ndarray
 Examples = dict[str, Tensor]  # of the arguments of a function
@@ -278,13 +278,13 @@ def _content(value: Any) -> Any:
         return str(value.dtype), value.shape, value.tobytes()
     if not isinstance(value, Tensor):
         return repr(value)
-    return (tuple(value.shape), *value.flatten().tolist()) if value.numel() <= FEW else id(value)
+    return (tuple(value.shape), *value.flatten().tolist()) if value.numel() <= MAX_NUMBERS_READ else id(value)
 
 
 def _settings(module: nn.Module) -> Iterator[tuple[str, Any]]:
     """A module's attributes: its own, its class's and its bases'."""
     own, kind = vars(module), type(module)
-    yield from ((name, value) for name, value in own.items() if name not in OF_MODULES)
+    yield from ((name, value) for name, value in own.items() if name not in TORCH_ATTRIBUTES)
     if kind not in _NAMES:
         _NAMES[kind] = _names_of(kind)
     absent = object()  # descriptors are looked at, not run

@@ -24,12 +24,12 @@ import llvmlite
 from llvmlite import binding
 
 VARIABLE = "STEADY_KERNEL_CACHE"
-BOUND = 64 * 2**20  # bytes of all files; the least recently used ones go
+MAX_BYTES = 64 * 2**20  # bytes of all files; the least recently used ones go
 AN_HOUR = 3600.0  # a use is noted once in it, to save writes
 MAGIC = b"steady-ppl kernel 1\n"  # the format of a file: this, the digest of its name and code, its code
-OURS = re.compile(r"[0-9a-f]{64}(\.[0-9a-f]{16}\.partial)?")  # the names of files; others are left alone
+FILE_NAME = re.compile(r"[0-9a-f]{64}(\.[0-9a-f]{16}\.partial)?")  # the names of files; others are left alone
 DIGEST = sha256().digest_size
-SWEEPS = "0"  # how names begin whose writing is followed by a look through the folder: one in sixteen
+SWEEP_PREFIX = "0"  # how names begin whose writing is followed by a look through the folder: one in sixteen
 OTHERS_CAN_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
@@ -59,7 +59,7 @@ def machine_code(key: str, text: Callable[[], str]) -> Any:
         engine.finalize_object()
         if folder is not None and kept is None and made:
             _write(folder, name, made.pop())
-            if name.startswith(SWEEPS):
+            if name.startswith(SWEEP_PREFIX):
                 _forget(folder)
         return engine
 
@@ -134,13 +134,13 @@ def _forget(folder: int) -> None:
     found = []
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
-            if OURS.fullmatch(entry.name):
+            if FILE_NAME.fullmatch(entry.name):
                 with suppress(OSError):  # another process has removed it
                     about = entry.stat(follow_symlinks=False)
                     found.append((about.st_mtime, about.st_size, entry.name))
     left = sum(size for _, size, _ in found)
     for _, size, name in sorted(found):
-        if left <= BOUND * 3 // 4:
+        if left <= MAX_BYTES * 3 // 4:
             return
         with suppress(OSError):
             os.unlink(name, dir_fd=folder)

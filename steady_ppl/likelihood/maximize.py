@@ -37,8 +37,8 @@ MAX_MOVE = 150  # steps of differences, 1.5 of a logarithm: the most that a numb
 SHARE_AGAINST_SCORE = 1 / 3
 """Of that, for a number whose own score points the other way: noise or a friction that is driven to nothing early has
 no score there, and a fit cannot return."""
-FEWER = 0.8  # share of fits that take one step more, by which the time left is told
-SURE = 0.1  # nats that another step may gain where a fit has converged
+SHARE_THAT_GOES_ON = 0.8  # share of fits that take one step more, by which the time left is told
+CONVERGED_DECREMENT = 0.1  # nats that another step may gain where a fit has converged
 MAX_DECREASE = 0.3  # nats by which an objective may fall: paths are at rest but for the tolerance
 MAX_ROUGHNESS = 1.5  # mean square deviation, in the program's own, from which noise is widened before a fit
 OUTLIER_SD, SEARCHES = 6.0, 3  # standard deviations by which an outlier is less likely, and searches for its path
@@ -60,7 +60,7 @@ class Maximum:
     @property
     def converged(self) -> bool:
         """Whether a step would gain less than a tenth of a nat."""
-        return self.decrement is None or self.decrement < SURE
+        return self.decrement is None or self.decrement < CONVERGED_DECREMENT
 
 
 def maximise(
@@ -166,7 +166,7 @@ def climb(
     information = _of_drives(here) if information is None else _regularised(information)
     taken, decrement, passes = 0, 0.0, PASSES
     rises = deque[float](maxlen=3)  # of log p(y) by the last steps
-    with stages(*(("", FEWER**step) for step in range(steps + 1))) as begin:
+    with stages(*(("", SHARE_THAT_GOES_ON**step) for step in range(steps + 1))) as begin:
         for taken in range(steps + 1):
             begin()
             move, singular = torch.linalg.solve_ex(information, here.gradient)
@@ -182,7 +182,8 @@ def climb(
                 is_given, own = False, _of_drives(here)
                 seen, _ = torch.linalg.solve_ex(own, here.gradient)
                 more = 0.5 * float(here.gradient @ seen)
-                if taken == 0 or (more > SURE and len(here.scores) >= 2 * len(own)):  # few drives know too little
+                few_drives = len(here.scores) < 2 * len(own)  # they know too little
+                if taken == 0 or (more > CONVERGED_DECREMENT and not few_drives):
                     information, move, decrement = own, seen, more
             behind = taken >= 6 and here.log_likelihood + (steps - taken) * max(0.0, *rises) < hopeless
             if decrement < precision or taken == steps or behind:

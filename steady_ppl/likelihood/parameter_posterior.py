@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 FREEDOM = 5.0  # of the Student t: its tails are heavier than those of any posterior that data tell
 ROUNDS = (0.25, 0.25, 0.5)  # shares of the values; each round draws about what those before found
-ENOUGH = 4  # effective values a number, for which the weights that shape the next round are tempered
+MIN_EFFECTIVE_DRAWS = 4  # effective values a number, for which the weights that shape the next round are tempered
 RELIABLE = 0.7  # Pareto tail index above which weights are not to be trusted (Vehtari et al. 2024)
 
 LogLikelihood = Callable[[Program], Tensor]
@@ -162,7 +162,7 @@ def adapt(program: Program, shape: NormalShape, judge: LogLikelihood, count: int
 
 def _shaped(shape: NormalShape, values: Tensor, log_weights: Tensor) -> NormalShape:
     """The moments of weighed values; weights are tempered until enough of the values count."""
-    enough = min(ENOUGH * values.shape[1], int(torch.isfinite(log_weights).sum()) / 2)
+    enough = min(MIN_EFFECTIVE_DRAWS * values.shape[1], int(torch.isfinite(log_weights).sum()) / 2)
     power = 1.0
     while (weights := (power * log_weights).softmax(0)).square().sum().reciprocal() < enough:
         power *= 0.8

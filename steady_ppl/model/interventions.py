@@ -30,7 +30,7 @@ from steady_ppl.model.substeps import row_ends
 
 
 @dataclass(eq=False)
-class Altering(ByColumn):
+class Transforming(ByColumn):
     """Replace the distribution of each site that a method of a program samples."""
 
     change: Callable[[Any, slice], Any]  # of a distribution and the columns of the channels or measurements that it has
@@ -39,29 +39,29 @@ class Altering(ByColumn):
         message["fn"] = self.change(message["fn"], self.take(message["fn"]))
 
 
-def pushed(program: Program, pushes: Mapping[str, Tensor]) -> Altering:
+def pushed(program: Program, pushes: Mapping[str, Tensor]) -> Transforming:
     """Add to the means of a program's channels while its `transition` runs: channel → `(...)` in the channel's unit."""
     return _by_channel(program, pushes, 0.0, lambda fn, push: with_moments(fn, loc=unwrapped(fn).loc + push))
 
 
-def widened(program: Program, factors: Mapping[str, Tensor]) -> Altering:
+def widened(program: Program, factors: Mapping[str, Tensor]) -> Transforming:
     """Multiply the spreads of a program's channels, channel → factor `(...)`, while its `transition` runs."""
     return _by_channel(program, factors, 1.0, lambda fn, factor: with_moments(fn, scale=unwrapped(fn).scale * factor))
 
 
 def _by_channel(
     program: Program, values: Mapping[str, Tensor], missing: float, alter: Callable[[Any, Tensor], Any]
-) -> Altering:
+) -> Transforming:
     """Alter each channel's distribution by its own value."""
 
     def change(fn: Any, columns: slice) -> Any:
         mean, _ = normal_moments(fn, "channel")
         return alter(fn, as_event(_side_by_side(values, program.channel_names[columns], missing, mean), fn.event_dim))
 
-    return Altering(change)
+    return Transforming(change)
 
 
-def misread(program: Program, change: Callable[[Tensor], Tensor]) -> Altering:
+def misread(program: Program, change: Callable[[Tensor], Tensor]) -> Transforming:
     """Change the mean measurement, `(..., K)` and angles on the circle, while a program's `observe` runs."""
 
     def at_site(fn: Any, columns: slice) -> Any:
@@ -72,19 +72,19 @@ def misread(program: Program, change: Callable[[Tensor], Tensor]) -> Altering:
         whole = torch.cat([whole[..., : columns.start], reading, whole[..., columns.stop :]], -1)
         return with_moments(fn, loc=as_event(change(whole)[..., columns], fn.event_dim))
 
-    return Altering(at_site)
+    return Transforming(at_site)
 
 
-def blurred(factors: Tensor) -> Altering:
+def blurred(factors: Tensor) -> Transforming:
     """Multiply the measurements' standard deviations by factors `(..., K)` while a program's `observe` runs."""
 
     def change(fn: Any, columns: slice) -> Any:
         return with_moments(fn, scale=unwrapped(fn).scale * as_event(factors[..., columns], fn.event_dim))
 
-    return Altering(change)
+    return Transforming(change)
 
 
-def heavy_tailed(share: Tensor) -> Altering:
+def heavy_tailed(share: Tensor) -> Transforming:
     """Give the measurements' noise the tails of a Student t of 1/`share` degrees of freedom, its scale the normal's."""
 
     def change(fn: Any, columns: slice) -> Any:
@@ -92,10 +92,10 @@ def heavy_tailed(share: Tensor) -> Altering:
         kind = WrappedStudentT if isinstance(base, WrappedNormal) else dist.StudentT
         return kind((1 / share).expand(base.loc.shape), base.loc, base.scale).to_event(fn.event_dim)
 
-    return Altering(change)
+    return Transforming(change)
 
 
-class Coloured(Altering):
+class Coloured(Transforming):
     """Let a share (channel → share) of each channel's last deviation stay; both deviations are `(..., C)`."""
 
     def __init__(self, program: Program, shares: Mapping[str, Tensor], last: Tensor) -> None:

@@ -14,10 +14,10 @@ from steady_ppl.model.substeps import MAX_SUBSTEPS, Held, advance, with_substeps
 from steady_ppl.utils.random import seeded
 
 GROWTH = 1.1  # of a deviation over a row, from which it counts
-FINER = 16  # times as many substeps, at which it must not grow nearly as much
-SLOWER = 1000.0  # times, by which rows are moved apart to see whether actuators look at time
-LONG = 1.5  # times the usual step, from which the message names a row's length
-SHORTER = 64  # times, by which a step is shortened to see whether its result follows
+SUBSTEP_FACTOR = 16  # times as many substeps, at which it must not grow nearly as much
+ROW_SPACING_FACTOR = 1000.0  # times, by which rows are moved apart to see whether actuators look at time
+LONG_STEP_RATIO = 1.5  # times the usual step, from which the message names a row's length
+STEP_DIVISOR = 64  # times, by which a step is shortened to see whether its result follows
 STATES, ROWS = 64, 16  # at which a transition is looked at
 COMMANDS = 256  # rows of commands, at which actuators are looked at
 AHEAD = 1600  # substeps that a program moves on to see where it comes: of 100 rows where it takes one
@@ -28,15 +28,15 @@ _Given = tuple[Tensor, Tensor, Tensor]  # control, time and step
 def divergence(program: Program, data: Trajectories, rows: int | None = None) -> str | None:
     """Say that a program's step is unstable, or return None where it is not.
 
-    A deviation that grows at the program's own step but not at `FINER` times as many substeps, as eigenvalues of a
-    row's derivative in the state say, grows because of the step. These are looked at where drives begin and where the
+    A deviation that grows at the program's own step but not in `SUBSTEP_FACTOR` times as many substeps grows because of
+    the step. Eigenvalues of a row's derivative in the state say so. They are looked at where drives begin and where the
     program comes from there in fine steps without noise: a drag may be too stiff at speed alone. Of each drive of
     `data`, as returned by `for_program`, the first `rows` are looked at; all when None.
     """
     steps = torch.where(data.transitions, data.steps, 0.0)[:rows]
     if not bool(steps.any()):
         return None
-    finer = with_substeps(program, min(MAX_SUBSTEPS, FINER * program.substeps))
+    finer = with_substeps(program, min(MAX_SUBSTEPS, SUBSTEP_FACTOR * program.substeps))
     state, given = _visited(finer, data, steps)
     own, fine = _eigenvalues(program, state, given), _eigenvalues(finer, state, given)
     if own is None or fine is None:
@@ -50,7 +50,7 @@ def divergence(program: Program, data: Trajectories, rows: int | None = None) ->
     there = once.flatten(0, -2)[worst]
     fastest = there[(there - 1).abs().argmax()]
     length = float(step.expand(once.shape[:-1]).flatten()[worst])
-    long = f" in a row of {length:.3g} s" if length > LONG * data.median_step else ""
+    long = f" in a row of {length:.3g} s" if length > LONG_STEP_RATIO * data.median_step else ""
     size = float((1 - fastest).abs()) * program.substeps
     kind = "damping" if float(fastest.imag.abs()) < 0.1 * size else "frequency"
     enough = min(MAX_SUBSTEPS, 2 ** math.ceil(math.log2(max(2.0, 2 * size))))
@@ -104,7 +104,7 @@ def is_step(program: Program, data: Trajectories) -> bool:
     state, (control, time, step) = _some(program, data)
     own = with_substeps(program, 1)
     changes = []
-    for short in (step, step / SHORTER):
+    for short in (step, step / STEP_DIVISOR):
         with within_row():
             still, pushed = (_after(own, state, (control, time, short), noise) for noise in (0.0, 1.0))
         changes.append((_largest(still - state), _largest(pushed - still)))
@@ -133,7 +133,7 @@ def counts_rows(program: Program) -> bool:
 
     def counts(act: Callable[[Program, Tensor, Tensor], Tensor]) -> bool:
         acting = act(program, commands, times)
-        if not torch.equal(acting, act(program, commands, SLOWER * times)):
+        if not torch.equal(acting, act(program, commands, ROW_SPACING_FACTOR * times)):
             return False
         return not torch.equal(acting[1:], act(program, other, times)[1:])
 
@@ -167,7 +167,7 @@ def require_convergence(program: Program, state: Tensor, control: Tensor, time: 
     def ends(count: int) -> Tensor:
         return _after(with_substeps(program, count), state, (control, time, step), 1.0)
 
-    coarse, fine = (_largest(ends(count) - ends(2 * count)) for count in (8, SHORTER))
+    coarse, fine = (_largest(ends(count) - ends(2 * count)) for count in (8, STEP_DIVISOR))
     beyond = fine - 0.7 * coarse - 1e-4 * (1 + _largest(ends(8)))
     beyond = torch.where(fine.isfinite(), beyond, torch.inf)
     if bool((beyond > 0).any()):

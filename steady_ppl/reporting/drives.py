@@ -16,7 +16,7 @@ from steady_ppl.runs.fit import Fit
 from steady_ppl.runs.posterior import drawn_states
 from steady_ppl.utils.angles import nearest_turn
 
-AROUND = 0.5  # s shown before and after a stretch
+MARGIN = 0.5  # s shown before and after a stretch
 LEVELS, MISSING = 65534, -32768  # codes of sixteen bits, which are finer than a screen
 MAX_NUMBERS = 300_000  # of all drives and runs: .8 MB of text
 QUANTILES = (0.05, 0.5, 0.95)
@@ -71,7 +71,7 @@ def where_to_look(found: Check, cell: Cell) -> Place | None:
     start, end = cell.where["time"] if "time" in cell.where else _longest(there[:, drive], found, drive)
     if cell.map in ("all", "drive"):
         start, end = 0.0, float(found.data.elapsed[int(found.data.lengths[drive]) - 1, drive])
-    return drive, round(max(0.0, start - AROUND), 3), round(end + AROUND, 3)
+    return drive, round(max(0.0, start - MARGIN), 3), round(end + MARGIN, 3)
 
 
 def _rows(found: Check, cell: Cell) -> tuple[np.ndarray, np.ndarray]:

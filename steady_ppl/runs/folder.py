@@ -20,7 +20,7 @@ from steady_ppl.utils.text import command_line
 PARAMETERS, RECORD, POSTERIOR = "parameters.safetensors", "run.json", "posterior.nc"
 CHECKPOINT, DISCOVERY = "checkpoint.safetensors", "discovery.json"
 FILES = (PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY)
-ASIDE, LOCK, JOURNAL = "previous", ".lock", "journal"
+BACKUP, LOCK, JOURNAL = "previous", ".lock", "journal"
 
 FORMAT = 1
 FINISHED = ("finished", "interrupted")  # what the record of a run that can be used says
@@ -90,7 +90,7 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         with only_writer(folder):
-            for name in (ASIDE, JOURNAL):
+            for name in (BACKUP, JOURNAL):
                 if (folder / name).is_symlink():  # out of the run, to files that are somebody else's to remove
                     raise RunError(f"{folder}: {name} in it is a link: remove the link, or choose another folder")
             if not resume:
@@ -101,9 +101,9 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
                 if not resume:
                     _clean_up(folder)
                 raise
-            if (folder / ASIDE).is_dir():
-                _remove(folder / ASIDE)
-                (folder / ASIDE).rmdir()
+            if (folder / BACKUP).is_dir():
+                _remove(folder / BACKUP)
+                (folder / BACKUP).rmdir()
     finally:
         for place in made:
             if place.is_dir() and not any(place.iterdir()):
@@ -130,7 +130,7 @@ def only_writer(folder: Path) -> Iterator[None]:
 
 
 def _put_aside(folder: Path) -> None:
-    aside = folder / ASIDE
+    aside = folder / BACKUP
     if aside.is_dir():  # of an overwriting fit that was killed: it, not what that fit left, is the finished run
         _remove(folder)
         return
@@ -149,7 +149,7 @@ def _put_aside(folder: Path) -> None:
 
 def _clean_up(folder: Path) -> None:
     """Undo what a failed block wrote."""
-    aside, checkpoint = folder / ASIDE, folder / CHECKPOINT
+    aside, checkpoint = folder / BACKUP, folder / CHECKPOINT
     if not aside.is_dir():
         begun = checkpoint.is_file() and json.loads(read_tensors(checkpoint)[1]["step"]) > 0
         if not begun and not any((folder / JOURNAL).glob("*")):

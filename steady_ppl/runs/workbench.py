@@ -17,7 +17,7 @@ TRUTH = "models/hovercraft.py:HovercraftTruth"
 
 
 def workbench() -> Path:
-    """The folder with the rooms: the checkout, else the copy that the wheel carries; UsageError: there is neither."""
+    """The checkout, else the copy of models, recipes and notebooks in the wheel; UsageError: there is neither."""
     here = Path(__file__).resolve().parents[1]  # the package
     for folder in (here.parent, here / "workbench"):
         if all((folder / room).is_dir() for room in FOLDERS) and (folder / "inference" / "steady.py").is_file():
@@ -28,7 +28,7 @@ def workbench() -> Path:
 
 
 def make_workbench(folder: Path) -> list[Path]:
-    """Copy the rooms into a folder, which is made or empty, and simulate first tables of drives there.
+    """Copy models, recipes and notebooks into a folder, made or empty, and simulate first tables of drives there.
 
     Returns:
         The tables, of a hovercraft with drag; of its true states only the test table has more than each first row.

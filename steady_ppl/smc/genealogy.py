@@ -15,7 +15,7 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, sample_channels
 from steady_ppl.smc.resampling import systematic, take
 
-FEW = 10  # particles in effect: with fewer, what a filter says hangs on a handful of draws
+MIN_EFFECTIVE_SIZE = 10  # particles in effect: with fewer, what a filter says hangs on a handful of draws
 
 
 def event_dims(*seen: Recording) -> dict[str, int]:
@@ -95,9 +95,9 @@ class Filtered:
     channels: Callable[[Tensor, dict[str, Tensor]], dict[str, Tensor]] | None = None
 
     def scarce(self, data: Trajectories) -> Tensor:
-        """Share of each trajectory's measured rows after which fewer than `FEW` particles were in effect, `(B,)`."""
+        """Share of a trajectory's measured rows after which fewer than `MIN_EFFECTIVE_SIZE` were in effect, `(B,)`."""
         measured = data.observed.any(-1)
-        return ((self.effective_sizes < FEW) & measured).sum(0) / measured.sum(0).clamp(min=1)
+        return ((self.effective_sizes < MIN_EFFECTIVE_SIZE) & measured).sum(0) / measured.sum(0).clamp(min=1)
 
     def paths(self, draws: int) -> Paths:
         """Equally weighted paths, resampled systematically from all surviving lineages and traced back."""
@@ -122,4 +122,6 @@ class Filtered:
 
 def few_starts(roots: float) -> str | None:
     """What is to be said where so many of the particles' starts survive a drive: all paths begin alike."""
-    return f"of the particles' starts {roots:.0f} survive a drive: raise particles" if roots < FEW else None
+    return (
+        f"of the particles' starts {roots:.0f} survive a drive: raise particles" if roots < MIN_EFFECTIVE_SIZE else None
+    )

@@ -25,7 +25,7 @@ from steady_ppl.utils.text import printable
 TABLE, EARLIER, ARRIVED = "results.parquet", "earlier.parquet", "arrived"
 KINDS = (types.is_integer, types.is_floating, types.is_boolean, types.is_string, types.is_large_string, types.is_null)
 NUMBERS = ("integer", "floating", "mixed-integer-float")  # as pandas infers them
-ENOUGH = 100  # results for which the table is written anew, at least
+MIN_RESULTS_BETWEEN_WRITES = 100  # results for which the table is written anew, at least
 
 
 class StudyTable:
@@ -40,7 +40,7 @@ class StudyTable:
         seen = {name: printable(value) if isinstance(value, str) else value for name, value in row.items()}
         _write(pd.DataFrame([seen]), self.folder / ARRIVED / f"{row['key']}.parquet")
         self.waiting += 1
-        if self.waiting >= max(ENOUGH, self.rows // 10):
+        if self.waiting >= max(MIN_RESULTS_BETWEEN_WRITES, self.rows // 10):
             self.merge()
 
     def keep(self, keys: Collection[str]) -> None:

@@ -28,7 +28,7 @@ from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import tell
 
-SEVERAL = 10  # validations are in a training
+TYPICAL_VALIDATIONS = 10  # validations are in a training
 SETTLED = 1.0  # nats a drive by which held-out log p(y) may rise at the end of a training that has converged
 
 
@@ -345,7 +345,7 @@ class Validation:
         """Log p(y) of each held-out trajectory."""
         assert self.data is not None
         given: Any = {name: getattr(self, name) for name in ("particles", "known_start", "every", "look_ahead")}
-        kernels = SEVERAL * self.particles * self.data.time.numel() >= STEPS_WORTH_COMPILING
+        kernels = TYPICAL_VALIDATIONS * self.particles * self.data.time.numel() >= STEPS_WORTH_COMPILING
         with seeded(seed, "validate"):
             return log_likelihood(program, self.data, kernels=kernels, **given).tolist()
 

@@ -9,7 +9,7 @@ import torch
 from examples import drives, example
 
 import steady_ppl as st
-from steady_ppl.discovery.candidates import NATS
+from steady_ppl.discovery.candidates import TIE_NATS
 from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, is_doubtful
 from steady_ppl.discovery.refits import Fold, first_by_draws, first_refit, refit_with, starts_by_draws
 from steady_ppl.effects import chosen_variant
@@ -98,11 +98,11 @@ def test_a_program_whose_linearised_likelihood_is_off_is_fitted_by_draws(monkeyp
     assert isinstance(base.fitting, ByDraws)
     found = refit_with(base, chosen_variant(program, "lever_arm"), 0.1)
     assert not isinstance(found, str) and found.fitting == base.fitting
-    assert float((found.held_out - base.held_out).sum()) > NATS
+    assert float((found.held_out - base.held_out).sum()) > TIE_NATS
     likely, path = copy.deepcopy(found.program), found.folds[0].path
     ByLikelihood().fit(Problem(likely, train, True), path)
     there = found.fitting.judge(Problem(likely, train, True), path)
-    assert float((found.maxima[0].log_likelihood - there.log_likelihood).sum()) > -NATS
+    assert float((found.maxima[0].log_likelihood - there.log_likelihood).sum()) > -TIE_NATS
 
 
 def test_a_nearly_linear_program_is_fitted_by_likelihood() -> None:

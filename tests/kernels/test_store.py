@@ -351,8 +351,8 @@ def test_the_bound_holds_and_what_was_used_last_stays(folder, monkeypatch):
     assert compiled("first", 0)
     (file,) = folder.iterdir()
     size = file.stat().st_size
-    monkeypatch.setattr(store, "BOUND", 8 * size)
-    monkeypatch.setattr(store, "SWEEPS", "")
+    monkeypatch.setattr(store, "MAX_BYTES", 8 * size)
+    monkeypatch.setattr(store, "SWEEP_PREFIX", "")
     (folder / "letter.txt").write_bytes(bytes(100 * size))  # nothing of ours
     left_over = folder / f"{store._name('cut off')}.{'0' * 16}.partial"
     left_over.write_bytes(bytes(size))
