@@ -2,7 +2,6 @@
 
 import ctypes
 import hashlib
-import inspect
 import itertools
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
@@ -32,7 +31,7 @@ Value = TypeVar("Value")
 Array = np.ndarray
 Examples = dict[str, Tensor]  # of the arguments of a function
 _COMPILED: WeakKeyDictionary[type[nn.Module], dict[Any, Any]] = WeakKeyDictionary()
-_NAMES: WeakKeyDictionary[type[nn.Module], list[str]] = WeakKeyDictionary()
+_NAMES: WeakKeyDictionary[type[nn.Module], list[tuple[int, list[str]]]] = WeakKeyDictionary()
 _READ: WeakKeyDictionary[nn.Module, dict[Any, Any]] = WeakKeyDictionary()  # of programs that are `unchanged` for now
 
 
@@ -283,25 +282,26 @@ def _content(value: Any) -> Any:
 
 def _settings(module: nn.Module) -> Iterator[tuple[str, Any]]:
     """A module's attributes: its own, its class's and its bases'."""
-    own, kind = vars(module), type(module)
+    own = vars(module)
     yield from ((name, value) for name, value in own.items() if name not in TORCH_ATTRIBUTES)
+    kind = type(module)
     if kind not in _NAMES:
         _NAMES[kind] = _names_of(kind)
-    absent = object()  # descriptors are looked at, not run
-    for name in _NAMES[kind]:
-        value = inspect.getattr_static(kind, name, absent)
-        if name not in own and value is not absent:
-            yield name, value
+    for at, names in _NAMES[kind]:
+        given = vars(kind.__mro__[at])
+        yield from ((name, given[name]) for name in names if name not in own and name in given)
 
 
-def _names_of(kind: type[nn.Module]) -> list[str]:
-    """The settings among the attributes of a class and its bases; by name, since values may keep the class for ever."""
-    found = dict[str, bool]()
-    for base in itertools.takewhile(lambda base: base is not nn.Module, kind.__mro__):
-        for name, value in vars(base).items():
-            foreign = name.startswith("__") or base.__module__.startswith("torch.")
-            found.setdefault(name, not foreign and not callable(value))
-    return [name for name, is_setting in found.items() if is_setting]
+def _names_of(kind: type[nn.Module]) -> list[tuple[int, list[str]]]:
+    """The settings among the attributes of a class, each in the first of its bases that has it, by their order: a base
+    itself would keep the class, which is the first of them, for ever."""
+    found, known = [], set[str]()
+    for at, base in enumerate(itertools.takewhile(lambda base: base is not nn.Module, kind.__mro__)):
+        names = [name for name in vars(base) if name not in known and not name.startswith("__")]
+        known.update(names)
+        if not base.__module__.startswith("torch."):
+            found.append((at, [name for name in names if not callable(vars(base)[name])]))
+    return found
 
 
 def close(mine: Tensor, theirs: Tensor) -> bool:
