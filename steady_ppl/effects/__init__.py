@@ -1,4 +1,7 @@
-"""Physical effects that a program may lack: what they are, which apply, and how to add one."""
+"""Physical effects that a program may lack: what they are, which apply, and how to add one.
+
+Nothing here knows of data beyond what an effect's choices need, or of how an effect is found.
+"""
 
 from steady_ppl.effects.attach import (
     added,

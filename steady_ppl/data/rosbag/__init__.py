@@ -1,1 +1,4 @@
-"""ROS bags to trajectories: read messages, pick fields by a mapping, bring them to even rows."""
+"""ROS bags to trajectories: read messages, pick fields by a mapping, bring them to even rows.
+
+Nothing here needs ROS, or knows a program beyond its columns.
+"""
