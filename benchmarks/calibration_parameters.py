@@ -17,7 +17,7 @@ from uniformity import inside, ranks, together, uniform
 from steady_ppl import Program, Trajectories, run_filter, seeded, simulate
 from steady_ppl.likelihood.maximize import maximise
 from steady_ppl.likelihood.parameter_posterior import (
-    RELIABLE,
+    MAX_TAIL_INDEX,
     LogLikelihood,
     about_maximum,
     adapt,
@@ -106,5 +106,5 @@ def summary(records: list[dict], name: str) -> dict:
         "p_values": p_values,
         "inside_50": inside(found, DRAWS, 0.5),
         "inside_90": inside(found, DRAWS, 0.9),
-        "reliable": sum(record[name]["tail_index"] <= RELIABLE for record in records),
+        "reliable": sum(record[name]["tail_index"] <= MAX_TAIL_INDEX for record in records),
     }

@@ -34,7 +34,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 from dask_cluster import Dask, wait_for  # noqa: E402
 
 from steady_ppl.runs.fit import packages  # noqa: E402
-from steady_ppl.studies.executors import Cluster, Local, Place, computed  # noqa: E402  # noqa: E402
+from steady_ppl.studies.executors import Cluster, Executor, Local, computed  # noqa: E402
 from steady_ppl.studies.job import Job  # noqa: E402
 from steady_ppl.studies.plan import read_plan  # noqa: E402
 from steady_ppl.studies.runner import run_study  # noqa: E402
@@ -92,7 +92,7 @@ def efficiency(folder: Path, rounds: int, jobs: int, steps: int) -> dict[str, An
     fit_seconds: dict[str, list[float]] = {name: [] for name in seconds}
     plan = read_plan(fits(folder / "fits", jobs, steps))
     with cluster(folder / "one", 1) as one, cluster(folder / "two", 2) as two:
-        places: dict[str, Callable[[], Place]] = {
+        places: dict[str, Callable[[], Executor]] = {
             "cluster, 1": lambda: Cluster(one.address),
             "cluster, 2": lambda: Cluster(two.address),
             "processes, 1": lambda: Local(1),

@@ -14,7 +14,7 @@ from steady_ppl.errors import UsageError
 from steady_ppl.utils.files import require_picture, require_place, write_picture
 from steady_ppl.utils.text import say, tell
 
-OFTEN = 0.1  # share of the measured rows after which hardly a particle is left
+MIN_SHARE_OF_POOR_ROWS = 0.1  # share of the measured rows after which hardly a particle is left
 SIMULATIONS = 100  # sets for the bands of a report
 
 
@@ -126,7 +126,7 @@ def evaluate(
         if result["filter"] != "lookahead":
             say(f"{run}: judged by the filter {result['filter']}")
         share, count, drive = (result["scarce"][key] for key in ("share", "particles", "trajectory"))
-        if share > OFTEN:
+        if share > MIN_SHARE_OF_POOR_ROWS:
             say(
                 f"{run}: after {share:.0%} of drive {drive}'s measured rows fewer than {MIN_EFFECTIVE_SIZE} of the "
                 f"filter's {count} particles were in effect: its log p(y) scatters and is mostly too low, "

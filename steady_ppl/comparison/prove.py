@@ -16,7 +16,7 @@ from steady_ppl.comparison.scores import (
     MIN_DRIVES,
     SECONDS,
     Judged,
-    Row,
+    ProgramScores,
     as_row,
     judge_program,
     keeping_velocity,
@@ -162,7 +162,7 @@ def _few_starts(data: Trajectories, horizons: Mapping[str, int], known_start: bo
     return notes
 
 
-def _blown_up(rows: Mapping[str, Row]) -> list[str]:
+def _blown_up(rows: Mapping[str, ProgramScores]) -> list[str]:
     notes = []
     for name, row in rows.items():
         if horizons := [key.horizon for key, sums in row.sums.items() if not np.isfinite(sums.total).all()]:
@@ -170,7 +170,7 @@ def _blown_up(rows: Mapping[str, Row]) -> list[str]:
     return notes
 
 
-def far_off(rows: Mapping[str, Row], data: Trajectories) -> list[str]:
+def far_off(rows: Mapping[str, ProgramScores], data: Trajectories) -> list[str]:
     """Drives on which the linearised program's log p(y) is not to be trusted, the worst of each row."""
     notes = []
     for name, row in rows.items():

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from steady_ppl.comparison.scores import BANDS, COVERAGE, RESAMPLES, Change, Key, Row, paired
+from steady_ppl.comparison.scores import BANDS, COVERAGE, RESAMPLES, Change, Key, ProgramScores, paired
 from steady_ppl.effects import attached
 from steady_ppl.model.program import error_groups
 from steady_ppl.utils.late import Displayed
@@ -41,7 +41,7 @@ class Proof(Displayed):
         notes: what was left out or is not as it seems.
     """
 
-    rows: dict[str, Row]
+    rows: dict[str, ProgramScores]
     reference: str
     horizons: dict[str, int]
     step: float
@@ -158,7 +158,7 @@ def _sign(found: Sequence[Change | None]) -> int:
     return signs.pop() if len(signs) == 1 else 0
 
 
-def _added(before: Row, after: Row) -> str:
+def _added(before: ProgramScores, after: ProgramScores) -> str:
     """The effects that the one has more, empty where that is not the whole difference."""
     ours, theirs = ({variant.name: variant for variant in attached(row.program)} for row in (after, before))
     if theirs.keys() - ours.keys():

@@ -28,7 +28,7 @@ SECONDS = (1.0, 3.0, 10.0)
 BANDS = ("one step", "1 s", "3 s")
 DRAWN = 12  # horizons of the picture
 SETS, CELLS = 20, 100_000  # simulated sets for the noise floor, and rows of all their drives at most
-SHARED = 0.9  # of all rows; a bearing's noise grows beside its landmark
+MIN_SHARE_OF_ROWS = 0.9  # of all rows; a bearing's noise grows beside its landmark
 RESAMPLES, COVERAGE = 2000, 0.95  # of the bootstrap
 MIN_DRIVES = 5
 Scales = dict[str, dict[str, float | None]]  # "channels" and "measurements" → component → σ, None where there is none
@@ -100,7 +100,7 @@ def paired(ours: Sums, theirs: Sums, *, seed: int) -> Change | None:
 
 
 @dataclass(frozen=True)
-class Row:
+class ProgramScores:
     """A line of the table."""
 
     program: Program  # that was judged
@@ -198,7 +198,7 @@ def noise_floor(true: Judged, seed: int) -> Judged | str:
     return judge(own, ahead)
 
 
-def as_row(judged: Judged, counted: Mapping[int, Tensor]) -> Row:
+def as_row(judged: Judged, counted: Mapping[int, Tensor]) -> ProgramScores:
     """Sum over each drive the cells that count, `(T + 1 − horizon, B, K)` for each horizon."""
     likely = judged.ahead.log_likelihood.numpy(force=True)
     sums = {Key("log_likelihood", "", 0): Sums(likely, np.ones_like(likely))}
@@ -214,7 +214,7 @@ def as_row(judged: Judged, counted: Mapping[int, Tensor]) -> Row:
     for (group, horizon), (squares, known) in judged.states.items():
         if bool(known.any()):
             sums[Key("state", group, horizon)] = _sums(squares.unsqueeze(-1), known.unsqueeze(-1), root=True)
-    return Row(problem.program, sums, noise_scales(problem, judged.tracked), judged.neglected)
+    return ProgramScores(problem.program, sums, noise_scales(problem, judged.tracked), judged.neglected)
 
 
 def _sums(values: Tensor, there: Tensor, *, root: bool = False) -> Sums:
@@ -242,5 +242,5 @@ def _constants(labels: Sequence[str], spreads: Tensor, inside: Tensor) -> dict[s
         some = spread.expand(inside.shape)[inside]
         usual = some.median()
         same = torch.isclose(some, usual, rtol=1e-5, atol=0.0).double().mean()
-        found[label] = float(usual) if float(same) > SHARED else None
+        found[label] = float(usual) if float(same) > MIN_SHARE_OF_ROWS else None
     return found

@@ -14,7 +14,7 @@ from steady_ppl.data.trajectories import Trajectories
 
 MIN_ROWS = 12  # rows of a stretch
 MAX_DEVIATION = 1e-6  # of the column's range over all drives, by which a row may be beside the line
-Run = tuple[int, int, int, str]  # drive, first and last row, column
+RowRange = tuple[int, int, int, str]  # drive, first and last row, column
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class Stretch:
 def frozen_stretches(data: Trajectories) -> list[Stretch]:
     """Stretches in which a measurement or a known state, which was logged too, is on a line over time though it
     scatters elsewhere."""
-    runs: list[Run] = []
-    moving: set[Run] = set()
+    runs: list[RowRange] = []
+    moving: set[RowRange] = set()
     for column, values, there in _columns(data):
         of_column = _runs(data.time, values, there)
         if sum(last - first for _, first, last in of_column) < 0.5 * float(there.sum()):
@@ -56,7 +56,7 @@ def frozen_stretches(data: Trajectories) -> list[Stretch]:
     return found
 
 
-def _beside(run: Run, moving: set[Run]) -> bool:
+def _beside(run: RowRange, moving: set[RowRange]) -> bool:
     """Whether another known state moves along a line meanwhile: then one that keeps its value is made up as well."""
     drive, first, last, _ = run
     return any(m[0] == drive and m[1] <= last and first <= m[2] and m[3].startswith("x.") for m in moving)

@@ -13,7 +13,16 @@ from torch import Tensor
 
 from steady_ppl.discovery.curves import curves
 from steady_ppl.discovery.effect_scores import Column, columns_of, scores_along, simulate_scores
-from steady_ppl.discovery.refits import ALWAYS, BY_LIKELIHOOD, Fits, Refit, Threshold, fit_near, judged_fits, refit_with
+from steady_ppl.discovery.refits import (
+    BY_LIKELIHOOD,
+    NO_THRESHOLD,
+    Fits,
+    Refit,
+    Threshold,
+    fit_near,
+    judged_fits,
+    refit_with,
+)
 from steady_ppl.discovery.screening import ALPHA, Screened, Tested, departures, screen
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.errors import FilterError
@@ -149,7 +158,7 @@ def leaders(screened: Screened, first: bool) -> list[Tested]:
     return [tested for i, tested in alive if i in few or float(screened.alike[top, i]) > ALIKE]
 
 
-def fitted(now: Refit, tested: Tested, screening: Screening, threshold: Threshold = ALWAYS) -> Candidate:
+def fitted(now: Refit, tested: Tested, screening: Screening, threshold: Threshold = NO_THRESHOLD) -> Candidate:
     """A program with a candidate, by the screening that tested it; see `refit_with` for `threshold`."""
     effect = tested.variant.effect
     known = screening.information[_key(tested.column)] if effect.null == 0 and effect.form in LINEAR else None

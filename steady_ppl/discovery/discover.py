@@ -34,7 +34,7 @@ from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
 FITTED_FURTHER = 10.0  # nats that fitting a run further may gain before it is said
-FEWEST_DRIVES, FEWEST_SETS = 5, 50
+MIN_DRIVES, MIN_SETS = 5, 50
 NOT_CONVERGED = "the program's own fit has not converged: no ranking below is to be trusted"
 
 
@@ -98,9 +98,9 @@ def discover(
             raise UsageError("mix puts two tables together: name the second one (--valid)")
         train, valid = joined(train=train, valid=valid), None
     if valid is None:
-        if len(train) < 2 * FEWEST_DRIVES:
+        if len(train) < 2 * MIN_DRIVES:
             raise DataError(
-                f"{len(train)} drives are too few: {2 * FEWEST_DRIVES} are needed, half of them to choose by, because "
+                f"{len(train)} drives are too few: {2 * MIN_DRIVES} are needed, half of them to choose by, because "
                 "the unit that is resampled is the drive"
             )
         valid = train.subset(range(1, len(train), 2))
@@ -202,15 +202,15 @@ def _of_one_drive(found: Found) -> str:
 def require(problem: Problem, valid: Trajectories, simulations: int) -> None:
     """Refuse what cannot be searched: the faults that `discover` raises."""
     program, train = problem.program, problem.data
-    if simulations < FEWEST_SETS:
-        raise UsageError(f"got {simulations} simulations: the calibration needs at least {FEWEST_SETS}, 200 are better")
+    if simulations < MIN_SETS:
+        raise UsageError(f"got {simulations} simulations: the calibration needs at least {MIN_SETS}, 200 are better")
     elements(program)
     if not program.channel_names:
         raise UsageError("the program declares no noise channels, through which effects act")
     for name, drives in (("training", train), ("validation", valid)):
-        if len(drives) < FEWEST_DRIVES:
+        if len(drives) < MIN_DRIVES:
             raise DataError(
-                f"{len(drives)} {name} drives are too few: each half needs at least {FEWEST_DRIVES}, because the unit "
+                f"{len(drives)} {name} drives are too few: each half needs at least {MIN_DRIVES}, because the unit "
                 "that is resampled is the drive"
             )
         if drives.time.shape[0] < 3 or not bool(drives.observed[1:].any()):

@@ -67,7 +67,7 @@ class Threshold:
     stops_early: bool = False  # whether a fit ends on its way where it will not reach that of its drives, which decides
 
 
-ALWAYS = Threshold()
+NO_THRESHOLD = Threshold()
 BY_LIKELIHOOD, BY_DRAWS, FIRST_BY_DRAWS = ByLikelihood(), ByDraws(), ByDraws(steps=180)
 
 
@@ -212,7 +212,7 @@ def refit_with(
     value: float | Sequence[float] | Tensor,
     *,
     information: Tensor | Maximum | None = None,
-    threshold: Threshold = ALWAYS,
+    threshold: Threshold = NO_THRESHOLD,
 ) -> Refit | str:
     """The program with an effect whose coefficient begins at `value`, or why it cannot be fitted.
 
@@ -278,7 +278,7 @@ def _refit(
     maxima: Sequence[Maximum | None] = (None, None),
     information: Tensor | None = None,
     least: Sequence[float] = (-math.inf, -math.inf),
-    threshold: Threshold = ALWAYS,
+    threshold: Threshold = NO_THRESHOLD,
     unwidened: Program | None = None,
     fitting: Fitting = BY_LIKELIHOOD,
 ) -> Refit:

@@ -25,7 +25,16 @@ from steady_ppl.discovery.candidates import (
     leaders,
     screen_program,
 )
-from steady_ppl.discovery.refits import ALWAYS, Fits, Refit, Threshold, first_refit, fit_near, judged_fits, refit_with
+from steady_ppl.discovery.refits import (
+    NO_THRESHOLD,
+    Fits,
+    Refit,
+    Threshold,
+    first_refit,
+    fit_near,
+    judged_fits,
+    refit_with,
+)
 from steady_ppl.discovery.screening import ALPHA, Tested
 from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
@@ -255,7 +264,7 @@ def _threshold(candidates: Sequence[Candidate]) -> Threshold:
 def _curves(search: Search) -> list[Candidate]:
     """Fits of the curves that the first tests point at; they are given up where they stay far behind all effects."""
     base, screening = search.base, search.rounds[0].screening
-    named, threshold = None, ALWAYS
+    named, threshold = None, NO_THRESHOLD
     if search.found:
         named = judged(base, search.found[0].candidate.tested, search.final)
         threshold = replace(_threshold([named]), stops_early=True)

@@ -18,7 +18,7 @@ from steady_ppl.model.validate import step_size
 from steady_ppl.utils.cores import one_thread
 
 DAMPING = 1e-2  # of the first step, relative to the curvature
-AT_ONCE = 50_000  # rows of all places and drives
+MAX_ROWS_OF_BATCH = 50_000  # rows of all places and drives
 
 
 @one_thread()
@@ -52,7 +52,7 @@ def fixes(program: Program, data: Trajectories, *, places: int = 32, passes: int
     precision = 1 / drawn.var(0).clamp(min=1e-12)
     precision[list(program.angle_indices)] = 0.0  # normal, flat over angles
     prior = drawn.mean(0), precision
-    drives = max(1, AT_ONCE // (places * len(data.time)))
+    drives = max(1, MAX_ROWS_OF_BATCH // (places * len(data.time)))
     parts = torch.arange(len(data)).split(drives)
     states = torch.cat(
         [_found(program, data.subset(part), guesses[:, :, part], told, prior, passes) for part in parts], 1

@@ -21,7 +21,7 @@ from steady_ppl.smc.filter import Proposal
 from steady_ppl.smc.resampling import by_component
 from steady_ppl.utils.angles import wrap
 
-Steering = tuple[Tensor, Tensor, Tensor, Tensor]
+SteeringParts = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def log_future(
@@ -35,7 +35,7 @@ def log_future(
 
 
 def steer(
-    state: Tensor, path: Tensor, angles: Tensor, steering: Steering, own: Tensor, stays: Tensor, untwisted: float
+    state: Tensor, path: Tensor, angles: Tensor, steering: SteeringParts, own: Tensor, stays: Tensor, untwisted: float
 ) -> tuple[Tensor, Tensor]:
     """Draw every particle's noise `(N, B, C)`: its own, standard normal, if it `stays`, else steered.
 
@@ -150,7 +150,7 @@ def log_future_in_parallel(
 
 
 def steer_in_parallel(
-    state: Tensor, path: Tensor, angles: Tensor, steering: Steering, own: Tensor, stays: Tensor, untwisted: float
+    state: Tensor, path: Tensor, angles: Tensor, steering: SteeringParts, own: Tensor, stays: Tensor, untwisted: float
 ) -> tuple[Tensor, Tensor]:
     """`steer` for a device."""
     shift, gain, factor, whitening = steering

@@ -28,7 +28,7 @@ from steady_ppl.model.substeps import acting_controls, sample_row
 from steady_ppl.model.validate import start_size, step_size
 from steady_ppl.smc.genealogy import Paths, event_dims
 
-HIDDEN, BOUND = 16, 3.0  # units of a network beside its affine mean, and how many times the usual size they reach
+HIDDEN_UNITS, BOUND = 16, 3.0  # units of a network beside its affine mean, and how many times the usual size they reach
 
 
 class VariationalGuide(nn.Module):
@@ -268,8 +268,8 @@ class InferenceNetwork(VariationalGuide):
         self.first = nn.Linear(width, 2 * first + _below(first))
         given = width + inputs + acting
         self.affine = nn.Linear(given, later * (2 + size) + _below(later))
-        self.by_code, self.by_state = nn.Linear(given, HIDDEN), nn.Linear(size, HIDDEN, bias=False)
-        self.head = nn.Linear(HIDDEN, later, bias=False)
+        self.by_code, self.by_state = nn.Linear(given, HIDDEN_UNITS), nn.Linear(size, HIDDEN_UNITS, bias=False)
+        self.head = nn.Linear(HIDDEN_UNITS, later, bias=False)
         for layer in (self.first, self.affine, self.head):
             for value in layer.parameters():
                 nn.init.zeros_(value)

@@ -218,7 +218,7 @@ def climb(
     ]
 
 
-def _searched(here: _Here, move: Tensor, passes: int) -> tuple[float, _Here | None]:
+def _searched(here: _LinearizedObjective, move: Tensor, passes: int) -> tuple[float, _LinearizedObjective | None]:
     """The share of a move that does not fall, and where it leads; None where none does and nothing is moved."""
     share, terms = 1.0 if bool(torch.isfinite(move).all()) else 0.0, [at.term for at in here.terms]
     before = [values_of(term.parts) for term in terms]
@@ -234,7 +234,7 @@ def _searched(here: _Here, move: Tensor, passes: int) -> tuple[float, _Here | No
     return 0.0, None
 
 
-def _of_drives(here: _Here) -> Tensor:
+def _of_drives(here: _LinearizedObjective) -> Tensor:
     """The information by the cross products of the drives' scores."""
     by_drive = here.scores - here.scores.mean(0)
     information = by_drive.T @ by_drive
@@ -246,7 +246,7 @@ def _regularised(information: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class _TermHere:
+class _LinearizedTerm:
     term: Term  # along the path that its drives have here
     shares: dict[str, float]  # in the log prior of parameters, which other terms may have in common with it
     ahead: Lookahead
@@ -254,8 +254,8 @@ class _TermHere:
 
 
 @dataclass(frozen=True)
-class _Here:
-    terms: list[_TermHere]
+class _LinearizedObjective:
+    terms: list[_LinearizedTerm]
     scores: Tensor  # (B, P), of the drives of all terms
     gradient: Tensor  # (P,)
 
@@ -268,11 +268,11 @@ class _Here:
         return sum(float(term.ahead.log_likelihood.sum()) for term in self.terms)
 
 
-def _linearised(terms: Sequence[Term], passes: int = PASSES) -> _Here:
+def _linearised(terms: Sequence[Term], passes: int = PASSES) -> _LinearizedObjective:
     return _scored(_valued(terms, passes))
 
 
-def _tried(terms: Sequence[Term], passes: int, least: float) -> _Here | None:
+def _tried(terms: Sequence[Term], passes: int, least: float) -> _LinearizedObjective | None:
     """None where the step went too far: the objective falls below `least`, or a program diverges there."""
     try:
         found = _valued(terms, passes)
@@ -285,7 +285,7 @@ def _tried(terms: Sequence[Term], passes: int, least: float) -> _Here | None:
     return here if bool(torch.isfinite(here.gradient).all()) else None
 
 
-def _valued(terms: Sequence[Term], passes: int) -> list[_TermHere]:
+def _valued(terms: Sequence[Term], passes: int) -> list[_LinearizedTerm]:
     found, owners = [], Counter(column for term in terms for column in term.columns)
     for term in terms:
         names = [part.name.split("[")[0] for part in term.parts]
@@ -293,11 +293,11 @@ def _valued(terms: Sequence[Term], passes: int) -> list[_TermHere]:
         ahead = term.problem.smooth(term.path, passes=passes, tolerance=TOLERANCE)
         objective = float(ahead.log_likelihood.sum()) + log_prior(term.problem.program, shares)
         there = replace(term, path=resting_path(ahead, term.problem.data))
-        found.append(_TermHere(there, shares, ahead, objective))
+        found.append(_LinearizedTerm(there, shares, ahead, objective))
     return found
 
 
-def _scored(found: list[_TermHere]) -> _Here:
+def _scored(found: list[_LinearizedTerm]) -> _LinearizedObjective:
     columns, by_drive = {column for at in found for column in at.term.columns}, []
     gradient = torch.zeros(len(columns), dtype=torch.float64)
     for at in found:
@@ -307,7 +307,7 @@ def _scored(found: list[_TermHere]) -> _Here:
         wide = own.new_zeros((len(own), len(gradient)))
         wide[:, at.term.columns] = own
         by_drive.append(wide)
-    return _Here(found, torch.cat(by_drive), gradient)
+    return _LinearizedObjective(found, torch.cat(by_drive), gradient)
 
 
 def posterior_score(problem: Problem, path: ReferencePath) -> Tensor:

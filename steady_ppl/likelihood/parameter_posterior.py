@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 FREEDOM = 5.0  # of the Student t: its tails are heavier than those of any posterior that data tell
 ROUNDS = (0.25, 0.25, 0.5)  # shares of the values; each round draws about what those before found
 MIN_EFFECTIVE_DRAWS = 4  # effective values a number, for which the weights that shape the next round are tempered
-RELIABLE = 0.7  # Pareto tail index above which weights are not to be trusted (Vehtari et al. 2024)
+MAX_TAIL_INDEX = 0.7  # Pareto tail index above which weights are not to be trusted (Vehtari et al. 2024)
 
 LogLikelihood = Callable[[Program], Tensor]
 
@@ -49,7 +49,7 @@ class ParameterPosterior:
     Attributes:
         names: of the P numbers, as in `Maximum.names`.
         draws: `(M, P)` in the parameters' own units.
-        tail_index: Pareto's k of the weights; above `RELIABLE` the draws are not to be trusted.
+        tail_index: Pareto's k of the weights; above `MAX_TAIL_INDEX` the draws are not to be trusted.
     """
 
     names: tuple[str, ...]
@@ -59,7 +59,7 @@ class ParameterPosterior:
     @property
     def is_reliable(self) -> bool:
         """Whether the distribution that was drawn from covers the posterior."""
-        return self.tail_index <= RELIABLE
+        return self.tail_index <= MAX_TAIL_INDEX
 
     def interval(self, share: float = 0.9) -> dict[str, tuple[float, float]]:
         """The central interval of each number."""

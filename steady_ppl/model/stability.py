@@ -20,7 +20,7 @@ LONG_STEP_RATIO = 1.5  # times the usual step, from which the message names a ro
 STEP_DIVISOR = 64  # times, by which a step is shortened to see whether its result follows
 STATES, ROWS = 64, 16  # at which a transition is looked at
 COMMANDS = 256  # rows of commands, at which actuators are looked at
-AHEAD = 1600  # substeps that a program moves on to see where it comes: of 100 rows where it takes one
+MAX_SUBSTEPS_AHEAD = 1600  # substeps that a program moves on to see where it comes: of 100 rows where it takes one
 _Given = tuple[Tensor, Tensor, Tensor]  # control, time and step
 
 
@@ -78,7 +78,7 @@ def _visited(finer: Program, data: Trajectories, steps: Tensor) -> tuple[Tensor,
     The longest row of all is looked at from the start; the others are of the drive that it belongs to.
     """
     drive = int(steps.amax(0).argmax())
-    rows = torch.where(steps[:, drive] > 0)[0][: max(1, AHEAD // finer.substeps)]
+    rows = torch.where(steps[:, drive] > 0)[0][: max(1, MAX_SUBSTEPS_AHEAD // finer.substeps)]
     longest = steps[:, drive].argmax().reshape(1)
     states = [_starts(finer, 1)]
     for row in rows[:-1].tolist():

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MEASURED, NEAR, FAR, REFERENCE, FLOOR = "black", "#0072b2", "#d55e00", "#cc79a7", "#009e73"
+MEASURED, NEAR, FAR, REFERENCE, FLOOR_COLOR = "black", "#0072b2", "#d55e00", "#cc79a7", "#009e73"
 COMPONENTS = 4  # panels at most
 WIDTH = 165  # letters of a line over the whole width
 
@@ -156,7 +156,7 @@ def against_references(found: Check, axes: Axes) -> None:
     """Errors over the noise floor, root mean square over the components, against the time ahead."""
     horizons = list(found.horizons.values())
     seconds = [horizon * found.data.median_step for horizon in horizons]
-    axes.axhline(1, color=FLOOR, lw=1.5, label="noise alone")
+    axes.axhline(1, color=FLOOR_COLOR, lw=1.5, label="noise alone")
 
     def line(errors: Mapping[int, tuple[Any, Any]], style: str, color: str, label: str) -> None:
         relative = [_relative(*errors[horizon], found.floor[horizon].mean(0)) for horizon in horizons]

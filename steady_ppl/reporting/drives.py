@@ -21,7 +21,7 @@ LEVELS, MISSING = 65534, -32768  # codes of sixteen bits, which are finer than a
 MAX_NUMBERS = 300_000  # of all drives and runs: .8 MB of text
 QUANTILES = (0.05, 0.5, 0.95)
 PATHS = 8  # draws in the plane
-Place = tuple[int, float, float]  # drive, and from when to when
+DriveInterval = tuple[int, float, float]  # drive, and from when to when
 
 
 def _strips(found: Check) -> dict[str, Any] | None:
@@ -58,7 +58,7 @@ def _regimes(found: Check) -> dict[str, Any]:
     }
 
 
-def where_to_look(found: Check, cell: Cell) -> Place | None:
+def where_to_look(found: Check, cell: Cell) -> DriveInterval | None:
     """The drive and the seconds that add most to a cell; None where it is of no place."""
     if cell.map in ("lag", "memory"):
         return None

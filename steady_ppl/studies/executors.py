@@ -27,7 +27,7 @@ from steady_ppl.studies.job import CHANGED, Job, JobFiles, differing, digest_of,
 from steady_ppl.utils.cores import ONE_THREAD
 from steady_ppl.utils.text import one_line, shown
 
-Row = dict[str, Any]
+ResultRow = dict[str, Any]
 Say = Callable[[str], None]
 
 WORKER_WAIT = 30  # s for the first worker, and between looks at whether there still is one
@@ -38,7 +38,7 @@ MIN_REFUSED_JOBS = 4  # jobs whose files are others, at which a worker has been 
 MAX_LOST_JOBS = 10  # jobs that Dask gives up while nothing is begun
 
 
-class Place(AbstractContextManager):
+class Executor(AbstractContextManager):
     """Where jobs are computed."""
 
     lost: tuple[type[BaseException], ...] = ()
@@ -47,18 +47,18 @@ class Place(AbstractContextManager):
     def __exit__(self, *raised: Any) -> None:
         pass
 
-    def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
+    def results(self, jobs: Sequence[Job], say: Say) -> Generator[ResultRow]:
         """What comes back, in any order; `say` hears of what holds it up. ComputationError: workers die before they
         begin."""
         raise NotImplementedError
 
 
-def given_up(job: Job) -> Row:
+def given_up(job: Job) -> ResultRow:
     """The row of a job that kills its workers."""
     return job.columns | {"outcome": "failed", "reason": "its worker died each time that it was tried"}
 
 
-class Local(Place):
+class Local(Executor):
     """So many processes of this machine, each with one thread and one job at a time, so that one that dies takes no
     other job with it. Its job is tried again when all others have ended, the last time alone: it may need all the
     memory."""
@@ -66,7 +66,7 @@ class Local(Place):
     def __init__(self, workers: int) -> None:
         self.workers = workers
 
-    def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
+    def results(self, jobs: Sequence[Job], say: Say) -> Generator[ResultRow]:
         left = list(jobs)
         with warnings.catch_warnings():
             # loky replaces a process that has grown, and says so where it is given its next job
@@ -91,7 +91,7 @@ class _Process:
         try:
             return self.executor.submit(run, job)
         except BrokenProcessPool as error:
-            self.died_idle, dead = True, Future[Row]()
+            self.died_idle, dead = True, Future[ResultRow]()
             dead.set_exception(error)
             return dead
 
@@ -99,7 +99,7 @@ class _Process:
         self.executor.shutdown(kill_workers=True)
 
 
-def _rows(jobs: Sequence[Job], workers: int, died: list[Job], say: Say) -> Generator[Row]:
+def _rows(jobs: Sequence[Job], workers: int, died: list[Job], say: Say) -> Generator[ResultRow]:
     """The rows of jobs, but of those whose processes have `died`."""
     waiting, running, idle, unloaded = list(reversed(jobs)), dict[Future, tuple[Job, _Process]](), list[_Process](), 0
     try:
@@ -129,7 +129,7 @@ def _rows(jobs: Sequence[Job], workers: int, died: list[Job], say: Say) -> Gener
             process.end()
 
 
-class Cluster(Place):
+class Cluster(Executor):
     """A cluster that is there already. Workers may come and go while a study goes on: when one dies, its job is given
     to another; one that joins late and would find something else is not used.
 
@@ -196,7 +196,7 @@ class Cluster(Place):
                 raise UsageError(f"the worker {worker} cannot take part: {one_line(answer)}")
         return answers
 
-    def results(self, jobs: Sequence[Job], say: Say) -> Generator[Row]:
+    def results(self, jobs: Sequence[Job], say: Say) -> Generator[ResultRow]:
         for worker, other in self._ask(other_files, JobFiles().digests_of(jobs)).items():
             if other:
                 raise UsageError(f"the worker {worker} does not see {other[0]} as it is here: it needs the same paths")
@@ -235,7 +235,7 @@ class Cluster(Place):
                 self.looked, self.deserted = time.monotonic(), alone
         return sent.running.next_batch(block=False)
 
-    def _usable(self, answer: Answer, job: Job, sent: _Sent, say: Say) -> Row | None:
+    def _usable(self, answer: Answer, job: Job, sent: _Sent, say: Say) -> ResultRow | None:
         """Its row; None, and the job is sent again, where the worker is unlike this machine."""
         reason = answer.unlike
         if answer.row.get("reason") == CHANGED and JobFiles().is_of(job):
@@ -257,7 +257,7 @@ class Answer(NamedTuple):
 
     worker: str
     unlike: str
-    row: Row
+    row: ResultRow
 
 
 class _Sent:

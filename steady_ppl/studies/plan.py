@@ -23,7 +23,7 @@ from steady_ppl.utils.text import shown
 
 MOST_PANELS, MOST_PUBLISHED, LONGEST = 12, 100, 1000  # of a picture; characters of its title and labels
 MAX_NUMBER = 1e100  # a number beyond cannot be drawn
-MOST_JOBS, MOST_DRIVES = 100_000, 1_000_000
+MAX_JOBS, MAX_DRIVES = 100_000, 1_000_000
 
 FORMAT = 1
 RECORD = "study.json"
@@ -126,8 +126,8 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
         raise UsageError("expected at least one seed and one method")
     methods = [_method_axes(folder, one, task) for one in content["method"]]
     cells = len(content["seeds"]) * _cells(source) * sum(_cells(one["settings"]) for one in methods)
-    if cells > MOST_JOBS:
-        raise UsageError(f"{cells:,} jobs; expected at most {MOST_JOBS:,} of one study")
+    if cells > MAX_JOBS:
+        raise UsageError(f"{cells:,} jobs; expected at most {MAX_JOBS:,} of one study")
     files, different = JobFiles(), dict[str, Job]()
     for job in _jobs(content, task, source, methods):
         with labelled(f"method {job.method}"):
@@ -238,8 +238,8 @@ def _source_axes(folder: Path, given: Mapping[str, Any], instead: Path | None, t
         if problem := mismatch(values, [(form, None)], f"data.{name}"):
             raise UsageError(problem)
         for value in values if form != TEXT else ():
-            if value is not None and not 0 < value <= MOST_DRIVES:
-                raise UsageError(f"data.{name} is {value}, expected more than 0 and at most {MOST_DRIVES:,}")
+            if value is not None and not 0 < value <= MAX_DRIVES:
+                raise UsageError(f"data.{name} is {value}, expected more than 0 and at most {MAX_DRIVES:,}")
         if values != [None]:
             axes[name] = values
     return axes

@@ -16,13 +16,13 @@ from steady_ppl.model.program import Program, error_groups, for_program
 from steady_ppl.runs.fit import packages
 from steady_ppl.runs.recipes import find_recipe, require_settings
 from steady_ppl.smc.simulate import simulate
-from steady_ppl.studies.executors import Place, Row, Say
+from steady_ppl.studies.executors import Executor, ResultRow, Say
 from steady_ppl.studies.job import CHANGED, ERRORS, drives, in_words, told, told_settings, truth, without_effect
 from steady_ppl.studies.plan import RECORD, Plan, record_plan, recorded_plan
 from steady_ppl.studies.table import read_results, study_table
 
 
-def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, say: Say = lambda line: None) -> int:
+def run_study(plan: Plan, folder: Path, place: Executor, *, again: bool = False, say: Say = lambda line: None) -> int:
     """Compute what of a study is not there yet.
 
     Args:
@@ -56,7 +56,7 @@ def run_study(plan: Plan, folder: Path, place: Place, *, again: bool = False, sa
             say(f"some of them were computed with {'; '.join(others)}: here is {here}")
         jobs, began = len(left), time.monotonic()
 
-        def keep(row: Row) -> None:
+        def keep(row: ResultRow) -> None:
             table.add(row)
             kept[row["key"]] = row["outcome"]
             result = f"failed, {row['reason']}" if row["outcome"] == "failed" else f"{row['seconds']:.0f} s"

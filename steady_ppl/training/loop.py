@@ -29,7 +29,7 @@ from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import tell
 
 TYPICAL_VALIDATIONS = 10  # validations are in a training
-SETTLED = 1.0  # nats a drive by which held-out log p(y) may rise at the end of a training that has converged
+MAX_FINAL_GAIN = 1.0  # nats a drive by which held-out log p(y) may rise at the end of a training that has converged
 
 
 class Guide(Protocol):
@@ -111,14 +111,14 @@ class Trained:
 
     @property
     def still_rising(self) -> float | None:
-        """By how many nats a drive held-out log p(y) rose over the last quarter, if that is more than `SETTLED` and its
+        """By how many nats a drive held-out log p(y) rose over the last quarter, if by more than `MAX_FINAL_GAIN` and its
         end was kept; None where it had settled, or where fewer than three validations cannot tell."""
         judged = [(entry["step"], entry["log_likelihood"]) for entry in self.history if "log_likelihood" in entry]
         if len(judged) < 3 or self.interrupted or judged[-1][0] != self.kept:
             return None
         before = max(value for step, value in judged[:-1] if step <= max(0.75 * self.kept, judged[0][0]))
         risen = judged[-1][1] - before
-        return risen if risen > SETTLED else None
+        return risen if risen > MAX_FINAL_GAIN else None
 
 
 @one_thread()

@@ -25,7 +25,7 @@ from steady_ppl.utils.tensor_files import read_tensors, write_tensors
 
 Piece = tuple[Mapping[str, Tensor], Mapping[str, Any]]
 RANDOM = "random state"  # of torch, after the piece
-SAID = ({"values": {str: ANYTHING}}, {"failed": TEXT})
+ENTRY_FORM = ({"values": {str: ANYTHING}}, {"failed": TEXT})
 
 _files: ContextVar[Iterator[Path] | None] = ContextVar("the files of a journal's pieces, in order", default=None)
 
@@ -70,7 +70,7 @@ def _read(file: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     except (ValueError, RecursionError):
         said = None
     state, now = tensors.get(RANDOM), torch.get_rng_state()
-    if mismatch(said, SAID) is not None or state is None or (state.shape, state.dtype) != (now.shape, now.dtype):
+    if mismatch(said, ENTRY_FORM) is not None or state is None or (state.shape, state.dtype) != (now.shape, now.dtype):
         raise RunError(f"{file} is damaged: it is no piece of a search; --force begins the search anew")
     return tensors, said
 

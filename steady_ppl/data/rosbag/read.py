@@ -25,7 +25,7 @@ import pandas as pd
 
 from steady_ppl.data.rosbag.mapping import BagColumn, BagMapping
 from steady_ppl.data.rosbag.reader import Bag, Say, bag_name, check_field, has_stamp, open_bag, stamp_of, value_at
-from steady_ppl.data.rosbag.resample import Piece, Series, align, held_pauses, in_rows
+from steady_ppl.data.rosbag.resample import EvenRows, Series, align, held_pauses, in_rows
 from steady_ppl.data.table import from_frame
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
@@ -52,7 +52,7 @@ def read_bags(paths: Sequence[str | Path], mapping: BagMapping, say: Say = say_a
             raise UsageError(f"two bags are named {label}, and so would be their trajectories: rename one")
     if not files:
         raise UsageError("there is no bag: name at least one")
-    kept: dict[str, Piece] = {}
+    kept: dict[str, EvenRows] = {}
     with stages(*((f"reading {label}", 1) for label in labels)) as begin:
         for file, label in zip(files, labels, strict=True):
             begin()
@@ -148,7 +148,7 @@ def _series(where: str, column: BagColumn, time: np.ndarray, values: np.ndarray)
     return Series(column, time[good], values[good])
 
 
-def _pieces(series: list[Series], mapping: BagMapping, label: str, say: Say) -> dict[str, Piece]:
+def _pieces(series: list[Series], mapping: BagMapping, label: str, say: Say) -> dict[str, EvenRows]:
     """The trajectories of a bag by name, without those that say nothing; what is left out is said."""
     found = in_rows(series, mapping.step, label)
     for held in held_pauses(series, mapping.step):

@@ -26,7 +26,7 @@ class Series:
 
 
 @dataclass(frozen=True)
-class Piece:
+class EvenRows:
     """The rows of one trajectory, its columns by their names."""
 
     start: int  # ns, the time of the first row
@@ -40,7 +40,7 @@ class Piece:
         return len(next(iter(self.cells.values())))
 
 
-def in_rows(series: Sequence[Series], step: float, name: str = "bag") -> list[Piece]:
+def in_rows(series: Sequence[Series], step: float, name: str = "bag") -> list[EvenRows]:
     """The pieces between pauses, each with rows from where all controls are known to its last measurement.
 
     No series of a control may be empty. More rows than `MAX_ROWS` are a DataError that names the bag.
@@ -98,7 +98,7 @@ def _intersection(a: list[tuple[int, int]], b: list[tuple[int, int]]) -> list[tu
     return found
 
 
-def _piece(series: Sequence[Series], start: int, end: int, step: float, name: str) -> Piece:
+def _piece(series: Sequence[Series], start: int, end: int, step: float, name: str) -> EvenRows:
     spacing = step * 1e9
     last = int(np.floor((end - start) / spacing + 0.5))
     if last >= MAX_ROWS:
@@ -119,7 +119,7 @@ def _piece(series: Sequence[Series], start: int, end: int, step: float, name: st
             values = _interpolated(one, time, None if column.kind == "u" else 2 * spacing)
         cells[column.name] = column.scale * values + column.offset
     rivals = {name: count - len(at) for name, (at, _, count) in nearest.items()}
-    return Piece(start, cells, rivals, {name: count for name, (_, _, count) in nearest.items()})
+    return EvenRows(start, cells, rivals, {name: count for name, (_, _, count) in nearest.items()})
 
 
 def _nearest(one: Series, start: int, spacing: float, last: int) -> tuple[np.ndarray, np.ndarray, int]:
