@@ -111,7 +111,7 @@ class Trained:
 
     @property
     def still_rising(self) -> float | None:
-        """By how many nats a drive held-out log p(y) rose over the last quarter, if by more than `MAX_FINAL_GAIN` and its
+        """By how many nats a drive held-out log p(y) rose over the last quarter, if more than `MAX_FINAL_GAIN` and its
         end was kept; None where it had settled, or where fewer than three validations cannot tell."""
         judged = [(entry["step"], entry["log_likelihood"]) for entry in self.history if "log_likelihood" in entry]
         if len(judged) < 3 or self.interrupted or judged[-1][0] != self.kept:

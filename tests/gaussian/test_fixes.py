@@ -66,7 +66,7 @@ def test_many_drives_go_in_parts(monkeypatch) -> None:
     program = example("hovercraft")
     data = drives(program, 5, 11)
     whole = found(program, data)
-    monkeypatch.setattr(sys.modules[fixes.__module__], "AT_ONCE", 2 * 32 * 11)
+    monkeypatch.setattr(sys.modules[fixes.__module__], "MAX_ROWS_OF_BATCH", 2 * 32 * 11)
     torch.testing.assert_close(found(program, data), whole, equal_nan=True)
 
 
