@@ -72,7 +72,7 @@ def _end(line: str) -> str:
         width = os.get_terminal_size(sys.stderr.fileno()).columns or 80
     except OSError:  # it does not know its width
         width = 80
-    return line if len(line) < width else f"…{line[2 - width :]}"
+    return line if len(line) < width else f"…{line[len(line) - max(0, width - 2) :]}"
 
 
 def in_words(doing: str, share: float, until_now: float, elapsed: float) -> str:

@@ -64,4 +64,5 @@ def _hash(tensors: Mapping[str, Tensor], text: Mapping[str, str]) -> str:
 
 
 def damaged(path: Path, why: str) -> RunError:
+    """The error to raise for a file of a run that is not what was written."""
     return RunError(f"{path.name} in {path.parent} is damaged ({why})")
