@@ -165,10 +165,14 @@ def test_what_rivals_say_can_be_stored():
 # --- the stored results -----------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def stored() -> list[dict]:
-    """The records of the last full run."""
-    return [json.loads(line) for line in STORED.read_text().splitlines()]
+def records(name: str) -> list[dict]:
+    return [json.loads(line) for line in STORED.with_stem(name).read_text().splitlines()]
+
+
+@pytest.fixture(scope="module", params=["discovery", "discovery-continuous"])
+def stored(request: pytest.FixtureRequest) -> list[dict]:
+    """The records in worlds that take the program's own step, and in finer ones."""
+    return records(request.param)
 
 
 def test_every_set_has_its_record_by_one_engine(stored):
@@ -185,21 +189,14 @@ def test_p_values_of_clean_sets_are_uniform_and_one_in_twenty_is_accused(stored)
     assert low <= 0.05 <= high
 
 
-def test_the_stored_table_is_that_of_the_records(stored):
-    assert STORED.with_suffix(".md").read_text().startswith(discovery_scores.scores_table(stored))
+@pytest.mark.parametrize("name", ["discovery", "discovery-continuous"])
+def test_the_stored_table_is_that_of_the_records(name):
+    page = STORED.with_stem(name).with_suffix(".md").read_text()
+    assert page.startswith(discovery_scores.scores_table(records(name)))
 
 
-def test_the_sets_in_finer_worlds_are_the_first_of_all_by_one_engine():
-    file = STORED.with_stem("discovery-continuous")
-    records = [json.loads(line) for line in file.read_text().splitlines()]
-    assert {record["set"] for record in records} == {one.name for one in EVERY[: len(records)]}
-    assert len({record["version"] for record in records}) == 1
-    page = file.with_suffix(".md").read_text()
-    assert page.startswith(discovery_scores.scores_table(records)) and f"The first {len(records)} of the" in page
-
-
-def test_the_stored_comparison_is_that_of_the_records(stored):
+def test_the_stored_comparison_is_that_of_the_records():
     beside = STORED.with_stem("discovery-rivals")
     rivals = [json.loads(line) for line in beside.read_text().splitlines()]
     assert len(rivals) == 140 and not any("failed" in record for record in rivals)
-    assert beside.with_suffix(".md").read_text() == discovery_scores.rivals_table(stored, rivals)
+    assert beside.with_suffix(".md").read_text() == discovery_scores.rivals_table(records("discovery"), rivals)
