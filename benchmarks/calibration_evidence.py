@@ -19,6 +19,7 @@ from torch import Tensor
 
 from steady_ppl import Program, Trajectories, run_filter, seeded
 from steady_ppl.gaussian.smoother import find_and_smooth
+from steady_ppl.model.problem import Problem
 
 FILTERS = {
     "bootstrap 200": (200, False),
@@ -64,7 +65,7 @@ def unbiased(name: str, which: str, count: int = COUNT) -> dict:
     torch.set_num_threads(1)
     program, data = drive(name)
     with seeded("evidence", "linearised"):  # its starts are drawn
-        linear = float(find_and_smooth(program, data).log_likelihood)
+        linear = float(find_and_smooth(Problem(program, data)).log_likelihood)
     error, about = 0.0, linear
     if name != "cart":
         fine = estimates(name, FINE, True, max(8, count // 10))

@@ -26,7 +26,7 @@ from steady_ppl.likelihood.parameter_posterior import (
     resampled,
     weighed,
 )
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import for_program
 
 DRAWS, DRIVES = 99, 4
@@ -76,7 +76,7 @@ def ranked(seed: int) -> dict:
     torch.set_num_threads(1)
     program, truth, data = drawn(seed)
     with seeded(seed, "parameters"):
-        maximum = maximise(program, data)
+        maximum = maximise(Problem(program, data))
         problem = Problem(program, data)
         shape = about_maximum(problem, maximum.path)
         judge = linearised(problem, maximum.path)

@@ -26,7 +26,7 @@ from steady_ppl.discovery.effect_scores import columns_of
 from steady_ppl.discovery.refits import Refit, first_refit
 from steady_ppl.discovery.screening import MIN_SHARE_OF_INFORMATION, Screened
 from steady_ppl.effects import Variant, attached, catalogue, chosen_variant, parsed
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.problem import Problem
 
 Array = np.ndarray
 MODEL = Path(__file__).resolve().parents[1] / "models" / "hovercraft.py"

@@ -22,7 +22,7 @@ from torch import Tensor
 from steady_ppl import Program, Trajectories, for_program
 from steady_ppl.discovery.refits import Refit, first_refit, refit_with
 from steady_ppl.effects import Variant
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.problem import Problem
 
 Tables = Sequence[Trajectories]
 WINDOWS = (15, 23, 31, 41, 71)  # rows
@@ -104,7 +104,7 @@ def smoothed_residuals(
     began = time.perf_counter()
     base = base or fitted(tables, program, known_start)
     data, path = base.folds[0].drives, base.folds[0].path
-    at = smoothed(smooth(base.program, data, path, known_start=known_start), data)
+    at = smoothed(smooth(Problem(base.program, data, known_start), path), data)
     known = evidence(base.program, data, at.states, candidates(base.program, data, withheld))
     effects, detected = one_by_one(rows_of(known, at.channels.mean))
     return {"smoothed residuals": Ranking(tuple(effects), detected, time.perf_counter() - began)}
@@ -145,7 +145,7 @@ def _whitened(base: Refit, known_start: bool) -> tuple[Tensor, Tensor]:
     from steady_ppl.gaussian.predict import predict
 
     data, path = base.folds[0].held_out, base.folds[0].held_out_path
-    tracked = track(base.program, data, path, known_start=known_start)
+    tracked = track(Problem(base.program, data, known_start), path)
     found = predict(base.program, data, tracked, [1])[1]
     linear = tracked.linearization
     spread = linear.state @ tracked.covariances[:-1] @ linear.state.mT + linear.noise @ linear.noise.mT

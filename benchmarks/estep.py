@@ -44,6 +44,7 @@ from steady_ppl import (
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.model.joint import Joint
+from steady_ppl.model.problem import Problem
 
 MUSTS = {"good": Bound(0.05), "first": Bound(0.1)}
 CHEAPER = 20
@@ -77,7 +78,7 @@ def main() -> int:
 def scatter_of_evidence(program: Program, data: Trajectories, known_start: bool, must: float, runs: int) -> int:
     """sd of log p(y) of the lookahead filter with 100 particles."""
     with seeded("path"):
-        ahead = find_and_smooth(program, data, known_start=known_start)
+        ahead = find_and_smooth(Problem(program, data, known_start))
     with seeded("evidence"):
         values = [
             particle_filter(

@@ -54,7 +54,7 @@ def timed(call, *arguments, **options):
 MAXIMISE = "timed(st.fit_by_likelihood, program.with_effect(effect), train, known_start=True)"
 REFIT = """
 from steady_ppl.discovery.refits import first_refit, refit_with
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.problem import Problem
 base = first_refit(Problem(program, train, True), valid, seed=seed)
 timed(refit_with, base, chosen_variant(program, effect), 0.01)
 """

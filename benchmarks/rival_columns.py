@@ -18,6 +18,7 @@ from steady_ppl.gaussian.linearize import ReferencePath, linearize
 from steady_ppl.likelihood.parameters import elements, moved
 from steady_ppl.likelihood.scores import channel_moments
 from steady_ppl.model.interventions import by_channel
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.substeps import acting_controls
 
 REGRESSED = ("push", "command", "history")  # forms of effects that change an acceleration
@@ -63,7 +64,7 @@ def evidence(program: Program, data: Trajectories, states: Tensor, variants: Seq
         variants: of the catalogue.
     """
     path = ReferencePath(states, states.new_zeros((*data.steps.shape, len(program.channels))))
-    linear = linearize(program, data, path, kernels=False)
+    linear = linearize(Problem(program, data), path, kernels=False)
     mean, spread = _moments(program, data, states)
     found, called, labels = [], [], []
     for column in columns_of([variant for variant in variants if variant.effect.form in REGRESSED]):

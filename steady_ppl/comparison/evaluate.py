@@ -16,9 +16,9 @@ from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, labelled
 from steady_ppl.likelihood.evidence import choose_filter, evidence, in_parts, run_filter
-from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.handlers import AtMean, Recording, as_vector, residual, running
 from steady_ppl.model.planar_vehicle import PlanarVehicle, UnknownMap
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, error_groups, for_program, names
 from steady_ppl.model.substeps import acting_controls
 from steady_ppl.runs.fit import Fit

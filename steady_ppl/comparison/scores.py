@@ -15,12 +15,13 @@ from steady_ppl.criticism.baselines import ConstantVelocity, constant_velocity
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, UsageError
 from steady_ppl.gaussian.information_filter import Lookahead
-from steady_ppl.gaussian.kalman import Tracked
-from steady_ppl.gaussian.linearize import ReferencePath
+from steady_ppl.gaussian.kalman import Tracked, track
+from steady_ppl.gaussian.linearize import ReferencePath, why_not_linear
 from steady_ppl.gaussian.predict import Prediction, named_horizons, predict, simulate_again, states_ahead
+from steady_ppl.gaussian.smoother import find_and_smooth, smooth
 from steady_ppl.likelihood.evidence import neglected
-from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import measured, substep_spreads
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, error_groups, for_program
 from steady_ppl.utils.random import seeded
 
@@ -129,12 +130,12 @@ def judge_program(
     """Find the paths from the measurements alone, unless one is given; predict, and compare; errors as of `prove`."""
     problem = Problem(program, for_program(program, data), known_start)
     unseen = problem.without_truth()
-    if (why := unseen.why_not_linear()) is not None:
+    if (why := why_not_linear(program, unseen.data, known_start=known_start)) is not None:
         said = f"{name}: prove needs programs that can be linearised: {why.split(': looking')[0]}"
         raise UsageError(f"{said} (`steady evaluate` takes any)")
     try:
         with seeded(seed, "prove"):
-            ahead = unseen.find_and_smooth(path)
+            ahead = find_and_smooth(unseen, path=path)
     except FilterError as error:
         raise FilterError(f"{name}: {error}", trajectory=error.trajectory, time=error.time) from error
     judged = judge(problem, ahead)
@@ -148,7 +149,7 @@ def judge_program(
 def judge(problem: Problem, ahead: Lookahead, kernels: bool | None = None) -> Judged:
     """Track along a path that was found and compare what is predicted from every row with measurements and truth."""
     program, data, unseen = problem.program, problem.data, problem.without_truth()
-    tracked = unseen.track(ahead.linearization.path, kernels=kernels)
+    tracked = track(unseen, ahead.linearization.path, kernels=kernels)
     named = named_horizons(data, SECONDS)
     longest, states = max(named.values()), dict[tuple[str, int], tuple[Tensor, Tensor]]()
     horizons = {round(rows) for rows in np.geomspace(1, longest, DRAWN).tolist()} | set(named.values())
@@ -174,7 +175,7 @@ def keeping_velocity(before: Judged) -> Judged | str:
     coasting.error_groups = unseen.program.error_groups  # type: ignore[misc]
     path = before.tracked.path(unseen.data)
     still = ReferencePath(path.states, torch.zeros_like(path.noise))
-    ahead = replace(unseen, program=coasting).smooth(still, kernels=False)
+    ahead = smooth(replace(unseen, program=coasting), still, kernels=False)
     if not bool(torch.isfinite(ahead.log_likelihood).all()):
         return "it blows up on these drives"
     return judge(replace(before.problem, program=coasting), ahead, kernels=False)
@@ -190,7 +191,7 @@ def noise_floor(true: Judged, seed: int) -> Judged | str:
         starts = data.known_start.expand(sets, -1, -1) if unseen.known_start else drawn[:, 0]
         again, path = simulate_again(program, data, starts, true.tracked.noise.shape[-1])
     own = replace(unseen, data=again)
-    ahead = own.smooth(path)
+    ahead = smooth(own, path)
     if not bool(torch.isfinite(ahead.log_likelihood).all()):
         return "the true program does not explain drives of its own"
     if true.states:

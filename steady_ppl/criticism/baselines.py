@@ -9,11 +9,11 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from steady_ppl.gaussian.kalman import Tracked
+from steady_ppl.gaussian.kalman import Tracked, track
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, on_a_circle, predict
-from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.handlers import AtMean, ByColumn, Recording, Standardised, as_event, normal_moments, running
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance, joined, sample_channels
 from steady_ppl.utils.angles import wrap
@@ -101,7 +101,7 @@ def constant_velocity(problem: Problem, tracked: Tracked, horizons: Sequence[int
     for multiple in MULTIPLES:
         coasting = ConstantVelocity(program, (multiple * sizes).tolist())
         start = ReferencePath(path.states, (values / (multiple * sizes)).to(values.dtype))
-        found = replace(problem, program=coasting).track(start, passes=3, kernels=False)
+        found = track(replace(problem, program=coasting), start, passes=3, kernels=False)
         likely = float(found.log_likelihood.sum())
         if math.isfinite(likely) and (best is None or likely > best[0]):
             best = likely, coasting, found

@@ -23,9 +23,12 @@ from steady_ppl.data.frozen_sensors import frozen_stretches
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
+from steady_ppl.gaussian.kalman import track
+from steady_ppl.gaussian.linearize import why_not_linear
 from steady_ppl.gaussian.predict import named_horizons, predict
+from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.kernels.rows import in_plain_torch, without_kernels
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit
@@ -66,16 +69,16 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     if run.time.shape[0] < 2 or not bool(run.observed[1:].any()):
         raise DataError("nothing to compare: no trajectory has a measurement after its first row")
     refuse_long(run)
-    if (why := problem.why_not_linear()) is not None:
+    if (why := why_not_linear(problem.program, problem.data, known_start=problem.known_start)) is not None:
         raise UsageError(f"check needs a program that can be linearised: {why.split(': looking')[0]}")
     horizons = named_horizons(run, SECONDS)
     parts = (("finding paths", 1), ("comparing time steps", 1), ("simulating drives", 2), ("judging", 2))
     with stages(*parts) as begin:
         begin()
         with seeded(seed, "check"), without_kernels() as uncompiled:
-            ahead = problem.find_and_smooth()
+            ahead = find_and_smooth(problem)
             path = ahead.linearization.path
-            real = problem.track(path, passes=1)
+            real = track(problem, path, passes=1)
             _, drawn, _ = ahead.draws(simulations)
             starts = run.known_start.expand(simulations, -1, -1) if fit.known_start else drawn[:, 0]
             begin()

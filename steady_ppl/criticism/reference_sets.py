@@ -16,11 +16,11 @@ from steady_ppl.criticism.perturbations import Direction, directions
 from steady_ppl.criticism.residual_maps import Residuals
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
-from steady_ppl.gaussian.kalman import Tracked
+from steady_ppl.gaussian.kalman import Tracked, track
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, predict, simulate_again
-from steady_ppl.gaussian.smoother import REST_TOLERANCE, means_as_path
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.gaussian.smoother import REST_TOLERANCE, means_as_path, smooth
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.angles import wrap_angles
 from steady_ppl.utils.cores import Result, side_by_side
@@ -95,7 +95,7 @@ def _block(problem: Problem, starts: Tensor, channels: int, horizons: Sequence[i
             return {}, {}
         kept = whole.repeat_interleave(len(problem.data)).nonzero().flatten()
         copies, sets = copies.subset(kept), int(whole.sum())
-        tracked = copies.track(ReferencePath(near.states[:, kept], near.noise[:, kept]), passes=1)
+        tracked = track(copies, ReferencePath(near.states[:, kept], near.noise[:, kept]), passes=1)
     again = copies.data
     simulated = predict(program, again, tracked, horizons, bands=[1])
     errors, scores = residuals(program, again, tracked, simulated[1], sets), directions(program, again, tracked)
@@ -111,15 +111,15 @@ def _block(problem: Problem, starts: Tensor, channels: int, horizons: Sequence[i
 def _tracked(problem: Problem, truth: ReferencePath) -> tuple[ReferencePath, Tracked]:
     """Paths near the posterior's modes, and the drives along them. Drives whose path is still on its way after a single
     step from the truth take more."""
-    near = means_as_path(problem.smooth(truth, passes=1), problem.data)
-    tracked = problem.track(near, passes=1)
+    near = means_as_path(smooth(problem, truth, passes=1), problem.data)
+    tracked = track(problem, near, passes=1)
     far = ~((tracked.noise - near.noise).abs().amax((0, 2)) <= REST_TOLERANCE) | _starts_elsewhere(tracked, near)
     if bool(far.any()):
         index = far.nonzero().flatten()
         begin = ReferencePath(truth.states[:, index], truth.noise[:, index])
-        path = problem.subset(index).smooth(begin, passes=LINEARISATIONS).linearization.path
+        path = smooth(problem.subset(index), begin, passes=LINEARISATIONS).linearization.path
         near.states[:, index], near.noise[:, index] = path.states, path.noise
-        tracked = problem.track(near, passes=1)
+        tracked = track(problem, near, passes=1)
     return near, tracked
 
 

@@ -19,8 +19,8 @@ from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.likelihood.maximize import Maximum, maximise, widen_noise
 from steady_ppl.likelihood.parameters import elements, values_of
-from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import widens
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import can_be_cut, counts_rows, is_step
 from steady_ppl.model.substeps import MAX_SUBSTEPS, with_substeps
@@ -192,14 +192,15 @@ def check_step(
 
     def trial(substeps: int, like: Program, path: ReferencePath, steps: int) -> StepTrial:
         changed = with_substeps(like, substeps)
+        problem = Problem(changed, data, known_start)
         if not refits:
-            ahead = smooth(changed, data, path, known_start=known_start, kernels=False)
-            require_found(ahead, changed, data)
+            ahead = smooth(problem, path, kernels=False)
+            require_found(ahead, problem)
             return StepTrial(substeps, float(ahead.log_likelihood.sum()), 0.0, changed, resting_path(ahead, data))
         if steps:
             with seeded(substeps, "wider noise"):
-                path = widen_noise(Problem(changed, data, known_start), path)
-        maximum = maximise(changed, data, path, known_start=known_start, steps=steps, precision=PRECISION)
+                path = widen_noise(problem, path)
+        maximum = maximise(problem, path, steps=steps, precision=PRECISION)
         return _trial(changed, maximum, names)
 
     def again(coarse: StepTrial, fine: StepTrial) -> StepTrial:
@@ -214,7 +215,7 @@ def check_step(
     if isinstance(at, Maximum):
         first = _trial(program, at, names)
     else:
-        first = trial(own, program, at or find_path(program, data, known_start=known_start), 0)
+        first = trial(own, program, at or find_path(Problem(program, data, known_start)), 0)
     if counts_rows(program):  # in substeps its delay is another
         return StepCheck((first,), max_shift, f"{UNKNOWN}: `actuators` counts rows, which are shorter in substeps")
     if 2 * own > most:

@@ -26,6 +26,7 @@ from steady_ppl.discovery.refits import (
 from steady_ppl.discovery.screening import ALPHA, Screened, Tested, departures, screen
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.errors import FilterError
+from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood.parameters import Element, elements
 from steady_ppl.likelihood.scores import measured, smoothed, typical_spreads
 from steady_ppl.model.program import Program
@@ -115,7 +116,7 @@ def screen_program(now: Refit, declared: Program, *, sets: int, seed: int, withh
     problem, parts = fold.fitting(program), elements(program)
     there = {variant.name for variant in attached(program)}
     seen = replace(fold.drives, states=fold.path.states)
-    ahead = problem.smooth(fold.path, passes=3, tolerance=0.01)
+    ahead = smooth(problem, fold.path, passes=3, tolerance=0.01)
     away = departures(declared, now, parts)
     away = [one for one in away if one.variant.name not in there and one.variant.effect.name not in withheld]
     there |= {departure.variant.name for departure in away}

@@ -20,9 +20,10 @@ from steady_ppl.discovery.result import Discovery
 from steady_ppl.discovery.search import MAX_EFFECTS, Found, Search, Settings, search
 from steady_ppl.effects import of_name, record, restore, written_class
 from steady_ppl.errors import DataError, UsageError
+from steady_ppl.gaussian.linearize import why_not_linear
 from steady_ppl.kernels.rows import in_plain_torch, without_kernels
 from steady_ppl.likelihood.parameters import elements
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit, program_source, versions
@@ -222,7 +223,7 @@ def require(problem: Problem, valid: Trajectories, simulations: int) -> None:
             f"{len(both)} of the validation drives are training drives as well ({some}): nothing could be judged "
             "by them"
         )
-    if (why := problem.why_not_linear()) is not None:
+    if (why := why_not_linear(problem.program, problem.data, known_start=problem.known_start)) is not None:
         raise UsageError(f"discover needs a program that can be linearised: {why.split(': looking')[0]}")
     constant = unexcited(program, train)
     if constant and len(constant) == len(program.control_names):

@@ -14,8 +14,8 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import simulate_again
+from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood.parameters import Element
-from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import (
     Smoothed,
     channel_moments,
@@ -25,6 +25,7 @@ from steady_ppl.likelihood.scores import (
     substep_spreads,
 )
 from steady_ppl.model.interventions import by_channel
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, row_controls
 from steady_ppl.utils.cores import Result, side_by_side
@@ -236,7 +237,7 @@ def simulate_scores(
 
     def score(index: Tensor) -> Result:
         part = replace(problem, data=drives.subset(index))
-        ahead = part.smooth(ReferencePath(path.states[:, index], path.noise[:, index]), passes=2)
+        ahead = smooth(part, ReferencePath(path.states[:, index], path.noise[:, index]), passes=2)
         return {"scores": scores_along(part, ahead, parts, columns), "likely": ahead.log_likelihood}, {}
 
     jobs = [partial(score, index) for index in torch.arange(len(drives)).split(PART)]

@@ -17,7 +17,8 @@ from steady_ppl.discovery.screening import Tested
 from steady_ppl.discovery.search import MIN_GAIN_OF_CURVE, Found, Search
 from steady_ppl.effects import Variant, attached
 from steady_ppl.gaussian.predict import simulate_again
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.gaussian.smoother import smooth
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.random import seeded
 
@@ -204,7 +205,7 @@ def _separation(refits: list[Refit], controls: Tensor, seed: int) -> float:
 
     def log_likelihood(judge: Program) -> Tensor:
         problem = Problem(judge, with_states_of(judge, again), fold.known_start)
-        return problem.smooth(with_states_of(judge, truth), passes=4).log_likelihood
+        return smooth(problem, with_states_of(judge, truth), passes=4).log_likelihood
 
     own = log_likelihood(program)
     apart = [float((own - log_likelihood(other)).mean()) for other in others]

@@ -23,14 +23,14 @@ from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.gaussian.smoother import require_found, resting_path
+from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.guides.base import Constant
 from steady_ppl.guides.linearized import LookaheadGuide
 from steady_ppl.likelihood.evidence import neglected
-from steady_ppl.likelihood.maximize import Maximum, Term, climb, kept_maximum, maximum_of
+from steady_ppl.likelihood.maximize import Maximum, Term, climb, kept_maximum, maximise
 from steady_ppl.likelihood.parameters import Element, elements, moved, set_values, values_of
-from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import channel_moments, substep_spreads
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.training.loop import Optimization, Validation, train
 from steady_ppl.utils.random import seeded
@@ -57,7 +57,7 @@ class ByLikelihood:
 
     def fit(self, problem: Problem, path: ReferencePath | None = None, **settings: Any) -> Maximum:
         """Move a program's parameters, in place, from a path that is found when None; see `maximise`."""
-        return maximum_of(problem, path, **settings)
+        return maximise(problem, path, **settings)
 
     def judge(self, problem: Problem, path: ReferencePath) -> Judgement:
         """Log p(y) of drives, linearised along a path that is improved from here."""
@@ -78,7 +78,7 @@ class ByDraws:
 
     def fit(self, problem: Problem, path: ReferencePath | None = None, **_: Any) -> Maximum:
         """See `ByLikelihood`."""
-        return kept_maximum(problem.program, lambda: self._climb(problem, path or problem.find_path()))
+        return kept_maximum(problem.program, lambda: self._climb(problem, path or find_path(problem)))
 
     def _climb(self, problem: Problem, path: ReferencePath) -> Maximum:
         program, data, known_start = problem.program, problem.data, problem.known_start
@@ -126,8 +126,8 @@ def is_doubtful(problem: Problem, path: ReferencePath) -> bool:
 
 
 def _at_rest(problem: Problem, path: ReferencePath) -> Lookahead:
-    ahead = problem.smooth(path, passes=15, tolerance=0.02)
-    require_found(ahead, problem.program, problem.data)
+    ahead = smooth(problem, path, passes=15, tolerance=0.02)
+    require_found(ahead, problem)
     return ahead
 
 

@@ -17,10 +17,11 @@ from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, Fitting, Judges,
 from steady_ppl.effects import Variant, attach, attached, coefficient
 from steady_ppl.errors import FilterError, SteadyError
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.likelihood.maximize import Maximum, fit_by_likelihood, maximum_of, refit_outliers
+from steady_ppl.gaussian.smoother import find_path
+from steady_ppl.likelihood.maximize import Maximum, fit_by_likelihood, maximise, refit_outliers
 from steady_ppl.likelihood.parameters import Element, elements, values_of
-from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import widens
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.random import seeded
 
@@ -148,7 +149,7 @@ def first_refit(problem: Problem, valid: Trajectories, *, seed: int, nearer: Pro
     with seeded(seed, "paths"):
         one = fit_by_likelihood(own, train, known_start=known_start)
         other = Problem(copy.deepcopy(own), valid, known_start)
-        second = refit_outliers(other, maximum_of(other, other.find_path()))
+        second = refit_outliers(other, maximise(other, find_path(other)))
     fold = Fold(train, one.path, valid, second.path, known_start)
     programs, folds = [own, other.program], [fold, Fold(valid, second.path, train, one.path, known_start)]
     parts = elements(own)
@@ -175,7 +176,7 @@ def starts_by_draws(given: Program, fitted: Program, fold: Fold) -> list[Start]:
     for program, near in ((given, None), (fitted, fold.path)):
         problem = fold.fitting(program)
         try:
-            judged = FIRST_BY_DRAWS.judge(problem, near or problem.find_path())
+            judged = FIRST_BY_DRAWS.judge(problem, near or find_path(problem))
             found.append(Start(program, judged.path, float(judged.log_likelihood.sum())))
         except FilterError as error:
             failures.append(error)
@@ -288,17 +289,14 @@ def _refit(
         guess = fold.information(information, folds[0])
         if threshold.stops_early and not fitted:
             floor = max(floor, threshold.drives)
-        anew: tuple[Program, Maximum] | None = None  # by paths that are found anew, as far as it follows the drives
-        if unwidened is not None:
-            again = fold.fitting(as_declared(unwidened, program))
-            with suppress(FilterError):
-                anew = again.program, maximum_of(again, hopeless=floor)
-                floor = max(floor, float(anew[1].log_likelihood.sum()))
+        anew = None if unwidened is None else _fit_anew(fold.fitting(as_declared(unwidened, program)), floor)
+        if anew is not None:
+            floor = max(floor, float(anew[1].log_likelihood.sum()))
         maximum = known or fitting.fit(fold.fitting(program), fold.path, information=guess, hopeless=floor)
         held_out_path = fold.held_out_path
         if anew is not None and anew[1].objective > maximum.objective:
             program, maximum = anew
-            held_out_path = fold.judging(program).find_path()
+            held_out_path = find_path(fold.judging(program))
         judged = fitting.judge(fold.judging(program), held_out_path)
         fitted.append(program)
         found.append(maximum)
@@ -317,6 +315,13 @@ def _refit(
             for program, fold in zip(judges.programs, judged_folds, strict=True)
         ]
     return Refit(fitted, found, judged_folds, fitting, judges, torch.cat(held_out), alone, unwidened)
+
+
+def _fit_anew(problem: Problem, floor: float) -> tuple[Program, Maximum] | None:
+    """A fit along paths that are found anew; None where the program cannot follow its drives."""
+    with suppress(FilterError):
+        return problem.program, maximise(problem, hopeless=floor)
+    return None
 
 
 def _information(maximum: Maximum, parts: Sequence[Element]) -> Tensor | None:

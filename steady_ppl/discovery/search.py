@@ -38,7 +38,7 @@ from steady_ppl.discovery.refits import (
 from steady_ppl.discovery.screening import ALPHA, Tested
 from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import with_substeps
 from steady_ppl.utils.progress import stages

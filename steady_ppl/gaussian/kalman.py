@@ -13,7 +13,7 @@ precision, zero where it is missing.
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.lanes import Array, array
 from steady_ppl.gaussian.linearize import LinearArrays, Linearization, ReferencePath, linearize
-from steady_ppl.model.program import Program
+from steady_ppl.model.problem import Problem
 
 
 class FilteredMoments(NamedTuple):
@@ -62,21 +62,12 @@ class Tracked:
         return torch.from_numpy(out)
 
 
-def track(
-    program: Program,
-    data: Trajectories,
-    path: ReferencePath,
-    *,
-    known_start: bool,
-    passes: int = 2,
-    kernels: bool | None = None,
-) -> Tracked:
+def track(problem: Problem, path: ReferencePath, *, passes: int = 2, kernels: bool | None = None) -> Tracked:
     """Linearise along a path near the posterior's mode, filter and smooth, and again along what was smoothed, in so
-    many passes; the other arguments are those of `linearize`."""
-    given: dict[str, Any] = {"known_start": known_start, "kernels": kernels}
-    tracked = filter_and_smooth(linearize(program, data, path, **given))
+    many passes; `kernels` is that of `linearize`."""
+    tracked = filter_and_smooth(linearize(problem, path, kernels=kernels))
     for _ in range(passes - 1):
-        tracked = filter_and_smooth(linearize(program, data, tracked.path(data), **given))
+        tracked = filter_and_smooth(linearize(problem, tracked.path(problem.data), kernels=kernels))
     return tracked
 
 

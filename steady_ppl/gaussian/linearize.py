@@ -31,6 +31,7 @@ from steady_ppl.model.handlers import (
     running,
     tangent_normal,
 )
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance, joined
 from steady_ppl.model.validate import start_size, step_size
@@ -102,11 +103,9 @@ class Linearization(Sensors):
 
 @torch.no_grad()
 def linearize(
-    program: Program,
-    data: Trajectories,
+    problem: Problem,
     path: ReferencePath,
     *,
-    known_start: bool = False,
     observation_weight: float = 1.0,
     kernels: bool | None = None,
     angles: tuple[int, ...] | None = None,
@@ -114,8 +113,7 @@ def linearize(
     """Differentiate the program along a path, all trajectories and times at once.
 
     Args:
-        program: its channel noise normal, its measurements normal or wrapped normal, components independent.
-        data: as returned by `for_program`; where `known_start`, the first state is certain.
+        problem: its program's channel noise normal, its measurements normal or wrapped normal, components independent.
         observation_weight: tempers the observations.
         kernels: differentiate by kernels where they can serve; None: if there are rows enough, see `on_all_rows`.
         angles: `Linearization.angles`, where they are known.
@@ -128,7 +126,7 @@ def linearize(
         with running(*state.shape[:-1]), Standardised(noise):
             return advance(program, state, control, time, step)
 
-    states, noise = path.states, path.noise
+    program, data, states, noise = problem.program, problem.data, path.states, path.noise
     if angles is None:
         angles = angles_on_a_circle(program, data, states[0, :1])
     along = {"state": states[:-1], "noise": noise}
@@ -136,7 +134,7 @@ def linearize(
     moved, (by_state, by_noise), in_plain_torch = _jacobians(program, "step", step, along, given, kernels)
     offset = (moved - (by_noise @ noise.unsqueeze(-1)).squeeze(-1) - states[1:]).double()
     offset[..., angles] = wrap(offset[..., angles])  # a program may keep its angles on the circle, and so may a path
-    start_offset, start_noise = (part.double() for part in _start(program, data, states[0], known_start))
+    start_offset, start_noise = (part.double() for part in _start(problem, states[0]))
     start_turn = torch.zeros_like(start_offset)
     start_turn[:, angles] = (start_offset - wrap(start_offset))[:, angles]
     seen = linearize_sensors(program, data, states, observation_weight=observation_weight, kernels=kernels)
@@ -190,7 +188,7 @@ def why_not_linear(program: Program, data: Trajectories, *, known_start: bool = 
         state = broadcast_event(program.initial(), torch.Size((rows - 1, 1)), 1)
     path = ReferencePath(state[:1].expand(rows, -1, -1), state.new_zeros((rows - 1, 1, step_size(program))))
     try:
-        linearize(program, data, path, known_start=known_start)
+        linearize(Problem(program, data, known_start), path)
     except ProgramError as error:
         return str(error)
     return None
@@ -210,15 +208,15 @@ def _residuals(program: Program, state: Tensor, measurement: Tensor, observed: T
     return torch.cat(list(parts), -1)
 
 
-def _start(program: Program, data: Trajectories, first: Tensor, known_start: bool) -> tuple[Tensor, Tensor]:
+def _start(problem: Problem, first: Tensor) -> tuple[Tensor, Tensor]:
     def start(noise: Tensor) -> Tensor:
         left = noise.shape[:-1]
         with running(*left), Standardised(noise):
-            return broadcast_event(program.initial(), left, 1)
+            return broadcast_event(problem.program.initial(), left, 1)
 
-    if known_start:
-        return data.known_start - first, first.new_zeros((*first.shape, 1))
-    began, (start_noise,) = _derivatives(start, first.new_zeros((first.shape[0], start_size(program))))
+    if problem.known_start:
+        return problem.data.known_start - first, first.new_zeros((*first.shape, 1))
+    began, (start_noise,) = _derivatives(start, first.new_zeros((first.shape[0], start_size(problem.program))))
     return began - first, start_noise
 
 

@@ -18,6 +18,7 @@ from steady_ppl.gaussian.linearize import ReferencePath, angles_on_a_circle, lin
 from steady_ppl.kernels.jit import unchanged
 from steady_ppl.kernels.rows import on_all_rows
 from steady_ppl.model.handlers import KnownStart, Recording, Standardised, broadcast_event, normal_moments, running
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import divergence
 from steady_ppl.model.substeps import acting_controls, joined, parted, sample_channels
@@ -32,11 +33,9 @@ REST_TOLERANCE = 0.05  # a trajectory is at rest where no noise moves by more, i
 
 @torch.no_grad()
 def smooth(
-    program: Program,
-    data: Trajectories,
+    problem: Problem,
     path: ReferencePath,
     *,
-    known_start: bool = False,
     observation_weight: float = 1.0,
     passes: int = 10,
     tolerance: float = 0.01,
@@ -47,7 +46,7 @@ def smooth(
     Gauss and Newton's method. A step is halved while its end is worse by more than `MAX_INCREASE` nats, see `_merit`.
 
     Args:
-        program, data, known_start, observation_weight, kernels: of `linearize`.
+        problem, observation_weight, kernels: of `linearize`.
         path: where to begin; the better, the fewer passes.
         passes: linearisations at most.
         tolerance: stop when no noise moves by more, in standard deviations of its channel.
@@ -57,11 +56,12 @@ def smooth(
     """
 
     def look(path: ReferencePath) -> Lookahead:
-        return look_ahead(linearize(program, data, path, **given))
+        return look_ahead(linearize(problem, path, **given))
 
-    given: dict[str, Any] = {"known_start": known_start, "observation_weight": observation_weight, "kernels": kernels}
-    with unchanged(program):
-        given["angles"] = angles_on_a_circle(program, data, path.states[0, :1])
+    data = problem.data
+    given: dict[str, Any] = {"observation_weight": observation_weight, "kernels": kernels}
+    with unchanged(problem.program):
+        given["angles"] = angles_on_a_circle(problem.program, data, path.states[0, :1])
         if passes == 1:
             return look(path)
         accepted = path = ReferencePath(path.states, torch.where(data.transitions[..., None], path.noise, 0.0))
@@ -130,30 +130,24 @@ def _either(which: Tensor, one: ReferencePath, other: ReferencePath) -> Referenc
 
 
 def find_and_smooth(
-    program: Program,
-    data: Trajectories,
-    *,
-    known_start: bool = False,
-    observation_weight: float = 1.0,
-    may_fail: bool = False,
-    path: ReferencePath | None = None,
+    problem: Problem, *, observation_weight: float = 1.0, may_fail: bool = False, path: ReferencePath | None = None
 ) -> Lookahead:
     """Find paths from the measurements alone, unless some are given, and look ahead along them; a `FilterError` says
     that the bootstrap filter of the search broke down, or the linearised program unless it `may_fail`."""
-    near = path or find_path(program, data, known_start=known_start, observation_weight=observation_weight)
-    ahead = smooth(program, data, near, known_start=known_start, observation_weight=observation_weight)
+    near = path or find_path(problem, observation_weight=observation_weight)
+    ahead = smooth(problem, near, observation_weight=observation_weight)
     if not may_fail:
-        require_found(ahead, program, data)
+        require_found(ahead, problem)
     return ahead
 
 
-def require_found(ahead: Lookahead, program: Program, data: Trajectories) -> None:
+def require_found(ahead: Lookahead, problem: Problem) -> None:
     """Raise a `FilterError` where the linearised program's log p(y) is not finite."""
     broken = ~torch.isfinite(ahead.log_likelihood)
     if bool(broken.any()):
         drive = int(broken.nonzero()[0])
-        label = data.labels[drive]
-        why = divergence(program, data.subset([drive])) or (
+        label = problem.data.labels[drive]
+        why = divergence(problem.program, problem.data.subset([drive])) or (
             "the linearised program's log p(y) is not finite: its parameters or states have blown up, or it cannot be "
             "linearised there (--recipe steady --guide bootstrap does not)"
         )
@@ -175,10 +169,8 @@ def resting_path(ahead: Lookahead, data: Trajectories) -> ReferencePath:
 
 @torch.no_grad()
 def find_path(
-    program: Program,
-    data: Trajectories,
+    problem: Problem,
     *,
-    known_start: bool = False,
     observation_weight: float = 1.0,
     particles: int = 250,
     tempering: Sequence[float] = (1.0, 0.1, 0.01, 0.001),
@@ -197,13 +189,13 @@ def find_path(
     Raises:
         FilterError: a bootstrap filter broke down.
     """
-    copies = data.subset(torch.arange(len(data)).repeat(len(tempering)))
+    program, data, known_start = problem.program, problem.data, problem.known_start
+    copies = problem.subset(torch.arange(len(data)).repeat(len(tempering)))
     weights = observation_weight * data.controls.new_tensor(tempering).repeat_interleave(len(data))
-    known: Any = {"known_start": known_start}
-    filtered = particle_filter(program, copies, particles=particles, observation_weight=weights, **known)
-    found = filtered.paths(1).within(copies)
-    path = ReferencePath(found.states[0], standard_noise(program, copies, found)[0])
-    ahead = smooth(program, copies, path, observation_weight=observation_weight, passes=passes, **known)
+    given: Any = {"known_start": known_start, "particles": particles, "observation_weight": weights}
+    found = particle_filter(program, copies.data, **given).paths(1).within(copies.data)
+    path = ReferencePath(found.states[0], standard_noise(program, copies.data, found)[0])
+    ahead = smooth(copies, path, observation_weight=observation_weight, passes=passes)
     likely = torch.nan_to_num(ahead.log_likelihood, nan=-torch.inf).view(len(tempering), len(data))
     chosen = likely.argmax(0) * len(data) + torch.arange(len(data), device=likely.device)
     best = ahead.linearization.path  # whose likelihood is known; a step further may be too far
@@ -221,23 +213,16 @@ def standard_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor
 
 
 @torch.no_grad()
-def smoother_paths(
-    program: Program,
-    data: Trajectories,
-    ahead: Lookahead,
-    draws: int,
-    *,
-    known_start: bool = False,
-    kernels: bool | None = None,
-) -> Paths:
+def smoother_paths(problem: Problem, ahead: Lookahead, draws: int, *, kernels: bool | None = None) -> Paths:
     """Draws of the linearised posterior as paths of the program.
 
     The channel noise is what the program makes of the standard normal noise at the drawn states, so that a curved mean
     does not inflate the noise; the states agree with it to first order.
     """
+    program, data = problem.program, problem.data
     start_noise, states, noise = (values.to(data.controls.dtype) for values in ahead.draws(draws))
     trajectories = len(data)
-    certain = KnownStart(data.known_start) if known_start else Standardised(start_noise.unsqueeze(1))
+    certain = KnownStart(data.known_start) if problem.known_start else Standardised(start_noise.unsqueeze(1))
     with running(draws, 1, trajectories), Recording() as start, certain:
         program.initial()
     few = slice(0, 1)  # one transition says which sites there are

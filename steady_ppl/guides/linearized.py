@@ -15,12 +15,13 @@ from steady_ppl.gaussian.smoother import (
     means_as_path,
     require_found,
     resting_path,
+    smooth,
     smoother_paths,
 )
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.guides.base import FilteringGuide, LinearRamp, PathGuide, Tempering
 from steady_ppl.guides.variational import VariationalGuide, log_ratio, times
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.angles import wrap
 
@@ -84,12 +85,11 @@ class LinearizedGuide(PathGuide):
         """Remember paths found from the measurements alone, where they are likelier than what is known already."""
         if not trajectories:
             return
-        part, start, weight = data.subset(trajectories), self.known_start, self.tempering(progress)
+        part, weight = data.subset(trajectories), self.tempering(progress)
         for label in part.labels:
             self.memory[f"searched/{label}"] = torch.tensor(progress, dtype=torch.float64)
-        ahead = find_and_smooth(
-            self.program, part, known_start=start, observation_weight=weight, may_fail=known is not None
-        )
+        problem = Problem(self.program, part, self.known_start)
+        ahead = find_and_smooth(problem, observation_weight=weight, may_fail=known is not None)
         found = resting_path(ahead, part)
         better = ahead.log_likelihood > (-torch.inf if known is None else known[trajectories])  # not where it is a nan
         kept = better.nonzero().flatten().tolist()
@@ -100,7 +100,7 @@ class LinearizedGuide(PathGuide):
         path = ReferencePath(self._recall("states", data), self._recall("noise", data))
         weight, kernels = self.tempering(progress), data.time.numel() >= WORTH_COMPILING
         problem = Problem(self.program, data, self.known_start)
-        return problem.smooth(path, observation_weight=weight, passes=self.passes, kernels=kernels)
+        return smooth(problem, path, observation_weight=weight, passes=self.passes, kernels=kernels)
 
     def _recall(self, kind: str, data: Trajectories) -> Tensor:
         known = [self.memory[f"{kind}/{label}"] for label in data.labels]
@@ -126,9 +126,9 @@ class GaussianGuide(LinearizedGuide):
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
         """Linearise, smooth and keep `draws` independent paths."""
         ahead, figures = self.look_ahead(data, progress)
-        require_found(ahead, self.program, data)
-        kernels = data.time.numel() >= WORTH_COMPILING
-        paths = smoother_paths(self.program, data, ahead, self.draws, known_start=self.known_start, kernels=kernels)
+        problem = Problem(self.program, data, self.known_start)
+        require_found(ahead, problem)
+        paths = smoother_paths(problem, ahead, self.draws, kernels=data.time.numel() >= WORTH_COMPILING)
         self.in_plain_torch = self.in_plain_torch or paths.in_plain_torch
         self.keep(paths, data)
         return figures
@@ -188,7 +188,7 @@ class SmootherGuide(VariationalGuide):
     def __init__(self, program: Program, data: Trajectories, **more: Any) -> None:
         super().__init__(program, **more)
         kind, self.labels = data.controls.dtype, data.labels
-        ahead = find_and_smooth(program, data, known_start=self.known_start)
+        ahead = find_and_smooth(Problem(program, data, self.known_start))
         self.register_buffer("path", ahead.linearization.path.states.to(kind))
         self.register_buffer("angles", ahead.linearization.circular)
         self.steps = _Steered(ahead.steps, kind)

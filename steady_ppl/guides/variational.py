@@ -23,6 +23,7 @@ from steady_ppl.gaussian.smoother import find_and_smooth, means_as_path
 from steady_ppl.guides.base import Constant, Substituting, Tempering, sample_known
 from steady_ppl.likelihood.scores import channel_moments
 from steady_ppl.model.handlers import KnownStart, Recording, Replaying, Standardised, broadcast_event, running
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, sample_row
 from steady_ppl.model.validate import start_size, step_size
@@ -246,7 +247,7 @@ class InferenceNetwork(VariationalGuide):
         super().__init__(program, **more)
         require(width >= 1, "width", width, "at least 1")
         self.width, self.centred = width, centred
-        path = means_as_path(find_and_smooth(program, data, known_start=self.known_start), data)
+        path = means_as_path(find_and_smooth(Problem(program, data, self.known_start)), data)
         states = path.states
         self.angles = program.angle_indices
         self.register_buffer("circular", on_a_circle(program, data, states))

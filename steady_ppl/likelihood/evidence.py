@@ -14,9 +14,10 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, require
 from steady_ppl.gaussian.information_filter import Lookahead
-from steady_ppl.gaussian.smoother import means_as_path
+from steady_ppl.gaussian.linearize import why_not_linear
+from steady_ppl.gaussian.smoother import find_and_smooth, means_as_path
 from steady_ppl.gaussian.twisted_proposal import Twist
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.smc.filter import particle_filter
 from steady_ppl.smc.genealogy import Filtered
@@ -36,7 +37,7 @@ def run_filter(
 ) -> Filtered:
     """The particle filter at observation weight 1, bootstrap or looking ahead; settings and errors are those of
     `particle_filter`."""
-    proposal = Twist(Problem(program, data, known_start).find_and_smooth()) if look_ahead else None
+    proposal = Twist(find_and_smooth(Problem(program, data, known_start))) if look_ahead else None
     more: dict[str, Any] = {"proposal": proposal, "keep_history": keep_history, "kernels": kernels}
     return particle_filter(program, data, particles=particles, known_start=known_start, **more)
 
@@ -59,7 +60,7 @@ def choose_filter(
     look_ahead: bool | None = None,
 ) -> FilterChoice:
     """Settle what is None: the filter by the program's noise, its particles (200 looking ahead, else 5000)."""
-    reason = Problem(program, data, known_start).why_not_linear() if look_ahead is None else "as asked"
+    reason = why_not_linear(program, data, known_start=known_start) if look_ahead is None else "as asked"
     ahead = reason is None if look_ahead is None else look_ahead
     name = "lookahead" if ahead else f"bootstrap ({reason})"
     count = (200 if ahead else 5000) if particles is None else particles
@@ -83,7 +84,7 @@ def neglected(
         particles: of the filter, for each trajectory.
         ahead: of these drives; found from the measurements when None.
     """
-    ahead = ahead or Problem(program, data, known_start).find_and_smooth()
+    ahead = ahead or find_and_smooth(Problem(program, data, known_start))
     filtered = particle_filter(
         program, data, particles=particles, known_start=known_start, proposal=Twist(ahead), keep_history=False
     )
@@ -153,9 +154,8 @@ def smoothed_states(program: Program, data: Trajectories, *, known_start: bool) 
     By the iterated smoother, angles on its path's turn; where the program's noise is not normal, from the surviving
     lineages of a bootstrap filter. With a `known_start` the first state is the true one.
     """
-    problem = Problem(program, data, known_start)
-    if problem.why_not_linear() is None:
-        return means_as_path(problem.find_and_smooth(), data).states
+    if why_not_linear(program, data, known_start=known_start) is None:
+        return means_as_path(find_and_smooth(Problem(program, data, known_start)), data).states
     parts = [
         particle_filter(program, part, particles=2000, known_start=known_start).paths(100).states.mean(0)
         for part in in_parts(data, 2000)

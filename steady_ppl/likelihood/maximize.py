@@ -13,7 +13,6 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,10 +21,10 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.gaussian.smoother import require_found, resting_path
+from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.likelihood.parameters import Element, elements, on_both_sides, set_values, values_of
-from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import parameter_scores, smoothed, widens
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.journal import Piece, piece
@@ -64,11 +63,9 @@ class Maximum:
 
 
 def maximise(
-    program: Program,
-    data: Trajectories,
+    problem: Problem,
     path: ReferencePath | None = None,
     *,
-    known_start: bool = False,
     information: Tensor | None = None,
     steps: int = 25,
     precision: float = 0.02,
@@ -77,10 +74,8 @@ def maximise(
     """Move a program's parameters, in place, to where log p(y) of the linearised program plus the log prior is largest.
 
     Args:
-        program: with normal noise; see `linearize`.
-        data: as returned by `for_program`.
+        problem: its program with normal noise; see `linearize`.
         path: of the drives, near their posterior means; found from the measurements when None.
-        known_start: the first state is certain.
         information: of the learnable numbers, `(P, P)`, where it is known.
         steps: scoring steps at most.
         precision: stop when another step would gain less, nats.
@@ -89,15 +84,10 @@ def maximise(
     Raises:
         FilterError: the program cannot be smoothed at its initial parameters.
     """
-    settings: dict[str, Any] = {"information": information, "precision": precision, "hopeless": hopeless}
-    return maximum_of(Problem(program, data, known_start), path, steps=steps, **settings)
-
-
-def maximum_of(problem: Problem, path: ReferencePath | None = None, **settings: Any) -> Maximum:
-    """`maximise` a problem; settings and errors are its."""
 
     def compute() -> Maximum:
-        (found,) = climb([Term.alone(problem, path or problem.find_path())], **settings)
+        terms = [Term.alone(problem, path or find_path(problem))]
+        (found,) = climb(terms, information=information, steps=steps, precision=precision, hopeless=hopeless)
         return found
 
     return kept_maximum(problem.program, compute)
@@ -157,7 +147,7 @@ def climb(
     """
     here = _linearised(terms)
     for at in here.terms:
-        require_found(at.ahead, at.term.problem.program, at.term.problem.data)
+        require_found(at.ahead, at.term.problem)
     began = [at.objective for at in here.terms]
     reach = torch.zeros_like(here.gradient)
     for term in terms:
@@ -290,7 +280,7 @@ def _valued(terms: Sequence[Term], passes: int) -> list[_LinearizedTerm]:
     for term in terms:
         names = [part.name.split("[")[0] for part in term.parts]
         shares = {name: 1 / owners[column] for name, column in zip(names, term.columns, strict=True)}
-        ahead = term.problem.smooth(term.path, passes=passes, tolerance=TOLERANCE)
+        ahead = smooth(term.problem, term.path, passes=passes, tolerance=TOLERANCE)
         objective = float(ahead.log_likelihood.sum()) + log_prior(term.problem.program, shares)
         there = replace(term, path=resting_path(ahead, term.problem.data))
         found.append(_LinearizedTerm(there, shares, ahead, objective))
@@ -369,7 +359,7 @@ def fit_by_likelihood(program: Program, data: Trajectories, *, known_start: bool
         begin()
         path = widen_noise(problem)
         begin()
-        found = maximum_of(problem, path)
+        found = maximise(problem, path)
         begin()
         return refit_outliers(problem, found)
 
@@ -385,7 +375,7 @@ def refit_outliers(problem: Problem, maximum: Maximum) -> Maximum:
         if not len(outliers):
             break
         part = problem.subset(outliers)
-        there = part.smooth(part.find_path())
+        there = smooth(part, find_path(part))
         better = there.log_likelihood > maximum.log_likelihood[outliers] + 1
         if not bool(better.any()):
             break
@@ -393,7 +383,7 @@ def refit_outliers(problem: Problem, maximum: Maximum) -> Maximum:
         found = resting_path(there, part.data)
         states[:, outliers[better]], noise[:, outliers[better]] = found.states[:, better], found.noise[:, better]
         before = maximum.gained - maximum.objective
-        maximum = maximum_of(problem, ReferencePath(states, noise))
+        maximum = maximise(problem, ReferencePath(states, noise))
         maximum = replace(maximum, gained=maximum.objective + before)
     return maximum
 
@@ -404,16 +394,16 @@ def widen_noise(problem: Problem, path: ReferencePath | None = None) -> Referenc
     A program that lacks a strong effect explains nothing at its declared noise: scores there lead nowhere. A path that
     is given is returned where the noise is wide enough.
     """
-    path = path or problem.find_path()
-    ahead = problem.smooth(path)
+    path = path or find_path(problem)
+    ahead = smooth(problem, path)
     every = elements(problem.program)
     parts = [part for part, wider in zip(every, widens(problem.program, every, problem.data), strict=True) if wider]
     while parts and _roughness(ahead, problem.data) > MAX_ROUGHNESS:
         before = values_of(parts)
         for part in parts:
             part.move(math.log(3.0))
-        wider_path = problem.find_path()
-        there = problem.smooth(wider_path)
+        wider_path = find_path(problem)
+        there = smooth(problem, wider_path)
         if not float(there.log_likelihood.sum()) > float(ahead.log_likelihood.sum().nan_to_num(-math.inf)):
             set_values(parts, before)
             break

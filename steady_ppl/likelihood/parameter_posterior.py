@@ -23,9 +23,10 @@ from torch.distributions import transform_to
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, require
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.likelihood.maximize import MAX_MOVE, PASSES, TOLERANCE, log_prior, maximum_of, posterior_score
+from steady_ppl.gaussian.smoother import smooth
+from steady_ppl.likelihood.maximize import MAX_MOVE, PASSES, TOLERANCE, log_prior, maximise, posterior_score
 from steady_ppl.likelihood.parameters import Element, elements, on_both_sides, set_values, values_of
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
@@ -108,7 +109,7 @@ def parameter_posterior(
     problem = Problem.of_table(program, table, known_start)
     with seeded(seed, "parameters"), stages(("finding the maximum", 1), ("weighing", 4)) as begin:
         begin()
-        path = maximum_of(problem).path
+        path = maximise(problem).path
         begin()
         proposed, log_weights = adapt(program, about_maximum(problem, path), linearised(problem, path), proposals)
         return resampled(program, proposed, log_weights, draws)
@@ -189,7 +190,7 @@ def linearised(problem: Problem, path: ReferencePath) -> LogLikelihood:
 
     def judge(program: Program) -> Tensor:
         own = replace(problem, program=program)
-        return own.smooth(path, passes=PASSES, tolerance=TOLERANCE, kernels=False).log_likelihood.sum()
+        return smooth(own, path, passes=PASSES, tolerance=TOLERANCE, kernels=False).log_likelihood.sum()
 
     return judge
 

@@ -27,7 +27,8 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.gaussian.information_filter import Lookahead, posterior_moments
+from steady_ppl.gaussian.information_filter import Lookahead
+from steady_ppl.gaussian.posterior_moments import posterior_moments
 from steady_ppl.kernels.graph import NotCompilable
 from steady_ppl.kernels.rows import Slopes, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import Element, moved, on_both_sides

@@ -21,6 +21,7 @@ from steady_ppl.errors import RunError
 from steady_ppl.model.loading import load_program
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import is_count
+from steady_ppl.runs.export import Dynamics
 from steady_ppl.runs.folder import FINISHED, PARAMETERS, POSTERIOR, RECORD, read_record, run_folder, write_record
 from steady_ppl.training.loop import Trained
 from steady_ppl.utils.cores import one_thread
@@ -30,8 +31,6 @@ from steady_ppl.utils.tensor_files import read_tensors, write_tensors
 
 if TYPE_CHECKING:
     import arviz
-
-    from steady_ppl.runs.export import Dynamics
 
 
 @dataclass(repr=False)
@@ -60,7 +59,7 @@ class Fit(Displayed):
         self, data: Trajectories, *, draws: int = 100, particles: int | None = None, every: int = 1, seed: int = 0
     ) -> arviz.InferenceData:
         """Posterior draws of states and channel noise as ArviZ `InferenceData`; see `steady_ppl.runs.posterior`."""
-        from steady_ppl.runs.posterior import posterior
+        from steady_ppl.runs.posterior import posterior  # here, for it loads xarray
 
         return posterior(
             self.program, data, draws=draws, particles=particles, every=every, known_start=self.known_start, seed=seed
@@ -85,8 +84,6 @@ class Fit(Displayed):
 
     def dynamics(self, step: float | None = None) -> Dynamics:
         """A copy of the learned dynamics as a plain torch module; `step` is the program's when not given."""
-        from steady_ppl.runs.export import Dynamics
-
         return Dynamics(copy.deepcopy(self.program), self.program.step if step is None else step)
 
     def save(self, folder: str | Path, *, train: Trajectories | None = None, force: bool = False) -> None:

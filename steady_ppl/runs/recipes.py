@@ -11,9 +11,10 @@ import torch
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, require
+from steady_ppl.gaussian.linearize import why_not_linear
 from steady_ppl.likelihood.parameters import MAX_PARAMETERS
-from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.loading import program_file, run_file
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.runs.diagnostics import diagnose_fit, diagnose_units
 from steady_ppl.runs.fit import Fit, program_source, sha256, versions
@@ -95,7 +96,8 @@ def suited_recipe(
     count = sum(value.numel() for value in program.parameters() if value.requires_grad)
     if not 0 < count <= MAX_PARAMETERS:
         return "steady", f"{count} learnable numbers, where likelihood takes 1 to {MAX_PARAMETERS}"
-    why = Problem.of_table(program, table, known_start).why_not_linear()
+    problem = Problem.of_table(program, table, known_start)
+    why = why_not_linear(program, problem.data, known_start=known_start)
     if why is not None:
         return "steady", f"likelihood needs a program that can be linearised: {why.split(': looking')[0]}"
     return "likelihood", f"{count} learnable numbers and noise that can be linearised; --recipe steady takes any"

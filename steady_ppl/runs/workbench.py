@@ -72,7 +72,7 @@ def empty_again(folder: Path) -> Iterator[None]:
 
 
 def _simulate_tables(folder: Path) -> list[Path]:
-    from steady_ppl.data.table import write_table
+    from steady_ppl.data.table import write_table  # here, for it loads torch
     from steady_ppl.model.loading import load_program
     from steady_ppl.smc.simulate import simulate
 

@@ -16,7 +16,7 @@ from steady_ppl.criticism.residual_maps import _adjusted
 from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.kernels import rows as rows_by_kernels
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import for_program
 from steady_ppl.utils import cores
 from steady_ppl.utils.cores import one_core
@@ -95,7 +95,7 @@ def test_paths_are_those_of_more_linearisations(known_start):
     with seeded(1, "again"):
         again, truth = simulate_again(program, data, data.known_start.expand(4, -1, -1), 3)
     _, tracked = simulated._tracked(Problem(program, again, known_start), truth)
-    rested = smooth(program, again, truth, known_start=known_start, passes=simulated.LINEARISATIONS)
+    rested = smooth(Problem(program, again, known_start), truth, passes=simulated.LINEARISATIONS)
     means, noise = rested.means()
     inside = again.transitions[..., None]
     torch.testing.assert_close(tracked.noise * inside, noise * inside, rtol=0, atol=3 * simulated.REST_TOLERANCE)

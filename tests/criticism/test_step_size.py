@@ -40,6 +40,7 @@ from steady_ppl.criticism.step_size import check_step
 from steady_ppl.gaussian.smoother import find_path
 from steady_ppl.likelihood.maximize import Maximum
 from steady_ppl.likelihood.parameters import elements
+from steady_ppl.model.problem import Problem
 
 CASE = Path(__file__).parents[3] / "shared" / "cases" / "exact_unicycle"
 
@@ -162,7 +163,8 @@ def stubbed(monkeypatch, levels, *, at=True, looks=5.0):
     data = for_program(program, simulate(program, 3, seed=0))
     fits = []
 
-    def maximise(changed, data, path, *, steps, **settings):
+    def maximise(problem, path, *, steps, **settings):
+        changed = problem.program
         ends = levels[changed.substeps]
         if steps:
             fits.append(changed.substeps)
@@ -177,8 +179,8 @@ def stubbed(monkeypatch, levels, *, at=True, looks=5.0):
         return Maximum(likely, value, path, every, firm, steps, promised if steps else promised + looks, 0.0)
 
     monkeypatch.setattr(step_size, "maximise", maximise)
-    path = find_path(program, data, known_start=False)
-    own = replace(maximise(program, data, path, steps=0), decrement=0.0) if at else path
+    path = find_path(Problem(program, data))
+    own = replace(maximise(Problem(program, data), path, steps=0), decrement=0.0) if at else path
     return check_step(program, data, own), fits
 
 
@@ -237,10 +239,10 @@ def test_the_second_order_step_is_fine_enough_for_the_hovercraft_and_explicit_eu
 def test_what_a_finer_step_has_gained_is_kept_where_the_next_one_fails(turning, monkeypatch) -> None:
     maximise = step_size.maximise
 
-    def failing(program, *arguments, **settings):
-        if program.substeps >= 4:
+    def failing(problem, *arguments, **settings):
+        if problem.program.substeps >= 4:
             raise FilterError("broken")
-        return maximise(program, *arguments, **settings)
+        return maximise(problem, *arguments, **settings)
 
     monkeypatch.setattr(step_size, "maximise", failing)
     found = checked(Turning(), turning)

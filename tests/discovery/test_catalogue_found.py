@@ -14,7 +14,7 @@ from steady_ppl import Program, simulate
 from steady_ppl.discovery.finding import findings
 from steady_ppl.discovery.search import Settings, search
 from steady_ppl.effects import parsed
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.problem import Problem
 
 SEEN = [effect for effect in EFFECTS if effect != "coloured_noise"]  # white and coloured are alike at this noise
 DRIVES, ROWS = 12, 81

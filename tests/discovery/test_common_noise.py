@@ -24,7 +24,7 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path, smooth
 from steady_ppl.likelihood.maximize import Term, climb, maximise
 from steady_ppl.likelihood.parameters import elements, values_of
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.problem import Problem
 
 HIDDEN = 0.15  # m/s², process noise that the sensor of these drives nearly hides
 
@@ -60,8 +60,8 @@ def refitted(program, seed: int = 1, **options):
 def likelihood(programs, folds) -> float:
     found = 0.0
     for program, fold in zip(programs, folds, strict=True):
-        path = find_path(program, fold.drives, known_start=True)
-        found += float(smooth(program, fold.drives, path, known_start=True).log_likelihood.sum())
+        path = find_path(Problem(program, fold.drives, True))
+        found += float(smooth(Problem(program, fold.drives, True), path).log_likelihood.sum())
     return found
 
 
@@ -108,13 +108,13 @@ def test_programs_that_have_everything_in_common_are_one(priors):
     pooled = example("linear_gaussian")
     pooled.priors = priors
     both = joined(train=train, valid=valid)
-    whole = maximise(pooled, both, known_start=True, precision=1e-4)
+    whole = maximise(Problem(pooled, both, True), precision=1e-4)
     terms, orders = [], ([0, 1, 2, 3], [2, 0, 3, 1])
     for data, order in zip((train, valid), orders, strict=True):
         program = example("linear_gaussian")
         program.priors = priors
         parts = [elements(program)[index] for index in order]
-        terms.append(Term(Problem(program, data, True), find_path(program, data, known_start=True), parts, order))
+        terms.append(Term(Problem(program, data, True), find_path(Problem(program, data, True)), parts, order))
     first, second = climb(terms, precision=1e-4)
     assert first.objective + second.objective == pytest.approx(whole.objective, abs=1e-3)
     for term in terms:
@@ -148,7 +148,7 @@ def test_effects_that_are_noise_are_in_common_too(effect):
 def test_what_moves_the_motion_or_only_some_rows_is_no_noise():
     program = example("hovercraft").with_effect("range_dependent_noise", 0.1).with_effect("yaw_bias", 0.1)
     data = drives(program, 3, 21)
-    path = find_path(program, data, known_start=True)
+    path = find_path(Problem(program, data, True))
     found = noise_numbers(program, data, path)
     assert [part.name for index, part in enumerate(elements(program)) if index in found] == [
         "noise[0]",

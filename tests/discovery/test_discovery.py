@@ -21,8 +21,8 @@ from steady_ppl.discovery.discover import NOT_CONVERGED, _of_one_drive
 from steady_ppl.discovery.finding import _spread, next_run
 from steady_ppl.effects import Effect, chosen_variant, parsed
 from steady_ppl.effects.registry import _EFFECTS, register
-from steady_ppl.likelihood.maximize import maximise, maximum_of, refit_outliers
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.likelihood.maximize import maximise, refit_outliers
+from steady_ppl.model.problem import Problem
 from steady_ppl.plotting.discovery import unknown_effect
 
 DRIVES, ROWS, SETS = 10, 81, 50
@@ -184,7 +184,7 @@ def test_what_cannot_be_tested_says_why(clean):
 
 @pytest.mark.slow
 def test_a_fit_that_has_not_converged_is_said_before_any_ranking(monkeypatch):
-    monkeypatch.setattr("steady_ppl.discovery.refits.maximum_of", partial(maximum_of, steps=1))
+    monkeypatch.setattr("steady_ppl.discovery.refits.maximise", partial(maximise, steps=1))
     found = discovered("yaw_bias=0.1")
     assert not found.search.base.converged and NOT_CONVERGED in found.doubts
     assert str(found).startswith("warning: the program's own fit has not converged")
@@ -205,7 +205,7 @@ def test_not_knowing_a_knee_is_in_the_coefficients_interval():
 def test_a_drive_whose_path_is_lost_is_fitted_again():
     program = owner()
     data = st.for_program(program, tables(program, drives=6, rows=41)[0]).without_truth(keep_start=True)
-    right = maximise(program, data, known_start=True)
+    right = maximise(Problem(program, data, True))
     lost, states = right.log_likelihood.clone(), right.path.states.clone()
     lost[2], states[1:, 2] = -500.0, 0.0
     problem = Problem(program, data, True)

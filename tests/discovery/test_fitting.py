@@ -15,14 +15,14 @@ from steady_ppl.discovery.refits import Fold, first_by_draws, first_refit, refit
 from steady_ppl.effects import chosen_variant
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.problem import Problem
 
 
 @pytest.mark.slow
 def test_both_ways_agree_where_the_program_is_nearly_linear() -> None:
     program = example("hovercraft", torch.float32)
     data = drives(example("hovercraft.py:HovercraftTruth", torch.float32), 6, 61, seed=3)
-    path = find_path(program, data, known_start=True)
+    path = find_path(Problem(program, data, True))
     fits = []
     for fitting in (ByLikelihood(), ByDraws(steps=200)):
         own = copy.deepcopy(program)
@@ -48,7 +48,7 @@ def test_fits_by_draws_begin_at_the_likelier_program() -> None:
     good, far = example("hovercraft", torch.float32), example("hovercraft", torch.float32)
     data = drives(good, 4, 41, seed=1)
     far.mass = torch.tensor(4.5)
-    path = find_path(good, data, known_start=True)
+    path = find_path(Problem(good, data, True))
     fold = Fold(data, path, data, path, True)
     for given, fitted in ((good, far), (far, good)):
         first, second = starts_by_draws(given, fitted, fold)
@@ -66,7 +66,7 @@ def test_where_a_climb_by_draws_diverges_another_begins_at_the_program_as_given(
     given, fitted = example("hovercraft", torch.float32), example("hovercraft", torch.float32)
     data = drives(fitted, 4, 41, seed=1)
     given.mass = torch.tensor(1.8)
-    path = find_path(fitted, data, known_start=True)
+    path = find_path(Problem(fitted, data, True))
     folds = [Fold(data, path, data, path, True)] * 2
     began = []
 
@@ -92,7 +92,7 @@ def test_a_program_whose_linearised_likelihood_is_off_is_fitted_by_draws(monkeyp
     truth.noise = torch.tensor([2.0, 1.0, 1.0])
     train, valid = drives(truth, 6, 61, seed=1), drives(truth, 6, 61, seed=2)
     program = example("paper.py:PaperTruck", torch.float32)
-    assert is_doubtful(Problem(program, train, True), find_path(program, train, known_start=True))
+    assert is_doubtful(Problem(program, train, True), find_path(Problem(program, train, True)))
     monkeypatch.setattr("steady_ppl.discovery.fitting.MAX_LINEARISATION_ERROR", 0.0)
     base = first_refit(Problem(program, train, True), valid, seed=0)
     assert isinstance(base.fitting, ByDraws)

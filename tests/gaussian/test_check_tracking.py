@@ -15,6 +15,7 @@ from steady_ppl.gaussian.kalman import filter_and_smooth, track
 from steady_ppl.gaussian.linearize import ReferencePath, linearize
 from steady_ppl.gaussian.predict import on_a_circle, predict, simulate_again
 from steady_ppl.gaussian.smoother import find_and_smooth, means_as_path
+from steady_ppl.model.problem import Problem
 
 
 def anywhere(data) -> ReferencePath:
@@ -27,7 +28,7 @@ def anywhere(data) -> ReferencePath:
 @pytest.mark.parametrize("known_start", [False, True])
 def test_the_filter_is_kalmans(cart, uneven, known_start):
     exact = kalman(uneven, cart_parameters(cart), known_start=known_start)
-    tracked = track(cart, uneven, anywhere(uneven), known_start=known_start, passes=1)
+    tracked = track(Problem(cart, uneven, known_start), anywhere(uneven), passes=1)
     rows = uneven.rows
     torch.testing.assert_close(tracked.states[rows], exact.means[rows])
     torch.testing.assert_close(tracked.covariances[rows], exact.covariances[rows])
@@ -36,7 +37,7 @@ def test_the_filter_is_kalmans(cart, uneven, known_start):
 
 @pytest.mark.parametrize("known_start", [False, True])
 def test_smoothed_states_and_noise_are_the_exact_posteriors(cart, uneven, known_start):
-    tracked = track(cart, uneven, anywhere(uneven), known_start=known_start, passes=1)
+    tracked = track(Problem(cart, uneven, known_start), anywhere(uneven), passes=1)
     for trajectory in range(len(uneven)):
         exact = CartPosterior(uneven, trajectory, cart_parameters(cart), known_start=known_start)
         rows = int(uneven.lengths[trajectory])
@@ -49,7 +50,7 @@ def test_smoothed_states_and_noise_are_the_exact_posteriors(cart, uneven, known_
 
 def test_scores_are_the_slopes_of_the_log_likelihood(cart, uneven):
     path, size = anywhere(uneven), 1e-4
-    linear = linearize(cart, uneven, path)
+    linear = linearize(Problem(cart, uneven), path)
     tracked = filter_and_smooth(linear)
     seen = uneven.observed[5].all(-1)
     shifted = linear.residual.clone()
@@ -65,7 +66,7 @@ def test_scores_are_the_slopes_of_the_log_likelihood(cart, uneven):
 def test_it_agrees_with_the_lookahead_on_a_hovercraft():
     program = example("hovercraft").requires_grad_(False)
     data = drives(program, 3, 15, gaps=True)
-    ahead = find_and_smooth(program, data, known_start=True)
+    ahead = find_and_smooth(Problem(program, data, True))
     tracked = filter_and_smooth(ahead.linearization)
     mine, theirs = tracked.path(data), means_as_path(ahead, data)
     torch.testing.assert_close(mine.states, theirs.states, rtol=1e-6, atol=1e-6)
@@ -82,7 +83,7 @@ def test_predictions_are_kalmans(cart, uneven, horizon):
         matrix = system.matrix[k : k + starts]
         mean = (matrix @ mean[..., None])[..., 0] + system.offset[k : k + starts]
         covariance = matrix @ covariance @ matrix.mT + system.noise[k : k + starts]
-    tracked = track(cart, uneven, anywhere(uneven), known_start=False, passes=1)
+    tracked = track(Problem(cart, uneven), anywhere(uneven), passes=1)
     found = predict(cart, uneven, tracked, [horizon])[horizon]
     seen = uneven.observed[horizon:, :, 0]
     assert bool((found.observed[..., 0] == seen).all())
@@ -96,8 +97,8 @@ def test_predictions_are_kalmans(cart, uneven, horizon):
 def test_ninety_percent_bands_cover_ninety_percent_of_what_the_program_makes():
     program = example("hovercraft").requires_grad_(False)
     data = drives(program, 40, 41)
-    path = means_as_path(find_and_smooth(program, data, known_start=True), data)
-    tracked = track(program, data, path, known_start=True)
+    path = means_as_path(find_and_smooth(Problem(program, data, True)), data)
+    tracked = track(Problem(program, data, True), path)
     for horizon, found in predict(program, data, tracked, [1, 10]).items():
         independent = int(found.observed.sum()) / (1 if horizon == 1 else 4 * horizon)  # errors overlap and go together
         margin = 4 * math.sqrt(0.9 * 0.1 / independent)

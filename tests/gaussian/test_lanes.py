@@ -10,14 +10,16 @@ from examples import drives, example
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.gaussian.information_filter import look_ahead, posterior_moments
+from steady_ppl.gaussian.information_filter import look_ahead
 from steady_ppl.gaussian.linearize import ReferencePath, linearize
+from steady_ppl.gaussian.posterior_moments import posterior_moments
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 
 
 def found(program: Program, data: Trajectories, path: ReferencePath) -> list[Tensor]:
     """What the recursions come to, trajectories first."""
-    ahead = look_ahead(linearize(program, data, path))
+    ahead = look_ahead(linearize(Problem(program, data), path))
     moments = posterior_moments(ahead, data)
     of_rows = (ahead.precision, ahead.information, *ahead.means(), *ahead.covariances())
     arrays = (moments.lag, *moments.channels, *moments.measurements)

@@ -17,6 +17,7 @@ from torch import Tensor
 from steady_ppl import Program, ProgramError, seeded, stack
 from steady_ppl.gaussian.linearize import Linearization, ReferencePath, linearize, why_not_linear
 from steady_ppl.model.handlers import Standardised, running
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.substeps import advance
 
 PROGRAMS = (
@@ -97,7 +98,7 @@ def test_the_transition_is_that_of_finite_differences(name):
     program = prepared(name)
     data = drives(program, 3, 12, gaps=True)
     path = near_the_truth(program, data)
-    linear, inside = linearize(program, data, path), data.transitions
+    linear, inside = linearize(Problem(program, data), path), data.transitions
     before, noise = path.states[:-1], path.noise
     by_state = central_differences(lambda states: arrived(program, data, states, noise), before)
     by_noise = central_differences(lambda noise: arrived(program, data, before, noise), noise)
@@ -114,7 +115,7 @@ def test_the_measurement_is_that_of_finite_differences(name):
     program = prepared(name)
     data = drives(program, 3, 12, gaps=True)
     path = near_the_truth(program, data)
-    linear, seen = linearize(program, data, path), data.observed
+    linear, seen = linearize(Problem(program, data), path), data.observed
     mean, sd = measured(program, path.states)
     by_state = central_differences(lambda states: on_the_circle(measured(program, states)[0] - mean), path.states)
     torch.testing.assert_close(linear.measurement[seen], by_state[seen], rtol=1e-6, atol=1e-7)
@@ -130,7 +131,7 @@ def test_the_start_is_that_of_finite_differences(name):
     program = prepared(name)
     data = drives(program, 3, 12)
     path = near_the_truth(program, data)
-    linear = linearize(program, data, path)
+    linear = linearize(Problem(program, data), path)
     nothing = torch.zeros(3, len(program.states), dtype=torch.float64)
     torch.testing.assert_close(linear.start_offset + linear.start_turn, began(program, nothing) - path.states[0])
     torch.testing.assert_close(
@@ -151,7 +152,7 @@ def test_noise_that_enters_by_its_square_is_linearised_around_the_paths():
     program = Squared().double().requires_grad_(False)
     data = drives(program, 2, 6)
     path = near_the_truth(program, data)
-    linear, kick = linearize(program, data, path), program.noise**2 * data.steps
+    linear, kick = linearize(Problem(program, data), path), program.noise**2 * data.steps
     torch.testing.assert_close(linear.noise[..., 1, 0], 2 * kick * path.noise[..., 0])
     # (2ε̄ε − ε̄²) is what is left of ε² to first order: −ε̄² at ε = 0
     expected = path.states[:-1, :, 1] - kick * path.noise[..., 0] ** 2 - path.states[1:, :, 1]
@@ -163,7 +164,7 @@ def test_a_known_start_is_certain(name):
     program = prepared(name)
     data = drives(program, 3, 12, gaps=True)
     path = near_the_truth(program, data)
-    known, unknown = (linearize(program, data, path, known_start=known) for known in (True, False))
+    known, unknown = (linearize(Problem(program, data, known), path) for known in (True, False))
     torch.testing.assert_close(known.start_offset, data.states[0] - path.states[0])
     assert known.start_noise.shape[:2] == (3, len(program.states)) and not known.start_noise.any()
     assert_same(known, unknown, "start_offset", "start_turn", "start_noise")
@@ -176,7 +177,7 @@ def test_a_known_start_is_certain(name):
 def test_nothing_moves_past_a_trajectorys_end_and_missing_cells_say_nothing(name):
     program = prepared(name)
     data = drives(program, 3, 12, gaps=True)
-    linear = linearize(program, data, near_the_truth(program, data))
+    linear = linearize(Problem(program, data), near_the_truth(program, data))
     assert data.lengths.tolist() == [12, 10, 12]
     for moving in (linear.offset, linear.state, linear.noise):
         assert not moving[10:, 1].any() and not moving[~data.transitions].any()
@@ -199,7 +200,7 @@ def test_what_stands_in_padding_and_missing_cells_changes_nothing():
         measurements=torch.where(data.observed, data.measurements, 1e6),
         controls=torch.where(data.rows[..., None], data.controls, 1e3),
     )
-    assert_same(linearize(program, data, path), linearize(program, rubbish, path))
+    assert_same(linearize(Problem(program, data), path), linearize(Problem(program, rubbish), path))
 
 
 @pytest.mark.parametrize("name", ["hovercraft", "pendulum"])
@@ -209,7 +210,7 @@ def test_whole_turns_of_an_angle_that_is_measured_change_nothing(name):
     path = near_the_truth(program, data)
     turns = torch.tensor([1, -2, 3], dtype=torch.float64)[:, None]
     turned = replace(data, measurements=data.measurements + 2 * math.pi * turns)
-    here, there = linearize(program, data, path), linearize(program, turned, path)
+    here, there = linearize(Problem(program, data), path), linearize(Problem(program, turned), path)
     assert here.residual.abs().max() <= math.pi
     assert_same(here, there)
 
@@ -219,7 +220,7 @@ def test_a_position_is_not_an_angle():
     data = drives(program, 3, 12, gaps=True)
     path = near_the_truth(program, data)
     further = replace(data, measurements=data.measurements + 2 * math.pi)
-    here, there = linearize(program, data, path), linearize(program, further, path)
+    here, there = linearize(Problem(program, data), path), linearize(Problem(program, further), path)
     torch.testing.assert_close(there.residual, here.residual + 2 * math.pi * data.observed)
 
 
@@ -228,7 +229,7 @@ def test_the_observation_weight_scales_precision_and_log_scale(name):
     program = prepared(name)
     data = drives(program, 3, 12, gaps=True)
     path = near_the_truth(program, data)
-    whole, tempered = (linearize(program, data, path, observation_weight=weight) for weight in (1.0, 0.3))
+    whole, tempered = (linearize(Problem(program, data), path, observation_weight=weight) for weight in (1.0, 0.3))
     torch.testing.assert_close(tempered.precision, 0.3 * whole.precision)
     torch.testing.assert_close(tempered.log_scale, 0.3 * whole.log_scale)
     assert_same(whole, tempered, "precision", "log_scale")
@@ -239,7 +240,7 @@ def test_a_bearing_to_where_one_stands_does_not_say_where():
     data = drives(program, 2, 6)
     path = near_the_truth(program, data)
     path.states[3, 1, :2] = torch.tensor(program.landmarks[2], dtype=torch.float64)
-    linear = linearize(program, data, path)
+    linear = linearize(Problem(program, data), path)
     tensors = vars(linear).keys() - {"path", "angles", "in_plain_torch"}
     assert all(getattr(linear, name).isfinite().all() for name in tensors)
     assert not linear.measurement[3, 1, 2, :2].any()
@@ -250,8 +251,8 @@ def test_single_precision_gives_the_same_in_double():
     program, single = prepared("hovercraft"), example("hovercraft", torch.float32).requires_grad_(False)
     data = drives(program, 3, 12, gaps=True)
     path = near_the_truth(program, data)
-    rough = linearize(single, data.to(torch.float32), ReferencePath(path.states.float(), path.noise.float()))
-    exact = linearize(program, data, path)
+    rough = linearize(Problem(single, data.to(torch.float32)), ReferencePath(path.states.float(), path.noise.float()))
+    exact = linearize(Problem(program, data), path)
     for name in vars(exact).keys() - {"path", "angles", "in_plain_torch"}:
         found, wanted = getattr(rough, name), getattr(exact, name)
         assert found.dtype == torch.float64
@@ -306,7 +307,7 @@ def test_noise_that_is_not_normal_and_independent_is_refused_by_name(program, si
     data = drives(refused, 2, 6)
     path = near_the_truth(refused, data)
     with pytest.raises(ProgramError, match=rf"site '{site}' is {distribution} .*--guide bootstrap") as error:
-        linearize(refused, data, path)
+        linearize(Problem(refused, data), path)
     assert error.value.site == site
     assert why_not_linear(refused, data) == str(error.value)
 
@@ -314,7 +315,7 @@ def test_noise_that_is_not_normal_and_independent_is_refused_by_name(program, si
 def test_a_student_t_sensor_is_linearised_by_the_normal_that_touches_it():
     program = HeavyTailedSensor().double().requires_grad_(False)
     data = drives(program, 2, 6)
-    linear = linearize(program, data, near_the_truth(program, data))
+    linear = linearize(Problem(program, data), near_the_truth(program, data))
     sd = float(program.measurement_sd)
     exact = torch.distributions.StudentT(3.0, 0.0, sd)
     residuals = linear.residual.clone().requires_grad_()
@@ -330,7 +331,7 @@ def test_a_student_t_sensor_is_linearised_by_the_normal_that_touches_it():
 def test_a_known_start_needs_no_normal_prior():
     program = UncertainStart().double().requires_grad_(False)
     data = drives(program, 2, 6)
-    linear = linearize(program, data, near_the_truth(program, data), known_start=True)
+    linear = linearize(Problem(program, data, True), near_the_truth(program, data))
     assert not linear.start_noise.any()
 
 
@@ -353,4 +354,4 @@ def test_an_operation_without_a_derivative_is_refused():
     program = Custom().double().requires_grad_(False)
     data = drives(program, 2, 6)
     with pytest.raises(ProgramError, match="cannot be linearised.*--guide bootstrap"):
-        linearize(program, data, near_the_truth(program, data))
+        linearize(Problem(program, data), near_the_truth(program, data))

@@ -20,6 +20,7 @@ from steady_ppl.gaussian.linearize import ReferencePath, linearize
 from steady_ppl.gaussian.smoother import smooth, smoother_paths
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.model.handlers import Standardised, running
+from steady_ppl.model.problem import Problem
 
 
 def anywhere(program, data) -> ReferencePath:
@@ -38,7 +39,7 @@ def estimates(program, data, runs: int, particles: int, twist=Twist, *, aim=None
     other, change = aim or (program, {})
     seen = replace(many, **{name: function(many) for name, function in change.items()})
     with seeded("estimates"):
-        ahead = smooth(other, seen, anywhere(program, many), known_start=known_start, passes=2)
+        ahead = smooth(Problem(other, seen, known_start), anywhere(program, many), passes=2)
         filtered = particle_filter(
             program,
             many,
@@ -58,7 +59,7 @@ def estimates(program, data, runs: int, particles: int, twist=Twist, *, aim=None
 @pytest.mark.parametrize("drive", ["even", "uneven"])
 def test_the_smoother_is_exact_from_any_path(cart, drive, known_start, request):
     data = request.getfixturevalue(drive)
-    ahead = smooth(cart, data, anywhere(cart, data), known_start=known_start, passes=2, tolerance=0.0)
+    ahead = smooth(Problem(cart, data, known_start), anywhere(cart, data), passes=2, tolerance=0.0)
     (states, noise), (covariances, *_) = ahead.means(), ahead.covariances()
     for trajectory, rows in enumerate(data.lengths.tolist()):
         exact = CartPosterior(data, trajectory, cart_parameters(cart), known_start=known_start)
@@ -76,15 +77,15 @@ def test_the_smoother_is_exact_from_any_path(cart, drive, known_start, request):
 @pytest.mark.parametrize("drive", ["even", "uneven"])
 def test_the_log_likelihood_is_kalmans(cart, drive, weight, known_start, request):
     data = request.getfixturevalue(drive)
-    settings = {"known_start": known_start, "observation_weight": weight}
-    ahead = smooth(cart, data, anywhere(cart, data), passes=2, tolerance=0.0, **settings)
+    problem, path = Problem(cart, data, known_start), anywhere(cart, data)
+    ahead = smooth(problem, path, observation_weight=weight, passes=2, tolerance=0.0)
     exact = kalman(data, cart_parameters(cart), weight=weight, known_start=known_start).log_likelihood
     torch.testing.assert_close(ahead.log_likelihood, exact, rtol=0, atol=1e-10)
     assert torch.equal(ahead.winding_masses, torch.zeros(1, 3, dtype=torch.float64))
 
 
 def test_the_first_lookahead_is_exact_wherever_it_is_taken(cart, uneven):
-    ahead = look_ahead(linearize(cart, uneven, anywhere(cart, uneven)))
+    ahead = look_ahead(linearize(Problem(cart, uneven), anywhere(cart, uneven)))
     exact = kalman(uneven, cart_parameters(cart)).log_likelihood
     # the path is some 15 measurement deviations off: its cost of some thousand nats cancels
     torch.testing.assert_close(ahead.log_likelihood, exact, rtol=0, atol=1e-8)
@@ -92,7 +93,7 @@ def test_the_first_lookahead_is_exact_wherever_it_is_taken(cart, uneven):
 
 @pytest.mark.parametrize("known_start", [False, True])
 def test_the_future_of_a_row_is_worth_what_kalman_says_of_it(cart, even, known_start):
-    ahead = smooth(cart, even, anywhere(cart, even), known_start=known_start, passes=2)
+    ahead = smooth(Problem(cart, even, known_start), anywhere(cart, even), passes=2)
     future = Twist(ahead).log_future(4, even.states[4].unsqueeze(0))[0]
     rest = replace(
         even,
@@ -111,7 +112,7 @@ def test_the_future_of_a_row_is_worth_what_kalman_says_of_it(cart, even, known_s
 @pytest.mark.parametrize("drive", ["even", "uneven"])
 def test_draws_have_the_moments_of_the_exact_smoother(cart, drive, known_start, request):
     data = request.getfixturevalue(drive)
-    ahead = smooth(cart, data, anywhere(cart, data), known_start=known_start, passes=2)
+    ahead = smooth(Problem(cart, data, known_start), anywhere(cart, data), passes=2)
     start, states, _ = ahead.draws(3000)
     if not known_start:
         torch.testing.assert_close(states[:, 0], START_MEAN + START_SD * start, rtol=0, atol=1e-10)
@@ -127,7 +128,7 @@ def test_draws_have_the_moments_of_the_exact_smoother(cart, drive, known_start, 
 
 
 def test_the_noise_of_draws_leads_from_each_state_to_the_next(cart, uneven):
-    _, states, noise = smooth(cart, uneven, anywhere(cart, uneven), passes=2).draws(50)
+    _, states, noise = smooth(Problem(cart, uneven), anywhere(cart, uneven), passes=2).draws(50)
     with running(50, 11, 3), Standardised(noise):
         after = cart.transition(states[:, :-1], uneven.controls[:-1], uneven.elapsed[:-1], uneven.steps)
     inside = uneven.transitions
@@ -172,7 +173,7 @@ def test_a_bad_twist_is_unbiased(cart, uneven, resample_below, known_start):
 def test_a_twist_towards_tempered_observations_is_unbiased(cart, uneven):
     many = copies(uneven, 1000)
     with seeded("tempered"):
-        ahead = smooth(cart, many, anywhere(cart, many), observation_weight=0.2, passes=2)
+        ahead = smooth(Problem(cart, many), anywhere(cart, many), observation_weight=0.2, passes=2)
         filtered = particle_filter(cart, many, particles=20, proposal=Twist(ahead, untwisted=0.1))
     runs = filtered.log_likelihood.view(3, 1000).T
     assert_mean((runs - kalman(uneven, cart_parameters(cart)).log_likelihood).exp(), torch.ones(3))
@@ -182,7 +183,7 @@ def test_a_twist_towards_tempered_observations_is_unbiased(cart, uneven):
 def test_a_tempered_filter_that_looks_ahead_estimates_the_power_posteriors_evidence(cart, uneven, weight):
     many = copies(uneven, 500)
     with seeded("power"):
-        ahead = smooth(cart, many, anywhere(cart, many), observation_weight=weight, passes=2)
+        ahead = smooth(Problem(cart, many), anywhere(cart, many), observation_weight=weight, passes=2)
         proposal = Twist(ahead, untwisted=0.3)
         filtered = particle_filter(cart, many, particles=20, observation_weight=weight, proposal=proposal)
     runs = filtered.log_likelihood.view(3, 500).T
@@ -216,7 +217,9 @@ def test_paths_of_a_filter_with_a_bad_twist_have_the_moments_of_the_exact_smooth
     many = copies(uneven, runs)
     other, change = bad_aim(cart)
     with seeded("smoother"):
-        ahead = smooth(other, replace(many, measurements=change["measurements"](many)), anywhere(cart, many), passes=2)
+        ahead = smooth(
+            Problem(other, replace(many, measurements=change["measurements"](many))), anywhere(cart, many), passes=2
+        )
         filtered = particle_filter(cart, many, particles=1000, proposal=Twist(ahead, untwisted=0.1))
         paths = filtered.paths(300)
     for trajectory, rows in enumerate(uneven.lengths.tolist()):
@@ -230,20 +233,20 @@ def test_paths_of_a_filter_with_a_bad_twist_have_the_moments_of_the_exact_smooth
 
 @pytest.mark.parametrize("share", [-0.1, 1.0, 1.5, math.nan])
 def test_the_untwisted_share_is_below_one(cart, even, share):
-    ahead = smooth(cart, even, anywhere(cart, even), passes=2)
+    ahead = smooth(Problem(cart, even), anywhere(cart, even), passes=2)
     with pytest.raises(ValueError, match=r"\[0, 1\)"):
         Twist(ahead, untwisted=share)
 
 
 @pytest.mark.parametrize("weight", [0.0, -0.5, 1.1, math.nan])
 def test_the_weight_of_a_tempered_twist_is_at_most_one(cart, even, weight):
-    ahead = smooth(cart, even, anywhere(cart, even), passes=2)
+    ahead = smooth(Problem(cart, even), anywhere(cart, even), passes=2)
     with pytest.raises(ValueError, match=r"\(0, 1\]"):
         Twist(ahead, tempered=weight)
 
 
 def test_a_tempered_twist_is_wider_and_the_estimate_stays_unbiased(cart, even):
-    ahead = smooth(cart, even, anywhere(cart, even), passes=2)
+    ahead = smooth(Problem(cart, even), anywhere(cart, even), passes=2)
     exact, tempered = Twist(ahead), Twist(ahead, tempered=0.5)
     widths = [twist.lookahead.steps.factor.det() for twist in (exact, tempered)]
     assert (widths[1] > widths[0])[:-1].all()
@@ -252,7 +255,7 @@ def test_a_tempered_twist_is_wider_and_the_estimate_stays_unbiased(cart, even):
 
 
 def test_a_filter_that_looks_ahead_shows_no_frames(cart, even):
-    twist = Twist(smooth(cart, even, anywhere(cart, even), passes=2))
+    twist = Twist(smooth(Problem(cart, even), anywhere(cart, even), passes=2))
     with pytest.raises(ValueError, match="on_frame"):
         particle_filter(cart, even, particles=5, proposal=twist, on_frame=lambda *_: None)
 
@@ -276,12 +279,12 @@ class TwoKicks(type(example("linear_gaussian"))):
 def test_several_noise_sites_are_steered_together(uneven, known_start):
     program = TwoKicks().double().requires_grad_(False)
     exact = kalman(uneven, cart_parameters(program), known_start=known_start).log_likelihood
-    ahead = smooth(program, uneven, anywhere_of(uneven, channels=2), known_start=known_start, passes=2)
+    ahead = smooth(Problem(program, uneven, known_start), anywhere_of(uneven, channels=2), passes=2)
     torch.testing.assert_close(ahead.log_likelihood, exact, rtol=0, atol=1e-9)
     steered = Twist(ahead, untwisted=0.0)
     found = particle_filter(program, uneven, particles=5, known_start=known_start, proposal=steered)
     torch.testing.assert_close(found.log_likelihood, exact, rtol=0, atol=1e-9)
-    paths = smoother_paths(program, uneven, ahead, 4000, known_start=known_start)
+    paths = smoother_paths(Problem(program, uneven, known_start), ahead, 4000)
     assert paths.noise["first"].shape == (4000, 11, 3) and paths.noise["second"].shape == (4000, 11, 3, 1)
     posterior = CartPosterior(uneven, 0, cart_parameters(program), known_start=known_start)
     both = paths.noise["first"][:, :, 0] + paths.noise["second"][:, :, 0, 0]

@@ -18,6 +18,7 @@ from steady_ppl.gaussian.smoother import find_and_smooth, find_path, smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.likelihood.evidence import neglected, run_filter
 from steady_ppl.model.handlers import Standardised, running
+from steady_ppl.model.problem import Problem
 from steady_ppl.utils.angles import wrap
 
 
@@ -65,10 +66,10 @@ def bearings(hovercraft):
     return drives(hovercraft, 3, 21, gaps=True)
 
 
-def smoothed(program, data, **settings) -> Lookahead:
+def smoothed(program, data, *, known_start=True, **settings) -> Lookahead:
     """At the mode, so that it does not matter how one got there."""
-    settings = {"known_start": True, "passes": 40, "tolerance": 1e-11} | settings
-    return smooth(program, data, near_the_truth(program, data), **settings)
+    settings = {"passes": 40, "tolerance": 1e-11} | settings
+    return smooth(Problem(program, data, known_start), near_the_truth(program, data), **settings)
 
 
 @pytest.mark.parametrize("turn", [0.5, math.pi, 4.0])
@@ -175,7 +176,7 @@ def test_a_broad_start_counts_the_neighbouring_turns(hovercraft, bearings):
     alone = {}
     for turns in (0, 1, -1, 2, -2):  # those that begin within four deviations of π
         single.turns = turns
-        alone[turns] = look_ahead(linearize(single, bearings, path)).log_likelihood
+        alone[turns] = look_ahead(linearize(Problem(single, bearings), path)).log_likelihood
     assert (ahead.log_likelihood - alone[0]).min() > 0.01
     together = torch.stack(list(alone.values()))
     torch.testing.assert_close(ahead.log_likelihood, together.logsumexp(0), rtol=0, atol=1e-9)
@@ -186,7 +187,7 @@ def test_whole_turns_of_the_path_change_nothing_from_a_broad_start(hovercraft, b
     path = smoothed(hovercraft, bearings, known_start=False).linearization.path
     turn = 2 * math.pi * (torch.arange(6) == 2).double()
     turned = ReferencePath(path.states + turn, path.noise)
-    here, there = (look_ahead(linearize(hovercraft, bearings, p)).log_likelihood for p in (path, turned))
+    here, there = (look_ahead(linearize(Problem(hovercraft, bearings), p)).log_likelihood for p in (path, turned))
     # a turn that is left out on one side has a thousandth of the mass: more than 4 prior deviations off
     torch.testing.assert_close(here, there, rtol=0, atol=0.002)
 
@@ -217,8 +218,8 @@ def began(program, noise: Tensor) -> Tensor:
 def test_a_path_is_found_from_the_measurements_alone(hovercraft, bearings, known_start):
     blind = bearings.without_truth(keep_start=known_start)
     with seeded("find"):
-        path = find_path(hovercraft, blind, known_start=known_start)
-    found = smooth(hovercraft, blind, path, known_start=known_start, passes=40, tolerance=1e-11).means()[0]
+        path = find_path(Problem(hovercraft, blind, known_start))
+    found = smooth(Problem(hovercraft, blind, known_start), path, passes=40, tolerance=1e-11).means()[0]
     apart = found - smoothed(hovercraft, bearings, known_start=known_start).means()[0]
     # one turn further on the broad prior pulls the heading by 2π (.05 / π)², its posterior deviation being below .05
     assert max(wrap(apart[..., 2])[bearings.rows].abs().max(), apart[bearings.rows][:, [0, 1]].abs().max()) < 2e-3
@@ -230,9 +231,9 @@ def test_a_path_is_found_from_sharp_bearings_without_a_start(every):
     program.bearing_sd = math.radians(1.25)
     data = for_program(program, simulate(program, 16, seed=1011)).observed_every(every)
     with seeded("sharp"):
-        path = find_path(program, data)
-    found = smooth(program, data, path).log_likelihood
-    best = smooth(program, data, near_the_truth(program, data), passes=30).log_likelihood
+        path = find_path(Problem(program, data))
+    found = smooth(Problem(program, data), path).log_likelihood
+    best = smooth(Problem(program, data), near_the_truth(program, data), passes=30).log_likelihood
     assert (found > best - 0.5).all()  # drives on a wrong path are off by thousands of nats
 
 
@@ -247,7 +248,7 @@ def test_steps_that_go_too_far_are_halved():
     drive = for_program(program, simulate(truth, 16, seed=11)).subset([12])
     for seed in range(3):
         with seeded("path", seed):
-            assert float(find_and_smooth(program, drive, known_start=True).log_likelihood) > 140
+            assert float(find_and_smooth(Problem(program, drive, True)).log_likelihood) > 140
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -260,45 +261,45 @@ def test_a_drive_past_a_beacon_three_centimetres_off_comes_to_rest_where_a_filte
     program.landmarks = tuple(tuple((before[40, drive, :2] + torch.tensor([0.03, 0.0])).tolist()) for drive in range(4))
     data = drives(program, 4, 81, seed=2)
     with seeded(seed, "path"):
-        path = find_path(program, data, known_start=True)
-    ahead = smooth(program, data, path, known_start=True, passes=15, tolerance=0.02)
+        path = find_path(Problem(program, data, True))
+    ahead = smooth(Problem(program, data, True), path, passes=15, tolerance=0.02)
     with seeded(0, "judge"):
         beyond = neglected(program, data, known_start=True, ahead=ahead)
     assert (beyond.abs() < 5).all()
 
 
 def test_a_path_that_does_not_begin_at_a_known_start_is_led_there(cart, uneven):
-    path = find_path(cart, uneven)
+    path = find_path(Problem(cart, uneven))
     path.states[0] += 0.3
-    found = smooth(cart, uneven, path, known_start=True, tolerance=1e-9)
+    found = smooth(Problem(cart, uneven, True), path, tolerance=1e-9)
     torch.testing.assert_close(found.means()[0][0], uneven.known_start, rtol=0, atol=1e-9)
-    exact = smooth(cart, uneven, find_path(cart, uneven, known_start=True), known_start=True, tolerance=1e-9)
+    exact = smooth(Problem(cart, uneven, True), find_path(Problem(cart, uneven, True)), tolerance=1e-9)
     torch.testing.assert_close(found.log_likelihood, exact.log_likelihood, rtol=0, atol=1e-9)
 
 
 def test_a_path_smooths_alike_alone_and_padded_whatever_its_padding_holds(hovercraft, bearings):
-    path = find_path(hovercraft, bearings, known_start=True)
+    path = find_path(Problem(hovercraft, bearings, True))
     short = int(bearings.lengths.argmin())
     rows = int(bearings.lengths[short])
     assert rows < len(path.states)
     path.noise[rows - 1 :, short] = 1e3
     path = ReferencePath(path.states + 0.2, path.noise)
-    together = smooth(hovercraft, bearings, path, known_start=True, passes=3, tolerance=0)
+    together = smooth(Problem(hovercraft, bearings, True), path, passes=3, tolerance=0)
     path.noise[rows - 1 :, short] = 0.0
-    alone = smooth(hovercraft, bearings.subset([short]), of(path, [short]), known_start=True, passes=3, tolerance=0)
+    alone = smooth(Problem(hovercraft, bearings.subset([short]), True), of(path, [short]), passes=3, tolerance=0)
     torch.testing.assert_close(together.log_likelihood[[short]], alone.log_likelihood, rtol=0, atol=1e-9)
 
 
 def test_steps_on_a_linear_program_never_cost_more(cart, uneven):
     """Whole steps are taken there from any path: one pass more is the exact mean."""
-    path = find_path(cart, uneven)
+    path = find_path(Problem(cart, uneven))
     far = ReferencePath(path.states + 5.0, path.noise - 3.0)
-    once, settled = (smooth(cart, uneven, far, passes=passes) for passes in (2, 20))
+    once, settled = (smooth(Problem(cart, uneven), far, passes=passes) for passes in (2, 20))
     torch.testing.assert_close(once.means()[0], settled.means()[0], rtol=0, atol=1e-8)
 
 
 def test_a_found_path_on_the_cart_is_the_exact_mean(cart, uneven):
-    path = find_path(cart, uneven, particles=50, tempering=(1.0, 0.1))
+    path = find_path(Problem(cart, uneven), particles=50, tempering=(1.0, 0.1))
     for trajectory, rows in enumerate(uneven.lengths.tolist()):
         exact = CartPosterior(uneven, trajectory, cart_parameters(cart))
         torch.testing.assert_close(path.states[:rows, trajectory], exact.states_mean, rtol=0, atol=1e-9)
@@ -316,9 +317,9 @@ def test_a_drive_without_measurements_has_no_evidence_whatever_the_turns(hovercr
 def test_one_trajectory_that_blows_up_does_not_stop_the_passes_of_the_others(hovercraft, bearings):
     path = smoothed(hovercraft, bearings).linearization.path
     far = replace(path, states=path.states + torch.tensor([0.3, -0.3, 0.1, 0.0, 0.0, 0.0]).double())
-    alone = smooth(hovercraft, bearings.subset([1, 2]), of(far, [1, 2]), known_start=True, passes=4, tolerance=1e-9)
+    alone = smooth(Problem(hovercraft, bearings.subset([1, 2]), True), of(far, [1, 2]), passes=4, tolerance=1e-9)
     far.states[:, 0] = torch.nan
-    together = smooth(hovercraft, bearings, far, known_start=True, passes=4, tolerance=1e-9)
+    together = smooth(Problem(hovercraft, bearings, True), far, passes=4, tolerance=1e-9)
     assert not torch.isfinite(together.log_likelihood[0])
     torch.testing.assert_close(together.log_likelihood[1:], alone.log_likelihood, rtol=0, atol=1e-9)
 

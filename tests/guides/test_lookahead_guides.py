@@ -29,6 +29,7 @@ from steady_ppl import (
 from steady_ppl.comparison.evaluate import evaluate
 from steady_ppl.gaussian.smoother import find_path, means_as_path, smooth, smoother_paths
 from steady_ppl.model.handlers import AtMean, Recording, Replaying, Standardised, running
+from steady_ppl.model.problem import Problem
 
 GUIDES = (GaussianGuide, LookaheadGuide)
 Cart = type(example("linear_gaussian"))
@@ -141,10 +142,10 @@ def test_gaussian_draws_obey_the_density_of_the_channels(name):
             if name.startswith("neural"):
                 parameter.normal_(0, 0.2)
     data = drives(program, 2, 12, gaps=True)
-    path = find_path(program, data, known_start=True)
-    ahead = smooth(program, data, path, known_start=True)
+    path = find_path(Problem(program, data, True))
+    ahead = smooth(Problem(program, data, True), path)
     with seeded("draws"):
-        paths = smoother_paths(program, data, ahead, 20, known_start=True)
+        paths = smoother_paths(Problem(program, data, True), ahead, 20)
     with seeded("draws"):
         _, states, white = ahead.draws(20)
     torch.testing.assert_close(paths.states[:, data.rows], states[:, data.rows])
@@ -160,7 +161,7 @@ def test_gaussian_draws_obey_the_density_of_the_channels(name):
 def test_gaussian_draws_agree_with_the_transition_to_first_order():
     program = example("hovercraft:HovercraftTruth").requires_grad_(False)
     data = drives(program, 2, 12)
-    ahead = smooth(program, data, find_path(program, data, known_start=True), known_start=True, passes=40, tolerance=0)
+    ahead = smooth(Problem(program, data, True), find_path(Problem(program, data, True)), passes=40, tolerance=0)
     mean = means_as_path(ahead, data)
     _, states, noise = ahead.draws(50)
 

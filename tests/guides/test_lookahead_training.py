@@ -20,6 +20,7 @@ from steady_ppl import (
     train,
 )
 from steady_ppl.gaussian.smoother import find_and_smooth, find_path, smooth
+from steady_ppl.model.problem import Problem
 from steady_ppl.utils.tensor_files import read_tensors
 
 GUIDES = (GaussianGuide, LookaheadGuide)
@@ -57,7 +58,7 @@ def test_paths_follow_a_program_that_changes_from_one_refresh_to_the_next():
         before = guide.memory["noise/1"].clone()
         guide.refresh(data, share / 10)
         assert not torch.equal(guide.memory["noise/1"], before)
-    exact = smooth(program, data, find_path(program, data, known_start=True), known_start=True, passes=20)
+    exact = smooth(Problem(program, data, True), find_path(Problem(program, data, True)), passes=20)
     for i, label in enumerate(data.labels):
         assert (guide.memory[f"noise/{label}"] - exact.means()[1][:, i]).abs().max() < 0.1
 
@@ -67,9 +68,9 @@ def test_a_guide_remembers_its_paths_from_one_refresh_to_the_next(monkeypatch):
     data = drives(program, 3, 12, gaps=True)
     searched = []
 
-    def counting(program, data, **settings):
-        searched.append(data.labels)
-        return find_and_smooth(program, data, **settings)
+    def counting(problem, **settings):
+        searched.append(problem.data.labels)
+        return find_and_smooth(problem, **settings)
 
     monkeypatch.setattr("steady_ppl.guides.linearized.find_and_smooth", counting)
     guide = GaussianGuide(program, draws=4, known_start=True, tempering=Constant())
@@ -81,7 +82,7 @@ def test_a_guide_remembers_its_paths_from_one_refresh_to_the_next(monkeypatch):
     guide.memory["noise/3"].fill_(math.nan)
     assert guide.refresh(data, 0.0)["paths_lost"] == 1
     assert searched[2:] == [("3",)]  # the remembered path has blown up
-    exact = smooth(program, data, find_path(program, data, known_start=True), known_start=True, passes=20)
+    exact = smooth(Problem(program, data, True), find_path(Problem(program, data, True)), passes=20)
     for i, label in enumerate(data.labels):
         apart = guide.memory[f"states/{label}"] - exact.means()[0][:, i]
         assert apart[data.rows[:, i]].abs().max() < 0.02

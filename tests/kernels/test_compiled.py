@@ -25,6 +25,7 @@ from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.guides import linearized
 from steady_ppl.kernels import jit, rows as rows_by_kernels
+from steady_ppl.model.problem import Problem
 from steady_ppl.smc.backends import CompiledStepping, Stepping, stepping_for
 
 HovercraftTruth = type(example("hovercraft:HovercraftTruth"))
@@ -85,9 +86,9 @@ def test_a_kernels_jacobians_are_those_of_torch(name, monkeypatch):
     data = drives(program, 3, 9, gaps=True)
     torch.manual_seed(1)
     states, noise = 2 * torch.randn(9, 3, len(program.states)), torch.randn(8, 3, len(program.channels))
-    by_torch = linearize(program, data, ReferencePath(states, noise))
+    by_torch = linearize(Problem(program, data), ReferencePath(states, noise))
     monkeypatch.setattr(rows_by_kernels, "ROWS_WORTH_COMPILING", 1)
-    by_kernel = linearize(program, data, ReferencePath(states, noise))
+    by_kernel = linearize(Problem(program, data), ReferencePath(states, noise))
     assert by_kernel.in_plain_torch is None and jit._COMPILED[type(program)]
     for part in ("offset", "state", "noise", "residual", "measurement", "precision", "log_scale"):
         torch.testing.assert_close(getattr(by_kernel, part), getattr(by_torch, part), rtol=1e-4, atol=2e-5)
@@ -99,7 +100,7 @@ def test_a_program_has_kernels_for_the_filter_and_for_its_jacobians(monkeypatch)
     data = drives(program, 2, 9)
     path = ReferencePath(torch.randn(9, 2, 6), torch.randn(8, 2, 3))
     for _ in range(2):
-        assert linearize(program, data, path).in_plain_torch is None
+        assert linearize(Problem(program, data), path).in_plain_torch is None
         assert particle_filter(program, data, particles=32, kernels=True).in_plain_torch is None
 
 
@@ -121,11 +122,11 @@ def test_jacobians_that_have_fallen_behind_their_program_are_found_out(monkeypat
     program = Stale()
     data = drives(example("hovercraft", torch.float32), 2, 31)
     path = ReferencePath(torch.randn(31, 2, 6), torch.randn(30, 2, 3))
-    assert linearize(program, data, path).in_plain_torch is None
+    assert linearize(Problem(program, data), path).in_plain_torch is None
     with torch.no_grad():
         for parameter in program.parameters():
             parameter += 0.1
-    assert "different numbers" in linearize(program, data, path).in_plain_torch
+    assert "different numbers" in linearize(Problem(program, data), path).in_plain_torch
 
 
 def test_every_trajectory_may_have_an_observation_weight_of_its_own():
@@ -171,7 +172,7 @@ def test_a_filter_estimates_the_same_with_kernels_as_without(look_ahead, gaps):
     program = single("hovercraft.py:HovercraftTruth")
     data = drives(program, 2, 9, gaps=gaps)
     many = data.subset(torch.arange(2).repeat_interleave(100))
-    proposal = Twist(find_and_smooth(program, many, known_start=True)) if look_ahead else None
+    proposal = Twist(find_and_smooth(Problem(program, many, True))) if look_ahead else None
     ratios = []
     for kernels in (True, False):
         with seeded("filter", int(kernels)):

@@ -16,6 +16,7 @@ from steady_ppl.kernels import jit, rows as rows_by_kernels
 from steady_ppl.kernels.rows import Slopes, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import elements, on_both_sides
 from steady_ppl.model.handlers import Standardised, running
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.substeps import acting_controls, advance, with_substeps
 
 PROGRAMS = ["hovercraft.py:HovercraftTruth", "truck", "pendulum", "linear_gaussian"]
@@ -75,7 +76,7 @@ def test_copies_share_a_kernel_and_have_their_own_numbers():
             parameter += 0.1
     path = ReferencePath(torch.randn(9, 2, 6), torch.randn(8, 2, 3))
     for which in (program, other):
-        by_kernel, by_torch = (linearize(which, data, path, kernels=kernels) for kernels in (True, False))
+        by_kernel, by_torch = (linearize(Problem(which, data), path, kernels=kernels) for kernels in (True, False))
         assert by_kernel.in_plain_torch is None
         torch.testing.assert_close(by_kernel.state, by_torch.state, rtol=1e-4, atol=2e-5)
         torch.testing.assert_close(by_kernel.offset, by_torch.offset, rtol=1e-4, atol=2e-5)
@@ -108,8 +109,8 @@ def test_a_program_that_differs_in_what_nothing_tells_is_not_run_by_the_others_k
     other = copy.deepcopy(program)
     other.hidden.drag = 0.5
     path = ReferencePath(torch.randn(9, 2, 6), torch.randn(8, 2, 3))
-    assert linearize(program, data, path).in_plain_torch is None
-    found, expected = linearize(other, data, path), linearize(other, data, path, kernels=False)
+    assert linearize(Problem(program, data), path).in_plain_torch is None
+    found, expected = linearize(Problem(other, data), path), linearize(Problem(other, data), path, kernels=False)
     assert found.in_plain_torch == jit.DIFFERENT and torch.equal(found.state, expected.state)
 
 
@@ -128,7 +129,7 @@ def test_a_program_that_writes_into_its_tensors_is_compiled():
     program = InPlace()
     data = drives(program, 2, 9)
     path = ReferencePath(torch.randn(9, 2, 6), torch.randn(8, 2, 3))
-    found, expected = linearize(program, data, path), linearize(program, data, path, kernels=False)
+    found, expected = linearize(Problem(program, data), path), linearize(Problem(program, data), path, kernels=False)
     assert found.in_plain_torch is None
     torch.testing.assert_close(found.state, expected.state, rtol=1e-4, atol=2e-5)
 

@@ -15,6 +15,7 @@ from pyro.nn import PyroParam
 from small import HOVERCRAFT, simulated, steady, written
 
 import steady_ppl as st
+from steady_ppl.model.problem import Problem
 from steady_ppl.runs.diagnostics import diagnose_fit, diagnose_units
 from steady_ppl.runs.recipes import find_recipe
 from steady_ppl.training.loop import Trained
@@ -58,8 +59,8 @@ def likelihood(program, table) -> float:
 
     data = st.for_program(program, table)
     with st.seeded(0, "paths"):
-        path = find_path(program, data, known_start=True)
-    return float(smooth(program, data, path, known_start=True, passes=4).log_likelihood.sum())
+        path = find_path(Problem(program, data, True))
+    return float(smooth(Problem(program, data, True), path, passes=4).log_likelihood.sum())
 
 
 def test_it_is_a_recipe_of_the_command_line(tmp_path: Path, drives, capsys):

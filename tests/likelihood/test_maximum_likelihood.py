@@ -15,7 +15,7 @@ from steady_ppl.effects import chosen_variant
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood.maximize import maximise, widen_noise
 from steady_ppl.likelihood.parameters import elements
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.problem import Problem
 
 
 def set_values(program, values) -> None:
@@ -26,15 +26,15 @@ def set_values(program, values) -> None:
 def likelihood_of_cart(program, data) -> float:
     from steady_ppl.gaussian.smoother import find_path
 
-    path = find_path(program, data, known_start=True)
-    return float(smooth(program, data, path, known_start=True).log_likelihood.sum())
+    path = find_path(Problem(program, data, True))
+    return float(smooth(Problem(program, data, True), path).log_likelihood.sum())
 
 
 @pytest.fixture(scope="module")
 def cart():
     program = example("linear_gaussian")
     data = drives(program, 30, 60)
-    maximum = maximise(program, data, known_start=True)
+    maximum = maximise(Problem(program, data, True))
     return program, data, maximum
 
 
@@ -56,7 +56,7 @@ def test_the_start_does_not_matter(cart):
     far = example("linear_gaussian")
     for part, by in zip(elements(far), (1.0, -1.0, 0.7, -0.5), strict=True):
         part.move(by)
-    again = maximise(far, data, known_start=True)
+    again = maximise(Problem(far, data, True))
     assert again.objective == pytest.approx(maximum.objective, abs=0.05)
     for ours, theirs in zip(elements(far), elements(program), strict=True):
         torch.testing.assert_close(ours.parameter.data, theirs.parameter.data, atol=0.02, rtol=0.02)
@@ -66,7 +66,7 @@ def test_a_prior_pulls(cart):
     program, data, _ = cart
     pulled = copy.deepcopy(program)
     pulled.priors = {"gain": dist.Normal(2.0, 0.005)}
-    maximise(pulled, data, known_start=True)
+    maximise(Problem(pulled, data, True))
     gain, before = float(pulled.gain.detach()), float(program.gain.detach())
     assert before < gain < 2.0 and 2.0 - gain < (2.0 - before) / 4
 
@@ -79,7 +79,7 @@ def test_noise_is_widened_before_a_program_that_explains_nothing_is_fitted():
     data = drives(truth.with_effect("yaw_quadratic_drag", 0.25), 6, 61)
     path = widen_noise(Problem(program, data, True))
     assert float(program.noise.detach().min()) > 0.1
-    assert maximise(program, data, path, known_start=True).converged
+    assert maximise(Problem(program, data, True), path).converged
     right = example("hovercraft")
     before = right.noise.detach().clone()
     widen_noise(Problem(right, drives(right, 6, 41), True))
@@ -97,9 +97,9 @@ def test_drives_are_judged_by_fits_that_have_seen_them_for_the_noise_alone():
     variant = chosen_variant(program, "yaw_bias", "")
     first, second = (float(value) for value in found.coefficients(variant))
     assert float(found.coefficient(variant)) == pytest.approx((6 * first + 8 * second) / 14)
-    judged = smooth(found.judges.programs[0], valid, found.folds[0].held_out_path, known_start=True, passes=4)
+    judged = smooth(Problem(found.judges.programs[0], valid, True), found.folds[0].held_out_path, passes=4)
     torch.testing.assert_close(found.held_out[:8], judged.log_likelihood, atol=0.05, rtol=0)
-    again = maximise(copy.deepcopy(found.programs[0]), train, found.folds[0].path, known_start=True)
+    again = maximise(Problem(copy.deepcopy(found.programs[0]), train, True), found.folds[0].path)
     assert again.objective == pytest.approx(found.maxima[0].objective, abs=0.1)
     assert float((found.held_out - base.held_out).sum()) > 5
 
@@ -141,7 +141,7 @@ def test_a_fit_that_cannot_reach_what_it_must_ends_after_six_steps_and_one_that_
         far = example("linear_gaussian")
         for part, by in zip(elements(far), (1.0, -1.0, 0.7, -0.5), strict=True):
             part.move(by)
-        return maximise(far, data, known_start=True, hopeless=hopeless)
+        return maximise(Problem(far, data, True), hopeless=hopeless)
 
     whole = steps(-float("inf"))
     assert whole.converged and whole.steps > 8
@@ -154,5 +154,5 @@ def test_a_fit_that_begins_with_too_much_information_does_not_end_at_once(cart):
     far = example("linear_gaussian")
     for part, by in zip(elements(far), (0.2, -0.2, 0.1, -0.1), strict=True):
         part.move(by)
-    again = maximise(far, data, known_start=True, information=1e4 * maximum.information, steps=60)
+    again = maximise(Problem(far, data, True), information=1e4 * maximum.information, steps=60)
     assert again.objective == pytest.approx(maximum.objective, abs=0.1)

@@ -11,6 +11,7 @@ from oracles import cart_parameters, kalman
 
 import steady_ppl as st
 from steady_ppl.gaussian.smoother import find_and_smooth
+from steady_ppl.model.problem import Problem
 
 TRUTH = "hovercraft:HovercraftTruth"
 
@@ -58,7 +59,7 @@ def test_a_sensor_that_is_nearly_exact_leaves_the_smoother_exact(sd):
     cart = example("linear_gaussian").requires_grad_(False)
     cart.measurement_sd = torch.tensor(sd, dtype=torch.float64)
     data = drives(cart, 3, 40)
-    found = find_and_smooth(cart, data).log_likelihood
+    found = find_and_smooth(Problem(cart, data)).log_likelihood
     torch.testing.assert_close(found, kalman(data, cart_parameters(cart)).log_likelihood, rtol=1e-6, atol=1e-6)
 
 
@@ -92,7 +93,7 @@ def test_single_precision_agrees_with_double(data):
     ahead = {}
     for program in (single, double):
         with st.seeded("numerics"):
-            ahead[program] = find_and_smooth(program, st.for_program(program, data))
+            ahead[program] = find_and_smooth(Problem(program, st.for_program(program, data)))
     assert (ahead[single].log_likelihood - ahead[double].log_likelihood).abs().max() < 0.05
     paths = [ahead[program].means()[0].double() for program in (single, double)]
     spread = ahead[double].covariances()[0].diagonal(dim1=-2, dim2=-1).double().sqrt()

@@ -16,6 +16,7 @@ from steady_ppl.gaussian.smoother import find_path, means_as_path, smooth
 from steady_ppl.kernels import rows as rows_by_kernels
 from steady_ppl.likelihood.parameters import elements, moved
 from steady_ppl.likelihood.scores import Smoothed, parameter_scores, smoothed, typical_spreads
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.substeps import with_substeps
 
 EFFECTS = (
@@ -38,9 +39,9 @@ EFFECTS = (
 
 def settled(program, data, path=None):
     """The linearised program about its own posterior means."""
-    path = path or find_path(program, data, known_start=True)
+    path = path or find_path(Problem(program, data, True))
     for _ in range(4):
-        ahead = smooth(program, data, path, known_start=True, passes=5, kernels=False)
+        ahead = smooth(Problem(program, data, True), path, passes=5, kernels=False)
         path = means_as_path(ahead, data)
     return ahead, path
 
@@ -66,9 +67,9 @@ def test_a_linear_program_has_its_kalman_filters_scores():
     found = parameter_scores(program, data, at, parts)
     for index, part in enumerate(parts):
         with moved(part, 1e-4):
-            up = smooth(program, data, path, known_start=True).log_likelihood
+            up = smooth(Problem(program, data, True), path).log_likelihood
         with moved(part, -1e-4):
-            down = smooth(program, data, path, known_start=True).log_likelihood
+            down = smooth(Problem(program, data, True), path).log_likelihood
         torch.testing.assert_close(found[:, index], (up - down) / 2e-4, rtol=2e-3, atol=2e-3)
 
 

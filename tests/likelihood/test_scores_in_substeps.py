@@ -11,6 +11,7 @@ from steady_ppl import fit_by_likelihood, for_program, seeded, simulate, with_su
 from steady_ppl.gaussian.smoother import find_path, means_as_path, smooth, smoother_paths
 from steady_ppl.likelihood.parameters import elements, moved
 from steady_ppl.likelihood.scores import parameter_scores, smoothed
+from steady_ppl.model.problem import Problem
 
 Cart = type(example("linear_gaussian"))
 
@@ -24,7 +25,7 @@ def fast(damping, substeps, noise=3.0):
 
 
 def at_rest(program, data, path):
-    return smooth(program, data, path, passes=20, tolerance=1e-7, kernels=False)
+    return smooth(Problem(program, data), path, passes=20, tolerance=1e-7, kernels=False)
 
 
 def log_likelihood(program, data, path):
@@ -36,7 +37,7 @@ def beside_the_maximum(damping, substeps):
     data = for_program(Cart().double(), simulate(fast(damping, substeps), 6, seed=1, substeps=substeps)).without_truth()
     program = fast(1.2 * damping, substeps, noise=2.0)
     with seeded(0, "path"):
-        path = find_path(program, data)
+        path = find_path(Problem(program, data))
     return program, data, at_rest(program, data, path)
 
 
@@ -77,7 +78,7 @@ def test_the_density_of_given_draws_has_the_same_slopes(damping, substeps) -> No
     lots = []
     for seed in range(10):
         with seeded(seed, "draws"):
-            paths = smoother_paths(program, data, ahead, 400)
+            paths = smoother_paths(Problem(program, data), ahead, 400)
         program.zero_grad()
         _, slopes = joint_density(program, paths, data)
         lots.append(torch.stack([-slope / 400 for slope in slopes.values()]))

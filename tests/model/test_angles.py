@@ -14,6 +14,7 @@ from steady_ppl import WrappedNormal, particle_filter, seeded, stack, wrap
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
+from steady_ppl.model.problem import Problem
 
 Truth = type(example("hovercraft:HovercraftTruth"))
 
@@ -62,7 +63,7 @@ class Starts(Truth):
 
 def found(program, data, known_start: bool = False) -> Lookahead:
     with seeded("found"):
-        return find_and_smooth(program.double().requires_grad_(False), data, known_start=known_start)
+        return find_and_smooth(Problem(program.double().requires_grad_(False), data, known_start))
 
 
 @pytest.fixture(scope="module")

@@ -33,6 +33,7 @@ from steady_ppl.gaussian.linearize import linearize
 from steady_ppl.gaussian.smoother import find_path, smooth
 from steady_ppl.kernels.rows import on_all_rows
 from steady_ppl.model.handlers import AtMean, Recording, Standardised, running
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.substeps import (
     advance,
     channel_scales,
@@ -149,8 +150,8 @@ def test_the_filters_noise_leads_from_each_state_to_the_next(pair) -> None:
 def test_the_linearised_program_is_that_of_the_program_unrolled_by_hand(pair) -> None:
     cut, unrolled, data = pair
     with seeded(4, "path"):
-        path = find_path(unrolled, data)
-    mine, theirs = (linearize(program, data, path) for program in (cut, unrolled))
+        path = find_path(Problem(unrolled, data))
+    mine, theirs = (linearize(Problem(program, data), path) for program in (cut, unrolled))
     for name in ("state", "noise", "offset", "measurement", "residual"):
         torch.testing.assert_close(getattr(mine, name), getattr(theirs, name), rtol=1e-10, atol=1e-10)
 
@@ -195,7 +196,7 @@ def test_two_substeps_of_the_cart_have_its_exact_evidence() -> None:
     exact = kalman_filter(system, data).log_likelihood
     program = with_substeps(cart, 2)
     with seeded(0, "path"):
-        found = smooth(program, data, find_path(program, data)).log_likelihood
+        found = smooth(Problem(program, data), find_path(Problem(program, data))).log_likelihood
     torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-7)
     with seeded(0, "filter"):
         drawn = torch.stack([particle_filter(program, data, particles=4000).log_likelihood for _ in range(6)])

@@ -12,6 +12,7 @@ from oracles import assert_mean
 from steady_ppl import particle_filter, seeded
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
+from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import for_program
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
@@ -26,7 +27,7 @@ def problem(rows: int, device: str):
 
 def filtered(rows: int, device: str, look_ahead: bool = False):
     program, data = problem(rows, device)
-    proposal = Twist(find_and_smooth(program, data, known_start=True)) if look_ahead else None
+    proposal = Twist(find_and_smooth(Problem(program, data, True))) if look_ahead else None
     with seeded("device", device):
         return particle_filter(program, data, particles=500, known_start=True, proposal=proposal)
 
@@ -44,7 +45,7 @@ def test_a_filter_waits_for_the_device_no_more_often_on_a_longer_drive(look_ahea
     for rows in (9, 33):
         filtered(rows, "cuda", look_ahead)
         program, data = problem(rows, "cuda")
-        proposal = Twist(find_and_smooth(program, data, known_start=True)) if look_ahead else None
+        proposal = Twist(find_and_smooth(Problem(program, data, True))) if look_ahead else None
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             torch.cuda.set_sync_debug_mode("warn")

@@ -12,6 +12,7 @@ from examples import cut, drives, elsewhere, example
 from steady_ppl import particle_filter, seeded
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
+from steady_ppl.model.problem import Problem
 from steady_ppl.smc.filter import Proposal
 from steady_ppl.smc.resampling import systematic
 
@@ -138,7 +139,7 @@ class InOrder(Proposal):
 @pytest.mark.parametrize("look_ahead", [False, True])
 @pytest.mark.parametrize("resample_below", [0.0, 1.0])
 def test_the_order_of_the_particles_changes_nothing(hovercraft, bearings, resample_below, look_ahead, monkeypatch):
-    ahead = Twist(find_and_smooth(hovercraft, bearings), untwisted=0.3) if look_ahead else None
+    ahead = Twist(find_and_smooth(Problem(hovercraft, bearings)), untwisted=0.3) if look_ahead else None
     order, runs = torch.randperm(60), []
     for proposal in (InOrder(torch.arange(60), ahead), InOrder(order, ahead)):
         monkeypatch.setattr("steady_ppl.smc.genealogy.systematic", proposal.systematic)

@@ -9,8 +9,7 @@ import torch
 from examples import drives, example
 
 from steady_ppl.errors import DataError
-from steady_ppl.gaussian.smoother import find_path, smooth
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.model.problem import Problem
 
 
 def test_a_known_start_must_be_given_for_every_drive() -> None:
@@ -31,14 +30,3 @@ def test_a_table_gives_no_truth_but_the_start() -> None:
     known = Problem.of_table(program, table, known_start=True)
     assert torch.equal(known.data.states[0], table.states[0]) and bool(known.data.states[1:].isnan().all())
     assert known.subset([2]).data.labels == (table.labels[2],) and known.subset([2]).known_start
-
-
-@pytest.mark.parametrize("known_start", [False, True])
-def test_what_it_is_asked_is_about_all_three(known_start: bool) -> None:
-    program = example("linear_gaussian")
-    problem = Problem.of_table(program, drives(program, 3, 9), known_start)
-    path = find_path(program, problem.data, known_start=known_start)
-    expected = smooth(program, problem.data, path, known_start=known_start, passes=3).log_likelihood
-    torch.testing.assert_close(problem.smooth(path, passes=3).log_likelihood, expected, rtol=0, atol=0)
-    torch.testing.assert_close(problem.find_and_smooth().log_likelihood, expected)
-    assert problem.why_not_linear() is None
