@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_drives import SCAN, U, taken, values
 from bag_writing import Said, stamped, write_bag
 from hypothesis import given, settings, strategies as st
-from test_import_bag import SCAN, U, taken, values
 
 from steady_ppl import BagColumn, BagMapping, read_bags
 from steady_ppl.data.rosbag.resample import align

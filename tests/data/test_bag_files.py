@@ -7,10 +7,10 @@ import sqlite3
 from pathlib import Path
 
 import pytest
+from bag_drives import MAPPING, ODOMETRY, SCAN, TWIST, drive
 from bag_writing import CELL_TEXT, THRUST, THRUST_TEXT, write_bag
 from small import steady
-from test_import_bag import MAPPING, ODOMETRY, SCAN, TWIST, drive
-from test_table import same
+from small_tables import same
 
 from steady_ppl import BagColumn, BagMapping, read_bags, read_table
 

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from bag_drives import FLOATS, MAPPING, SCAN, TWIST, drive, values
 from bag_writing import KINDS, THRUST, filled, stamped, typestore, write_bag
 from small import steady
-from test_import_bag import FLOATS, MAPPING, SCAN, TWIST, drive, values
 
 from steady_ppl import BagColumn, BagMapping, UsageError, read_bags, read_table
 from steady_ppl.data.rosbag.reader import listing, open_bag

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import torch
 from examples import MODELS, HeavyTailed
+from learned import held_out, same, values
 from small import HOVERCRAFT, contents, only_start, simulated, steady, written
 
-from steady_ppl import UsageError, for_program, load_program, log_likelihood, seeded, simulate
+from steady_ppl import UsageError, for_program, load_program, seeded, simulate
 from steady_ppl.runs.recipes import find_recipe, recipe_folder
 
 QUIET = {"progress": False}
@@ -21,14 +22,6 @@ FEW = {
     "lookahead": {"guide": "lookahead", "particles": 20, "draws": 3},
     "gaussian": {"draws": 3},
 }
-
-
-def values(program) -> dict[str, torch.Tensor]:
-    return {name: value.detach().clone() for name, value in program.state_dict().items()}
-
-
-def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
-    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
 # --- finding them -----------------------------------------------------------------------------------------------------
@@ -74,14 +67,6 @@ def test_steady_finds_a_mass_that_was_wrong_by_far(guide: str) -> None:
     find_recipe("steady")(program, train, **options, **QUIET)
     assert abs(program.mass.item() - 1.5) < abs(3.0 - 1.5) / 5
     assert held_out(program, valid) > before
-
-
-def held_out(program, data) -> float:
-    """Log p(y) of other drives, the same random numbers for every program."""
-    with seeded(0):
-        return (
-            log_likelihood(program, for_program(program, data), particles=1000, known_start=True, every=1).mean().item()
-        )
 
 
 @pytest.mark.parametrize("guide", list(FEW))
