@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-import re
-import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from bag_drives import FLOATS, MAPPING, TWIST, U, Y, drive, taken, values
+from bag_drives import FLOATS, MAPPING, U, Y, drive, taken, values
 from bag_writing import KINDS, Said, write_bag
-from examples import MODELS
 from small import simulated, steady
 from small_tables import same
 
@@ -37,25 +34,6 @@ def test_every_kind_of_bag_gives_the_numbers_that_were_written(tmp_path: Path, c
     assert torch.equal(data.measurements[:, 0], torch.stack([i / 4, 2 * (12 - i / 16) - 1], -1))
     assert torch.allclose(data.states[:, 0, 0], 0.5 * i - 3.0, rtol=0, atol=1e-12)  # on beyond pi, in one go
     same(read_bags([bag], BagMapping.read(tmp_path / "mapping.toml")), data)
-
-
-def test_options_spell_the_same_as_a_file(tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / "drive", "mcap", drive())
-    (tmp_path / "mapping.toml").write_text(MAPPING)
-    assert steady("import-bag", bag, tmp_path / "mapping.toml", "--out", tmp_path / "a.csv") == 0
-    maps = (
-        "u.speed=/cmd_vel:linear.x",
-        "y.range=/scan:ranges[1]",
-        "y.volt=/thrust:cells[0].volt,scale=2,offset=-1",
-        "x.heading=/odom:pose.pose.orientation,as=yaw",
-    )
-    options = [word for text in maps for word in ("--map", text)]
-    assert steady("import-bag", bag, *options, "--step", 0.1, "--out", tmp_path / "b.csv") == 0
-    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
-    extra = ("--map", "y.left=/thrust:left", "--step", 0.2)
-    assert steady("import-bag", bag, tmp_path / "mapping.toml", *extra, "--out", tmp_path / "c.csv") == 0
-    data = read_table(tmp_path / "c.csv")
-    assert data.measurement_names == ("range", "volt", "left") and data.median_step == pytest.approx(0.2)
 
 
 # --- rows -------------------------------------------------------------------------------------------------------------
@@ -158,56 +136,6 @@ def test_a_pause_of_a_control_splits_and_what_says_nothing_is_dropped(tmp_path: 
 # --- what is in a bag -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_without_a_mapping_the_bag_is_listed_and_the_list_is_a_mapping_to_start_from(
-    tmp_path: Path, capsys, kind: str
-) -> None:
-    bag = write_bag(tmp_path / "drive", kind, drive())
-    assert steady("import-bag", bag) == 0
-    out, error = capsys.readouterr()
-    assert error == ""
-    for says in (
-        f"# /cmd_vel  {TWIST}  12 messages  10 Hz\n#     linear.x, linear.y, linear.z, angular.x, angular.y,",
-        'pose.pose.orientation (as = "yaw"), pose.pose.orientation.x',
-        "pose.covariance[0…35]",
-        "ranges[0…1], intensities[] (empty in the first message)",
-        "left, right, cells[0…1].volt\n",
-        '# [columns."y.cmd_vel_linear_x"]\n# topic = "/cmd_vel"\n# field = "linear.x"\n',
-    ):
-        assert says in out
-    assert "gear" not in out  # which is text
-    start = tmp_path / "start.toml"
-    start.write_text(out)
-    with pytest.raises(Exception, match="there is no measurement"):
-        BagMapping.read(start)
-    head, step, sections = out.partition("step = 0.1  # s between two rows\n")
-    start.write_text(head + step + re.sub("^# ?", "", sections, flags=re.MULTILINE))
-    columns = {column.topic: column for column in BagMapping.read(start).columns}
-    assert columns["/cmd_vel"] == BagColumn("y.cmd_vel_linear_x", "/cmd_vel", "linear.x")
-    assert columns["/scan"].field == "angle_min" and columns["/scan"].clock == "aligned"
-    assert len(columns) == 4
-
-
-def test_the_list_of_several_bags_is_one_mapping(tmp_path: Path, capsys) -> None:
-    for name in ("one", "two"):
-        write_bag(tmp_path / name, "mcap", drive())
-    assert steady("import-bag", tmp_path / "one", tmp_path / "two") == 0
-    out = capsys.readouterr().out
-    assert "# one\n" in out and "# two\n" in out
-    assert tomllib.loads(out) == {"step": 0.1} and out.count('"y.cmd_vel_linear_x"') == 1
-
-
-def test_topics_that_spell_alike_are_columns_of_their_own(tmp_path: Path, capsys) -> None:
-    bag = write_bag(tmp_path / "drive", "mcap", values([(0.0, 1.0)], "/a/b") + values([(0.0, 1.0)], "/a_b"))
-    assert steady("import-bag", bag) == 0
-    sections = capsys.readouterr().out.partition("step = 0.1")[2]
-    mapping = tomllib.loads("step = 0.1" + re.sub("^# ?", "", sections, flags=re.MULTILINE))
-    assert {name: said["topic"] for name, said in mapping["columns"].items()} == {
-        "y.a_b_data": "/a/b",
-        "y.a_b_data_2": "/a_b",
-    }
-
-
 def test_a_pause_over_which_a_command_is_held_is_said(tmp_path: Path, capsys) -> None:
     controls = [(at / 10, 1.0) for at in (*range(20), *range(600, 620))]
     bag = write_bag(tmp_path / "drive", "mcap", values(controls, "/u") + values([(at / 10, 0.0) for at in range(625)]))
@@ -219,14 +147,6 @@ def test_a_pause_over_which_a_command_is_held_is_said(tmp_path: Path, capsys) ->
     assert len(data) == 2 and not any("is held" in line for line in said)
     taken(bag, BagColumn("u.b", "/u", "data", between="interpolate"), Y, say=said.append)
     assert any("u.b is interpolated over it" in line for line in said)
-
-
-def test_the_mapping_that_the_how_to_shows_is_one() -> None:
-    text = (MODELS.parent / "docs" / "import-bag.md").read_text().split("```toml\n")[1].split("```")[0]
-    speed, bearing, heading = BagMapping.parse(tomllib.loads(text), "import-bag.md").columns
-    assert speed == BagColumn("u.speed", "/cmd_vel", "linear.x", longest=1.0)
-    assert bearing == BagColumn("y.bearing_0", "/bearings", "ranges[0]", clock="aligned")
-    assert heading == BagColumn("x.heading", "/mocap", "pose.pose.orientation", reading="yaw")
 
 
 # --- end to end -------------------------------------------------------------------------------------------------------

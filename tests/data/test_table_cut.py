@@ -57,16 +57,6 @@ def test_what_cannot_be_cut_says_why():
         st.cut(replace(data, labels=("a", "a-1", "b"), lengths=torch.tensor([21, 8, 21])), 1.0)
 
 
-def test_the_command_cuts_and_says_what_it_left_out(tmp_path, capsys):
-    table = written(tmp_path / "log.csv", simulated(trajectories=2, rows=31))
-    assert steady("data", "cut", table, "--seconds", 1, "--out", tmp_path / "cut.csv") == 0
-    out, error = capsys.readouterr()
-    assert out == f"{tmp_path / 'cut.csv'}: 6 drives\n" and "2 rows left out" in error
-    assert len(st.read_table(tmp_path / "cut.csv")) == 6
-    assert steady("data", "cut", table, "--seconds", 0, "--out", tmp_path / "no.csv") == 2
-    assert not (tmp_path / "no.csv").exists()
-
-
 def test_what_looks_at_drives_as_a_whole_refuses_long_ones(tmp_path, capsys):
     rows = MAX_ROWS + 1
     frame = st.to_frame(simulated(trajectories=6, rows=11))

@@ -1,4 +1,4 @@
-"""`steady simulate --effect`, `steady add` and `steady effects`."""
+"""`steady add` and `steady effects`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from examples import MODELS
 from small import FEW, QUICK, steady, written
 
-from steady_ppl import Fit, load_program, read_table
+from steady_ppl import Fit, load_program
 from steady_ppl.effects import attached
 
 
@@ -28,42 +28,6 @@ def ready(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def work(ready: Path, tmp_path: Path) -> Path:
     shutil.copytree(ready, tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__"))
     return tmp_path
-
-
-# --- simulate ---------------------------------------------------------------------------------------------------------
-
-
-def test_simulate_with_effects_says_their_values(work: Path, capsys) -> None:
-    few = ("--trajectories", 2, "--seed", 3)
-    given = ("--effect", "linear_drag", "--effect", "slope=0.05,-0.03", "--effect", "thrust_saturation:knee=0.6=0.3")
-    assert steady("simulate", work / "hovercraft.py", *few, "--out", work / "plain.csv") == 0
-    capsys.readouterr()
-    assert steady("simulate", work / "hovercraft.py", *few, *given, "--out", work / "with.csv") == 0
-    out, error = capsys.readouterr()
-    assert out == "" and error.splitlines() == [
-        "steady: linear_drag = 0.12 1/s (typical)",
-        "steady: slope = 0.05, -0.03 m/s² (as given)",
-        "steady: thrust_saturation (knee 0.6) = 0.3 (as given)",
-        "steady: simulated in steps of 5 ms, 20 a row",
-    ]
-    plain, other = read_table(work / "plain.csv"), read_table(work / "with.csv")
-    assert torch.equal(plain.controls, other.controls) and not torch.allclose(plain.states, other.states)
-
-
-@pytest.mark.parametrize(
-    ("effects", "says"),
-    [
-        (("liner_drag",), "no effect 'liner_drag': did you mean linear_drag?"),
-        (("slope=1",), "takes 2 numbers (x, y), got 1"),
-        (("gain_error:left",), "does not apply to Hovercraft"),
-        (("linear_drag", "linear_drag=0.2"), "effect linear_drag is given twice"),
-    ],
-)
-def test_simulate_refuses_an_effect_that_is_none(work: Path, capsys, effects: tuple[str, ...], says: str) -> None:
-    options = [part for effect in effects for part in ("--effect", effect)]
-    assert steady("simulate", work / "hovercraft.py", *options, "--out", work / "out.csv") == 2
-    assert says in capsys.readouterr().err.splitlines()[-1]
-    assert not (work / "out.csv").exists()
 
 
 # --- add --------------------------------------------------------------------------------------------------------------
