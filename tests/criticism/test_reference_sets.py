@@ -7,12 +7,10 @@ import pytest
 import torch
 from examples import drives, example
 from oracles import assert_mean
-from scipy import stats
 
 import steady_ppl.criticism.reference_sets as simulated
 from steady_ppl import FilterError
 from steady_ppl.criticism.perturbations import directions
-from steady_ppl.criticism.residual_maps import _adjusted
 from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.kernels import rows as rows_by_kernels
@@ -117,8 +115,3 @@ def test_scores_of_parameters_by_kernels_are_those_by_differences(monkeypatch):
     for name, scores in found[0].items():
         size = float(found[1][name].abs().max())
         torch.testing.assert_close(scores, found[1][name], rtol=0.01, atol=0.01 * size, msg=name)
-
-
-def test_adjusted_p_values_are_scipys():
-    p_values = np.random.default_rng(0).uniform(0, 1, 300).round(2) ** 2
-    np.testing.assert_allclose(_adjusted(p_values), stats.false_discovery_control(p_values), rtol=1e-12)

@@ -1,0 +1,146 @@
+"""The catalogue: how effects are named, which there are, their page, their units and their declarations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from examples import MODELS, drives, example, short
+
+from steady_ppl import UsageError
+from steady_ppl.effects import Effect, catalogue, chosen_variant, find, not_applicable, parsed
+from steady_ppl.effects.registry import page
+
+PROGRAMS = ("hovercraft", "truck", "pendulum")
+
+
+@pytest.mark.parametrize(
+    ("text", "read"),
+    [
+        ("linear_drag", ("linear_drag", "", {}, None)),
+        ("linear_drag=0.1", ("linear_drag", "", {}, (0.1,))),
+        ("slope=0.05,-0.03", ("slope", "", {}, (0.05, -0.03))),
+        ("gain_error:turn", ("gain_error", "turn", {}, None)),
+        ("gain_error:turn=-1e-2", ("gain_error", "turn", {}, (-0.01,))),
+        ("landmark_bias:2", ("landmark_bias", "2", {}, None)),
+        ("landmark_bias:2=0.1", ("landmark_bias", "2", {}, (0.1,))),
+        ("thrust_saturation:knee=0.6", ("thrust_saturation", "", {"knee": 0.6}, None)),
+        ("thrust_saturation:knee=0.6=0.45", ("thrust_saturation", "", {"knee": 0.6}, (0.45,))),
+        ("thrust_saturation:turn:knee=0.6=0.45", ("thrust_saturation", "turn", {"knee": 0.6}, (0.45,))),
+        ("sticky_patch:x=1:y=-2:radius=3=0.5", ("sticky_patch", "", {"x": 1.0, "y": -2.0, "radius": 3.0}, (0.5,))),
+    ],
+)
+def test_names_are_read(text: str, read) -> None:
+    assert parsed(text) == read
+
+
+@pytest.mark.parametrize(
+    ("program", "text", "says"),
+    [
+        ("hovercraft", "liner_drag", "did you mean linear_drag?"),
+        ("hovercraft", "zzz", "there are acceleration_bias, "),
+        ("hovercraft", "stiffness", "does not apply to Hovercraft: no channel has a position"),
+        ("truck", "slope", "does not apply to Truck: the program holds the lateral velocity at zero"),
+        ("truck", "gain_error:left", "no place 'left': it can be at speed, turn"),
+        ("hovercraft", "landmark_bias:4", "it can be at bearing_0, "),
+        ("hovercraft", "linear_drag:yaw", "no place 'yaw': there is one only"),
+        ("hovercraft", "thrust_saturation:x=3:knee=0.6", "no option x: it has knee"),
+        ("hovercraft", "slope=1", "effect slope takes 2 numbers (x, y), got 1"),
+        ("hovercraft", "linear_drag=1,2", "effect linear_drag takes one number, got 2"),
+        ("hovercraft", "linear_drag=", "expected NAME or NAME=NUMBER"),
+        ("hovercraft", "linear_drag=much", "expected NAME or NAME=NUMBER"),
+        ("hovercraft", "thrust_saturation:knee=", "expected NAME or NAME=NUMBER"),
+        ("hovercraft", "thrust_saturation:knee=0.5,0.6:x=1", "expected NAME or NAME=NUMBER"),
+        ("truck", "gain_error:turn:speed", "it is at turn or at speed"),
+        ("hovercraft", "linear_drag=nan", "finite numbers, got nan"),
+        ("hovercraft", "linear_drag=inf", "finite numbers, got inf"),
+        ("hovercraft", "process_noise=-1", "a positive number, got -1.0"),
+        ("hovercraft", "acceleration_limit=0", "a positive number, got 0.0"),
+        ("hovercraft", "heavy_tails=-1", "a number between 0 and 0.49, got -1"),
+        ("hovercraft", "coloured_noise=2", "a number between -0.99 and 0.99, got 2"),
+        ("truck", "actuator_lag=-0.1", "a number at least 0, got"),
+        ("hovercraft", "sticky_patch:x=nan=0.5", "sticky_patch: x is a finite number, got nan"),
+    ],
+)
+def test_a_wrong_name_or_number_is_explained(program: str, text: str, says: str) -> None:
+    model = example(program)
+
+    def add() -> None:
+        name, at, options, value = parsed(text)
+        model.with_effect(chosen_variant(model, name, at, **options), value)
+
+    with pytest.raises(UsageError) as caught:
+        add()
+    assert says in str(caught.value)
+
+
+def test_all_effects_of_the_design_are_there() -> None:
+    design = """
+        linear_drag quadratic_drag coulomb_friction yaw_linear_drag yaw_quadratic_drag slope wind acceleration_bias
+        yaw_bias thrust_asymmetry gain_error speed_dependent_gain thrust_saturation dead_zone actuator_lag
+        actuator_delay battery_sag acceleration_limit lateral_coupling weathervane magnus lever_arm side_slip
+        curvature_steering sticky_patch stiffness cubic_stiffness bearing_bias landmark_bias sensor_scale clock_offset
+        heavy_tails range_dependent_noise process_noise command_noise coloured_noise
+    """
+    assert set(design.split()) <= {effect.name for effect in catalogue()}
+    for name in PROGRAMS:
+        program = example(name)
+        applies = {effect.name for effect in catalogue(program)}
+        assert applies | not_applicable(program).keys() == {effect.name for effect in catalogue()}
+
+
+def test_every_effects_docstring_has_all_its_texts() -> None:
+    for effect in catalogue():
+        texts = (effect.text, effect.equation, effect.feels, effect.occurs)
+        assert all(text and text == " ".join(text.split()) for text in texts), effect.name
+
+
+def test_the_page_of_the_catalogue_is_up_to_date() -> None:
+    """`steady effects > docs/effects.md` brings it up to date."""
+    assert (MODELS.parent / "docs" / "effects.md").read_text() == page()
+    truck = page(example("truck"))
+    assert "- `slope`: the program holds the lateral velocity at zero" in truck
+    assert "| `landmark_bias` | bearing_0, bearing_1, bearing_2, bearing_3 |" in truck
+
+
+def test_coefficients_have_the_units_of_what_they_act_on() -> None:
+    units = {
+        ("pendulum", "coulomb_friction"): "rad/s²",
+        ("pendulum", "cubic_stiffness"): "1/(rad² s²)",
+        ("pendulum", "quadratic_drag"): "1/rad",
+        ("pendulum", "stiffness"): "1/s²",
+        ("pendulum", "sensor_bias"): "rad",
+        ("pendulum", "dead_zone"): "N m",
+        ("hovercraft", "coulomb_friction"): "m/s²",
+        ("hovercraft", "yaw_quadratic_drag"): "1/rad",
+        ("hovercraft", "dead_zone"): "N",
+        ("truck", "dead_zone:turn"): "rad/s",
+    }
+    for (program, effect), unit in units.items():
+        assert chosen_variant(short(program), effect).unit == unit, (program, effect)
+
+
+def test_probes_go_with_the_size_of_the_commands() -> None:
+    """Pulse widths of a thousand and more, not newtons."""
+    program = short("hovercraft")
+    data = drives(program, 2, 6)
+    large = replace(data, controls=1000 * data.controls)
+    (small,), (great,) = (find("dead_zone", program).variants(program, table) for table in (data, large))
+    assert small.probes == [small.scale * probe for probe in (0.05, 0.15, 0.3)]
+    assert 500 <= great.scale / small.scale <= 2000
+    assert great.scale <= float(large.controls.abs().max()) < 2 * great.scale
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"typical": 0.0}, "none would feel it"),
+        ({"typical": (0.1, 0.1)}, "2 typical numbers for 1 components"),
+        ({"typical": (0.1, 0.1), "components": ("east", "north"), "sign": 1}, "has no sign"),
+        ({"limit": 0.0}, "a magnitude above zero"),
+    ],
+)
+def test_a_wrong_declaration_is_explained(wrong: dict, says: str) -> None:
+    right = {"typical": 0.1, "limit": 1.0}
+    with pytest.raises(UsageError, match=says):
+        Effect("mine", "push", "a = c", "a = c", "1", "pulls", lambda self, c: {}, **{**right, **wrong})
