@@ -8,7 +8,7 @@ from functools import partial
 
 import pytest
 import torch
-from examples import example
+from examples import drives, example
 from matplotlib.figure import Figure
 from pyro.nn import PyroParam
 from small import finite
@@ -21,8 +21,7 @@ from steady_ppl.discovery.discover import NOT_CONVERGED, _of_one_drive
 from steady_ppl.discovery.finding import _spread, next_run
 from steady_ppl.effects import Effect, chosen_variant, parsed
 from steady_ppl.effects.registry import _EFFECTS, register
-from steady_ppl.likelihood.maximize import maximise, maximum_of, refit_outliers
-from steady_ppl.likelihood.problem import Problem
+from steady_ppl.likelihood.maximize import maximum_of
 from steady_ppl.plotting.discovery import unknown_effect
 
 DRIVES, ROWS, SETS = 10, 81, 50
@@ -202,18 +201,6 @@ def test_not_knowing_a_knee_is_in_the_coefficients_interval():
     assert places > 0.1 * alone**2 and finding.sd[0] ** 2 == pytest.approx(alone**2 + places, rel=1e-3)
 
 
-def test_a_drive_whose_path_is_lost_is_fitted_again():
-    program = owner()
-    data = st.for_program(program, tables(program, drives=6, rows=41)[0]).without_truth(keep_start=True)
-    right = maximise(program, data, known_start=True)
-    lost, states = right.log_likelihood.clone(), right.path.states.clone()
-    lost[2], states[1:, 2] = -500.0, 0.0
-    problem = Problem(program, data, True)
-    found = refit_outliers(problem, replace(right, log_likelihood=lost, path=replace(right.path, states=states)))
-    assert torch.allclose(found.log_likelihood, right.log_likelihood, atol=0.3)
-    assert refit_outliers(problem, right) is right
-
-
 @pytest.mark.slow
 def test_the_next_run_tells_what_these_drives_do_not():
     """Steady flight at one speed: what brakes it may go with the velocity or with its square."""
@@ -368,3 +355,15 @@ def test_what_is_withheld_is_an_effect(withheld, says):
     program = example("hovercraft")
     with pytest.raises(st.UsageError, match=says):
         st.discover(program, st.simulate(program, 10), withheld=withheld)
+
+
+def test_mixed_tables_are_one_and_every_second_drive_chooses() -> None:
+    program = example("hovercraft", torch.float32)
+    train, valid = drives(program, 6, 21, seed=1), drives(program, 5, 21, seed=2)
+    found = st.discover(program, train, valid, known_start=True, mix=True, simulations=50)
+    first, second = found.search.base.folds
+    assert first.drives.labels == ("train 1", "train 3", "train 5", "valid 1", "valid 3", "valid 5")
+    assert second.drives.labels == ("train 2", "train 4", "train 6", "valid 2", "valid 4")
+    assert "the tables were mixed: 5 of the 11 drives were kept to choose by" in found.notes
+    with pytest.raises(st.UsageError, match="mix puts two tables together"):
+        st.discover(program, train, known_start=True, mix=True)

@@ -11,7 +11,6 @@ from examples import drives, example
 from steady_ppl.discovery.fitting import Judges
 from steady_ppl.discovery.refits import BY_LIKELIHOOD, Fold, Refit
 from steady_ppl.discovery.screening import departures
-from steady_ppl.discovery.search import Found
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.likelihood.parameters import elements
 
@@ -47,17 +46,3 @@ def test_a_departure_is_the_mean_of_all_folds_and_its_test_is_of_the_first():
     assert translation.away == pytest.approx(math.log(2)) and translation.share == pytest.approx(4 / 6)
     assert translation.factor == pytest.approx(math.exp((4 * math.log(2) + 2 * math.log(4)) / 6))
     assert found["process_noise:yaw"].factor == pytest.approx(1.0)
-
-
-def test_a_class_begins_with_what_was_chosen():
-    """Also where another gains more, whose own test says nothing."""
-
-    class Stub:
-        against_its_sign = False
-
-        def __init__(self, total):
-            self.total = total
-
-    more, chosen, near, far = Stub(10.5), Stub(10.0), Stub(8.5), Stub(7.0)
-    found = Found(chosen, [more, chosen, near, far], None)
-    assert found.alike == [chosen, more, near]

@@ -1,14 +1,12 @@
-"""The catalogue: how effects are named, which there are, their page, their units and their declarations."""
+"""How effects are named, which there are, and their page."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
-from examples import MODELS, drives, example, short
+from examples import MODELS, example
 
 from steady_ppl import UsageError
-from steady_ppl.effects import Effect, catalogue, chosen_variant, find, not_applicable, parsed
+from steady_ppl.effects import catalogue, chosen_variant, not_applicable, parsed
 from steady_ppl.effects.registry import page
 
 PROGRAMS = ("hovercraft", "truck", "pendulum")
@@ -101,46 +99,3 @@ def test_the_page_of_the_catalogue_is_up_to_date() -> None:
     truck = page(example("truck"))
     assert "- `slope`: the program holds the lateral velocity at zero" in truck
     assert "| `landmark_bias` | bearing_0, bearing_1, bearing_2, bearing_3 |" in truck
-
-
-def test_coefficients_have_the_units_of_what_they_act_on() -> None:
-    units = {
-        ("pendulum", "coulomb_friction"): "rad/s²",
-        ("pendulum", "cubic_stiffness"): "1/(rad² s²)",
-        ("pendulum", "quadratic_drag"): "1/rad",
-        ("pendulum", "stiffness"): "1/s²",
-        ("pendulum", "sensor_bias"): "rad",
-        ("pendulum", "dead_zone"): "N m",
-        ("hovercraft", "coulomb_friction"): "m/s²",
-        ("hovercraft", "yaw_quadratic_drag"): "1/rad",
-        ("hovercraft", "dead_zone"): "N",
-        ("truck", "dead_zone:turn"): "rad/s",
-    }
-    for (program, effect), unit in units.items():
-        assert chosen_variant(short(program), effect).unit == unit, (program, effect)
-
-
-def test_probes_go_with_the_size_of_the_commands() -> None:
-    """Pulse widths of a thousand and more, not newtons."""
-    program = short("hovercraft")
-    data = drives(program, 2, 6)
-    large = replace(data, controls=1000 * data.controls)
-    (small,), (great,) = (find("dead_zone", program).variants(program, table) for table in (data, large))
-    assert small.probes == [small.scale * probe for probe in (0.05, 0.15, 0.3)]
-    assert 500 <= great.scale / small.scale <= 2000
-    assert great.scale <= float(large.controls.abs().max()) < 2 * great.scale
-
-
-@pytest.mark.parametrize(
-    ("wrong", "says"),
-    [
-        ({"typical": 0.0}, "none would feel it"),
-        ({"typical": (0.1, 0.1)}, "2 typical numbers for 1 components"),
-        ({"typical": (0.1, 0.1), "components": ("east", "north"), "sign": 1}, "has no sign"),
-        ({"limit": 0.0}, "a magnitude above zero"),
-    ],
-)
-def test_a_wrong_declaration_is_explained(wrong: dict, says: str) -> None:
-    right = {"typical": 0.1, "limit": 1.0}
-    with pytest.raises(UsageError, match=says):
-        Effect("mine", "push", "a = c", "a = c", "1", "pulls", lambda self, c: {}, **{**right, **wrong})
