@@ -1,74 +1,25 @@
-"""Looking ahead: exact on the cart, unbiased wherever it looks, and the same in any world."""
+"""Looking ahead: exact on the cart, with bearings the same in any world, and from a broad start."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 
-import pyro
-import pyro.distributions as dist
 import pytest
 import torch
-from examples import copies, example
+from examples import elsewhere
 from oracles import START_MEAN, START_SD, CartPosterior, assert_mean, cart_parameters, kalman
+from paths import anywhere, at_its_mode
 from torch import Tensor
 
-from steady_ppl import particle_filter, seeded, stack
-from steady_ppl.gaussian import twisted_proposal
+from steady_ppl import particle_filter, seeded
 from steady_ppl.gaussian.information_filter import look_ahead
 from steady_ppl.gaussian.linearize import ReferencePath, linearize
-from steady_ppl.gaussian.smoother import smooth, smoother_paths
+from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.model.handlers import Standardised, running
 
-
-def anywhere(program, data) -> ReferencePath:
-    """A path that has nothing to do with the drives."""
-    with seeded("anywhere"):
-        states = 3 * torch.randn(*data.time.shape, len(program.states), dtype=torch.float64)
-        return ReferencePath(states, torch.randn(*data.steps.shape, len(program.channels), dtype=torch.float64))
-
-
-def estimates(program, data, runs: int, particles: int, twist=Twist, *, aim=None, **settings) -> Tensor:
-    """log p(y) of each trajectory by `runs` independent filters, `(runs, B)`; `aim` is the program, and a change of
-    the data, that the lookahead is of."""
-    filter_settings = {name: settings.pop(name) for name in ("resample_below",) if name in settings}
-    known_start = settings.pop("known_start", False)
-    many = copies(data, runs)
-    other, change = aim or (program, {})
-    seen = replace(many, **{name: function(many) for name, function in change.items()})
-    with seeded("estimates"):
-        ahead = smooth(other, seen, anywhere(program, many), known_start=known_start, passes=2)
-        filtered = particle_filter(
-            program,
-            many,
-            particles=particles,
-            known_start=known_start,
-            proposal=twist(ahead, **settings),
-            keep_history=False,
-            **filter_settings,
-        )
-    return filtered.log_likelihood.view(len(data), runs).T
-
-
-# --- the smoother -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("known_start", [False, True])
-@pytest.mark.parametrize("drive", ["even", "uneven"])
-def test_the_smoother_is_exact_from_any_path(cart, drive, known_start, request):
-    data = request.getfixturevalue(drive)
-    ahead = smooth(cart, data, anywhere(cart, data), known_start=known_start, passes=2, tolerance=0.0)
-    (states, noise), (covariances, *_) = ahead.means(), ahead.covariances()
-    for trajectory, rows in enumerate(data.lengths.tolist()):
-        exact = CartPosterior(data, trajectory, cart_parameters(cart), known_start=known_start)
-        torch.testing.assert_close(states[:rows, trajectory], exact.states_mean, rtol=0, atol=1e-10)
-        expected = torch.stack([exact.states_covariance[row, :, row] for row in range(rows)])
-        torch.testing.assert_close(covariances[:rows, trajectory], expected, rtol=0, atol=1e-10)
-        push, velocity = data.controls[: rows - 1, trajectory, 0], exact.states_mean[:-1, 1]
-        excess = exact.latent_mean[2:] - cart.gain * push + cart.damping * velocity
-        torch.testing.assert_close(noise[: rows - 1, trajectory, 0], excess / cart.noise, rtol=0, atol=1e-9)
-        torch.testing.assert_close(ahead.log_likelihood[trajectory], exact.log_likelihood, rtol=0, atol=1e-10)
+# --- exact on the cart ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("known_start", [False, True])
@@ -88,23 +39,6 @@ def test_the_first_lookahead_is_exact_wherever_it_is_taken(cart, uneven):
     exact = kalman(uneven, cart_parameters(cart)).log_likelihood
     # the path is some 15 measurement deviations off: its cost of some thousand nats cancels
     torch.testing.assert_close(ahead.log_likelihood, exact, rtol=0, atol=1e-8)
-
-
-@pytest.mark.parametrize("known_start", [False, True])
-def test_the_future_of_a_row_is_worth_what_kalman_says_of_it(cart, even, known_start):
-    ahead = smooth(cart, even, anywhere(cart, even), known_start=known_start, passes=2)
-    future = Twist(ahead).log_future(4, even.states[4].unsqueeze(0))[0]
-    rest = replace(
-        even,
-        time=even.time[4:],
-        controls=even.controls[4:],
-        measurements=even.measurements[4:],
-        observed=even.observed[4:] & (torch.arange(8) > 0)[:, None, None],
-        states=even.states[4:],
-        lengths=even.lengths - 4,
-    )
-    exact = kalman(rest, cart_parameters(cart), known_start=True).log_likelihood
-    torch.testing.assert_close(future, exact, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("known_start", [False, True])
@@ -134,179 +68,140 @@ def test_the_noise_of_draws_leads_from_each_state_to_the_next(cart, uneven):
     torch.testing.assert_close(after[:, inside], states[:, 1:][:, inside], rtol=0, atol=1e-10)
 
 
-# --- the filter -------------------------------------------------------------------------------------------------------
+# --- invariances ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("known_start", [False, True])
-@pytest.mark.parametrize("resample_below", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize("drive", ["even", "uneven"])
-def test_an_exact_twist_leaves_no_variance(cart, drive, resample_below, known_start, request):
-    data = request.getfixturevalue(drive)
-    settings = {"resample_below": resample_below, "known_start": known_start}
-    runs = estimates(cart, data, 20, 5, untwisted=0.0, **settings)
-    exact = kalman(data, cart_parameters(cart), known_start=known_start).log_likelihood
-    assert runs.std(0).max() < 1e-10
-    torch.testing.assert_close(runs, exact.expand(20, 3), rtol=0, atol=1e-9)
+@pytest.mark.parametrize("turn", [0.5, math.pi, 4.0])
+def test_turning_and_moving_the_world_changes_nothing(hovercraft, bearings, turn):
+    other, moved, place = elsewhere(hovercraft, bearings, turn)
+    here, there = at_its_mode(hovercraft, bearings), at_its_mode(other, moved)
+    torch.testing.assert_close(here.log_likelihood, there.log_likelihood, rtol=0, atol=1e-6)
+    (ours, our_noise), (theirs, their_noise) = here.means(), there.means()
+    torch.testing.assert_close(our_noise, their_noise, rtol=0, atol=1e-6)
+    torch.testing.assert_close(place(ours[..., :2]), theirs[..., :2], rtol=0, atol=1e-6)
+    drawn = []
+    for ahead, data, program in ((here, bearings, hovercraft), (there, moved, other)):
+        with seeded("world"):
+            filtered = particle_filter(program, data, particles=50, known_start=True, proposal=Twist(ahead))
+            drawn.append((filtered.log_likelihood, filtered.paths(20).noise["acceleration"]))
+    torch.testing.assert_close(drawn[0], tuple(value.detach() for value in drawn[1]), rtol=0, atol=1e-5)
 
 
-def bad_aim(cart) -> tuple:
-    """The lookahead of a cart that is more strongly damped, seen less well, and a little further on."""
-    other = example("linear_gaussian").requires_grad_(False)
-    other.damping, other.noise, other.measurement_sd = (
-        torch.tensor(value, dtype=torch.float64) for value in (1.6, 0.8, 0.3)
-    )
-    return other, {"measurements": lambda data: data.measurements + 0.1}
+def test_whole_turns_of_the_heading_change_nothing(hovercraft, bearings):
+    turned = bearings.states.clone()
+    turned[..., 2] += math.pi * torch.tensor([2, -4, 6], dtype=torch.float64)
+    here, there = at_its_mode(hovercraft, bearings), at_its_mode(hovercraft, replace(bearings, states=turned))
+    torch.testing.assert_close(here.log_likelihood, there.log_likelihood, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("known_start", [False, True])
-@pytest.mark.parametrize("resample_below", [0.0, 0.5, 1.0])
-def test_a_bad_twist_is_unbiased(cart, uneven, resample_below, known_start):
-    data = uneven
-    settings = {"resample_below": resample_below, "known_start": known_start, "untwisted": 0.1}
-    runs = estimates(cart, data, 1000, 20, aim=bad_aim(cart), **settings)
-    exact = kalman(data, cart_parameters(cart), known_start=known_start).log_likelihood
-    assert runs.std(0).min() > 0.03  # bad, far beyond the rounding of a good one
-    assert_mean((runs - exact).exp(), torch.ones(3))
+def test_whole_turns_of_a_bearing_change_nothing(hovercraft, bearings):
+    turns = 2 * math.pi * torch.tensor([1, -2, 0, 3], dtype=torch.float64)
+    turned = replace(bearings, measurements=bearings.measurements + turns)
+    here, there = at_its_mode(hovercraft, bearings), at_its_mode(hovercraft, turned)
+    torch.testing.assert_close(here.log_likelihood, there.log_likelihood, rtol=0, atol=1e-6)
 
 
-def test_a_twist_towards_tempered_observations_is_unbiased(cart, uneven):
-    many = copies(uneven, 1000)
-    with seeded("tempered"):
-        ahead = smooth(cart, many, anywhere(cart, many), observation_weight=0.2, passes=2)
-        filtered = particle_filter(cart, many, particles=20, proposal=Twist(ahead, untwisted=0.1))
-    runs = filtered.log_likelihood.view(3, 1000).T
-    assert_mean((runs - kalman(uneven, cart_parameters(cart)).log_likelihood).exp(), torch.ones(3))
+def test_the_order_of_trajectories_and_landmarks_changes_nothing(hovercraft, bearings):
+    order, places = [2, 0, 3, 1], [1, 2, 0]
+
+    class Shuffled(type(hovercraft)):
+        landmarks = [hovercraft.landmarks[i] for i in order]
+
+    shuffled = replace(bearings, measurements=bearings.measurements[..., order], observed=bearings.observed[..., order])
+    here = at_its_mode(hovercraft, bearings).log_likelihood
+    there = at_its_mode(Shuffled().double(), shuffled.subset(places)).log_likelihood
+    torch.testing.assert_close(here[places], there, rtol=0, atol=1e-6)
+    assert (here - here[places]).abs().min() > 1e-3
 
 
-@pytest.mark.parametrize("weight", [0.1, 0.6])
-def test_a_tempered_filter_that_looks_ahead_estimates_the_power_posteriors_evidence(cart, uneven, weight):
-    many = copies(uneven, 500)
-    with seeded("power"):
-        ahead = smooth(cart, many, anywhere(cart, many), observation_weight=weight, passes=2)
-        proposal = Twist(ahead, untwisted=0.3)
-        filtered = particle_filter(cart, many, particles=20, observation_weight=weight, proposal=proposal)
-    runs = filtered.log_likelihood.view(3, 500).T
-    exact = kalman(uneven, cart_parameters(cart), weight=weight).log_likelihood
-    assert_mean((runs - exact).exp(), torch.ones(3))
+def test_a_trajectory_scores_the_same_alone_as_padded(hovercraft, bearings):
+    alone = bearings.subset([1])
+    rows = int(alone.lengths[0])
+    names = ("time", "controls", "measurements", "observed", "states")
+    cut = replace(alone, **{name: getattr(alone, name)[:rows] for name in names})
+    padded, whole = (at_its_mode(hovercraft, data).log_likelihood for data in (alone, cut))
+    torch.testing.assert_close(padded, whole, rtol=0, atol=1e-9)
 
 
-class Unweighted(Twist):
-    """The twist's proposals without their weights."""
+def test_a_wrong_landmark_costs_many_nats(hovercraft, bearings):
+    class Wrong(type(hovercraft)):
+        landmarks = ((12.0, -3.0), *hovercraft.landmarks[1:])
 
-    def step(self, row, state):
-        return super().step(row, state)[0], 0.0
-
-
-class Unstarted(Twist):
-    """The same, of the start alone."""
-
-    def start(self, particles):
-        return super().start(particles)[0], 0.0
+    right, wrong = (at_its_mode(program, bearings).log_likelihood for program in (hovercraft, Wrong().double()))
+    assert (right - wrong).min() > 20
 
 
-@pytest.mark.parametrize("twist", [Unweighted, Unstarted])
-def test_proposals_without_their_weights_are_biased(cart, even, twist):
-    runs = estimates(cart, even, 200, 20, twist, resample_below=0.5, untwisted=0.1)
-    ratio = (runs - kalman(even, cart_parameters(cart)).log_likelihood).exp()
-    assert ((ratio.mean(0) - 1).abs() > 10 * ratio.std(0) / math.sqrt(200)).all()
+def test_reversed_time_costs_many_nats(hovercraft, bearings):
+    whole = bearings.subset([0, 2])
+    reversed_ = replace(whole, measurements=whole.measurements.flip(0), observed=whole.observed.flip(0))
+    right, wrong = (at_its_mode(hovercraft, data).log_likelihood for data in (whole, reversed_))
+    assert (right - wrong).sum() > 100
 
 
-def test_paths_of_a_filter_with_a_bad_twist_have_the_moments_of_the_exact_smoother(cart, uneven):
-    runs = 60
-    many = copies(uneven, runs)
-    other, change = bad_aim(cart)
-    with seeded("smoother"):
-        ahead = smooth(other, replace(many, measurements=change["measurements"](many)), anywhere(cart, many), passes=2)
-        filtered = particle_filter(cart, many, particles=1000, proposal=Twist(ahead, untwisted=0.1))
-        paths = filtered.paths(300)
-    for trajectory, rows in enumerate(uneven.lengths.tolist()):
-        states = paths.states.view(300, -1, 3, runs, 2)[:, :rows, trajectory]
-        exact = CartPosterior(uneven, trajectory, cart_parameters(cart))
-        assert_mean(states.mean(0).transpose(0, 1), exact.states_mean)
-        centred = states - exact.states_mean[:, None]
-        within = (centred[..., :, None] * centred[..., None, :]).mean(0).transpose(0, 1)
-        assert_mean(within, torch.stack([exact.states_covariance[t, :, t] for t in range(rows)]))
+# --- a broad start ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("share", [-0.1, 1.0, 1.5, math.nan])
-def test_the_untwisted_share_is_below_one(cart, even, share):
-    ahead = smooth(cart, even, anywhere(cart, even), passes=2)
-    with pytest.raises(ValueError, match=r"\[0, 1\)"):
-        Twist(ahead, untwisted=share)
+def test_a_broad_start_counts_the_neighbouring_turns(hovercraft, bearings):
+    ahead = at_its_mode(hovercraft, bearings, known_start=False)
+    masses = ahead.winding_masses.exp()
+    torch.testing.assert_close(masses.sum(0), torch.ones(3, dtype=torch.float64))
+    assert ((masses > 1e-3).sum(0) > 1).all()
+
+    class OneTurn(type(hovercraft)):
+        """Its prior some turns further on, and no component known as an angle."""
+
+        angles = ()
+        turns = 0
+
+        def initial(self):
+            start = super().initial()
+            return start + 2 * math.pi * self.turns * (torch.arange(6) == 2).to(start)
+
+    single = OneTurn().double().requires_grad_(False)
+    found = ahead.linearization
+    path = replace(found.path, states=found.path.states + found.start_turn)  # on the turn of its prior
+    alone = {}
+    for turns in (0, 1, -1, 2, -2):  # those that begin within four deviations of π
+        single.turns = turns
+        alone[turns] = look_ahead(linearize(single, bearings, path)).log_likelihood
+    assert (ahead.log_likelihood - alone[0]).min() > 0.01
+    together = torch.stack(list(alone.values()))
+    torch.testing.assert_close(ahead.log_likelihood, together.logsumexp(0), rtol=0, atol=1e-9)
+    torch.testing.assert_close(masses.sort(0).values, together.softmax(0).sort(0).values, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("weight", [0.0, -0.5, 1.1, math.nan])
-def test_the_weight_of_a_tempered_twist_is_at_most_one(cart, even, weight):
-    ahead = smooth(cart, even, anywhere(cart, even), passes=2)
-    with pytest.raises(ValueError, match=r"\(0, 1\]"):
-        Twist(ahead, tempered=weight)
+def test_whole_turns_of_the_path_change_nothing_from_a_broad_start(hovercraft, bearings):
+    path = at_its_mode(hovercraft, bearings, known_start=False).linearization.path
+    turn = 2 * math.pi * (torch.arange(6) == 2).double()
+    turned = ReferencePath(path.states + turn, path.noise)
+    here, there = (look_ahead(linearize(hovercraft, bearings, p)).log_likelihood for p in (path, turned))
+    # a turn that is left out on one side has a thousandth of the mass: more than 4 prior deviations off
+    torch.testing.assert_close(here, there, rtol=0, atol=0.002)
 
 
-def test_a_tempered_twist_is_wider_and_the_estimate_stays_unbiased(cart, even):
-    ahead = smooth(cart, even, anywhere(cart, even), passes=2)
-    exact, tempered = Twist(ahead), Twist(ahead, tempered=0.5)
-    widths = [twist.lookahead.steps.factor.det() for twist in (exact, tempered)]
-    assert (widths[1] > widths[0])[:-1].all()
-    runs = estimates(cart, even, 500, 20, tempered=0.5)
-    assert_mean((runs - kalman(even, cart_parameters(cart)).log_likelihood).exp(), torch.ones(runs.shape[1]))
+def test_draws_from_a_broad_start_are_on_the_turns_that_their_masses_say(hovercraft, bearings):
+    ahead = at_its_mode(hovercraft, bearings, known_start=False)
+    start, states, _ = ahead.draws(3000)
+    mean, sd = began(hovercraft, torch.zeros(1, 6).double()), began(hovercraft, torch.ones(1, 6).double())
+    torch.testing.assert_close(states[:, 0], mean + (sd - mean) * start, rtol=0, atol=1e-9)
+    away = (states[..., 2] - (ahead.means()[0] + ahead.linearization.start_turn)[..., 2]) / (2 * math.pi)
+    assert (away.round() == away[:, :1].round())[:, bearings.rows].all()  # the whole drive is on the start's turn
+    counted = away[:, 0].round() == ahead.windings[:, None, None, 2] / (2 * math.pi)
+    assert ahead.windings.shape == (5, 6)
+    masses = ahead.winding_masses.exp()
+    often = masses > 0.005  # fifteen of the draws
+    assert_mean(counted.transpose(0, 1).double()[:, often], masses[often])
 
 
-def test_a_filter_that_looks_ahead_shows_no_frames(cart, even):
-    twist = Twist(smooth(cart, even, anywhere(cart, even), passes=2))
-    with pytest.raises(ValueError, match="on_frame"):
-        particle_filter(cart, even, particles=5, proposal=twist, on_frame=lambda *_: None)
+def began(program, noise: Tensor) -> Tensor:
+    with running(*noise.shape[:-1]), Standardised(noise):
+        return program.initial()
 
 
-# --- several sites ----------------------------------------------------------------------------------------------------
+# --- what goes wrong --------------------------------------------------------------------------------------------------
 
 
-class TwoKicks(type(example("linear_gaussian"))):
-    """The cart, its noise split into a scalar site and a vector site of one component: the same law."""
-
-    def transition(self, state, control, time, step):
-        position, velocity = state.unbind(-1)
-        mean, half = self.gain * control[..., 0] - self.damping * velocity, self.noise / math.sqrt(2)
-        first = pyro.sample("first", dist.Normal(mean, half))
-        second = pyro.sample("second", dist.Normal(torch.zeros_like(mean).unsqueeze(-1), half).to_event(1))
-        acceleration = first + second[..., 0]
-        return stack(position + velocity * step + acceleration * step**2 / 2, velocity + acceleration * step)
-
-
-@pytest.mark.parametrize("known_start", [False, True])
-def test_several_noise_sites_are_steered_together(uneven, known_start):
-    program = TwoKicks().double().requires_grad_(False)
-    exact = kalman(uneven, cart_parameters(program), known_start=known_start).log_likelihood
-    ahead = smooth(program, uneven, anywhere_of(uneven, channels=2), known_start=known_start, passes=2)
-    torch.testing.assert_close(ahead.log_likelihood, exact, rtol=0, atol=1e-9)
-    steered = Twist(ahead, untwisted=0.0)
-    found = particle_filter(program, uneven, particles=5, known_start=known_start, proposal=steered)
-    torch.testing.assert_close(found.log_likelihood, exact, rtol=0, atol=1e-9)
-    paths = smoother_paths(program, uneven, ahead, 4000, known_start=known_start)
-    assert paths.noise["first"].shape == (4000, 11, 3) and paths.noise["second"].shape == (4000, 11, 3, 1)
-    posterior = CartPosterior(uneven, 0, cart_parameters(program), known_start=known_start)
-    both = paths.noise["first"][:, :, 0] + paths.noise["second"][:, :, 0, 0]
-    assert_mean(both, posterior.latent_mean[2:])
-
-
-def anywhere_of(data, channels: int) -> ReferencePath:
-    rows, trajectories = data.time.shape
-    return ReferencePath(
-        torch.zeros(rows, trajectories, 2).double(), torch.zeros(rows - 1, trajectories, channels).double()
-    )
-
-
-def test_one_after_the_other_and_in_parallel_particles_are_steered_the_same() -> None:
-    torch.manual_seed(0)
-    double = {"dtype": torch.float64}
-    state, path = 5 * torch.randn(7, 3, 4, **double), torch.randn(3, 4, **double)
-    angles = torch.tensor([False, True, False, True])
-    factor = torch.randn(3, 2, 2, **double).triu() + 2 * torch.eye(2, **double)
-    steering = (torch.randn(3, 2, **double), torch.randn(3, 2, 4, **double), factor, twisted_proposal.inverse(factor))
-    own, stays = torch.randn(7, 3, 2, **double), torch.rand(7, 3) < 0.5
-    for share in (0.0, 0.3):
-        one = twisted_proposal.steer(state, path, angles, steering, own, stays & (share > 0), share)
-        other = twisted_proposal.steer_in_parallel(state, path, angles, steering, own, stays & (share > 0), share)
-        torch.testing.assert_close(one, other)
-    future = (torch.randn(3, 4, 4, **double), torch.randn(3, 4, **double), torch.randn(3, **double))
-    one = twisted_proposal.log_future(state, path, angles, *future)
-    torch.testing.assert_close(one, twisted_proposal.log_future_in_parallel(state, path, angles, *future))
+def test_a_drive_without_measurements_has_no_evidence_whatever_the_turns(hovercraft, bearings):
+    unseen = replace(bearings, observed=torch.zeros_like(bearings.observed))
+    ahead = at_its_mode(hovercraft, unseen, known_start=False)
+    torch.testing.assert_close(ahead.log_likelihood, torch.zeros(3, dtype=torch.float64), rtol=0, atol=1e-9)

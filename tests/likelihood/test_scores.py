@@ -8,11 +8,12 @@ from dataclasses import replace
 import pytest
 import torch
 from examples import drives, example
+from paths import settled
 
 from steady_ppl.discovery.curves import curves
 from steady_ppl.discovery.effect_scores import Column, Scoring
 from steady_ppl.effects import attach, chosen_variant, parsed
-from steady_ppl.gaussian.smoother import find_path, means_as_path, smooth
+from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.kernels import rows as rows_by_kernels
 from steady_ppl.likelihood.parameters import elements, moved
 from steady_ppl.likelihood.scores import Smoothed, parameter_scores, smoothed, typical_spreads
@@ -34,15 +35,6 @@ EFFECTS = (
     "range_dependent_noise",
     "measurement_noise",
 )
-
-
-def settled(program, data, path=None):
-    """The linearised program about its own posterior means."""
-    path = path or find_path(program, data, known_start=True)
-    for _ in range(4):
-        ahead = smooth(program, data, path, known_start=True, passes=5, kernels=False)
-        path = means_as_path(ahead, data)
-    return ahead, path
 
 
 def at_rest(program, data) -> tuple[Smoothed, object]:
