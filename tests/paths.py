@@ -8,6 +8,7 @@ from steady_ppl import seeded
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path, means_as_path, smooth
+from steady_ppl.likelihood.scores import Smoothed, smoothed
 
 
 def anywhere(program, data) -> ReferencePath:
@@ -36,6 +37,12 @@ def settled(program, data, path: ReferencePath | None = None) -> tuple[Lookahead
         ahead = smooth(program, data, path, known_start=True, passes=5, kernels=False)
         path = means_as_path(ahead, data)
     return ahead, path
+
+
+def at_rest(program, data) -> tuple[Smoothed, ReferencePath]:
+    """What scores need of it, and the path of the means."""
+    ahead, path = settled(program, data)
+    return smoothed(ahead, data), path
 
 
 def of(path: ReferencePath, trajectories: list[int]) -> ReferencePath:

@@ -1,80 +1,21 @@
-"""The recipe `likelihood`, and what a fit says that should be doubted."""
+"""What a fit says that should be doubted."""
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from examples import MODELS, HeavyTailed, example
+from examples import example
 from pyro.distributions import constraints
 from pyro.nn import PyroParam
 from small import HOVERCRAFT, simulated, steady, written
 
 import steady_ppl as st
 from steady_ppl.runs.diagnostics import diagnose_fit, diagnose_units
-from steady_ppl.runs.recipes import find_recipe
 from steady_ppl.training.loop import Trained
-
-NEURAL = f"{MODELS / 'neural_vehicle.py'}:NeuralHovercraft"
-
-
-@pytest.fixture(scope="module")
-def drives() -> tuple[st.Trajectories, st.Trajectories]:
-    """A hovercraft that is lighter and less noisy than its file says."""
-    truth = example("hovercraft", torch.float32)
-    truth.mass, truth.noise = torch.tensor(1.2), torch.tensor([0.08, 0.08, 0.05])
-    truth.duration = 6.0
-    return st.simulate(truth, 10, seed=1), st.simulate(truth, 6, seed=2)
-
-
-@pytest.fixture(scope="module")
-def fitted(drives) -> st.Fit:
-    return find_recipe("likelihood")(st.load_program(HOVERCRAFT), *drives, known_start=True)
-
-
-def test_it_finds_what_made_the_drives(fitted):
-    assert float(fitted.program.mass.detach()) == pytest.approx(1.2, rel=0.05)
-    assert float(fitted.program.noise[0].detach()) == pytest.approx(0.08, rel=0.4)
-    assert fitted.recipe == "likelihood" and not fitted.notes
-    first, last = fitted.trained.history
-    assert first["step"] == 0 and last["step"] == fitted.trained.kept
-    assert last["log_likelihood"] > first["log_likelihood"] + 1 and fitted.trained.still_rising is None
-
-
-def test_long_training_does_not_get_further(fitted, drives):
-    program = st.load_program(HOVERCRAFT)
-    long = find_recipe("steady")(program, drives[0], known_start=True, steps=150, progress=False).program
-    ours, theirs = (likelihood(one, drives[0]) for one in (fitted.program, long))
-    assert ours > theirs - 0.1
-
-
-def likelihood(program, table) -> float:
-    """Log p(y) of the linearised program."""
-    from steady_ppl.gaussian.smoother import find_path, smooth
-
-    data = st.for_program(program, table)
-    with st.seeded(0, "paths"):
-        path = find_path(program, data, known_start=True)
-    return float(smooth(program, data, path, known_start=True, passes=4).log_likelihood.sum())
-
-
-def test_it_is_a_recipe_of_the_command_line(tmp_path: Path, drives, capsys):
-    tables = [written(tmp_path / f"{name}.csv", data) for name, data in zip(("train", "valid"), drives, strict=True)]
-    command = ("fit", HOVERCRAFT, tables[0], "--valid", tables[1], "--recipe", "likelihood", "--known-start")
-    assert steady(*command, "--out", tmp_path / "run") == 0
-    assert "held-out log p(y) of a drive" in capsys.readouterr().out
-    assert json.loads((tmp_path / "run/run.json").read_text())["recipe"] == "likelihood"
-    assert float(st.Fit.load(tmp_path / "run").program.mass.detach()) == pytest.approx(1.2, rel=0.05)
-
-
-def test_what_it_cannot_fit_is_refused(drives):
-    for program, says in ((st.load_program(NEURAL), "a network cannot be looked at"), (HeavyTailed(), "StudentT")):
-        with pytest.raises(st.UsageError, match=says):
-            find_recipe("likelihood")(program, drives[0], known_start=True)
 
 
 def trained(*values: float, kept: int | None = None, interrupted: bool = False) -> Trained:
@@ -100,13 +41,13 @@ def test_a_training_that_still_rises_says_so(found: Trained, rising: float | Non
     assert [note.startswith("not converged") and "--steps 400" in note for note in notes] == [True] * bool(rising)
 
 
-def test_a_proof_says_what_may_be_training(drives):
+def test_a_proof_says_what_may_be_training(lighter):
     program = st.load_program(HOVERCRAFT)
     rows = {
         "before": st.Fit(program, "steady", known_start=True, trained=trained(-20.0, -6.0, -5.0, -2.0)),
         "after": st.Fit(program, "steady", known_start=True, trained=trained(-20.0, -6.0, -5.0, -4.9)),
     }
-    notes = st.prove(rows, drives[1], with_constant_velocity=False).notes
+    notes = st.prove(rows, lighter[1], with_constant_velocity=False).notes
     assert [note.split()[0] for note in notes if "had not converged" in note] == ["before"]
 
 
@@ -126,11 +67,11 @@ def test_a_number_that_a_fit_takes_away_is_named():
     assert len(diagnose_fit(st.Fit(program, "hand"), declared)) == 4
 
 
-def test_degrees_are_asked_for(tmp_path: Path, drives, capsys):
+def test_degrees_are_asked_for(tmp_path: Path, lighter, capsys):
     program = st.load_program(HOVERCRAFT)
-    data = st.for_program(program, drives[0])
+    data = st.for_program(program, lighter[0])
     assert diagnose_units(program, data) == []
-    degrees = replace(drives[0], measurements=torch.rad2deg(drives[0].measurements))
+    degrees = replace(lighter[0], measurements=torch.rad2deg(lighter[0].measurements))
     found = diagnose_units(program, st.for_program(program, degrees))
     assert len(found) == 4 and all("are these degrees?" in said for said in found)
     many_turns = replace(data, measurements=data.measurements + 4 * math.pi)
