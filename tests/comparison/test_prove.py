@@ -6,7 +6,6 @@ import json
 import math
 from dataclasses import replace
 
-import matplotlib
 import numpy as np
 import pytest
 import torch
@@ -18,12 +17,6 @@ import steady_ppl as st
 from steady_ppl.comparison.prove import far_off, prove
 from steady_ppl.comparison.scores import Key
 from steady_ppl.model.program import Program, for_program
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
-
-from steady_ppl.plotting.comparison import open_loop_picture
 
 
 def hovercraft(name: str = "hovercraft") -> Program:
@@ -267,20 +260,6 @@ def test_a_program_that_cannot_be_linearised_is_named(cart):
     rows = {"cart": cart, "heavy": Heavy().double().requires_grad_(False)}
     with pytest.raises(st.UsageError, match="heavy: prove needs programs that can be linearised: .*StudentT"):
         prove(rows, drives(cart, 5, 12))
-
-
-def test_the_picture_has_a_line_for_each_row_and_a_grey_floor(drag):
-    axes = open_loop_picture(drag)
-    assert [found.get_label() for found in axes.get_lines()] == ["before", "after", "constant velocity"]
-    assert [found.get_label() for found in axes.collections] == ["noise floor"]
-    assert axes.get_xlabel() == "predicted ahead [s]" and axes.get_ylabel().endswith("[rad]")
-    seconds, errors = axes.get_lines()[0].get_data()
-    key = Key("measurement", "rad", drag.horizons["1 s"])
-    assert errors[list(seconds).index(pytest.approx(1.0))] == drag.rows["before"].sums[key].value
-    assert open_loop_picture(drag, of="location").get_ylabel() == "location, root mean square error [m]"
-    with pytest.raises(st.UsageError, match="no open-loop error of 'speed'; there are angle, location, rad"):
-        open_loop_picture(drag, of="speed")
-    plt.close("all")
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
