@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -12,14 +12,6 @@ from examples import example
 from small import simulated
 
 from steady_ppl import Fit, UsageError, check
-from steady_ppl.plotting.check import check_picture
-from steady_ppl.runs.posterior import posterior
-from steady_ppl.training.loop import Trained
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
-
 from steady_ppl.plotting import (
     effective_sizes,
     held_out_curve,
@@ -29,20 +21,16 @@ from steady_ppl.plotting import (
     posterior_trajectories,
     posterior_velocities,
 )
-from steady_ppl.plotting.check import innovations
+from steady_ppl.plotting.check import check_picture, innovations
 from steady_ppl.plotting.fit import forecast_band
+from steady_ppl.runs.posterior import posterior
+from steady_ppl.training.loop import Trained
 
 
 @pytest.fixture(scope="module")
 def drawn():
     with torch.random.fork_rng():
         return posterior(example("hovercraft", torch.float32), simulated(rows=6), draws=4, particles=30)
-
-
-@pytest.fixture(autouse=True)
-def _close_figures():
-    yield
-    plt.close("all")
 
 
 def labels(axes) -> list[str]:
@@ -159,20 +147,6 @@ def test_a_forecast_is_a_band_after_what_was_used() -> None:
     assert labels(forecast_band(found, "1", "yaw_rate")) == ["forecast, median", "truth"]
     with pytest.raises(UsageError, match="no forecast of 'speed'; there are x, y, heading"):
         forecast_band(found, "1", "speed")
-
-
-def test_innovations_are_the_checks_standardised_errors() -> None:
-    program, data = example("hovercraft"), simulated(rows=30, trajectories=4)
-    data.observed[5, 2, 1] = False
-    found = check(Fit(program, "hand", known_start=True), data, simulations=20)
-    axes = innovations(found, "3")
-    lines = axes.get_lines()
-    assert labels(axes) == [f"bearing_{i}" for i in range(4)] and axes.get_title() == "trajectory 3"
-    scores = found.predictions[1].standardised[:, 2, 1].numpy()
-    drawn = lines[1].get_ydata()
-    assert np.isnan(drawn[4]) and np.array_equal(np.delete(drawn, 4), np.delete(scores, 4))
-    with pytest.raises(UsageError, match="no trajectory '9'; there are 1, 2, 3, 4"):
-        innovations(found, "9")
 
 
 HISTORY = [
