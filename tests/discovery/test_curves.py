@@ -79,3 +79,15 @@ def test_the_prior_of_a_curve_is_a_normal_with_its_covariance():
     whole = torch.distributions.MultivariateNormal(torch.zeros(4).double(), covariance)
     assert float(effect.prior.log_prob(heights)) == pytest.approx(float(whole.log_prob(heights.double())), abs=1e-3)
     assert covariance.diagonal().sqrt().tolist() == pytest.approx([HEIGHT_SD * 0.3] * 4, rel=1e-3)
+
+
+@pytest.mark.parametrize("circular", [False, True])
+def test_a_curve_is_straight_between_its_knots_round_a_circle_too(circular: bool):
+    knots, heights = (-1.0, 0.0, 1.0, 2.0), torch.tensor([1.0, 3.0, -2.0, 0.5])
+    values = torch.tensor([-9.0, -1.0, -0.5, 0.0, 0.25, 1.5, 2.0, 2.5, float("nan")])
+    expected = torch.tensor([1.0, 1.0, 2.0, 3.0, 1.75, -0.75, 0.5, 0.5])
+    if circular:  # a turn is four: after the last knot comes the first
+        expected = torch.tensor([1.0, 1.0, 2.0, 3.0, 1.75, -0.75, 0.5, 0.75])
+    found = height(values, knots, circular, heights)
+    torch.testing.assert_close(found[:-1], expected)
+    assert bool(found[-1].isnan())

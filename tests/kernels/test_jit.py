@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import gc
+import math
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,13 +14,15 @@ import numpy as np
 import pyro
 import pytest
 import torch
+from examples import example
 from pyro.distributions import constraints
 from pyro.nn import PyroModule, PyroParam
 from torch import Tensor, nn
 
 from steady_ppl.kernels import jit, rows as rows_by_kernels
+from steady_ppl.kernels.jit import close
 from steady_ppl.kernels.lowering import Tape
-from steady_ppl.kernels.rows import Slopes, in_plain_torch, on_all_rows, slopes_on_all_rows, without_kernels
+from steady_ppl.kernels.rows import Slopes, on_all_rows, slopes_on_all_rows
 
 STATES = torch.linspace(-2.0, 2.0, 90).view(10, 3, 3)
 Lines = Callable[[Any, Tensor], Tensor]
@@ -237,17 +240,28 @@ def test_parameters_between_other_bounds_have_a_kernel_each() -> None:
         assert_own(Bounded(bounds), lambda one, state: state * one.share)
 
 
-def test_why_there_is_no_kernel_is_noted_once_a_function():
-    class Sorting(nn.Module):
-        pass
+def test_numbers_agree_in_the_scale_of_their_component():
+    small, other = torch.tensor([[1e-5, 1.0], [2e-5, 2.0]]), torch.tensor([[5e-5, 1.0], [-3e-5, 2.0]])
+    assert close(small, small) and close(small * (1 + 1e-5), small) and not close(small, other)
+    missing = torch.tensor([[math.nan, 1.0], [2e-5, -math.inf]])
+    assert close(missing, missing.clone()) and not close(small, missing)
+    rounded = torch.tensor([[0.3, 100.0], [0.3 + 1e-7, 1e-6]])
+    assert close(rounded, torch.tensor([[0.3, 100.0], [0.3, 0.0]]))
 
-    program, given = Sorting(), {"state": torch.randn(4, 5, 3)}
-    with without_kernels() as why:
-        for _ in range(2):
-            assert isinstance(on_all_rows(program, "sorted", lambda state: state.sort(-1).values, given), str)
-        with without_kernels() as inner:
-            on_all_rows(program, "sorted twice", lambda state: state.sort(-1).values, given)
-    assert list(why) == ["sorted"] and list(inner) == ["sorted twice"]
-    (note,) = in_plain_torch({"one": "a", "two": "b", "three": "a"})
-    assert note == "computed in plain torch, without compiled kernels: one, three: a; two: b"
-    assert in_plain_torch({}) == []
+
+def test_a_program_is_read_once_while_it_is_unchanged_and_anew_after_it():
+    program = example("hovercraft")
+    plain = jit.signature(program)
+
+    def read_and_fail():
+        with jit.unchanged(program):
+            with jit.unchanged(program):
+                known = jit.signature(program)
+            program.landmarks = ((0.0, 0.0),)
+            assert jit.signature(program) is known
+            assert known == plain
+            raise RuntimeError("in between")
+
+    with pytest.raises(RuntimeError, match="in between"):
+        read_and_fail()
+    assert jit.signature(program) != plain

@@ -8,12 +8,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 from examples import drives, example
+from torch import nn
 
 from steady_ppl import seeded
-from steady_ppl.discovery.curves import height
 from steady_ppl.gaussian.linearize import ReferencePath, linearize
 from steady_ppl.kernels import jit, rows as rows_by_kernels
-from steady_ppl.kernels.rows import Slopes, slopes_on_all_rows
+from steady_ppl.kernels.rows import Slopes, in_plain_torch, on_all_rows, slopes_on_all_rows, without_kernels
 from steady_ppl.likelihood.parameters import elements, on_both_sides
 from steady_ppl.model.handlers import Standardised, running
 from steady_ppl.model.substeps import acting_controls, advance, with_substeps
@@ -83,14 +83,6 @@ def test_copies_share_a_kernel_and_have_their_own_numbers():
     assert sorted(kept) == ["measure on all rows", "step on all rows"]
 
 
-def test_programs_with_the_same_effect_are_of_one_class():
-    program = example("hovercraft")
-    one = program.with_effect("linear_drag", 0.1)
-    variant = type(one).attached["linear_drag"]
-    assert type(program.with_effect(variant, 0.3)) is type(program.with_effect(variant, 0.5)) is type(one)
-    assert type(one.with_effect("wind")) is not type(one)
-
-
 class Hidden(type(example("hovercraft"))):
     """What it does depends on a number that no signature tells."""
 
@@ -133,36 +125,6 @@ def test_a_program_that_writes_into_its_tensors_is_compiled():
     torch.testing.assert_close(found.state, expected.state, rtol=1e-4, atol=2e-5)
 
 
-@pytest.mark.parametrize("circular", [False, True])
-def test_a_curve_is_straight_between_its_knots(circular: bool):
-    knots, heights = (-1.0, 0.0, 1.0, 2.0), torch.tensor([1.0, 3.0, -2.0, 0.5])
-    values = torch.tensor([-9.0, -1.0, -0.5, 0.0, 0.25, 1.5, 2.0, 2.5, float("nan")])
-    expected = torch.tensor([1.0, 1.0, 2.0, 3.0, 1.75, -0.75, 0.5, 0.5])
-    if circular:  # a turn is four: after the last knot comes the first
-        expected = torch.tensor([1.0, 1.0, 2.0, 3.0, 1.75, -0.75, 0.5, 0.75])
-    found = height(values, knots, circular, heights)
-    torch.testing.assert_close(found[:-1], expected)
-    assert bool(found[-1].isnan())
-
-
-def test_a_program_is_read_once_while_it_is_unchanged_and_anew_after_it():
-    program = example("hovercraft")
-    plain = jit.signature(program)
-
-    def read_and_fail():
-        with jit.unchanged(program):
-            with jit.unchanged(program):
-                known = jit.signature(program)
-            program.landmarks = ((0.0, 0.0),)
-            assert jit.signature(program) is known
-            assert known == plain
-            raise RuntimeError("in between")
-
-    with pytest.raises(RuntimeError, match="in between"):
-        read_and_fail()
-    assert jit.signature(program) != plain
-
-
 def test_weighted_slopes_are_the_derivatives_of_weighted_sums():
     program = example("hovercraft.py:HovercraftTruth", torch.float32)
     data = drives(program, 4, 30)
@@ -175,3 +137,19 @@ def test_weighted_slopes_are_the_derivatives_of_weighted_sums():
             up, down = on_both_sides(part, lambda: (weights * ends(program)(*given.values())).sum((0, -1)))
         by = (up - down) / (2 * part.step)
         torch.testing.assert_close(found, by, rtol=0.02, atol=0.02 * float(by.abs().max()) + 1e-4)
+
+
+def test_why_there_is_no_kernel_is_noted_once_a_function():
+    class Sorting(nn.Module):
+        pass
+
+    program, given = Sorting(), {"state": torch.randn(4, 5, 3)}
+    with without_kernels() as why:
+        for _ in range(2):
+            assert isinstance(on_all_rows(program, "sorted", lambda state: state.sort(-1).values, given), str)
+        with without_kernels() as inner:
+            on_all_rows(program, "sorted twice", lambda state: state.sort(-1).values, given)
+    assert list(why) == ["sorted"] and list(inner) == ["sorted twice"]
+    (note,) = in_plain_torch({"one": "a", "two": "b", "three": "a"})
+    assert note == "computed in plain torch, without compiled kernels: one, three: a; two: b"
+    assert in_plain_torch({}) == []

@@ -10,43 +10,14 @@ import pyro.distributions as dist
 import pytest
 import torch
 from examples import drives, example
+from kernel_programs import EXAMPLES, HovercraftTruth, Stale, Switching, single
 from oracles import assert_mean
 
-from steady_ppl import (
-    Constant,
-    FilterError,
-    GaussianGuide,
-    SMCGuide,
-    particle_filter,
-    seeded,
-)
-from steady_ppl.gaussian.linearize import ReferencePath, linearize
+from steady_ppl import Constant, FilterError, SMCGuide, particle_filter, seeded
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
-from steady_ppl.guides import linearized
-from steady_ppl.kernels import jit, rows as rows_by_kernels
+from steady_ppl.kernels import jit
 from steady_ppl.smc.backends import CompiledStepping, Stepping, stepping_for
-
-HovercraftTruth = type(example("hovercraft:HovercraftTruth"))
-EXAMPLES = [
-    "hovercraft",
-    "hovercraft.py:HovercraftTruth",
-    "truck",
-    "pendulum",
-    "linear_gaussian",
-    "neural_vehicle.py:NeuralHovercraft",
-    "neural_vehicle.py:NeuralTruck",
-    "neural_vehicle.py:AuthorsHovercraft",
-]
-
-
-def single(name: str):
-    """A program in single precision, its parameters moved away from zero."""
-    program = example(name, torch.float32)
-    with seeded("moved", name), torch.no_grad():
-        for parameter in program.parameters():
-            parameter += 0.1 * torch.randn_like(parameter)
-    return program
 
 
 def stepping(program, data, particles: int = 40, weight: float | torch.Tensor = 0.7):
@@ -77,55 +48,6 @@ def test_kernels_come_to_the_numbers_of_the_programs_own_lines(name):
     data = drives(program, 3, 6, gaps=True)
     torch.manual_seed(1)
     assert_same(*stepping(program, data))
-
-
-@pytest.mark.parametrize("name", EXAMPLES)
-def test_a_kernels_jacobians_are_those_of_torch(name, monkeypatch):
-    program = single(name)
-    data = drives(program, 3, 9, gaps=True)
-    torch.manual_seed(1)
-    states, noise = 2 * torch.randn(9, 3, len(program.states)), torch.randn(8, 3, len(program.channels))
-    by_torch = linearize(program, data, ReferencePath(states, noise))
-    monkeypatch.setattr(rows_by_kernels, "ROWS_WORTH_COMPILING", 1)
-    by_kernel = linearize(program, data, ReferencePath(states, noise))
-    assert by_kernel.in_plain_torch is None and jit._COMPILED[type(program)]
-    for part in ("offset", "state", "noise", "residual", "measurement", "precision", "log_scale"):
-        torch.testing.assert_close(getattr(by_kernel, part), getattr(by_torch, part), rtol=1e-4, atol=2e-5)
-
-
-def test_a_program_has_kernels_for_the_filter_and_for_its_jacobians(monkeypatch):
-    monkeypatch.setattr(rows_by_kernels, "ROWS_WORTH_COMPILING", 1)
-    program = single("hovercraft")
-    data = drives(program, 2, 9)
-    path = ReferencePath(torch.randn(9, 2, 6), torch.randn(8, 2, 3))
-    for _ in range(2):
-        assert linearize(program, data, path).in_plain_torch is None
-        assert particle_filter(program, data, particles=32, kernels=True).in_plain_torch is None
-
-
-def test_jacobians_that_cannot_be_compiled_come_from_torch_and_the_guide_says_why(monkeypatch):
-    monkeypatch.setattr(linearized, "WORTH_COMPILING", 1)
-    data = drives(example("hovercraft", torch.float32), 2, 12)
-    guide = GaussianGuide(Switching(), draws=3, known_start=True)
-    with seeded("plain"):
-        guide.refresh(data, 1.0)
-    assert "reads a number out of a tensor" in guide.in_plain_torch
-    other = GaussianGuide(single("hovercraft"), draws=3, known_start=True)
-    with seeded("plain"):
-        other.refresh(data, 1.0)
-    assert other.in_plain_torch is None
-
-
-def test_jacobians_that_have_fallen_behind_their_program_are_found_out(monkeypatch):
-    monkeypatch.setattr(rows_by_kernels, "ROWS_WORTH_COMPILING", 1)
-    program = Stale()
-    data = drives(example("hovercraft", torch.float32), 2, 31)
-    path = ReferencePath(torch.randn(31, 2, 6), torch.randn(30, 2, 3))
-    assert linearize(program, data, path).in_plain_torch is None
-    with torch.no_grad():
-        for parameter in program.parameters():
-            parameter += 0.1
-    assert "different numbers" in linearize(program, data, path).in_plain_torch
 
 
 def test_every_trajectory_may_have_an_observation_weight_of_its_own():
@@ -205,20 +127,6 @@ def test_a_program_that_blows_up_is_said_to_have_done_so():
     controls[2, 1] = math.inf
     with pytest.raises(FilterError, match="trajectory 2 at .* that is a number"):
         particle_filter(program, replace(data, controls=controls), particles=64, known_start=True, kernels=True)
-
-
-class Switching(HovercraftTruth):
-    """Reads a number out of a parameter."""
-
-    def transition(self, state, control, time, step):
-        return super().transition(state, control * (2 if float(self.mass.detach()) > 1 else 1), time, step)
-
-
-class Stale(HovercraftTruth):
-    """Takes a parameter in a way that no trace sees."""
-
-    def transition(self, state, control, time, step):
-        return super().transition(state, control * self.mass.detach().numpy().item(), time, step)
 
 
 class HeavyTailed(HovercraftTruth):
