@@ -8,7 +8,7 @@ import pytest
 import torch
 from examples import drives, example
 from oracles import cart_evidence, cart_maximum
-from torch import Tensor
+from training_runs import same, values
 
 from steady_ppl import (
     Constant,
@@ -33,14 +33,6 @@ class Wrong(Cart):
     def __init__(self):
         super().__init__()
         self.gain, self.damping = torch.tensor(0.4), torch.tensor(2.4)
-
-
-def values(program) -> dict[str, Tensor]:
-    return {name: value.detach().clone() for name, value in program.named_parameters()}
-
-
-def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
-    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
 # --- from one refresh to the next -------------------------------------------------------------------------------------

@@ -1,9 +1,9 @@
-"""The training loop: independent fits, reproducible and resumable runs, early stopping, and learning itself."""
+"""The training loop: independent and reproducible fits, early stopping, and learning itself."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import pyro
@@ -13,11 +13,11 @@ from examples import drives, example
 from oracles import cart_evidence, cart_maximum
 from pyro.nn import pyro_method
 from torch import nn
+from training_runs import Cart, Scripted, Stopping, Wrong, run, same, values
 
 from steady_ppl import (
     Constant,
     Optimization,
-    RunError,
     SMCGuide,
     TrainingError,
     TruthGuide,
@@ -27,67 +27,6 @@ from steady_ppl import (
     stack,
     train,
 )
-from steady_ppl.training.checkpoint import Checkpoint
-from steady_ppl.training.loop import _judge
-from steady_ppl.utils.tensor_files import read_tensors
-
-Cart = type(example("linear_gaussian"))
-QUICK = Optimization(steps=6, validate_every=2, learning_rate=0.05)
-
-
-class Wrong(Cart):
-    """The cart with parameters far from those of its drives."""
-
-    def __init__(self):
-        super().__init__()
-        self.gain, self.damping = torch.tensor(0.4), torch.tensor(2.4)
-
-
-@dataclass(frozen=True)
-class Scripted(Validation):
-    """Held-out log p(y) by heart; remembers the parameters that it was shown."""
-
-    scores: tuple[tuple[float, ...], ...] = ()
-    shown: list[dict[str, torch.Tensor]] = field(default_factory=list)
-
-    def __call__(self, program, seed: int) -> list[float]:
-        self.shown.append(values(program))
-        return list(self.scores[len(self.shown) - 1])
-
-
-class Stopping(SMCGuide):
-    """Raises `error` at one E step, and remembers the live parameters at each."""
-
-    def __init__(self, program, *, at: int | None = None, error: BaseException | None = None, **settings) -> None:
-        super().__init__(program, particles=30, draws=5, **settings)
-        self.at, self.error, self.seen = at, error, []
-
-    def refresh(self, data, progress: float) -> dict[str, float]:
-        if len(self.seen) == self.at:
-            raise self.error
-        self.seen.append(values(self.program))
-        return super().refresh(data, progress)
-
-
-def values(program) -> dict[str, torch.Tensor]:
-    return {name: value.detach().clone() for name, value in program.named_parameters()}
-
-
-def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
-    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
-
-
-@pytest.fixture(scope="module")
-def data():
-    return drives(Cart(), 4, 12, gaps=True)
-
-
-def run(program, data, optimization=QUICK, *, guide=None, validation=None, **settings):
-    """A short training; every trajectory is held out as well."""
-    guide = guide or SMCGuide(program, particles=30, draws=5)
-    validation = validation or Validation(data, particles=50, every=2)
-    return train(program, guide, data, validation, optimization, progress=False, **settings)
-
 
 # --- fits of their own, the same run from the same seed ---------------------------------------------------------------
 
@@ -170,61 +109,7 @@ def test_a_program_of_pyro_methods_keeps_its_own_values_outside_of_training(data
         assert second.gain.item() == pytest.approx(0.1)
 
 
-# --- resuming and stopping --------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("batch", [None, 2])
-@pytest.mark.parametrize("stop", [1, 3, 4, 5])
-def test_a_resumed_run_repeats_an_uninterrupted_one_bit_for_bit(data, tmp_path, stop, batch):
-    optimization = Optimization(steps=6, validate_every=2, learning_rate=0.05, batch=batch, gradient_steps=2)
-    whole, killed, resumed = Wrong(), Wrong(), Wrong()
-    a = run(whole, data, optimization, checkpoint=tmp_path / "whole", seed=1)
-    guide = Stopping(killed, at=stop, error=RuntimeError("killed"))
-    with pytest.raises(RuntimeError, match="killed"):
-        run(killed, data, optimization, guide=guide, checkpoint=tmp_path / "cut", seed=1)
-    guide = Stopping(resumed)
-    b = run(resumed, data, optimization, guide=guide, checkpoint=tmp_path / "cut", resume=True, seed=1)
-    assert len(guide.seen) == 6 - stop // 2 * 2  # it went on from the last checkpoint, not from the beginning
-    assert a == b
-    assert same(values(whole), values(resumed))
-    left = [read_tensors(tmp_path / name) for name in ("whole", "cut")]
-    assert same(left[0][0], left[1][0]) and left[0][1] == left[1][1]
-
-
-def test_a_resumed_run_keeps_counting_the_patience(data, tmp_path):
-    scores = ((5.0,), (4.0,), (3.0,), (2.0,), (1.0,))
-    optimization = Optimization(steps=10, validate_every=2, patience=3, learning_rate=0.05)
-    whole, killed, resumed = Wrong(), Wrong(), Wrong()
-    a = run(whole, data, optimization, validation=Scripted(data, scores=scores))
-    guide, script = Stopping(killed, at=5, error=RuntimeError("killed")), Scripted(data, scores=scores)
-    with pytest.raises(RuntimeError, match="killed"):
-        run(killed, data, optimization, guide=guide, validation=script, checkpoint=tmp_path / "cut")
-    rest = Scripted(data, scores=scores[2:])
-    guide = Stopping(resumed)
-    b = run(resumed, data, optimization, guide=guide, validation=rest, checkpoint=tmp_path / "cut", resume=True)
-    assert (a.kept, a.history[-1]["step"]) == (b.kept, b.history[-1]["step"]) == (2, 8)
-    assert same(values(whole), values(resumed))
-
-
-def test_resuming_a_finished_run_changes_nothing(data, tmp_path):
-    program, again = Wrong(), Wrong()
-    a = run(program, data, checkpoint=tmp_path / "done")
-    written = (tmp_path / "done").read_bytes()
-    b = run(again, data, checkpoint=tmp_path / "done", resume=True)
-    assert a == b and same(values(program), values(again))
-    assert (tmp_path / "done").read_bytes() == written
-
-
-def test_resuming_needs_a_checkpoint_of_the_same_program(data, tmp_path):
-    with pytest.raises(RunError, match="no file"):
-        run(Wrong(), data, checkpoint=tmp_path / "nothing", resume=True)
-    run(Wrong(), data, checkpoint=tmp_path / "cart")
-    pendulum = example("pendulum", torch.float32)
-    with pytest.raises(RunError, match="other parameters"):
-        run(pendulum, drives(pendulum, 2, 6), checkpoint=tmp_path / "cart", resume=True)
-    (tmp_path / "cart").write_bytes((tmp_path / "cart").read_bytes()[:-50])
-    with pytest.raises(RunError, match="damaged"):
-        run(Wrong(), data, checkpoint=tmp_path / "cart", resume=True)
+# --- interrupted ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("at", [0, 1, 5])
@@ -456,11 +341,6 @@ def test_steady_learns_the_maximum_likelihood_estimate_of_the_cart():
     train(program, guide, data, Validation(), optimization, progress=False)
     # d standard errors off the estimate cost d² / 2 nats: half of one
     assert top - float(cart_evidence(program, data).detach()) < 0.125
-
-
-def test_a_checkpoint_of_other_validation_drives_is_refused():
-    with pytest.raises(RunError, match=r"it knows 2 held-out log p\(y\), and there are 1"):
-        _judge(Checkpoint({}, {}, {}, step=4, best_held_out=[1.0, 2.0]), [1.5], {})
 
 
 def test_gradients_are_scaled_down_to_their_norm(data, monkeypatch):
