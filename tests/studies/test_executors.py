@@ -1,4 +1,4 @@
-"""Studies that are computed: resumed, and by workers that die."""
+"""Jobs computed by processes of this machine, some of which die."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 from dask_cluster import wait_for
-from small import steady
 from small_studies import STUDY, written
 
 from steady_ppl.errors import ComputationError
@@ -18,22 +17,6 @@ from steady_ppl.studies.executors import TRIES, Attempts, Local
 from steady_ppl.studies.plan import read_plan
 from steady_ppl.studies.runner import run_study
 from steady_ppl.studies.table import TABLE, read_results
-
-
-def test_the_command_computes_what_is_not_there_and_draws_it(tmp_path: Path, capsys):
-    file, out = written(tmp_path), tmp_path / "out"
-    assert steady("study", file, "--workers", 2, "--out", out) == 0
-    said = capsys.readouterr()
-    assert "6 of 6 jobs done" in said.out and "6/6" in said.err and "left" in said.err
-    found = read_results(out).set_index("method")
-    assert (found["outcome"] == "done").all() and found["log_likelihood"].notna().all()
-    assert found.loc["learned", "settings.validation_particles"].tolist() and found["seed"].nunique() == 2
-    before = (out / TABLE).read_bytes()
-    assert steady("study", file, "--workers", 2, "--out", out) == 0
-    assert "6 of 6 jobs are there already" in capsys.readouterr().err and (out / TABLE).read_bytes() == before
-    assert steady("plot-study", out) == 0 and (out / "study.png").stat().st_size > 10_000
-    assert sorted(file.name for file in out.iterdir()) == [TABLE, "study.json", "study.png"]
-
 
 RECIPE = """
 import os, signal, time
@@ -196,8 +179,3 @@ def test_jobs_that_a_machine_takes_along_once_are_tried_again():
         attempts.sent(key)
         attempts.hear(key)
     assert not any(attempts.killed(str(place)) for place in range(40))
-
-
-def test_a_folder_that_is_no_study_is_said(tmp_path: Path, capsys):
-    assert steady("plot-study", tmp_path / "nowhere") == 2
-    assert "nowhere is not a study: it has no study.json" in capsys.readouterr().err
