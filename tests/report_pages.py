@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import shutil
@@ -14,6 +15,7 @@ from html.parser import HTMLParser
 from os import killpg
 from pathlib import Path
 
+import numpy as np
 import pyro
 import pyro.distributions as dist
 import pytest
@@ -163,3 +165,9 @@ def lines_of(page: Path, script: str, name: str, *options: str, anchor: str = ""
     dom, log = opened(with_script(page, script, name), "--dump-dom", *options, anchor=anchor)
     assert "CONSOLE" not in log, log
     return unescape(re.findall("<title>(.*?)</title>", dom)[0]).split(" | ")
+
+
+def unpacked(part: dict) -> np.ndarray:
+    """Numbers as they were before they were packed; NaN where there are none."""
+    codes = np.frombuffer(base64.b64decode(part["data"]), "<i2").reshape(part["shape"]).astype(float)
+    return np.where(codes == -32768, np.nan, part["low"] + part["step"] * (codes + 32767))

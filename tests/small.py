@@ -21,6 +21,7 @@ with warnings.catch_warnings():
 
 HOVERCRAFT, TRUTH = MODELS / "hovercraft.py", f"{MODELS / 'hovercraft.py'}:HovercraftTruth"
 
+HIDDEN = "\x1b[2J\x1b]0;owned\x07\r\x9b31m\u202e"  # clears the screen, renames the window, goes back, turns the line
 FEW = ("--guide", "bootstrap", "--particles", 20, "--draws", 3, "--steps", 3)
 QUICK = ("--particles", 50, "--rollouts", 5)
 

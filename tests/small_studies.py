@@ -36,6 +36,13 @@ published = {{log_likelihood = {{learned = [[50, -5.0], [60, -4.0]]}}}}
 """
 
 
+def search_study(**settings: object) -> str:
+    """The text of a study that searches what its data lack."""
+    text = STUDY[: STUDY.index("[[method]]")].replace("test = 2\n", 'effect = ["", "linear_drag=0.5"]\n')
+    said = ", ".join(f"{name} = {value}" for name, value in settings.items())
+    return f'task = "discover"{text}[[method]]\nname = "it"\nprogram = "{{model}}"\nsettings = {{{{{said}}}}}\n'
+
+
 def written(folder: Path, text: str = STUDY, name: str = "study.toml", **words: str) -> Path:
     file = folder / name
     file.write_text(text.format(**{"model": CART} | words))

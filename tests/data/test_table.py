@@ -1,72 +1,25 @@
-"""The table format: what its cells mean, and exact round trips."""
+"""The table format: what its cells mean, and exact round trips through files, frames and arrays."""
 
 from __future__ import annotations
 
+import doctest
 import math
 import tempfile
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
 from hypothesis import given, settings, strategies as st
+from small import simulated
+from small_tables import GOOD, SUFFIXES, example, same, write
 
-from steady_ppl.data.table import from_frame, read_table, to_frame, write_table
+from steady_ppl.data import table
+from steady_ppl.data.table import from_arrays, from_frame, read_table, to_frame, write_table
 from steady_ppl.data.trajectories import Trajectories, pad, pad_time
-
-SUFFIXES = ("csv", "parquet")
-
-GOOD = """\
-trajectory,time,u.left,y.bearing,y.range,x.x
-b,0.0,1.0,0.5,,10.0
-b,0.1,1.5,,2.0,
-b,0.3,,0.7,2.5,
-a,5.0,2.0,0.1,3.0,20.0
-a,5.5,2.5,0.2,3.5,21.0
-"""
-
-
-def write(folder: Path, text: str, name: str = "drives.csv") -> Path:
-    path = folder / name
-    path.write_text(text)
-    return path
-
-
-def same(a: Trajectories, b: Trajectories) -> None:
-    """Equal bit for bit, names and shapes included."""
-    for field in fields(Trajectories):
-        left, right = getattr(a, field.name), getattr(b, field.name)
-        if not isinstance(left, torch.Tensor):
-            assert left == right, field.name
-            continue
-        assert left.dtype == right.dtype and left.shape == right.shape, field.name
-        if left.is_floating_point():
-            empty = left.isnan()
-            assert torch.equal(empty, right.isnan()), field.name
-            left, right = (t.masked_fill(empty, 0.0).contiguous().view(torch.int64) for t in (left, right))
-        assert torch.equal(left, right), field.name
-
-
-def example(truth: bool = True) -> Trajectories:
-    """Two trajectories of 3 and 2 rows, as GOOD spells them."""
-    return Trajectories(
-        time=torch.tensor([[0.0, 5.0], [0.1, 5.5], [0.3, 6.0]], dtype=torch.float64),
-        controls=torch.tensor([[[1.0], [2.0]], [[1.5], [2.5]], [[0.0], [0.0]]], dtype=torch.float64),
-        measurements=torch.tensor(
-            [[[0.5, 0.0], [0.1, 3.0]], [[0.0, 2.0], [0.2, 3.5]], [[0.7, 2.5], [0.0, 0.0]]], dtype=torch.float64
-        ),
-        observed=torch.tensor([[[1, 0], [1, 1]], [[0, 1], [1, 1]], [[1, 1], [0, 0]]], dtype=torch.bool),
-        lengths=torch.tensor([3, 2]),
-        states=torch.tensor([[[10.0], [20.0]], [[math.nan], [21.0]], [[math.nan], [math.nan]]], dtype=torch.float64)
-        if truth
-        else None,
-        labels=("b", "a"),
-        control_names=("left",),
-        measurement_names=("bearing", "range"),
-        state_names=("x",) if truth else (),
-    )
-
+from steady_ppl.errors import DataError
 
 # --- what a table means
 
@@ -250,3 +203,77 @@ def test_no_state_columns_are_written_without_truth(tmp_path: Path) -> None:
 
 def test_unlabelled_trajectories_are_numbered() -> None:
     assert from_frame(to_frame(replace(example(), labels=()))).labels == ("1", "2")
+
+
+# --- arrays and frames ------------------------------------------------------------------------------------------------
+
+
+def columns(data, drive: int) -> dict[str, np.ndarray]:
+    """One drive as a person would have it in memory."""
+    frame = to_frame(data)
+    part = frame[frame["trajectory"] == data.labels[drive]].drop(columns="trajectory")
+    scalar = {name: part[name].to_numpy() for name in part if not name.startswith("y.")}
+    return scalar | {"y.bearing": part.filter(like="y.").to_numpy()}
+
+
+def test_arrays_are_the_table_that_they_were() -> None:
+    data = simulated()
+    again = from_arrays([columns(data, drive) for drive in range(3)], labels=data.labels)
+    assert to_frame(again)[to_frame(data).columns].equals(to_frame(data))
+
+
+def test_a_frame_in_memory_is_a_table() -> None:
+    data = simulated()
+    assert to_frame(from_frame(to_frame(data))).equals(to_frame(data))
+
+
+def test_nan_is_a_missing_measurement_and_drives_are_numbered() -> None:
+    drive = {"time": np.arange(3.0), "u.push": np.ones(3), "y.place": np.array([1.0, np.nan, 3.0])}
+    data = from_arrays([drive, {name: values[:2] for name, values in drive.items()}])
+    assert data.labels == ("1", "2") and data.lengths.tolist() == [3, 2]
+    assert data.observed[:, 0, 0].tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize(
+    ("drives", "labels", "said"),
+    [
+        ([], None, "got 0 drives and 0 labels"),
+        ([{}], ["a", "b"], "got 1 drives and 2 labels"),
+        (
+            [{"time": np.arange(3.0), "y.place": np.ones(2)}],
+            None,
+            r"trajectory 1 differ in shape: time \(3,\), y.place",
+        ),
+        ([{"time": np.arange(3.0), "y.place": np.ones((3, 2, 2))}], None, "differ in shape"),
+        (
+            [{"time": np.arange(2.0), "y.place": np.ones(2)}, {"time": np.arange(2.0), "y.other": np.ones(2)}],
+            None,
+            "trajectory 2 has other columns than 1",
+        ),
+        ([{"time": np.zeros(2), "y.place": np.ones(2)}], None, "column time, trajectory 1, row 2"),
+        ([{"time": np.arange(2.0), "place": np.ones(2)}], None, "column place: unknown column"),
+        (
+            [{"time": np.arange(2.0)}, {"time": 5 + np.arange(2.0)}],
+            ["a", "a"],
+            "2 drives need 2 labels, and a is there",
+        ),
+        (
+            [{"time": np.arange(2.0), "y.b": np.ones((2, 2)), "y.b_0": np.ones(2)}],
+            None,
+            "column y.b_0 of trajectory 1 is there twice",
+        ),
+        ([{"time": np.arange(2.0), "trajectory": np.ones(2)}], None, "column trajectory of trajectory 1 is what the"),
+    ],
+)
+def test_wrong_arrays_are_named(drives, labels, said: str) -> None:
+    with pytest.raises(DataError, match=said):
+        from_arrays(drives, labels)
+
+
+def test_the_example_runs() -> None:
+    assert doctest.testmod(table).attempted and not doctest.testmod(table).failed
+
+
+def test_frames_keep_their_index_to_themselves() -> None:
+    frame = to_frame(simulated())
+    assert to_frame(from_frame(frame.set_index(pd.RangeIndex(5, 5 + len(frame))))).equals(frame)

@@ -12,7 +12,7 @@ import pandas as pd
 import pyarrow
 import pyarrow.parquet
 import pytest
-from test_table import GOOD, SUFFIXES, example, write
+from small_tables import GOOD, SUFFIXES, example, write
 
 from steady_ppl.data.table import from_frame, read_table, to_frame, write_table
 from steady_ppl.errors import DataError

@@ -184,3 +184,11 @@ def test_an_init_that_fails_is_heard() -> None:
 
     with pytest.raises(RuntimeError, match="mine"):
         Broken()
+
+
+def test_programs_with_the_same_effect_are_of_one_class():
+    program = example("hovercraft")
+    one = program.with_effect("linear_drag", 0.1)
+    variant = type(one).attached["linear_drag"]
+    assert type(program.with_effect(variant, 0.3)) is type(program.with_effect(variant, 0.5)) is type(one)
+    assert type(one.with_effect("wind")) is not type(one)

@@ -9,6 +9,12 @@ from examples import MODELS
 from small import simulated, steady, written
 
 
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    """Drives of a cart."""
+    return written(tmp_path / "t.csv", simulated("linear_gaussian", 5, 9))
+
+
 @pytest.fixture(scope="session")
 def cart_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run of a cart on its own drives."""

@@ -11,7 +11,8 @@ import stat
 import time
 from pathlib import Path
 
-from bag_writing import KINDS, stamped, write_bag
+from bag_drives import drive
+from bag_writing import KINDS, write_bag
 from examples import MODELS
 from small import simulated, steady, written
 from small_studies import written as write_study
@@ -88,17 +89,9 @@ class Desk:
         self.tidy()
 
     def _write_bags(self) -> None:
-        """One of every kind with a command, a range, a pose and messages of a type of its own, and a mapping."""
-        messages = []
-        for at in (0.1 * i for i in range(10)):
-            messages += [
-                ("/cmd_vel", "geometry_msgs/msg/Twist", at, {"linear.x": 0.5 + at}),
-                ("/scan", "sensor_msgs/msg/LaserScan", at + 0.01, stamped(at, ranges=[1.0, 2.0 + at])),
-                ("/odom", "nav_msgs/msg/Odometry", at + 0.02, stamped(at, **{"pose.pose.orientation.w": 1.0})),
-                ("/thrust", "boat_msgs/msg/Thrust", at + 0.03, stamped(at, left=1.0)),
-            ]
+        """One of every kind, in which a type is its own, and a mapping."""
         for kind in KINDS:
-            write_bag(self.good / kind.replace(" ", "_"), kind, messages)
+            write_bag(self.good / kind.replace(" ", "_"), kind, drive(10))
         (self.good / "mapping.toml").write_text(MAPPING)
         (self.good / "boat_msgs" / "msg").mkdir(parents=True)
         (self.good / "boat_msgs" / "msg" / "Battery.msg").write_text("float64 volt\nstring name\nfloat32[3] gains\n")

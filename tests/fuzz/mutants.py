@@ -40,6 +40,21 @@ def spelt(spell: Callable[[str], str | bytes]) -> Change:
     return of_text(lambda draw, text: spell(text))
 
 
+def of_lines(change: Callable[[st.DrawFn, list[str]], list[str]]) -> Change:
+    """A change of the lines of a file's text."""
+    return of_text(lambda draw, text: "\n".join(change(draw, text.splitlines())) + "\n")
+
+
+def of_a_line(put: Callable[[st.DrawFn, str], list[str]], fits: Callable[[str], bool] = lambda line: True) -> Change:
+    """Others in the place of a line that fits."""
+
+    def change(draw: st.DrawFn, lines: list[str]) -> list[str]:
+        at = draw(st.sampled_from([i for i, line in enumerate(lines) if fits(line)]))
+        return [*lines[:at], *put(draw, lines[at]), *lines[at + 1 :]]
+
+    return of_lines(change)
+
+
 def _around(change: Callable[[st.DrawFn, bytes], bytes]) -> Change:
     """A change of a block of at most 64 bytes."""
 

@@ -6,7 +6,9 @@ import json
 import math
 import re
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import reduce
+from operator import getitem
 from typing import Any
 
 from hypothesis import strategies as st
@@ -29,19 +31,22 @@ def _json(change: JsonChange) -> Change:
     return of_text(lambda draw, text: json.dumps(change(draw, json.loads(text))))
 
 
-def _places(content: Any, here: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+def places(content: Any, here: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """The ways to every value within, that of the whole first."""
     inner = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
-    return [here, *(place for key, value in inner for place in _places(value, (*here, key)))]
+    return [here, *(place for key, value in inner for place in places(value, (*here, key)))]
+
+
+def at(content: Any, place: Iterable[Any]) -> Any:
+    """The value to which a way leads."""
+    return reduce(getitem, place, content)
 
 
 def _place(draw: st.DrawFn, content: Any) -> tuple[Any, Any]:
     """A dict or list and a key of it, the upper level as often as all that lie deeper."""
-    every = _places(content)[1:]
+    every = places(content)[1:]
     *path, last = draw(st.sampled_from([place for place in every if len(place) == 1]) | st.sampled_from(every))
-    for key in path:
-        content = content[key]
-    return content, last
+    return at(content, path), last
 
 
 def _odd_value(draw: st.DrawFn, content: Any) -> Any:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import struct
-from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -14,8 +14,9 @@ from typing import Any
 import pytest
 import torch
 from examples import MODELS
+from record_mutants import at, places
 from report_pages import FOUND, two_run_report
-from small import FEW, contents, simulated, steady, written
+from small import FEW, steady
 
 import steady_ppl as st
 from steady_ppl.errors import RunError
@@ -23,6 +24,17 @@ from steady_ppl.runs.folder import read_discovery
 from steady_ppl.utils.tensor_files import read_tensors, write_tensors
 
 CART = MODELS / "linear_gaussian.py"
+
+
+@pytest.fixture
+def copy(tmp_path: Path, cart_run: Path) -> Path:
+    """Of the cart's run, which names its program from where it now lies."""
+    place = tmp_path / "run"
+    shutil.copytree(cart_run, place)
+    record = json.loads((place / "run.json").read_text())
+    record["program"]["file"] = os.path.relpath(CART, place)
+    (place / "run.json").write_text(json.dumps(record))
+    return place
 
 
 @pytest.mark.parametrize(
@@ -37,33 +49,20 @@ CART = MODELS / "linear_gaussian.py"
         (lambda record: record.update(recipe=["\x1b[2J"]), "recipe is "),
     ],
 )
-def test_a_record_of_another_form_is_refused(tmp_path: Path, cart_run: Path, refused, change, says: str) -> None:
-    copy = copied(cart_run, tmp_path / "run")
+def test_a_record_of_another_form_is_refused(copy: Path, table: Path, refused, change, says: str) -> None:
     record = json.loads((copy / "run.json").read_text())
     change(record)
     (copy / "run.json").write_text(json.dumps(record))
-    refused(2, says, "evaluate", copy, written(tmp_path / "t.csv", simulated("linear_gaussian", 5, 9)))
+    refused(2, says, "evaluate", copy, table)
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "", "3", "\ud83d", '{"a": ' + "9" * 10_000 + "}"])
-def test_a_record_that_is_no_json_is_refused(tmp_path: Path, cart_run: Path, refused, text: str) -> None:
-    copy = copied(cart_run, tmp_path / "run")
+def test_a_record_that_is_no_json_is_refused(copy: Path, table: Path, refused, text: str) -> None:
     (copy / "run.json").write_bytes(text.encode(errors="surrogatepass"))
-    refused(2, "run.json is damaged", "evaluate", copy, written(tmp_path / "t.csv", simulated("linear_gaussian", 5, 9)))
+    refused(2, "run.json is damaged", "evaluate", copy, table)
 
 
-def copied(run: Path, place: Path) -> Path:
-    place.mkdir()
-    for name, content in contents(run).items():
-        (place / name).write_bytes(content)
-    record = json.loads((place / "run.json").read_text())
-    record["program"]["file"] = os.path.relpath(CART, place)
-    (place / "run.json").write_text(json.dumps(record))
-    return place
-
-
-def test_parameters_of_which_a_bit_has_turned_are_refused(tmp_path: Path, cart_run: Path, refused) -> None:
-    copy, table = copied(cart_run, tmp_path / "run"), written(tmp_path / "t.csv", simulated("linear_gaussian", 5, 9))
+def test_parameters_of_which_a_bit_has_turned_are_refused(copy: Path, table: Path, refused) -> None:
     file = copy / "parameters.safetensors"
     good = file.read_bytes()
     file.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
@@ -81,17 +80,14 @@ def test_parameters_that_are_not_finite_are_refused(tmp_path: Path, cart_run: Pa
         st.Fit.load(tmp_path / "run")
 
 
-def test_a_run_in_which_a_folder_takes_a_files_place_is_not_overwritten(
-    tmp_path: Path, cart_run: Path, refused
-) -> None:
-    copy, table = copied(cart_run, tmp_path / "run"), written(tmp_path / "t.csv", simulated("linear_gaussian", 5, 9))
+def test_a_run_in_which_a_folder_takes_a_files_place_is_not_overwritten(copy: Path, table: Path, refused) -> None:
     (copy / "run.json").unlink()
     (copy / "run.json").mkdir()
     refused(2, "run.json is a folder", "fit", CART, table, "--recipe", "hand", "--force", "--out", copy)
 
 
-def test_a_checkpoint_of_another_form_is_refused(tmp_path: Path, refused) -> None:
-    table, run = written(tmp_path / "t.csv", simulated("linear_gaussian", 5, 9)), tmp_path / "run"
+def test_a_checkpoint_of_another_form_is_refused(tmp_path: Path, table: Path, refused) -> None:
+    run = tmp_path / "run"
     assert steady("fit", CART, table, *FEW, "--out", run) == 0
     tensors, text = read_tensors(run / "checkpoint.safetensors")
     resumed = ("fit", CART, table, *FEW, "--out", run, "--resume")
@@ -109,15 +105,7 @@ def test_a_checkpoint_of_another_form_is_refused(tmp_path: Path, refused) -> Non
 
 def test_a_discovery_of_another_form_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "found.json"
-    said = {
-        "sentence": "s",
-        "candidates": [],
-        "effects": [],
-        "shape": None,
-        "doubts": [],
-        "notes": [],
-        "next_run": None,
-    }
+    said = FOUND | {"candidates": [], "effects": []}
     for change, says in (
         ({}, None),
         ({"candidates": [3]}, "candidates[0] is 3, expected names and values"),
@@ -145,22 +133,14 @@ FULL = FOUND | {
 ANY_LENGTH = ("candidates", "effects", "class", "doubts", "notes", "between", "detection_limit")
 
 
-def lists(content: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Where the lists within are, by keys and indices."""
-    inner = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
-    if isinstance(content, list):
-        yield place
-    for key, value in inner:
-        yield from lists(value, (*place, key))
+LISTS = [place for place in places(FULL) if isinstance(at(FULL, place), list)]
 
 
-@pytest.mark.parametrize("place", [pytest.param(place, id=".".join(map(str, place))) for place in lists(FULL)])
+@pytest.mark.parametrize("place", [pytest.param(place, id=".".join(map(str, place))) for place in LISTS])
 @pytest.mark.parametrize("longer", [False, True])
 def test_a_list_of_another_length_is_refused_or_shown(tmp_path: Path, place: tuple[Any, ...], longer: bool) -> None:
     found, file = deepcopy(FULL), tmp_path / "found.json"
-    part: Any = found
-    for key in place:
-        part = part[key]
+    part = at(found, place)
     part.append(part[-1]) if longer else part.pop()
     file.write_text(json.dumps(found))
     if place[-1] in ANY_LENGTH:

@@ -57,10 +57,8 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", list(FAULTS))
 def test_a_fault_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
-    monkeypatch.setattr(trying, "MOST_MIB", 20)
-    monkeypatch.setattr(trying, "SECONDS", 1)
-    monkeypatch.setattr(trying, "LONG", 1)
-    monkeypatch.setattr(trying, "PATIENCE", 3)
+    for limit, value in {"MOST_MIB": 20, "SECONDS": 1, "LONG": 1, "PATIENCE": 3}.items():
+        monkeypatch.setattr(trying, limit, value)
     place = tmp_path / "desk"
     place.mkdir()
     (place / "t.csv").write_text("good")

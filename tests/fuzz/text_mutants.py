@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from hypothesis import strategies as st
-from mutants import Change, of_text
+from mutants import Change, of_a_line, of_lines, of_text
 from table_mutants import CELLS, NAMES
 
 VALUES = (
@@ -26,44 +26,24 @@ DEFINITIONS = (
 values = st.sampled_from(VALUES) | st.integers().map(str) | st.floats().map(str)
 
 
-def _lines(change: Callable[[st.DrawFn, list[str]], list[str]]) -> Change:
-    return of_text(lambda draw, text: "\n".join(change(draw, text.splitlines())) + "\n")
-
-
-def _another_value(draw: st.DrawFn, lines: list[str]) -> list[str]:
-    at = draw(st.sampled_from([i for i, line in enumerate(lines) if "=" in line]))
-    return [*lines[:at], f"{lines[at].partition('=')[0]}= {draw(values)}", *lines[at + 1 :]]
-
-
-def _one_more(draw: st.DrawFn, lines: list[str]) -> list[str]:
-    at = draw(st.integers(0, len(lines) - 1))
-    return [*lines[:at], f"{draw(st.sampled_from(KEYS))} = {draw(values)}", *lines[at:]]
-
-
-def _lost(draw: st.DrawFn, lines: list[str]) -> list[str]:
-    at = draw(st.integers(0, len(lines) - 1))
-    return lines[:at] + lines[at + 1 :]
-
-
-def _another_section(draw: st.DrawFn, lines: list[str]) -> list[str]:
-    at = draw(st.sampled_from([i for i, line in enumerate(lines) if line.startswith("[")]))
-    return [*lines[:at], draw(st.sampled_from(SECTIONS)), *lines[at + 1 :]]
-
-
 def _at(number: int, line: str) -> Change:
-    return _lines(lambda draw, lines: [*lines[:number], line, *lines[number + 1 :]])
+    return of_lines(lambda draw, lines: [*lines[:number], line, *lines[number + 1 :]])
 
 
 def _behind(*more: str) -> Change:
-    return _lines(lambda draw, lines: [*lines, *more])
+    return of_lines(lambda draw, lines: [*lines, *more])
 
 
 TOML: Mapping[str, Change] = {
-    "another value": _lines(_another_value),
-    "one more key": _lines(_one_more),
-    "a line lost": _lines(_lost),
-    "another section": _lines(_another_section),
-    "lines shuffled": _lines(lambda draw, lines: draw(st.permutations(lines))),
+    "another value": of_a_line(
+        lambda draw, line: [f"{line.partition('=')[0]}= {draw(values)}"], lambda line: "=" in line
+    ),
+    "one more key": of_a_line(lambda draw, line: [f"{draw(st.sampled_from(KEYS))} = {draw(values)}", line]),
+    "a line lost": of_a_line(lambda draw, line: []),
+    "another section": of_a_line(
+        lambda draw, line: [draw(st.sampled_from(SECTIONS))], lambda line: line.startswith("[")
+    ),
+    "lines shuffled": of_lines(lambda draw, lines: draw(st.permutations(lines))),
     "nested 10,000 deep": _at(0, f"step = {'[' * 10_000}{']' * 10_000}"),
     "tables 10,000 deep": _behind(f"[{'.'.join(['a'] * 10_000)}]"),
     "a number of 10,000 digits": _at(0, f"step = {'9' * 10_000}"),

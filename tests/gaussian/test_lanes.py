@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 from examples import drives, example
+from paths import anywhere
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
@@ -27,18 +28,12 @@ def found(program: Program, data: Trajectories, path: ReferencePath) -> list[Ten
     return [ahead.log_likelihood, *(part.movedim(1, 0) for part in of_rows), *last]
 
 
-def random_path(program: Program, data: Trajectories) -> ReferencePath:
-    rows, count = data.time.shape
-    states = torch.randn(rows, count, len(program.states), dtype=torch.float64)
-    return ReferencePath(states, torch.randn(rows - 1, count, len(program.channels), dtype=torch.float64))
-
-
 @pytest.mark.parametrize("name", ["linear_gaussian", "pendulum", "hovercraft"])
 @pytest.mark.parametrize("count", [3, 8, 9, 17])
 def test_each_trajectory_is_as_it_is_alone(name: str, count: int) -> None:
     program = example(name)
     data = drives(program, count, 3)
-    path = random_path(program, data)
+    path = anywhere(program, data)
     together = found(program, data, path)
     for index in {0, 7 % count, count - 1}:
         own = ReferencePath(*(part[:, index : index + 1] for part in (path.states, path.noise)))
@@ -51,7 +46,7 @@ def test_each_trajectory_is_as_it_is_alone(name: str, count: int) -> None:
 def test_one_that_is_no_number_leaves_the_others_as_they_are(count: int, value: float) -> None:
     program = example("hovercraft")
     data = drives(program, count, 3)
-    path = random_path(program, data)
+    path = anywhere(program, data)
     before = found(program, data, path)
     path.states[1, 1] = value
     after = found(program, data, path)

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from examples import example
-from markupsafe import escape
-from report_pages import EVIL, FOUND, Elements, content, content_of, six_drives, two_run_report, two_runs
-from small import simulated, steady
+from report_pages import EVIL, FOUND, Elements, content, content_of, six_drives, two_run_report, two_runs, unpacked
+from small import steady
 
 import steady_ppl as st
-from steady_ppl.effects import attached
-from steady_ppl.reporting.drives import chosen, packed, where_to_look
-from steady_ppl.reporting.html import _equation, said, spread
+from steady_ppl.reporting.html import said
 
 MOST = 6_000_000  # bytes
 
@@ -44,22 +39,6 @@ def page(found, tmp_path_factory) -> Path:
     file = tmp_path_factory.mktemp("report") / "report.html"
     found.write(file)
     return file
-
-
-def unpacked(part: dict) -> np.ndarray:
-    codes = np.frombuffer(base64.b64decode(part["data"]), "<i2").reshape(part["shape"]).astype(float)
-    return np.where(codes == -32768, np.nan, part["low"] + part["step"] * (codes + 32767))
-
-
-def test_numbers_come_back_as_finely_as_sixteen_bits_are():
-    values = np.random.default_rng(0).normal(size=(3, 4, 5)) * 100
-    values[1, 2, 3] = np.nan
-    back = unpacked(packed(values))
-    np.testing.assert_array_equal(np.isnan(back), np.isnan(values))
-    np.testing.assert_allclose(back, values, atol=np.nanmax(values) - np.nanmin(values), rtol=0)
-    assert np.nanmax(abs(back - values)) <= 0.5001 * (np.nanmax(values) - np.nanmin(values)) / 65534
-    assert unpacked(packed(np.full((2, 2), np.nan))).shape == (2, 2)
-    np.testing.assert_array_equal(unpacked(packed(np.full(3, 7.0))), 7.0)
 
 
 def test_it_has_every_verdict_and_loads_nothing(found, page):
@@ -110,39 +89,6 @@ def test_what_is_drawn_is_what_was_computed(found, page, runs, data):
     assert np.nanmax(abs(shown)) == pytest.approx(strongest, abs=0.001)
 
 
-def test_a_place_to_look_at_is_where_the_misfit_is(runs):
-    table = simulated("hovercraft.py:HovercraftTruth", trajectories=6, rows=41)
-    measurements = table.measurements.clone()
-    measurements[15:25, 4, 1] += 0.4
-    check = st.check(runs["after"], replace(table, measurements=measurements), simulations=20)
-    (cell,) = (
-        one
-        for i, one in enumerate(check.misfit.cells)
-        if one.map == "drive" and one.residual == 1 and one.where["drive"] == 4
-    )
-    assert where_to_look(check, cell) == (4, 0.0, 4.5)
-    (cell,) = (one for one in check.misfit.cells if one.map == "all" and one.residual == 1)
-    place = where_to_look(check, cell)
-    assert place is not None and place[0] == 4
-    regimes = [one for one in check.misfit.cells if one.map == "regime" and one.residual == 1 and "left" in one.where]
-    for cell in regimes:
-        drive, start, end = where_to_look(check, cell)
-        middle = round(0.5 * (start + end) / 0.1)
-        low, high = cell.where["left"]
-        near = table.controls[max(0, middle - 6) : middle + 6, drive, 0]
-        assert bool(((near >= low - 1e-6) & (near <= high + 1e-6)).any())
-
-
-def test_there_is_room_for_the_strongest_drives(found):
-    checks = list(found.checks.values())
-    assert chosen(checks).note is None
-    few = chosen(checks, numbers=3 * 101 * 80)
-    assert 1 <= len(few.drives) < 6 and few.every == 1 and "strongest misfits" in few.note
-    assert f"{len(few.drives)} of 6 drives" in few.note
-    tiny = chosen(checks, numbers=500)
-    assert len(tiny.drives) == 1 and tiny.every > 1 and "th row" in tiny.note
-
-
 def test_one_run_alone_is_a_report_without_a_proof(runs, data, tmp_path):
     found = st.report({"only": runs["before"]}, data, simulations=20, draws=5)
     assert isinstance(found.proof, str) and "one run only" in found.html
@@ -189,25 +135,6 @@ def test_the_last_command_of_a_drive_acts_on_nothing(page):
     assert np.isnan(controls[:, :, -1]).all() and not np.isnan(controls[:, :, :-1]).any()
 
 
-def test_what_is_shown_row_by_row_has_an_upper_bound(runs):
-    """A page of three hundred drives is hardly larger than one of thirty."""
-    checks = [st.check(one, simulated(trajectories=6, rows=101), simulations=20) for one in runs.values()]
-    for numbers in (3_000, 30_000):
-        shown = chosen(checks, numbers)
-        rows = -(-101 // shown.every)
-        assert 0.5 * numbers < len(shown.drives) * rows * 100 < 1.5 * numbers
-        assert shown.note and "of 6 drives" in shown.note
-    assert chosen(checks).note is None
-
-
-def test_an_equation_that_is_no_latex_is_said_in_words(runs, data):
-    program = example("hovercraft", torch.float32).with_effect("linear_drag", 0.1)
-    (variant,) = attached(program)
-    broken = replace(variant.effect, equation=r"\frac{")
-    assert _equation(broken) == escape(broken.text)
-    assert "<math" in _equation(variant.effect)
-
-
 def test_the_command_writes_it(work: Path, tmp_path: Path, capsys, refused):
     table = work / "valid.parquet"
     page = tmp_path / "report.html"
@@ -226,18 +153,6 @@ def test_the_command_writes_it(work: Path, tmp_path: Path, capsys, refused):
     assert steady("report", work / "hand", table, *some, "--discovery", discovery, "--out", page) == 0
     assert "report.html" in capsys.readouterr().out and FOUND["sentence"] in page.read_text()
     assert not list(tmp_path.glob("*.partial"))
-
-
-def test_sentences_of_a_verdict_are_set_as_text():
-    assert said("`steady discover` <b> between -0.5 and -3 of 90 %") == (
-        "<code>steady discover</code> &lt;b&gt; between −0.5 and −3 of 90\u00a0%"
-    )
-
-
-def test_coefficients_stand_beside_their_own_spread():
-    assert spread({"coefficient": [1.0, -2.0], "sd": [0.1, 0.2]}) == "1 ± 0.1, −2 ± 0.2"
-    assert spread({"coefficient": 1.5, "sd": None}) == "1.5"
-    assert spread({"coefficient": [1.0, 2.0], "sd": None}) == "1, 2"
 
 
 def test_the_command_that_is_shown_is_the_one_that_was_given(work: Path, tmp_path: Path):

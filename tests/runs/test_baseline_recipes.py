@@ -13,8 +13,8 @@ import pyro.distributions as dist
 import pytest
 import torch
 from examples import MODELS
+from learned import held_out, same, values
 from small import HOVERCRAFT, only_start, simulated, steady, written
-from test_recipes import held_out, same, values
 
 from steady_ppl import UsageError, bearings_to, load_program, seeded, simulate
 from steady_ppl.model.planar_vehicle import PlanarVehicle

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import subprocess
 import sys
@@ -15,9 +14,6 @@ import torch
 from small import FEW, HOVERCRAFT, QUICK, steady, tree, written
 
 from steady_ppl import read_table
-from steady_ppl.cli.common import as_refusal
-from steady_ppl.errors import ComputationError, UsageError
-from steady_ppl.utils.files import whole_file
 
 THIRTY = "9" * 30
 LONG = "n" * 300
@@ -107,23 +103,7 @@ def test_a_name_may_be_as_long_as_the_file_system_has_them(tmp_path: Path, lengt
     assert len(read_table(table)) == 2 and tree(tmp_path) == [table]
 
 
-def test_another_error_of_a_file_is_a_line_too_and_a_defect_is_none() -> None:
-    said = as_refusal(PermissionError(errno.EACCES, "Permission denied", "locked/run"))
-    assert isinstance(said, UsageError) and str(said) == "locked/run: Permission denied"
-    full = as_refusal(OSError(errno.ENOSPC, "No space left on device"))  # as when numba keeps a compiled kernel
-    assert isinstance(full, UsageError) and str(full) == "a file cannot be written: No space left on device"
-    assert isinstance(as_refusal(MemoryError()), ComputationError)
-    assert as_refusal(OSError("nothing is known of it")) is None and as_refusal(RuntimeError("a defect")) is None
-
-
 # --- a file system that is read only ----------------------------------------------------------------------------------
-def test_what_cannot_be_removed_hides_no_error(tmp_path: Path, monkeypatch) -> None:
-    def refuse(*_, **__):
-        raise OSError(errno.EROFS, "Read-only file system")
-
-    monkeypatch.setattr(Path, "unlink", refuse)
-    with pytest.raises(UsageError, match="a.csv cannot be written: Read-only"), whole_file(tmp_path / "a.csv"):
-        pass
 
 
 READ_ONLY = """mount -t tmpfs -o size=1m none "$1" && mkdir "$1/run" && mount -o remount,ro "$1" || exit 77

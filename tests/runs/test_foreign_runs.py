@@ -9,15 +9,13 @@ import os
 from pathlib import Path
 
 import pytest
-from small import HOVERCRAFT, contents, steady, written
+from small import HIDDEN, HOVERCRAFT, contents, steady, written
 
 import steady_ppl as st
 from steady_ppl.utils.files import hidden_beside
-from steady_ppl.utils.text import printable, tell
 
 PACKAGE = Path(st.__file__).parent
 PAYLOAD = "from pathlib import Path\nPath({mark!r}).touch()\n"
-HIDDEN = "\x1b[2J\x1b]0;owned\x07\r\x9b31m\u202e"  # clears the screen, renames the window, goes back, turns the line
 
 
 @pytest.fixture
@@ -181,12 +179,6 @@ def test_a_terminal_is_told_nothing_by_names(tmp_path: Path, capsys) -> None:
     said = "".join(capsys.readouterr())
     assert not set(said) & (set(HIDDEN) - set("[2J]0;owned31m")), said
     assert "\\x1b[2J" in said
-
-
-def test_what_cannot_be_written_is_spelt_out(capsys) -> None:
-    assert printable("tab\tline\n ä→² 🚗") == "tab\tline\n ä→² 🚗"
-    tell(f"a\udcff{HIDDEN}b")
-    assert capsys.readouterr().out == "a\\udcff\\x1b[2J\\x1b]0;owned\\x07\\r\\x9b31m\\u202eb\n"
 
 
 def test_nothing_else_prints() -> None:

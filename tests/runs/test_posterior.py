@@ -14,7 +14,7 @@ from small import simulated
 from steady_ppl import Fit, Trajectories
 from steady_ppl.model.handlers import Replaying
 from steady_ppl.model.substeps import sample_row
-from steady_ppl.runs.posterior import posterior
+from steady_ppl.runs.posterior import posterior, states_frame
 
 ROWS = 9
 
@@ -166,3 +166,30 @@ def test_the_draws_of_the_cart_have_the_exact_posterior_mean() -> None:
             for run in runs
         ]
         assert_mean(torch.from_numpy(np.stack(means)), exact.states_mean)
+
+
+def test_headings_whose_start_nobody_knows_are_on_one_turn():
+    program, data = example("hovercraft", torch.float32), simulated(rows=21, trajectories=4).without_truth()
+    posterior = Fit(program, "hand").posterior(data, draws=60, seed=1)
+    heading = posterior["posterior"]["heading"].values[0]
+    around = abs(np.exp(1j * heading).mean(0))
+    assert around.min() > 0.9  # they are known
+    assert heading.std(0).max() < 0.5 and abs(heading[0, :, 0]).max() <= np.pi
+    table = states_frame(posterior)
+    assert (table["heading_high"] - table["heading_low"]).max() < 2
+
+
+def test_a_bearing_across_the_cut_has_a_narrow_forecast():
+    program = example("hovercraft", torch.float32)
+    program.landmarks = tuple((-1000.0, 0.1 * i) for i in range(4))
+    data = simulated(rows=8)
+    states = torch.zeros_like(data.states)
+    there = replace(data, states=states, measurements=torch.full_like(data.measurements, 3.1))
+    found = Fit(program, "hand", known_start=True).forecast(there, after=0.35, draws=200, particles=50)
+    draws = found["predictions"]["measured_bearing_0"].values[0, :, 0, 4:]
+    assert (draws > np.pi).any() and (draws < np.pi).any()
+    assert np.ptp(draws, axis=0).max() < 2
+    assert found["predictions"]["measured_bearing_0"].attrs["circular"] == 1
+    later = found["predictions_constant_data"]["measured_bearing_0"].values[0]
+    np.testing.assert_allclose(later[4:], 3.1, rtol=1e-6)
+    assert np.isnan(later[:4]).all()

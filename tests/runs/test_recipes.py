@@ -9,26 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from examples import MODELS, HeavyTailed
-from small import HOVERCRAFT, contents, only_start, simulated, steady, written
+from examples import MODELS, HeavyTailed, example
+from learned import held_out, same, values
+from small import FEW, HOVERCRAFT, contents, only_start, simulated, steady, written
 
-from steady_ppl import UsageError, for_program, load_program, log_likelihood, seeded, simulate
-from steady_ppl.runs.recipes import find_recipe, recipe_folder
+from steady_ppl import UsageError, for_program, load_program, read_table, seeded, simulate
+from steady_ppl.runs.recipes import find_recipe, recipe_folder, suited_recipe
 
 QUIET = {"progress": False}
-FEW = {
+GUIDES = {
     "bootstrap": {"guide": "bootstrap", "particles": 20, "draws": 3},
     "lookahead": {"guide": "lookahead", "particles": 20, "draws": 3},
     "gaussian": {"draws": 3},
 }
-
-
-def values(program) -> dict[str, torch.Tensor]:
-    return {name: value.detach().clone() for name, value in program.state_dict().items()}
-
-
-def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
-    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
 # --- finding them -----------------------------------------------------------------------------------------------------
@@ -61,14 +54,14 @@ def test_hand_changes_nothing(tmp_path: Path) -> None:
 # --- steady -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("guide", list(FEW))
+@pytest.mark.parametrize("guide", list(GUIDES))
 def test_steady_finds_a_mass_that_was_wrong_by_far(guide: str) -> None:
     """Believed to be twice as heavy as it is and seen through bearings only; held-out drives must gain as well."""
     train, valid = simulated(trajectories=12, rows=41), simulated(trajectories=4, rows=41, seed=1)
     program = load_program(HOVERCRAFT)
     program.mass = torch.tensor(3.0)
     before = held_out(program, valid)
-    options = {**FEW[guide], "draws": 5, "steps": 40, "learning_rate": 0.05, "known_start": True}
+    options = {**GUIDES[guide], "draws": 5, "steps": 40, "learning_rate": 0.05, "known_start": True}
     if guide == "bootstrap":
         options["particles"] = 60
     find_recipe("steady")(program, train, **options, **QUIET)
@@ -76,15 +69,7 @@ def test_steady_finds_a_mass_that_was_wrong_by_far(guide: str) -> None:
     assert held_out(program, valid) > before
 
 
-def held_out(program, data) -> float:
-    """Log p(y) of other drives, the same random numbers for every program."""
-    with seeded(0):
-        return (
-            log_likelihood(program, for_program(program, data), particles=1000, known_start=True, every=1).mean().item()
-        )
-
-
-@pytest.mark.parametrize("guide", list(FEW))
+@pytest.mark.parametrize("guide", list(GUIDES))
 @pytest.mark.parametrize("known_start", [True, False])
 @pytest.mark.parametrize("name", ["hovercraft.py:Hovercraft", "neural_vehicle.py:NeuralHovercraft"])
 def test_steady_never_looks_at_the_true_states(name: str, known_start: bool, guide: str) -> None:
@@ -94,7 +79,7 @@ def test_steady_never_looks_at_the_true_states(name: str, known_start: bool, gui
     for given in (lambda data: data, only_start, lambda data: data.without_truth(keep_start=known_start)):
         with seeded(1):
             program = load_program(MODELS / name)
-        options = {**FEW[guide], "steps": 4, "validate_every": 2, "known_start": known_start}
+        options = {**GUIDES[guide], "steps": 4, "validate_every": 2, "known_start": known_start}
         fit = find_recipe("steady")(program, given(train), given(valid), **options, **QUIET)
         results.append((values(program), fit.trained))
     for parameters, trained in results[1:]:
@@ -295,3 +280,56 @@ def test_a_recipe_of_another_form_is_bad_input_and_leaves_no_run(tmp_path: Path,
     error = capsys.readouterr().err
     assert "mine" in error and len(error.splitlines()) == 1
     assert contents(tmp_path) == before
+
+
+# --- the one that suits -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("program", "options", "device", "recipe", "says"),
+    [
+        ("hovercraft", {}, "cpu", "likelihood", "5 learnable numbers and noise that can be linearised"),
+        ("hovercraft", {"validation_particles": 50}, "cpu", "likelihood", "5 learnable numbers"),
+        ("hovercraft", {"particles": 50}, "cpu", "steady", "particles is a setting of it"),
+        ("hovercraft", {}, "cuda", "steady", "it computes on cuda"),
+        (
+            "neural_vehicle.py:NeuralHovercraft",
+            {},
+            "cpu",
+            "steady",
+            "where likelihood takes 1 to 60",
+        ),
+    ],
+)
+def test_it_goes_by_program_and_settings(tmp_path: Path, program: str, options, device: str, recipe: str, says: str):
+    table = read_table(written(tmp_path / "t.csv"))
+    name, why = suited_recipe(example(program), table, options, device=device)
+    assert name == recipe and says in why
+
+
+def test_noise_that_cannot_be_linearised_is_steadys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    table = read_table(written(tmp_path / "t.csv"))
+    monkeypatch.setattr("steady_ppl.runs.recipes.why_not_linear", lambda *_, **__: "its noise is Laplace")
+    assert suited_recipe(example("hovercraft"), table, {}) == (
+        "steady",
+        "likelihood needs a program that can be linearised: its noise is Laplace",
+    )
+
+
+def test_a_fit_says_which_and_keeps_it_and_goes_on_with_it(tmp_path: Path, capsys):
+    table = written(tmp_path / "t.csv")
+    assert steady("fit", HOVERCRAFT, table, "--out", tmp_path / "one") == 0
+    assert "recipe likelihood: 5 learnable numbers" in capsys.readouterr().err
+    assert json.loads((tmp_path / "one" / "run.json").read_text())["recipe"] == "likelihood"
+    assert steady("fit", HOVERCRAFT, table, *FEW, "--out", tmp_path / "two") == 0
+    assert "recipe steady: " in capsys.readouterr().err
+    assert steady("fit", HOVERCRAFT, table, *FEW, "--out", tmp_path / "two", "--resume") == 0
+    assert "recipe steady: " in capsys.readouterr().err
+    svi = ("fit", HOVERCRAFT, table, "--set", "steps=2", "--out", tmp_path / "four")
+    assert steady(*svi, "--recipe", "svi") == 0
+    capsys.readouterr()
+    assert steady(*svi, "--resume") == 0
+    assert json.loads((tmp_path / "four" / "run.json").read_text())["recipe"] == "svi"
+    assert "recipe " not in capsys.readouterr().err
+    assert steady("fit", HOVERCRAFT, table, "--recipe", "hand", "--out", tmp_path / "three") == 0
+    assert "recipe hand: " not in capsys.readouterr().err

@@ -1,38 +1,15 @@
-"""Files of another kind, JSON of another form, and what a file says on a line."""
+"""Files of another kind, and files that cannot be removed."""
 
 from __future__ import annotations
 
-import math
+import errno
 import os
 from pathlib import Path
 
 import pytest
 
-from steady_ppl.errors import DataError
-from steady_ppl.utils.files import read_json, require_file
-from steady_ppl.utils.schema import NUMBER, TEXT, WHOLE, Paired, mismatch
-from steady_ppl.utils.text import shown
-
-
-def test_a_form_is_told_from_another(tmp_path: Path) -> None:
-    form = {"a": NUMBER, "b": ([WHOLE], None), "c?": TEXT, "d": (NUMBER, TEXT)}
-    assert mismatch({"a": 1, "b": None, "d": "x"}, form) is None
-    assert mismatch({"a": 1, "b": [1, -1], "d": 2}, form) == "b[1] is -1, expected a whole number from 0 to 2^63"
-    assert mismatch({"a": math.inf, "b": [], "d": 2}, form) == "a is inf, expected a finite number"
-    assert mismatch({"a": True, "b": [], "d": 2}, form) == "a is True, expected a finite number"
-    assert mismatch({"b": [], "d": 2}, form) == "it has no a"
-    assert mismatch([], form) == "it is [], expected names and values"
-    assert mismatch({"x": 10**400}, {str: NUMBER}).startswith("x is 1000")
-    assert mismatch({"a": 1, "b": [], "c": 3, "d": 2}, form) == "c is 3, expected text"
-
-
-def test_a_list_of_another_length_is_told() -> None:
-    form = [Paired({"a": [NUMBER], "b": (NUMBER, [NUMBER], None), "c": [NUMBER, TEXT]}, ("a", "b"))]
-    for good in ({"a": [1], "b": 2}, {"a": [1, 2], "b": [3, 4]}, {"a": [], "b": None}):
-        assert mismatch([good | {"c": [1, "x"]}], form, "it") is None
-    assert mismatch([{"a": [1, 2], "b": 3, "c": [1, "x"]}], form) == "[0].b has length 1, expected 2 as a has"
-    assert mismatch([{"a": [], "b": None, "c": [1]}], form) == "[0].c is [1], expected a list of 2"
-    assert mismatch([{"a": [], "b": None, "c": [1, 2]}], form) == "[0].c[1] is 2, expected text"
+from steady_ppl.errors import DataError, UsageError
+from steady_ppl.utils.files import read_json, require_file, whole_file
 
 
 def test_what_may_never_end_is_no_file(tmp_path: Path) -> None:
@@ -44,6 +21,10 @@ def test_what_may_never_end_is_no_file(tmp_path: Path) -> None:
         read_json(tmp_path / "nothing", DataError)
 
 
-def test_what_a_file_says_is_shown_on_one_line() -> None:
-    assert shown("a\x1b[2J\nb\0\u202e") == r"a\x1b[2J\nb\x00\u202e"
-    assert shown("x" * 200, 10) == "x" * 9 + "…"
+def test_what_cannot_be_removed_hides_no_error(tmp_path: Path, monkeypatch) -> None:
+    def refuse(*_, **__):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(UsageError, match="a.csv cannot be written: Read-only"), whole_file(tmp_path / "a.csv"):
+        pass

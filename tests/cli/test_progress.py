@@ -1,0 +1,71 @@
+"""Progress on a terminal: one line that says what is being done and for how long, and is gone afterwards."""
+
+from __future__ import annotations
+
+import io
+import os
+import time
+
+import pytest
+
+from steady_ppl.cli import progress as progress_line
+from steady_ppl.cli.progress import in_words
+from steady_ppl.utils.progress import listening, stages
+
+
+@pytest.mark.parametrize(
+    ("share", "until_now", "elapsed", "said"),
+    [
+        (0.0, 0.0, 5.0, "x … 5 s so far"),
+        (0.5, 10.0, 12.0, "x … about 8 s left"),
+        (0.1, 60.0, 60.0, "x … about 9 min left"),
+        (0.9, 9.0, 20.0, "x … about to end"),
+    ],
+)
+def test_the_time_left_goes_by_what_is_done(share: float, until_now: float, elapsed: float, said: str) -> None:
+    assert in_words("x", share, until_now, elapsed) == said
+
+
+class Terminal(io.StringIO):
+    """A place to write to that says it is a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def two_seconds() -> None:
+    with stages(("first", 1), ("second", 1)) as begin:
+        for _ in range(2):
+            begin()
+            time.sleep(0.7)
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_progress_is_drawn_on_a_terminal_only_and_cleared(monkeypatch, is_terminal: bool) -> None:
+    screen = Terminal() if is_terminal else io.StringIO()
+    monkeypatch.setattr("sys.stderr", screen)
+    monkeypatch.setattr(progress_line, "PATIENCE", 0.1)
+    with progress_line.progress_line() as line, listening(line):
+        two_seconds()
+        shown = screen.getvalue()
+    if not is_terminal:
+        assert screen.getvalue() == ""
+        return
+    assert "first … 0 s so far" in shown or "first … 1 s so far" in shown
+    assert "second … about to end" in shown or "second … about 1 s left" in shown
+    assert shown.endswith(progress_line.CLEAR)
+
+
+@pytest.mark.parametrize("width", [2, 30])
+def test_progress_keeps_to_one_row_of_a_narrow_terminal(monkeypatch, width: int) -> None:
+    screen = Terminal()
+    screen.fileno = lambda: 2
+    monkeypatch.setattr("sys.stderr", screen)
+    monkeypatch.setattr("os.get_terminal_size", lambda _: os.terminal_size((width, 24)))
+    monkeypatch.setattr(progress_line, "PATIENCE", 0.1)
+    with progress_line.progress_line() as line, listening(line), stages(("a stage whose name is long", 1)) as begin:
+        begin()
+        time.sleep(0.7)
+    drawn = screen.getvalue().split(progress_line.CLEAR)
+    assert max(map(len, drawn)) == width - 1 and any(said.startswith("…") for said in drawn)
+    assert width == 2 or any(said.endswith("s so far") for said in drawn)

@@ -1,0 +1,369 @@
+"""`discover`: right about what is planted, silent where nothing is, and honest about what it cannot tell."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from examples import drives, example
+from matplotlib.figure import Figure
+from pyro.nn import PyroParam
+from small import finite
+from torch.distributions import constraints
+
+import steady_ppl as st
+from steady_ppl.discovery.candidates import variance_of_places
+from steady_ppl.discovery.curves import knots_of
+from steady_ppl.discovery.discover import NOT_CONVERGED, _of_one_drive
+from steady_ppl.discovery.finding import _spread, next_run
+from steady_ppl.effects import Effect, chosen_variant, parsed
+from steady_ppl.effects.registry import _EFFECTS, register
+from steady_ppl.likelihood.maximize import maximise
+from steady_ppl.plotting.discovery import unknown_effect
+
+DRIVES, ROWS, SETS = 10, 81, 50
+
+
+def owner():
+    """The hovercraft with the noise that simulates it, everything learnable."""
+    program = example("hovercraft", torch.float32)
+    program.noise = torch.tensor([0.08, 0.08, 0.05])
+    program.guesses = ()
+    return program
+
+
+def tables(program, drives: int = DRIVES, rows: int = ROWS, seed: int = 0):
+    program.duration = (rows - 1) * program.step
+    return st.simulate(program, drives, seed=2 * seed + 1), st.simulate(program, drives, seed=2 * seed + 2)
+
+
+def with_effects(program, *texts):
+    for text in texts:
+        name, at, options, value = parsed(text)
+        program = program.with_effect(chosen_variant(program, name, at, **options), value)
+    return program
+
+
+def discovered(*texts: str, program=None, seed: int = 0, known_start: bool = True, **more) -> st.Discovery:
+    program = owner() if program is None else program
+    train, valid = tables(with_effects(program, *texts), seed=seed)
+    return st.discover(program, train, valid, known_start=known_start, simulations=SETS, **more)
+
+
+@pytest.fixture(scope="module")
+def dragged() -> st.Discovery:
+    return discovered("quadratic_drag=0.05")
+
+
+@pytest.fixture(scope="module")
+def clean() -> st.Discovery:
+    return discovered()
+
+
+def test_a_missing_drag_is_found_with_its_coefficient(dragged):
+    assert dragged.verdict == "dynamics" and dragged.p_value < 0.05
+    (finding,) = dragged.findings
+    assert finding.alike[0] == "quadratic_drag" and finding.confidence > 0.8
+    assert abs(finding.coefficient[0] - 0.05) < 4 * finding.sd[0]
+    low, high = finding.interval[0]
+    assert low < finding.coefficient[0] < high
+    assert high - low == pytest.approx(2 * 1.645 * finding.sd[0], rel=1e-3)
+
+
+def test_the_error_falls_and_the_noise_with_it(dragged):
+    before, after = dragged.figures["before"], dragged.figures["after"]
+    assert after["log_likelihood"] > before["log_likelihood"] + 2
+    assert after["measurement"]["rad"]["3 s"] < 0.9 * before["measurement"]["rad"]["3 s"]
+    noise = [max(side["scales"]["channels"].values()) for side in (before, after)]
+    assert noise[0] > 1.5 * noise[1]
+
+
+def test_the_improved_fit_has_the_effect_and_can_be_kept(dragged, tmp_path):
+    program = dragged.after.program
+    assert float(program.quadratic_drag.detach()) == pytest.approx(dragged.findings[0].coefficient[0])
+    dragged.after.save(tmp_path / "run")
+    again = st.Fit.load(tmp_path / "run")
+    assert float(again.program.quadratic_drag.detach()) == pytest.approx(dragged.findings[0].coefficient[0])
+
+
+def test_clean_drives_give_none_and_say_what_could_have_been_seen(clean):
+    assert clean.verdict == "none" and clean.p_value > 0.05
+    assert clean.findings == [] and clean.shape is None and clean.figures["effect"] is None
+    limits = {one["effect"]: one["detection_limit"] for one in clean.figures["candidates"]}
+    assert 0 < limits["linear_drag"] < 0.2 and 0 < limits["bearing_bias"] < 0.1
+    assert len(limits["slope"]) == 2
+    assert clean.figures["before"] == clean.figures["after"]
+
+
+@pytest.mark.slow
+def test_a_fault_of_the_sensor_is_not_blamed_on_the_dynamics():
+    found = discovered("landmark_bias:1=0.07")
+    assert found.verdict == "sensor" and found.findings[0].alike == ["landmark_bias:bearing_1"]
+    assert abs(found.findings[0].coefficient[0] - 0.07) < 4 * found.findings[0].sd[0]
+
+
+@pytest.mark.slow
+def test_two_effects_are_both_found():
+    found = discovered("linear_drag=0.12", "landmark_bias:2=0.08")
+    assert {finding.alike[0] for finding in found.findings} >= {"landmark_bias:bearing_2"}
+    assert any("linear_drag" in finding.alike for finding in found.findings)
+
+
+@pytest.mark.slow
+def test_what_no_effect_explains_is_a_curve():
+    found = discovered("yaw_linear_drag=0.12", withheld=["yaw_linear_drag", "yaw_quadratic_drag"])
+    assert found.verdict == "other" and found.findings == []
+    shape = found.shape
+    assert (shape.channel, shape.variable) == ("yaw", "yaw_rate")
+    for point, height, band in zip(shape.points, shape.curve, shape.band, strict=True):
+        assert abs(height + 0.12 * point) < 3 * band + 0.02
+    assert found.figures["class"] == [] and found.figures["effect"] is None
+    axes = unknown_effect(found, axes=Figure().subplots())
+    (curve,) = (line for line in axes.get_lines() if line.get_label() == "curve")
+    assert curve.get_ydata().tolist() == pytest.approx(list(shape.curve)) and "yaw_rate [rad/s]" in axes.get_xlabel()
+
+
+@pytest.mark.slow
+def test_noise_that_is_not_the_declared_is_said_to_be():
+    program = owner()
+    truth = owner()
+    truth.noise = 3 * truth.noise.detach()
+    train, valid = tables(truth)
+    found = st.discover(program, train, valid, known_start=True, simulations=SETS)
+    assert found.verdict == "noise"
+    assert all(finding.variant.effect.name == "process_noise" for finding in found.findings)
+    assert found.findings[0].interval[0][0] < 3 < found.findings[0].interval[0][1] * 1.3
+    program.guesses = ("noise",)
+    again = st.discover(program, train, valid, known_start=True, simulations=SETS)
+    assert "process_noise" not in [finding.variant.effect.name for finding in again.findings]
+
+
+@pytest.mark.slow
+def test_a_sensor_whose_noise_is_learned_is_said_not_to_be_the_declared():
+    truth, program = FreeSight(), FreeSight()
+    truth.bearing_sd = torch.tensor(0.12)
+    found = st.discover(program, *tables(truth), known_start=True, simulations=SETS)
+    (finding,) = found.findings
+    assert found.verdict == "noise" and finding.variant.name == "measurement_noise"
+    low, high = finding.interval[0]
+    assert low < 0.12 / 0.06 < high and high - low < 0.2
+    assert "The noise is not as declared: measurement_noise = " in str(found)
+
+
+class FreeSight(type(owner())):
+    """The hovercraft, the standard deviation of its bearings learned."""
+
+    def __init__(self):
+        super().__init__()
+        self.noise = torch.tensor([0.08, 0.08, 0.05])
+        self.bearing_sd = PyroParam(torch.tensor(0.06), constraints.positive)
+
+
+def test_a_gain_of_one_drive_is_said_to_be(dragged):
+    (found,) = dragged.search.found
+    assert _of_one_drive(found) == ""
+    gain = torch.zeros(2 * DRIVES)
+    gain[13] = 9.0
+    alone = replace(found, candidate=replace(found.candidate, gain=gain))
+    assert _of_one_drive(alone).startswith("without drive 4 of the training drives nothing would be left")
+
+
+def test_what_was_found_comes_first_among_the_candidates(dragged):
+    assert dragged.figures["candidates"][0]["effect"] == "quadratic_drag"
+    assert dragged.figures["candidates"][1]["heldout_gain"] is not None
+
+
+def test_what_cannot_be_tested_says_why(clean):
+    notes = {one["effect"]: one["note"] for one in clean.figures["candidates"]}
+    assert notes["process_noise:yaw"] == "the fitted noise against the declared"
+
+
+@pytest.mark.slow
+def test_a_fit_that_has_not_converged_is_said_before_any_ranking(monkeypatch):
+    monkeypatch.setattr("steady_ppl.discovery.refits.maximise", partial(maximise, steps=1))
+    found = discovered("yaw_bias=0.1")
+    assert not found.search.base.converged and NOT_CONVERGED in found.doubts
+    assert str(found).startswith("warning: the program's own fit has not converged")
+    assert found.figures["doubts"] == found.doubts
+
+
+@pytest.mark.slow
+def test_not_knowing_a_knee_is_in_the_coefficients_interval():
+    found = discovered("thrust_saturation:knee=0.6=0.8")
+    (finding,) = found.findings
+    assert finding.variant.name == "thrust_saturation" and abs(finding.coefficient[0] - 0.8) < 3 * finding.sd[0]
+    alone = _spread(found.search, finding.variant, 1)[0]
+    (one,) = found.search.found
+    places = float(variance_of_places(one.without, one.candidate))
+    assert places > 0.1 * alone**2 and finding.sd[0] ** 2 == pytest.approx(alone**2 + places, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_the_next_run_tells_what_these_drives_do_not():
+    """Steady flight at one speed: what brakes it may go with the velocity or with its square."""
+    found = discovered("linear_drag=0.1")
+    (one,) = found.search.found
+    brakes = [c for c in one.candidates if c.variant.name in ("linear_drag", "quadratic_drag")]
+    run = next_run(Unclear(brakes), 0)
+    assert run.between == ["linear_drag", "quadratic_drag"] and run.separation > max(0.0, run.usual)
+    assert {len(values) for values in run.controls.values()} == {ROWS}
+    low, high = (float(edge) for edge in torch.aminmax(found.search.base.folds[0].drives.controls[:-1]))
+    assert all(low - 1e-3 <= value <= high + 1e-3 for values in run.controls.values() for value in values)
+
+
+class Unclear:
+    """A class of several effects."""
+
+    def __init__(self, alike):
+        self.alike = alike
+
+
+def test_a_sensor_that_failed_on_all_training_drives_is_no_obstacle():
+    program = example("pendulum", torch.float32)
+    train, valid = tables(program)
+    train.observed[:] = False
+    train.observed[0] = True
+    with pytest.raises(st.DataError, match="no measurements after their first rows"):
+        st.discover(program, train, valid, simulations=SETS)
+    assert knots_of(torch.zeros(0), circular=False) is None
+
+
+@pytest.mark.slow
+def test_an_effect_of_ones_own_is_found():
+    def tether(self, state, control, time, step, c):
+        return {"yaw": -c * state[..., 2].sin()}
+
+    effect = Effect(
+        name="compass_spring",
+        form="push",
+        equation=r"a_\psi = -c \sin\psi",
+        text="a_yaw = -c sin(heading)",
+        unit="rad/s²",
+        feels="turns north by itself",
+        function=tether,
+        typical=0.1,
+        limit=5.0,
+        lacks=lambda program: None if "heading" in program.angles else "there is no heading",
+    )
+    known = list(_EFFECTS)
+    register(effect)
+    try:
+        found = discovered("compass_spring=0.08")
+    finally:
+        _EFFECTS[:] = known
+    assert found.figures["effect"] == "compass_spring"
+    assert abs(found.findings[0].coefficient[0] - 0.08) < 4 * found.findings[0].sd[0]
+
+
+@pytest.mark.slow
+def test_a_pendulum_lacks_friction_and_a_spring_and_says_so():
+    program = example("pendulum", torch.float32)
+    found = discovered("coulomb_friction=0.8", "cubic_stiffness=4", program=program)
+    assert found.verdict == "dynamics"
+    assert {finding.alike[0] for finding in found.findings} == {"coulomb_friction", "cubic_stiffness"}
+    for finding, planted in ((one, 0.8 if one.alike[0] == "coulomb_friction" else 4) for one in found.findings):
+        assert abs(finding.coefficient[0] - planted) < 4 * finding.sd[0]
+
+
+@pytest.mark.slow
+def test_an_unknown_start_gaps_and_unequal_lengths_do_not_mislead():
+    train, valid = tables(with_effects(owner(), "quadratic_drag=0.06"), rows=91)
+    found = st.discover(owner(), gappy(train, 1), gappy(valid, 2), simulations=SETS)
+    assert found.verdict == "dynamics" and "quadratic_drag" in found.findings[0].alike
+
+
+def gappy(data, seed: int):
+    """A tenth of the cells missing, every third drive twenty rows shorter, no true states."""
+    random = torch.Generator().manual_seed(seed)
+    lengths = data.lengths.clone()
+    lengths[::3] -= 20
+    inside = torch.arange(len(data.time)).unsqueeze(-1) < lengths
+    seen = (torch.rand(data.observed.shape, generator=random) > 0.1) & inside.unsqueeze(-1) & data.observed
+    time = torch.where(inside, data.time, data.time.gather(0, (lengths - 1).unsqueeze(0)))
+    after = (torch.arange(len(data.time)).unsqueeze(-1) - lengths + 1).clamp(min=0)
+    return replace(
+        data,
+        time=time + 0.1 * after,
+        lengths=lengths,
+        observed=seen,
+        measurements=torch.where(seen, data.measurements, 0.0),
+        controls=torch.where(inside.unsqueeze(-1), data.controls, 0.0),
+        states=None,
+    )
+
+
+def test_a_run_that_has_an_effect_is_searched_for_the_next_one(dragged, tmp_path):
+    dragged.after.save(tmp_path / "run")
+    train, valid = tables(with_effects(owner(), "quadratic_drag=0.05"))
+    again = st.discover(st.Fit.load(tmp_path / "run"), train, valid, simulations=SETS)
+    assert "quadratic_drag" not in [finding.variant.name for finding in again.findings]
+    assert again.before.known_start
+
+
+SCHEMA = {
+    "verdict": str,
+    "p_value": float,
+    "effect": (str, type(None)),
+    "class": list,
+    "confidence": (float, type(None)),
+    "candidates": list,
+    "shape": (dict, type(None)),
+    "next_run": (dict, type(None)),
+    "before": dict,
+    "after": dict,
+}
+CANDIDATE = {
+    "effect": str,
+    "kind": str,
+    "statistic": float,
+    "p_value": float,
+    "coefficient": (float, list, type(None)),
+    "sd": (float, list, type(None)),
+    "unit": str,
+    "detection_limit": (float, list, type(None)),
+    "heldout_gain": (float, type(None)),
+    "heldout_gain_ci": (list, type(None)),
+}
+
+
+def test_the_figures_keep_to_the_schema(dragged, clean):
+    for found in (dragged, clean):
+        figures = json.loads(json.dumps(found.figures, allow_nan=False))
+        assert finite(figures)
+        for key, kind in SCHEMA.items():
+            assert isinstance(figures[key], kind), key
+        assert figures["verdict"] in ("none", "dynamics", "actuator", "sensor", "noise", "other")
+        for candidate in figures["candidates"]:
+            for key, kind in CANDIDATE.items():
+                assert isinstance(candidate[key], kind), (candidate["effect"], key)
+        names = [candidate["effect"] for candidate in figures["candidates"]]
+        assert len(names) == len(set(names))
+
+
+def test_the_text_says_the_verdict_first(dragged, clean):
+    assert str(dragged).startswith("The dynamics lack quadratic_drag = 0.0")
+    assert "a = -c v |v|" in str(dragged) and "open-loop error −" in str(dragged)
+    assert str(clean).startswith("No effect is missing as far as these drives can tell (p = ")
+    assert all(len(line) <= 125 for line in str(dragged).splitlines())
+
+
+@pytest.mark.parametrize(("withheld", "says"), [(["linaer_drag"], "did you mean linear_drag"), ("wind", "a list of")])
+def test_what_is_withheld_is_an_effect(withheld, says):
+    program = example("hovercraft")
+    with pytest.raises(st.UsageError, match=says):
+        st.discover(program, st.simulate(program, 10), withheld=withheld)
+
+
+def test_mixed_tables_are_one_and_every_second_drive_chooses() -> None:
+    program = example("hovercraft", torch.float32)
+    train, valid = drives(program, 6, 21, seed=1), drives(program, 5, 21, seed=2)
+    found = st.discover(program, train, valid, known_start=True, mix=True, simulations=50)
+    first, second = found.search.base.folds
+    assert first.drives.labels == ("train 1", "train 3", "train 5", "valid 1", "valid 3", "valid 5")
+    assert second.drives.labels == ("train 2", "train 4", "train 6", "valid 2", "valid 4")
+    assert "the tables were mixed: 5 of the 11 drives were kept to choose by" in found.notes
+    with pytest.raises(st.UsageError, match="mix puts two tables together"):
+        st.discover(program, train, known_start=True, mix=True)

@@ -1,0 +1,115 @@
+"""Programs with candidates, fitted to one half of the drives and judged on the other."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from examples import drives, example
+
+from steady_ppl.discovery.candidates import gain_of_fits
+from steady_ppl.discovery.fitting import ByDraws
+from steady_ppl.discovery.refits import (
+    Fold,
+    first_by_draws,
+    first_refit,
+    fit_near,
+    judged_fits,
+    refit_with,
+    starts_by_draws,
+)
+from steady_ppl.effects import chosen_variant
+from steady_ppl.errors import FilterError
+from steady_ppl.gaussian.smoother import find_path, smooth
+from steady_ppl.likelihood.maximize import maximise
+from steady_ppl.model.problem import Problem
+
+
+def test_fits_by_draws_begin_at_the_likelier_program() -> None:
+    good, far = example("hovercraft", torch.float32), example("hovercraft", torch.float32)
+    data = drives(good, 4, 41, seed=1)
+    far.mass = torch.tensor(4.5)
+    path = find_path(Problem(good, data, True))
+    fold = Fold(data, path, data, path, True)
+    for given, fitted in ((good, far), (far, good)):
+        first, second = starts_by_draws(given, fitted, fold)
+        assert first.program is good and second.program is far
+        assert first.log_likelihood > second.log_likelihood
+        assert first.path.states.shape == path.states.shape
+    stiff, still = good.with_effect("linear_drag", 1e3), good.with_effect("linear_drag", 0.0)
+    for given, fitted in ((still, stiff), (stiff, still)):
+        assert [start.program is still for start in starts_by_draws(given, fitted, fold)] == [True]
+    with pytest.raises(FilterError):
+        starts_by_draws(stiff, stiff, fold)
+
+
+def test_where_a_climb_by_draws_diverges_another_begins_at_the_program_as_given(monkeypatch) -> None:
+    given, fitted = example("hovercraft", torch.float32), example("hovercraft", torch.float32)
+    data = drives(fitted, 4, 41, seed=1)
+    given.mass = torch.tensor(1.8)
+    path = find_path(Problem(fitted, data, True))
+    folds = [Fold(data, path, data, path, True)] * 2
+    began = []
+
+    def train(program, guide, *arguments, **settings):
+        began.append(float(program.mass.detach()))
+        if began[-1] < 1.7:
+            raise FilterError("the model diverges")
+
+    monkeypatch.setattr("steady_ppl.discovery.fitting.train", train)
+    base = first_by_draws(given, [fitted, fitted], folds, seed=0)
+    assert began == pytest.approx([1.5, 1.8, 1.8])
+    assert [float(program.mass.detach()) for program in base.programs] == pytest.approx([1.8, 1.8])
+    assert isinstance(base.fitting, ByDraws)
+    began.clear()
+    with pytest.raises(FilterError, match="diverges"):
+        first_by_draws(fitted, [given, given], folds, seed=0)
+    assert began == pytest.approx([1.5])
+
+
+def test_drives_are_judged_by_fits_that_have_seen_them_for_the_noise_alone():
+    truth = example("hovercraft").with_effect("yaw_bias", 0.08)
+    program = example("hovercraft")
+    train, valid = drives(truth, 6, 41, seed=1), drives(truth, 8, 41, seed=2)
+    base = first_refit(Problem(program, train, True), valid, seed=0)
+    found = refit_with(base, chosen_variant(program, "yaw_bias", ""), 0.01)
+    assert not isinstance(found, str)
+    assert found.held_out.shape == (14,)
+    variant = chosen_variant(program, "yaw_bias", "")
+    first, second = (float(value) for value in found.coefficients(variant))
+    assert float(found.coefficient(variant)) == pytest.approx((6 * first + 8 * second) / 14)
+    judged = smooth(Problem(found.judges.programs[0], valid, True), found.folds[0].held_out_path, passes=4)
+    torch.testing.assert_close(found.held_out[:8], judged.log_likelihood, atol=0.05, rtol=0)
+    again = maximise(Problem(copy.deepcopy(found.programs[0]), train, True), found.folds[0].path)
+    assert again.objective == pytest.approx(found.maxima[0].objective, abs=0.1)
+    assert float((found.held_out - base.held_out).sum()) > 5
+
+
+def test_fits_begin_at_the_declared_noise_as_well_where_the_program_alone_explains_nothing():
+    """A sensor far worse than declared: without it, only process noise beyond all measure explains the drives."""
+    truth, program = example("hovercraft"), example("hovercraft")
+    for one in (truth, program):
+        one.noise = torch.tensor([0.08, 0.08, 0.05]).double()
+    truth = truth.with_effect("range_dependent_noise", 0.1)
+    train, valid = drives(truth, 6, 41, seed=1), drives(truth, 6, 41, seed=2)
+    base = first_refit(Problem(program, train, True), valid, seed=0)
+    assert base.unwidened is not None and float(base.program.noise.detach().max()) > 20 * 0.05
+    variant = chosen_variant(program, "range_dependent_noise", "")
+    found = refit_with(base, variant, 0.05)
+    assert not isinstance(found, str)
+    assert float(found.coefficient(variant)) == pytest.approx(0.1, rel=0.3)
+    assert all(one.noise.detach().max() < base.program.noise.detach().max() / 20 for one in found.programs)
+
+
+def test_a_fit_at_another_knee_is_the_one_from_nothing():
+    truth, program = example("hovercraft").with_effect("thrust_saturation", 0.8, knee=0.6), example("hovercraft")
+    train, valid = drives(truth, 5, 41, seed=1), drives(truth, 5, 41, seed=2)
+    base = first_refit(Problem(program, train, True), valid, seed=0)
+    assert base.unwidened is None
+    knees = [chosen_variant(program, "thrust_saturation", knee=knee) for knee in (0.5, 0.65)]
+    direct = [refit_with(base, knee, 0.5) for knee in knees]
+    near = judged_fits(fit_near(base, direct[0], [knees[1]]))
+    assert gain_of_fits(base, near) == pytest.approx(gain_of_fits(base, direct[1]), abs=0.2)
+    # fits rest within .02 nats of their maxima, .2 standard deviations: of two fits on two folds .4 nats, three of them
+    assert float((near.held_out - direct[1].held_out).sum()) == pytest.approx(0.0, abs=1.2)

@@ -1,0 +1,117 @@
+"""Scoring steps end where log p(y) is largest."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import pyro.distributions as dist
+import pytest
+import torch
+from examples import drives, example
+
+from steady_ppl import for_program, simulate
+from steady_ppl.gaussian.smoother import find_path, smooth
+from steady_ppl.likelihood.maximize import maximise, refit_outliers, widen_noise
+from steady_ppl.likelihood.parameters import elements
+from steady_ppl.model.problem import Problem
+
+
+def likelihood_of_cart(program, data) -> float:
+    path = find_path(Problem(program, data, True))
+    return float(smooth(Problem(program, data, True), path).log_likelihood.sum())
+
+
+@pytest.fixture(scope="module")
+def cart():
+    program = example("linear_gaussian")
+    data = drives(program, 30, 60)
+    maximum = maximise(Problem(program, data, True))
+    return program, data, maximum
+
+
+def test_no_neighbour_is_likelier(cart):
+    program, data, maximum = cart
+    assert maximum.converged and maximum.names == ("gain", "damping", "noise", "measurement_sd")
+    best = float(maximum.log_likelihood.sum())
+    assert best == pytest.approx(likelihood_of_cart(program, data), abs=1e-3)
+    for part in elements(program):
+        for by in (-0.1, 0.1):
+            neighbour = copy.deepcopy(program)
+            own = next(one for one in elements(neighbour) if one.name == part.name)
+            own.move(by)
+            assert likelihood_of_cart(neighbour, data) < best
+
+
+def test_the_start_does_not_matter(cart):
+    program, data, maximum = cart
+    far = example("linear_gaussian")
+    for part, by in zip(elements(far), (1.0, -1.0, 0.7, -0.5), strict=True):
+        part.move(by)
+    again = maximise(Problem(far, data, True))
+    assert again.objective == pytest.approx(maximum.objective, abs=0.05)
+    for ours, theirs in zip(elements(far), elements(program), strict=True):
+        torch.testing.assert_close(ours.parameter.data, theirs.parameter.data, atol=0.02, rtol=0.02)
+
+
+def test_a_prior_pulls(cart):
+    program, data, _ = cart
+    pulled = copy.deepcopy(program)
+    pulled.priors = {"gain": dist.Normal(2.0, 0.005)}
+    maximise(Problem(pulled, data, True))
+    gain, before = float(pulled.gain.detach()), float(program.gain.detach())
+    assert before < gain < 2.0 and 2.0 - gain < (2.0 - before) / 4
+
+
+def test_noise_is_widened_before_a_program_that_explains_nothing_is_fitted():
+    """A strong yaw drag that is missing: from the declared noise scoring steps end anywhere."""
+    truth, program = example("hovercraft"), example("hovercraft")
+    program.noise = torch.tensor([0.08, 0.08, 0.05]).double()
+    truth.noise = torch.tensor([0.08, 0.08, 0.05]).double()
+    data = drives(truth.with_effect("yaw_quadratic_drag", 0.25), 6, 61)
+    path = widen_noise(Problem(program, data, True))
+    assert float(program.noise.detach().min()) > 0.1
+    assert maximise(Problem(program, data, True), path).converged
+    right = example("hovercraft")
+    before = right.noise.detach().clone()
+    widen_noise(Problem(right, drives(right, 6, 41), True))
+    assert torch.equal(right.noise.detach(), before)
+
+
+def test_a_fit_that_cannot_reach_what_it_must_ends_after_six_steps_and_one_that_rises_goes_on(cart):
+    _, data, maximum = cart
+    best = float(maximum.log_likelihood.sum())
+
+    def steps(hopeless):
+        far = example("linear_gaussian")
+        for part, by in zip(elements(far), (1.0, -1.0, 0.7, -0.5), strict=True):
+            part.move(by)
+        return maximise(Problem(far, data, True), hopeless=hopeless)
+
+    whole = steps(-float("inf"))
+    assert whole.converged and whole.steps > 8
+    assert steps(best - 10).steps == whole.steps
+    assert steps(best + 1e6).steps == 6
+
+
+def test_a_fit_that_begins_with_too_much_information_does_not_end_at_once(cart):
+    _, data, maximum = cart
+    far = example("linear_gaussian")
+    for part, by in zip(elements(far), (0.2, -0.2, 0.1, -0.1), strict=True):
+        part.move(by)
+    again = maximise(Problem(far, data, True), information=1e4 * maximum.information, steps=60)
+    assert again.objective == pytest.approx(maximum.objective, abs=0.1)
+
+
+def test_a_drive_whose_path_is_lost_is_fitted_again():
+    program = example("hovercraft", torch.float32)
+    program.noise, program.guesses = torch.tensor([0.08, 0.08, 0.05]), ()
+    program.duration = 40 * program.step
+    data = for_program(program, simulate(program, 6, seed=1)).without_truth(keep_start=True)
+    right = maximise(Problem(program, data, True))
+    lost, states = right.log_likelihood.clone(), right.path.states.clone()
+    lost[2], states[1:, 2] = -500.0, 0.0
+    problem = Problem(program, data, True)
+    found = refit_outliers(problem, replace(right, log_likelihood=lost, path=replace(right.path, states=states)))
+    assert torch.allclose(found.log_likelihood, right.log_likelihood, atol=0.3)
+    assert refit_outliers(problem, right) is right
