@@ -20,11 +20,9 @@ import typer
 
 import steady_ppl as st
 from steady_ppl.errors import ComputationError, RunError
-from steady_ppl.runs.workbench import TRUTH, empty_again, workbench
+from steady_ppl.runs.workbench import TRUE_PROGRAM, empty_again, workbench
 from steady_ppl.utils.files import read_json
-from steady_ppl.utils.text import aligned, tell
-
-WIDTH = 100
+from steady_ppl.utils.text import TEXT_WIDTH, aligned, tell
 
 
 @dataclass
@@ -57,7 +55,7 @@ class Tour:
         step = self.steps[-1]
         step["seconds"], step["result"] = round(time.perf_counter() - step.pop("began"), 1), text
         said = f"{text} ({step['seconds']:.0f} s)"
-        self.say(textwrap.fill(said, WIDTH, initial_indent="   → ", subsequent_indent="     "))
+        self.say(textwrap.fill(said, TEXT_WIDTH, initial_indent="   → ", subsequent_indent="     "))
 
 
 def run(command: Any, arguments: Sequence[str]) -> str:
@@ -72,7 +70,7 @@ def run(command: Any, arguments: Sequence[str]) -> str:
     return said.getvalue()
 
 
-RECORD = "demo.json"  # of a demonstration; a folder without one is not a demonstration's
+DEMO_RECORD = "demo.json"  # of a demonstration; a folder without one is not a demonstration's
 OWNERS = "models/hovercraft.py"
 BEGINNING = (
     "A hovercraft whose owner's program knows no drag. What it did is known only by noisy bearings to four landmarks, "
@@ -110,7 +108,7 @@ def demonstrate(
     began = time.perf_counter()
     tour = Tour(command, say, force=out.exists())
     _open(out, force)
-    say(textwrap.fill(BEGINNING, WIDTH))
+    say(textwrap.fill(BEGINNING, TEXT_WIDTH))
     say(f"\n   $ cd {shlex.quote(str(out))}")
     with chdir(out):
         record_drives(tour, size)
@@ -123,14 +121,14 @@ def demonstrate(
         grown = add(tour, discover(tour, size))
         tour.step("Fit again, in the same way, on the same drives; and the true structure, as the yardstick")
         said = _fit(tour, grown, "after")
-        _fit(tour, TRUTH, "oracle")
+        _fit(tour, TRUE_PROGRAM, "oracle")
         tour.result(said)
         prove(tour)
         tour.step("See it: everything on one page")
         tour.steady(f"report runs/before runs/after test.csv --discovery runs/found{sets} --out report.html")
         tour.result("report.html: open it in a browser, it needs no network.")
-        hidden = f"What had been hidden: {st.load_program(TRUTH)}."
-        say(textwrap.fill(hidden, WIDTH, initial_indent="\n   ", subsequent_indent="   "))
+        hidden = f"What had been hidden: {st.load_program(TRUE_PROGRAM)}."
+        say(textwrap.fill(hidden, TEXT_WIDTH, initial_indent="\n   ", subsequent_indent="   "))
         _write_record({"status": "finished", "seconds": round(time.perf_counter() - began, 1), "steps": tour.steps})
     say(f"\n{out}: report.html; check, discovery and proof as .png, .txt and .json; drives; runs; {grown}")
     say(f"{time.perf_counter() - began:.0f} s in all")
@@ -140,7 +138,7 @@ def record_drives(tour: Tour, size: Size) -> None:
     """Simulate drives of a hovercraft with drag, and forget its poses."""
     tour.step("Record drives, of a hovercraft that does have drag")
     for seed, (name, count) in enumerate((("train", size.train), ("valid", size.valid), ("test", size.test)), 1):
-        tour.steady(f"simulate {TRUTH} --trajectories {count} --seed {seed} --out {name}.csv")
+        tour.steady(f"simulate {TRUE_PROGRAM} --trajectories {count} --seed {seed} --out {name}.csv")
     for table in ("train.csv", "valid.csv"):
         st.write_table(st.read_table(table).without_truth(keep_start=True), table)
     tour.result(
@@ -183,7 +181,7 @@ def prove(tour: Tour) -> None:
     """Before and after on the locked drives."""
     tour.step("Prove: on the locked drives, which nothing has seen so far")
     tour.steady(
-        f"prove runs/before runs/after test.csv --oracle runs/oracle --truth {TRUTH} "
+        f"prove runs/before runs/after test.csv --oracle runs/oracle --truth {TRUE_PROGRAM} "
         "--json proof.json --picture proof.png",
         keep="proof.txt",
     )
@@ -221,7 +219,7 @@ def _fit(tour: Tour, program: str, run: str) -> str:
 
 def _open(out: Path, force: bool) -> None:
     """Make the folder, mark it as a demonstration's, and put the owner's program there."""
-    if out.exists() and not force and not (out / RECORD).is_file():
+    if out.exists() and not force and not (out / DEMO_RECORD).is_file():
         raise RunError(f"{out} exists and is no demo's: choose another folder, or --force to write into it")
     source = workbench() / OWNERS
     with empty_again(out):
@@ -232,7 +230,7 @@ def _open(out: Path, force: bool) -> None:
 
 
 def _write_record(content: Mapping[str, Any]) -> None:
-    Path(RECORD).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    Path(DEMO_RECORD).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def demo(

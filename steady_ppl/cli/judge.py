@@ -218,9 +218,9 @@ def report(
 
 def _made(runs: list[Path], discovery: Path | None) -> list[str]:
     """How each of the runs, and what was discovered, were made, by which command if one did."""
-    from steady_ppl.runs.folder import RECORD, read_record
+    from steady_ppl.runs.folder import RUN_RECORD, read_record
 
-    if discovery is not None and (discovery / RECORD).is_file() and discovery not in runs:
+    if discovery is not None and (discovery / RUN_RECORD).is_file() and discovery not in runs:
         runs = [*runs[:1], discovery, *runs[1:]]
     made = []
     for run in runs:

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from steady_ppl.comparison.result import FLOOR, Proof
+from steady_ppl.comparison.result import CONSTANT_VELOCITY, NOISE_FLOOR, Proof
 from steady_ppl.comparison.scores import (
     MIN_DRIVES,
-    SECONDS,
+    PROOF_HORIZONS_SECONDS,
     Judged,
     ProgramScores,
     as_row,
@@ -33,7 +33,6 @@ from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
 
-CONSTANT_VELOCITY = "constant velocity"
 MAX_NEGLECTED = 2.0  # nats of a drive's log p(y) between a particle filter and the linearised program
 
 
@@ -100,14 +99,14 @@ def prove(
     if isinstance(coasting, Judged):
         judged[CONSTANT_VELOCITY] = coasting
     floor = noise_floor(true, seed) if true else None
-    absent = {CONSTANT_VELOCITY: coasting, FLOOR: floor}
+    absent = {CONSTANT_VELOCITY: coasting, NOISE_FLOOR: floor}
     notes += [f"no row {name!r}: {why}" for name, why in absent.items() if isinstance(why, str)]
     counted = _counted(judged.values())
     found = {name: as_row(row, counted) for name, row in judged.items()}
     if isinstance(floor, Judged):
-        found[FLOOR] = as_row(floor, _counted([floor]))
+        found[NOISE_FLOOR] = as_row(floor, _counted([floor]))
     drives = before.problem.data
-    horizons = named_horizons(drives, SECONDS)
+    horizons = named_horizons(drives, PROOF_HORIZONS_SECONDS)
     notes += drives.uneven_steps + diagnose_units(before.problem.program, drives)
     notes += _few_starts(drives, horizons, known_start) + unfinished(rows) + _blown_up(found) + far_off(found, data)
     return Proof(found, reference, horizons, drives.median_step, len(data), known_start, seed, notes)
@@ -134,7 +133,7 @@ def _require(programs: Mapping[str, Program], reference: str, truth: str | None,
     for name in (reference, truth):
         if name is not None and name not in programs:
             raise UsageError(f"there is no row {name!r}; the rows are {', '.join(programs)}")
-    for taken in {FLOOR, CONSTANT_VELOCITY} & programs.keys():
+    for taken in {NOISE_FLOOR, CONSTANT_VELOCITY} & programs.keys():
         raise UsageError(f"a row cannot be called {taken!r}: that is the name of a row of its own")
     ours = programs[reference].measurement_names
     for name, program in programs.items():

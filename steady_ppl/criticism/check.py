@@ -15,7 +15,7 @@ import torch
 from steady_ppl.criticism.attribution import SCATTER, attribute, scored
 from steady_ppl.criticism.baselines import constant_velocity, last_measurement
 from steady_ppl.criticism.perturbations import directions
-from steady_ppl.criticism.reference_sets import MIN_SETS, residuals, simulate_sets
+from steady_ppl.criticism.reference_sets import MIN_BAND_SETS, residuals, simulate_sets
 from steady_ppl.criticism.residual_maps import Residuals, judge
 from steady_ppl.criticism.result import Check
 from steady_ppl.criticism.step_size import check_step
@@ -33,7 +33,7 @@ from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
-SECONDS = (1.0, 3.0)
+CHECK_HORIZONS_SECONDS = (1.0, 3.0)  # ahead, besides one step
 MAX_RESIDUAL_SD = 4.0  # of a single residual; beside a landmark the linearised program knows no more
 
 
@@ -61,14 +61,14 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     program = fit.program
     problem = Problem.of_table(program, data, fit.known_start)
     run = problem.data
-    if simulations < MIN_SETS:
-        raise UsageError(f"got {simulations} simulations: bands need at least {MIN_SETS}, and 100 are better")
+    if simulations < MIN_BAND_SETS:
+        raise UsageError(f"got {simulations} simulations: bands need at least {MIN_BAND_SETS}, and 100 are better")
     if run.time.shape[0] < 2 or not bool(run.observed[1:].any()):
         raise DataError("nothing to compare: no trajectory has a measurement after its first row")
     refuse_long(run)
     if (why := problem.why_not_linear()) is not None:
         raise UsageError(f"check needs a program that can be linearised: {why.split(': looking')[0]}")
-    horizons = named_horizons(run, SECONDS)
+    horizons = named_horizons(run, CHECK_HORIZONS_SECONDS)
     parts = (("finding paths", 1), ("comparing time steps", 1), ("simulating drives", 2), ("judging", 2))
     with stages(*parts) as begin:
         begin()

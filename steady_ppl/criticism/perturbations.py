@@ -27,7 +27,7 @@ from steady_ppl.utils.angles import wrap, wrap_angles
 LAG = 0.3  # s
 DEAD_ZONE, SATURATION_KNEE = 0.2, 0.6  # of the largest command
 NOT_SUMMED = ("offset of", "curvature in")  # in the controls' own units
-MAX_PARAMETERS = 40  # parameters; a network's are not looked at one by one
+MAX_SCORED_PARAMETERS = 40  # parameters; a network's are not looked at one by one
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class _Scores:
 
     def of_parameters(self) -> Named:
         """The program's own parameters, where they move the mean."""
-        if not 0 < sum(value.numel() for value in self.program.parameters()) <= MAX_PARAMETERS:
+        if not 0 < sum(value.numel() for value in self.program.parameters()) <= MAX_SCORED_PARAMETERS:
             return
         parts = elements(self.program, frozen=True)
         for part, score in zip(parts, (self._pushed_by(parts) + self._shifted_by(parts)).unbind(-1), strict=True):

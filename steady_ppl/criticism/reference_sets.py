@@ -26,10 +26,10 @@ from steady_ppl.utils.angles import wrap_angles
 from steady_ppl.utils.cores import Result, side_by_side
 from steady_ppl.utils.random import seeded
 
-MIN_SETS = 20  # sets
+MIN_BAND_SETS = 20  # simulated sets for bands
 MAX_ROWS_OF_BLOCK = 100_000  # of all drives of a block: the memory of larger arrays takes longer to get than to fill
 ROUNDING = 1e-5  # of a state, in single precision
-LINEARISATIONS = 4  # of drives that need them: beside a landmark the truth is far from the mode
+MAX_LINEARISATIONS = 4  # of drives that need them: beside a landmark the truth is far from the mode
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def simulate_sets(problem: Problem, starts: Tensor, channels: int, horizons: Seq
     jobs = [partial(simulate, number, block) for number, block in enumerate(starts.split(at_once))]
     blocks = [(tensors, said) for tensors, said in side_by_side(jobs) if tensors]
     sets = sum(len(tensors["values"]) for tensors, _ in blocks)
-    if sets < MIN_SETS:
+    if sets < MIN_BAND_SETS:
         what = f"{len(starts) - sets} of {len(starts)} simulated sets blew up"
         raise FilterError(f"{what}: the fitted program does not even explain drives of its own")
 
@@ -117,7 +117,7 @@ def _tracked(problem: Problem, truth: ReferencePath) -> tuple[ReferencePath, Tra
     if bool(far.any()):
         index = far.nonzero().flatten()
         begin = ReferencePath(truth.states[:, index], truth.noise[:, index])
-        path = problem.subset(index).smooth(begin, passes=LINEARISATIONS).linearization.path
+        path = problem.subset(index).smooth(begin, passes=MAX_LINEARISATIONS).linearization.path
         near.states[:, index], near.noise[:, index] = path.states, path.noise
         tracked = problem.track(near, passes=1)
     return near, tracked

@@ -29,9 +29,9 @@ from steady_ppl.utils.random import seeded
 MIN_GAIN = 3.0  # nats, of all drives together, from which a finer step counts
 MAX_SHIFT = 2.0  # nats that watched parameters of another step lie below the maximum: two standard deviations
 MAX_DECREMENT = 1.0  # nats that a scoring step may promise; beyond it more steps may gain far more
-PRECISION = 0.005  # nats, of refits
+REFIT_PRECISION = 0.005  # nats
 MAX_SUBSTEPS_TRIED = 32  # of a trial, unless more are asked for; a program may always be tried at twice its own
-REFITS = 25  # scoring steps of a fit
+MAX_REFIT_STEPS = 25  # scoring steps of a fit
 UNKNOWN = "whether the time step suits is not known"
 
 
@@ -199,12 +199,12 @@ def check_step(
         if steps:
             with seeded(substeps, "wider noise"):
                 path = widen_noise(Problem(changed, data, known_start), path)
-        maximum = maximise(changed, data, path, known_start=known_start, steps=steps, precision=PRECISION)
+        maximum = maximise(changed, data, path, known_start=known_start, steps=steps, precision=REFIT_PRECISION)
         return _trial(changed, maximum, names)
 
     def again(coarse: StepTrial, fine: StepTrial) -> StepTrial:
         try:
-            found = trial(coarse.substeps, fine.program, fine.path, REFITS)
+            found = trial(coarse.substeps, fine.program, fine.path, MAX_REFIT_STEPS)
         except FilterError:  # it diverges with these parameters, or these drives do not tell them apart
             return coarse
         return found if found.log_likelihood > coarse.log_likelihood - MIN_GAIN else coarse
@@ -235,7 +235,7 @@ def check_step(
         go_on = True
         while go_on and 2 * trials[-1].substeps <= most:
             coarse = trials[-1]
-            fine = trial(2 * coarse.substeps, coarse.program, coarse.path, REFITS)
+            fine = trial(2 * coarse.substeps, coarse.program, coarse.path, MAX_REFIT_STEPS)
             trials.append(fine)
             if refits and _differs(coarse, fine, max_shift):  # several maxima of one program are no matter of its step
                 trials[-2] = again(coarse, fine)

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from steady_ppl.comparison.prove import far_off, prove
+from steady_ppl.comparison.scores import MIN_DRIVES
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories, joined
 from steady_ppl.discovery.candidates import TIE_NATS
@@ -33,8 +34,8 @@ from steady_ppl.utils.journal import journal
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
-FITTED_FURTHER = 10.0  # nats that fitting a run further may gain before it is said
-MIN_DRIVES, MIN_SETS = 5, 50
+MAX_UNREPORTED_GAIN = 10.0  # nats that fitting a run further may gain before it is said
+MIN_SETS = 50  # simulated sets for the calibration
 NOT_CONVERGED = "the program's own fit has not converged: no ranking below is to be trusted"
 
 
@@ -137,7 +138,7 @@ def discover(
 
 def _doubts(found: Search, is_fitted: bool) -> list[str]:
     doubts = [] if found.base.converged else [NOT_CONVERGED]
-    if is_fitted and found.gained > FITTED_FURTHER:
+    if is_fitted and found.gained > MAX_UNREPORTED_GAIN:
         doubts.append(
             f"the run had not converged: fitting it further gained {found.gained:.0f} nats on these drives, before "
             "anything was added. What follows begins from there; `steady prove` against the run would count them as "

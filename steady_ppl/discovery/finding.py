@@ -9,6 +9,7 @@ import torch
 from scipy import special
 from torch import Tensor
 
+from steady_ppl.comparison.scores import RESAMPLES
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.candidates import Candidate, variance_of_places
 from steady_ppl.discovery.curves import unit_of
@@ -21,11 +22,10 @@ from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.random import seeded
 
-INTERVAL = 0.9
-HALF_WIDTH = float(-special.ndtri((1 - INTERVAL) / 2))  # standard deviations on either side of it
-RESAMPLES = 2000
-DRIVES = 24  # simulated for each proposal
-TYPES = 3  # of every way of driving
+INTERVAL_COVERAGE = 0.9  # of the intervals of coefficients, and of the band of a curve
+HALF_WIDTH = float(-special.ndtri((1 - INTERVAL_COVERAGE) / 2))  # of such an interval, in standard deviations
+MAX_SIMULATED_DRIVES = 24  # of each proposed excitation
+EXCITATIONS_OF_KIND = 3  # that are held, pushed, stepped and swung
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def shape_of(search: Search, program: Program) -> Shape | None:
         return None
     variant = curve.variant
     heights = curve.refit.coefficient(variant)
-    width = float(-special.ndtri((1 - INTERVAL) / 2 / len(heights))) * math.sqrt(curve.refit.first_share)
+    width = float(-special.ndtri((1 - INTERVAL_COVERAGE) / 2 / len(heights))) * math.sqrt(curve.refit.first_share)
     channel = variant.at.partition("~")[0]
     variable = variant.options.get("variable", "reading")
     about = program.measurement_names[0] if channel == "all" else channel
@@ -196,7 +196,7 @@ def next_run(found: Found, seed: int) -> NextRun | None:
 def _separation(refits: list[Refit], controls: Tensor, seed: int) -> float:
     """Nats a drive by which the first member is told from the nearest other."""
     fold, (program, *others) = refits[0].folds[0], [refit.judges.programs[0] for refit in refits]
-    count = min(DRIVES, len(fold.drives))
+    count = min(MAX_SIMULATED_DRIVES, len(fold.drives))
     drives = replace(fold.drives.subset(range(count)), controls=controls[:, :count].contiguous())
     starts = fold.path.states[0, :count].unsqueeze(0)
     with seeded(seed, "next run"):
@@ -219,7 +219,7 @@ def _ways(data: Trajectories, seed: int) -> Iterator[tuple[str, Tensor]]:
     time = torch.arange(rows).to(driven) / max(1, rows - 1)
     middle = (low + high) / 2
     with seeded(seed, "ways of driving"):
-        for index in range(TYPES):
+        for index in range(EXCITATIONS_OF_KIND):
             held = torch.where(torch.rand(count) < 0.5, low, high)
             yield f"hold {index + 1}: one level throughout", held.expand(rows, count).clone()
             least = torch.zeros_like(low).clamp(low, high)

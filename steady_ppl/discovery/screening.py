@@ -19,7 +19,7 @@ import torch
 from scipy import optimize, special
 from torch import Tensor
 
-from steady_ppl.discovery.curves import NAME as CURVE, prior_covariance
+from steady_ppl.discovery.curves import CURVE, prior_covariance
 from steady_ppl.discovery.effect_scores import Column
 from steady_ppl.discovery.refits import Fold, Refit, as_declared
 from steady_ppl.effects import Variant, attached, catalogue
@@ -27,7 +27,7 @@ from steady_ppl.likelihood.parameters import Element, on_both_sides
 from steady_ppl.likelihood.scores import measured, substep_spreads
 from steady_ppl.model.program import Program
 
-ALPHA, POWER = 0.05, 0.95
+FAMILY_LEVEL, POWER = 0.05, 0.95  # of the tests of all candidates together, and at a detection limit
 MIN_SHARE_OF_INFORMATION = 1e-4  # of a column, that the fitted parameters must leave for it to be tested
 CONTAINED = "the fitted parameters already explain it"
 UNEXCITED = "these drives never excite it"
@@ -139,7 +139,7 @@ def screen(
 
 def _critical(simulated: np.ndarray) -> float:
     """The largest p-value below which the family's own p-value, (1 + sets as extreme) / (1 + sets), keeps the level."""
-    allowed = int(ALPHA * (len(simulated) + 1)) - 1
+    allowed = int(FAMILY_LEVEL * (len(simulated) + 1)) - 1
     return float(np.nextafter(np.sort(simulated)[max(0, allowed)], 0.0))
 
 

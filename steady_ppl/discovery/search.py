@@ -15,7 +15,7 @@ from steady_ppl.criticism.step_size import StepCheck, check_step
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.candidates import (
     CLEAR_GAIN,
-    NEAR_ALPHA,
+    NEAR_FAMILY_LEVEL,
     TIE_NATS,
     Candidate,
     Screening,
@@ -35,7 +35,7 @@ from steady_ppl.discovery.refits import (
     judged_fits,
     refit_with,
 )
-from steady_ppl.discovery.screening import ALPHA, Tested
+from steady_ppl.discovery.screening import FAMILY_LEVEL, Tested
 from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
 from steady_ppl.likelihood.problem import Problem
@@ -84,7 +84,7 @@ class Round:
     @property
     def quiet(self) -> bool:
         """Whether the tests found nothing."""
-        return self.screening.tests.p_value > ALPHA
+        return self.screening.tests.p_value > FAMILY_LEVEL
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ def _add_best(found: Search, screening: Screening, index: int) -> bool:
     if index == 0 and best is None:
         found.curves = _curves(found)
         if found.curve is None and not found.departed:  # neither can be what the tests found
-            best = next((c for c in able if c.total > TIE_NATS and c.tested.p_value <= NEAR_ALPHA), None)
+            best = next((c for c in able if c.total > TIE_NATS and c.tested.p_value <= NEAR_FAMILY_LEVEL), None)
     found.rounds[-1] = Round(screening, candidates, best)
     if best is None:
         return False

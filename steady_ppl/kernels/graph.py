@@ -17,7 +17,7 @@ from torch import Tensor
 
 from steady_ppl.errors import SteadyError
 
-PARAMETERS, TRAJECTORY, PARTICLE = range(3)  # what a value depends on
+PARAMETERS_ALONE, TRAJECTORY, PARTICLE = range(3)  # what a value depends on
 LEAVES = ("input", "parameter", "constant", "element")
 UNROLLED = 48  # the largest matrix whose product is written out element by element
 TOO_LONG = 3000  # scalar operations; compiling more takes longer than a fit
@@ -83,7 +83,7 @@ class ScalarGraph:
                 case "input":
                     level = self.levels_of_inputs[arguments[0]]
                 case "parameter" | "constant":
-                    level = PARAMETERS
+                    level = PARAMETERS_ALONE
                 case "element":
                     level = PARTICLE
                 case _:
@@ -243,8 +243,8 @@ class Tangents:
         tangents = [self._of_all(operand) for operand in operands]
         if operation in FLAT or all(tangent is None for tangent in tangents):
             return None
-        if operation in CHOICES:
-            condition, yes, no = CHOICES[operation](self, operands, tangents)
+        if operation in SELECTIONS:
+            condition, yes, no = SELECTIONS[operation](self, operands, tangents)
             zero = self.constants(0.0, value)
             return self.do("where", condition, zero if yes is None else yes, zero if no is None else no)
         if operation not in PARTIALS:
@@ -326,7 +326,7 @@ PARTIALS: dict[str, Callable[..., tuple[Values | None, ...]]] = {
 }
 
 # those that pass one operand on: which, and the derivatives that are passed on with it
-CHOICES: dict[str, Callable[[Tangents, Any, Any], Any]] = {
+SELECTIONS: dict[str, Callable[[Tangents, Any, Any], Any]] = {
     "where": lambda d, operands, tangents: (operands[0], tangents[1], tangents[2]),
     "relu": lambda d, operands, tangents: (d.do("gt", operands[0], 0.0), tangents[0], None),
     "maximum": lambda d, operands, tangents: (d.do("gt", *operands), *tangents),

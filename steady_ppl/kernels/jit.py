@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from steady_ppl.kernels.codegen import LANES, NAME, source
+from steady_ppl.kernels.codegen import KERNEL_NAME, SIMD_LANES, source
 from steady_ppl.kernels.graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph, derivatives
 from steady_ppl.kernels.lowering import Translation, first_names, where
 from steady_ppl.kernels.store import machine_code
@@ -45,7 +45,7 @@ class Kernel:
         self.outputs = outputs
         self._engine = machine_code(key, text)
         arguments = [ctypes.c_void_p] * (inputs + 4) + [ctypes.c_int64] * 3
-        self._call = ctypes.CFUNCTYPE(None, *arguments)(self._engine.get_function_address(NAME))
+        self._call = ctypes.CFUNCTYPE(None, *arguments)(self._engine.get_function_address(KERNEL_NAME))
 
     def __call__(
         self, parameters: Array, uniform: Array, inputs: Sequence[Array], ancestors: Array | None, out: Array
@@ -55,7 +55,7 @@ class Kernel:
         Args:
             parameters: `(P,)` what the graph takes of them.
             uniform: `(B, columns)`.
-            inputs: each `(elements, B, N)`, N at least `LANES`.
+            inputs: each `(elements, B, N)`, N at least `SIMD_LANES`.
             ancestors: `(B, N)` int64, where the first input is looked up; None: at each particle itself.
             out: `(outputs, B, N)`, overwritten; shares no memory with the inputs.
         """
@@ -63,7 +63,7 @@ class Kernel:
         for array in (parameters, uniform, *inputs, out):
             assert array.dtype == np.float32 and array.flags.c_contiguous
         assert len(out) == self.outputs and len(uniform) == trajectories
-        assert particles >= LANES and all(array.shape[1:] == out.shape[1:] for array in inputs)
+        assert particles >= SIMD_LANES and all(array.shape[1:] == out.shape[1:] for array in inputs)
         assert ancestors is None or (ancestors.dtype == np.int64 and ancestors.flags.c_contiguous)
         pointers = [parameters.ctypes.data, uniform.ctypes.data, *(array.ctypes.data for array in inputs)]
         which = None if ancestors is None else ancestors.ctypes.data

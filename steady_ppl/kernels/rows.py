@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from steady_ppl.kernels.codegen import LANES
+from steady_ppl.kernels.codegen import SIMD_LANES
 from steady_ppl.kernels.jit import Method, Number, close, compiled, discard
 
 COMPARED_EVERY = 16  # of a program's runs on all rows; the first two are compared as well
@@ -114,8 +114,8 @@ def _computed(
         kernels = rows * trajectories >= ROWS_WORTH_COMPILING
     if not kernels:
         return None
-    if rows * trajectories < LANES:
-        return f"fewer than {LANES} rows"
+    if rows * trajectories < SIMD_LANES:
+        return f"fewer than {SIMD_LANES} rows"
     if first.device.type != "cpu" or first.dtype != torch.float32:
         return f"{str(first.dtype).removeprefix('torch.')} on {first.device.type}"
     examples = {at: value[:1, :1].unsqueeze(0).clone() for at, value in arguments.items()}
@@ -145,7 +145,7 @@ def _noted(name: str, reason: str) -> str:
 
 def _a_few(values: Tensor) -> Tensor:
     """Some sixteen of all rows, `(1, ·, ·)`."""
-    return values.flatten(0, 1)[None, :: max(1, values.shape[0] * values.shape[1] // LANES)]
+    return values.flatten(0, 1)[None, :: max(1, values.shape[0] * values.shape[1] // SIMD_LANES)]
 
 
 def _run(method: Method, program: nn.Module, arguments: dict[str, Tensor], rows: int, trajectories: int) -> Tensor:

@@ -26,7 +26,7 @@ from steady_ppl.runs.fit import Fit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MAX_NUMBERS = 12  # numbers of a parameter that are shown one by one
+MAX_NUMBERS_SHOWN = 12  # numbers of a parameter that are shown one by one
 DOTS = 90  # an inch, of pictures
 SENTENCE, PARAGRAPH = Markup("<p><strong>{}</strong></p>"), Markup("<p>{}</p>")
 
@@ -98,7 +98,7 @@ def parameter_rows(program: Program) -> list[tuple[str, str]]:
         value = attrgetter(name)(program)
         numbers = value.flatten().tolist()
         said = ", ".join(f"{number:.4g}" for number in numbers)
-        if len(numbers) > MAX_NUMBERS:
+        if len(numbers) > MAX_NUMBERS_SHOWN:
             said = f"{' × '.join(map(str, value.shape))} numbers from {min(numbers):.4g} to {max(numbers):.4g}"
         rows.append((name, said))
     return rows

@@ -18,7 +18,7 @@ from steady_ppl.utils.angles import nearest_turn
 
 MARGIN = 0.5  # s shown before and after a stretch
 LEVELS, MISSING = 65534, -32768  # codes of sixteen bits, which are finer than a screen
-MAX_NUMBERS = 300_000  # of all drives and runs: .8 MB of text
+MAX_PACKED_NUMBERS = 300_000  # of all drives and runs: .8 MB of text
 QUANTILES = (0.05, 0.5, 0.95)
 PATHS = 8  # draws in the plane
 DriveInterval = tuple[int, float, float]  # drive, and from when to when
@@ -134,7 +134,7 @@ class Shown:
         return packed(np.asarray(values)[:: self.every, self.drives].transpose(1, 2, 0))
 
 
-def chosen(checks: list[Check], numbers: int = MAX_NUMBERS) -> Shown:
+def chosen(checks: list[Check], numbers: int = MAX_PACKED_NUMBERS) -> Shown:
     """As many drives as there is room for, those whose strips stand out most in any run first."""
     first = checks[0]
     rows, count = first.data.time.shape

@@ -12,8 +12,8 @@ from steady_ppl.utils.progress import stages
 
 FOLDERS = ("models", "inference", "notebooks", "studies")
 LEFT_OUT = {"__pycache__", ".ipynb_checkpoints"}
-DRIVES = {"train": 16, "valid": 16, "test": 32}
-TRUTH = "models/hovercraft.py:HovercraftTruth"
+DRIVES_OF_TABLE = {"train": 16, "valid": 16, "test": 32}
+TRUE_PROGRAM = "models/hovercraft.py:HovercraftTruth"
 
 
 def workbench() -> Path:
@@ -76,10 +76,10 @@ def _simulate_tables(folder: Path) -> list[Path]:
     from steady_ppl.model.loading import load_program
     from steady_ppl.smc.simulate import simulate
 
-    program = load_program(str(folder / TRUTH))
+    program = load_program(str(folder / TRUE_PROGRAM))
     tables = []
-    with stages(*((f"simulating {name}", count) for name, count in DRIVES.items())) as begin:
-        for seed, (name, count) in enumerate(DRIVES.items(), 1):
+    with stages(*((f"simulating {name}", count) for name, count in DRIVES_OF_TABLE.items())) as begin:
+        for seed, (name, count) in enumerate(DRIVES_OF_TABLE.items(), 1):
             begin()
             drives = simulate(program, count, seed=seed)
             tables.append(folder / f"{name}.csv")

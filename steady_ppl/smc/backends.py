@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.kernels.codegen import LANES
+from steady_ppl.kernels.codegen import SIMD_LANES
 from steady_ppl.kernels.graph import NotCompilable
 from steady_ppl.kernels.jit import Method, close, compiled, discard
 from steady_ppl.model.handlers import Observing, Recording, Standardised, running
@@ -68,13 +68,13 @@ def stepping_for(plain: Stepping, state: Tensor) -> tuple[Stepping, str | None]:
     """
     if state.device.type != "cpu" or state.dtype != torch.float32:
         return plain, f"{str(state.dtype).removeprefix('torch.')} on {state.device.type}"
-    if state.shape[0] < LANES:
-        return plain, f"fewer than {LANES} particles"
+    if state.shape[0] < SIMD_LANES:
+        return plain, f"fewer than {SIMD_LANES} particles"
     methods = compiled(plain.program, FILTER, lambda: _Methods(plain, state))
     if isinstance(methods, str):
         return plain, methods
     stepping = CompiledStepping(methods, plain)
-    if not stepping.agrees(state[:LANES]):
+    if not stepping.agrees(state[:SIMD_LANES]):
         return plain, discard(plain.program, FILTER)
     return stepping, None
 

@@ -17,8 +17,8 @@ from scipy import stats
 from steady_ppl.errors import UsageError
 from steady_ppl.plotting.comparison import COLORS, MARKS
 from steady_ppl.studies.job import IN_LIMITS
-from steady_ppl.studies.plan import MAX_NUMBER, Picture, Plan
-from steady_ppl.studies.table import NUMBERS
+from steady_ppl.studies.plan import MAX_MAGNITUDE, Picture, Plan
+from steady_ppl.studies.table import NUMERIC_KINDS
 from steady_ppl.utils.text import printable
 
 SIZES = (-1.0, 0.0, *(1.25 ** (place - 0.5) for place in range(-6, 12)), math.inf)
@@ -76,10 +76,10 @@ def _numbers(rows: pd.DataFrame, name: str) -> pd.Series:
     kind = infer_dtype(rows[name])
     if kind in ("boolean", "empty"):
         return rows[name].astype(object)
-    if kind not in NUMBERS:
+    if kind not in NUMERIC_KINDS:
         raise UsageError(f"column {name} of the table holds no numbers")
     numbers = rows[name].astype(float)
-    return numbers.where(numbers.abs() <= MAX_NUMBER)
+    return numbers.where(numbers.abs() <= MAX_MAGNITUDE)
 
 
 def chosen(picture: Picture, rows: pd.DataFrame) -> pd.DataFrame:

@@ -18,7 +18,7 @@ from steady_ppl.runs.recipes import find_recipe, require_settings
 from steady_ppl.smc.simulate import simulate
 from steady_ppl.studies.executors import Executor, ResultRow, Say
 from steady_ppl.studies.job import CHANGED, ERRORS, drives, in_words, told, told_settings, truth, without_effect
-from steady_ppl.studies.plan import RECORD, Plan, record_plan, recorded_plan
+from steady_ppl.studies.plan import STUDY_RECORD, Plan, record_plan, recorded_plan
 from steady_ppl.studies.table import read_results, study_table
 
 
@@ -81,7 +81,7 @@ def run_study(plan: Plan, folder: Path, place: Executor, *, again: bool = False,
 
 def _require_same_study(plan: Plan, folder: Path) -> None:
     """Keep its results from being put aside for those of another."""
-    if (folder / RECORD).exists():
+    if (folder / STUDY_RECORD).exists():
         there = recorded_plan(folder)
         if there.title != plan.title and not {job.key for job in there.jobs} & {job.key for job in plan.jobs}:
             raise RunError(f"{folder} holds another study, {there.title!r}: choose another folder")

@@ -9,6 +9,7 @@ from contextvars import ContextVar
 
 # what moves the cursor, colours, renames the window, turns lines round, is not seen, or cannot be written at all
 UNSEEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # categories of Unicode: control, format, half of a pair, line separators
+TEXT_WIDTH = 100  # characters of a line in the text of a result
 MAX_LINE_LENGTH = 1000  # characters of a line that is said; a file that somebody gives can put more into it
 
 _quiet: ContextVar[bool] = ContextVar("quiet", default=False)

@@ -178,7 +178,7 @@ def of_another_kernel(file: Path, other: bytes) -> None:
 
 
 def without_header(file: Path, other: bytes) -> None:
-    file.write_bytes(file.read_bytes()[len(store.MAGIC) + store.DIGEST :])
+    file.write_bytes(file.read_bytes()[len(store.MAGIC) + store.DIGEST_BYTES :])
 
 
 def of_another_format(file: Path, other: bytes) -> None:
