@@ -19,7 +19,7 @@ from pathlib import Path
 import pandas as pd
 
 from steady_ppl.studies.job import HELD_OUT, IN_LIMITS
-from steady_ppl.studies.pictures import SIZES, chosen, points
+from steady_ppl.studies.pictures import SIZE_EDGES, chosen, points
 from steady_ppl.studies.plan import Picture
 from steady_ppl.studies.table import TABLE
 
@@ -228,7 +228,7 @@ def discovery(rows: pd.DataFrame) -> tuple[str, Musts]:
         "|---|---|---|---|---|---|",
     ]
     shares = {column: {place: of for place, *of in points(done, IN_LIMITS, column)} for column in columns}
-    ranges = done.groupby(pd.cut(done[IN_LIMITS], SIZES), observed=True).size()
+    ranges = done.groupby(pd.cut(done[IN_LIMITS], SIZE_EDGES), observed=True).size()
     for place, (ends, searches) in zip(shares["found"], ranges.items(), strict=True):
         cells = [_share(*shares[column][place]) if place in shares[column] else "" for column in columns]
         size = "0" if ends.right == 0 else f"{ends.left:.2f} to {ends.right:.2f}"

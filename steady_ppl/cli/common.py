@@ -11,8 +11,8 @@ from steady_ppl.errors import ComputationError, SteadyError, UsageError
 from steady_ppl.utils.files import whole_file
 from steady_ppl.utils.text import shown, tell
 
-FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
-MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "Storage size calculation overflowed")
+NO_SPACE = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "Storage size calculation overflowed")
 
 
 def fit_or_program(source: str, program: str | None, seed: int = 0, substeps: int | None = None) -> Any:
@@ -122,8 +122,8 @@ def as_refusal(error: Exception) -> SteadyError | None:
     """
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return UsageError(f"{shown(str(error.filename), 100)}: {error.strerror}")
-    if isinstance(error, OSError) and error.errno in FULL:  # numba says no name of its cache
+    if isinstance(error, OSError) and error.errno in NO_SPACE:  # numba says no name of its cache
         return UsageError(f"a file cannot be written: {error.strerror}")
-    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(w in str(error) for w in MEMORY)):
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(w in str(error) for w in NO_MEMORY)):
         return ComputationError("this needs more memory than there is: take fewer or shorter drives, or less of each")
     return None

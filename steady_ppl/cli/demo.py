@@ -71,8 +71,8 @@ def run(command: Any, arguments: Sequence[str]) -> str:
 
 
 DEMO_RECORD = "demo.json"  # of a demonstration; a folder without one is not a demonstration's
-OWNERS = "models/hovercraft.py"
-BEGINNING = (
+OWNER_PROGRAM = "models/hovercraft.py"
+INTRODUCTION = (
     "A hovercraft whose owner's program knows no drag. What it did is known only by noisy bearings to four landmarks, "
     "the controls, and where each drive began (--known-start: exactly, as in the paper)."
 )
@@ -108,12 +108,12 @@ def demonstrate(
     began = time.perf_counter()
     tour = Tour(command, say, force=out.exists())
     _open(out, force)
-    say(textwrap.fill(BEGINNING, TEXT_WIDTH))
+    say(textwrap.fill(INTRODUCTION, TEXT_WIDTH))
     say(f"\n   $ cd {shlex.quote(str(out))}")
     with chdir(out):
         record_drives(tour, size)
         tour.step("Fit the owner's program, which has none")
-        tour.result(_fit(tour, OWNERS, "before"))
+        tour.result(_fit(tour, OWNER_PROGRAM, "before"))
         tour.step("Compare: does it explain even the drives that it was fitted to?")
         sets = size.calibration
         tour.steady(f"check runs/before train.csv{sets} --json check.json --picture check.png", keep="check.txt")
@@ -221,10 +221,10 @@ def _open(out: Path, force: bool) -> None:
     """Make the folder, mark it as a demonstration's, and put the owner's program there."""
     if out.exists() and not force and not (out / DEMO_RECORD).is_file():
         raise RunError(f"{out} exists and is no demo's: choose another folder, or --force to write into it")
-    source = workbench() / OWNERS
+    source = workbench() / OWNER_PROGRAM
     with empty_again(out):
         (out / "models").mkdir(exist_ok=True)
-        shutil.copyfile(source, out / OWNERS)
+        shutil.copyfile(source, out / OWNER_PROGRAM)
         with chdir(out):
             _write_record({"status": "running"})
 

@@ -24,7 +24,7 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, row_controls
 from steady_ppl.utils.angles import wrap, wrap_angles
 
-LAG = 0.3  # s
+LAG_SECONDS = 0.3
 DEAD_ZONE, SATURATION_KNEE = 0.2, 0.6  # of the largest command
 NOT_SUMMED = ("offset of", "curvature in")  # in the controls' own units
 MAX_SCORED_PARAMETERS = 40  # parameters; a network's are not looked at one by one
@@ -157,7 +157,7 @@ class _Scores:
             "dead zone of": -command.clamp(-DEAD_ZONE * most, DEAD_ZONE * most),
             "saturation of": command.clamp(-SATURATION_KNEE * most, SATURATION_KNEE * most) - command,
             "delay of": -change,
-            "lag of": lagged(command.unsqueeze(-1), time, torch.tensor(LAG)).squeeze(-1) - command,
+            "lag of": lagged(command.unsqueeze(-1), time, torch.tensor(LAG_SECONDS)).squeeze(-1) - command,
         }
         speed = next(iter(self.program.velocities(self.states).values()), None)
         if speed is not None:

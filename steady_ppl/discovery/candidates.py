@@ -37,7 +37,7 @@ TIE_NATS = 2.0  # of held-out log p(y) within which two candidates cannot be tol
 CLEAR_GAIN = 10.0  # nats of held-out log p(y) for which a test need only be near the family's level
 NEAR_FAMILY_LEVEL = FAMILY_LEVEL / 5  # p-value of a single test that is near it
 MIN_STATISTIC_TO_RETRY = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
-LINEAR = ("push", "command", "history", "measured", "viewpoint")
+LINEAR_FORMS = ("push", "command", "history", "measured", "viewpoint")  # of effects in proportion to the coefficient
 MIN_GAIN_OF_PLACE = 0.3  # nats by which another knee or place has to be likelier
 MAX_COORDINATE_SWEEPS = 4  # along all knees and places in turns, with steps of one size
 NEIGHBOUR_SHARE = 0.25  # of the grid's spacing, at which a place's likelihood is compared with its neighbours'
@@ -161,7 +161,7 @@ def leaders(screened: Screened, first: bool) -> list[Tested]:
 def fitted(now: Refit, tested: Tested, screening: Screening, threshold: Threshold = NO_THRESHOLD) -> Candidate:
     """A program with a candidate, by the screening that tested it; see `refit_with` for `threshold`."""
     effect = tested.variant.effect
-    known = screening.information[_key(tested.column)] if effect.null == 0 and effect.form in LINEAR else None
+    known = screening.information[_key(tested.column)] if effect.null == 0 and effect.form in LINEAR_FORMS else None
 
     def fit(start: Any) -> Candidate:
         return judged(now, tested, refit_with(now, tested.variant, start, information=known, threshold=threshold))

@@ -19,7 +19,7 @@ from steady_ppl.utils.late import Displayed
 from steady_ppl.utils.text import TEXT_WIDTH, aligned, number
 
 CANDIDATES_SHOWN = 12  # candidates in the table
-IN_WORDS = {
+VERDICT_PHRASES = {
     "none": "No effect is missing as far as these drives can tell",
     "dynamics": "The dynamics lack",
     "actuator": "The actuators lack",
@@ -213,7 +213,7 @@ def sentence(found: Discovery) -> str:
 
 
 def _verdict(found: Discovery) -> str:
-    start, p_value, shape = IN_WORDS[found.verdict], f"(p = {found.p_value:.2g})", found.shape
+    start, p_value, shape = VERDICT_PHRASES[found.verdict], f"(p = {found.p_value:.2g})", found.shape
     if found.verdict == "none":
         return f"{start} {p_value}; the limits below say what could not have been seen."
     if shape is not None:
@@ -224,7 +224,7 @@ def _verdict(found: Discovery) -> str:
     clauses: list[str] = []
     for kind in dict.fromkeys(finding.kind for finding in found.findings):
         said = [_said(finding, found.search.is_complete) for finding in found.findings if finding.kind == kind]
-        words = IN_WORDS[kind] if not clauses else IN_WORDS[kind][0].lower() + IN_WORDS[kind][1:]
+        words = VERDICT_PHRASES[kind] if not clauses else VERDICT_PHRASES[kind][0].lower() + VERDICT_PHRASES[kind][1:]
         clauses.append(f"{words} {' and '.join(said)}")
     if not found.search.is_complete:
         clauses.append("they do not explain all, so that an effect nobody has named may stand behind these names")

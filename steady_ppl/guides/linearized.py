@@ -10,13 +10,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, UsageError, require
 from steady_ppl.gaussian.information_filter import Lookahead, Steering
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.gaussian.smoother import (
-    find_and_smooth,
-    means_as_path,
-    require_found,
-    resting_path,
-    smoother_paths,
-)
+from steady_ppl.gaussian.smoother import find_and_smooth, means_as_path, require_found, resting_path, smoother_paths
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.guides.base import FilteringGuide, LinearRamp, PathGuide, Tempering
 from steady_ppl.guides.variational import VariationalGuide, log_ratio, times
@@ -24,7 +18,7 @@ from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.angles import wrap
 
-WORTH_COMPILING = 200  # rows of all trajectories together; a training linearises them hundreds of times
+GUIDE_ROWS_WORTH_COMPILING = 200  # rows of all trajectories together; a training linearises them hundreds of times
 
 
 class LinearizedGuide(PathGuide):
@@ -98,7 +92,7 @@ class LinearizedGuide(PathGuide):
 
     def _smooth(self, data: Trajectories, progress: float) -> Lookahead:
         path = ReferencePath(self._recall("states", data), self._recall("noise", data))
-        weight, kernels = self.tempering(progress), data.time.numel() >= WORTH_COMPILING
+        weight, kernels = self.tempering(progress), data.time.numel() >= GUIDE_ROWS_WORTH_COMPILING
         problem = Problem(self.program, data, self.known_start)
         return problem.smooth(path, observation_weight=weight, passes=self.passes, kernels=kernels)
 
@@ -127,7 +121,7 @@ class GaussianGuide(LinearizedGuide):
         """Linearise, smooth and keep `draws` independent paths."""
         ahead, figures = self.look_ahead(data, progress)
         require_found(ahead, self.program, data)
-        kernels = data.time.numel() >= WORTH_COMPILING
+        kernels = data.time.numel() >= GUIDE_ROWS_WORTH_COMPILING
         paths = smoother_paths(self.program, data, ahead, self.draws, known_start=self.known_start, kernels=kernels)
         self.in_plain_torch = self.in_plain_torch or paths.in_plain_torch
         self.keep(paths, data)

@@ -19,10 +19,10 @@ from steady_ppl.errors import SteadyError
 
 PARAMETERS_ALONE, TRAJECTORY, PARTICLE = range(3)  # what a value depends on
 LEAVES = ("input", "parameter", "constant", "element")
-UNROLLED = 48  # the largest matrix whose product is written out element by element
-TOO_LONG = 3000  # scalar operations; compiling more takes longer than a fit
-FLAT = {"round", "floor", "ceil", "sign", "gt", "ge", "lt", "le", "eq", "ne"}  # their derivatives are zero
-FLAT |= {"logical_and", "logical_or", "logical_not"}
+MAX_UNROLLED_ELEMENTS = 48  # of the largest matrix whose product is written out element by element
+MAX_OPERATIONS = 3000  # scalar operations; compiling more takes longer than a fit
+ZERO_DERIVATIVE = {"round", "floor", "ceil", "sign", "gt", "ge", "lt", "le", "eq", "ne"}  # their derivatives are zero
+ZERO_DERIVATIVE |= {"logical_and", "logical_or", "logical_not"}
 Values = list[int]  # a scalar, or the elements of a vector
 
 
@@ -77,8 +77,8 @@ class ScalarGraph:
         scalar = Scalar(operation, arguments)
         if scalar not in self.numbers:
             self.operations += operation not in LEAVES
-            if self.operations > TOO_LONG:
-                raise NotCompilable(f"more than {TOO_LONG} operations a particle")
+            if self.operations > MAX_OPERATIONS:
+                raise NotCompilable(f"more than {MAX_OPERATIONS} operations a particle")
             match operation:
                 case "input":
                     level = self.levels_of_inputs[arguments[0]]
@@ -152,7 +152,7 @@ class ScalarGraph:
         """A matrix `(O, I)` of scalars' numbers times the vector x, plus a bias."""
         rows, columns = matrix.shape
         whole = self._strided(matrix)
-        if rows * columns > UNROLLED and whole is not None:
+        if rows * columns > MAX_UNROLLED_ELEMENTS and whole is not None:
             return self.vector(Product(rows, *whole, tuple(bias) if bias else None, tuple(x)))
         result = []
         for k, row in enumerate(matrix.tolist()):
@@ -241,7 +241,7 @@ class Tangents:
     def _rule(self, operation: str, operands: Sequence[Values], value: Values) -> Values | None:
         """The chain rule, for scalars and for all elements of vectors."""
         tangents = [self._of_all(operand) for operand in operands]
-        if operation in FLAT or all(tangent is None for tangent in tangents):
+        if operation in ZERO_DERIVATIVE or all(tangent is None for tangent in tangents):
             return None
         if operation in SELECTIONS:
             condition, yes, no = SELECTIONS[operation](self, operands, tangents)

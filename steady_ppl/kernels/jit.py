@@ -24,8 +24,8 @@ TRACES = 32  # of one method of programs of one class; each takes some hundredth
 KERNELS = 256  # that are kept in memory
 MAX_NUMBERS_READ = 1000  # numbers of a tensor that are looked at one by one
 KEEPS_CHANGING = "its settings or tensors change from run to run"
-DIFFERENT = "its kernel and its own lines come to different numbers"
-SETTING = bool | int | float | str | tuple | list | dict | np.ndarray | Tensor
+RESULTS_DIFFER = "its kernel and its own lines come to different numbers"
+SETTING_KINDS = bool | int | float | str | tuple | list | dict | np.ndarray | Tensor
 TORCH_ATTRIBUTES = vars(nn.Module()).keys() - {"training"}  # where torch keeps parameters, buffers and hooks
 Value = TypeVar("Value")
 Array = np.ndarray
@@ -211,8 +211,8 @@ def compiled(program: nn.Module, name: str, build: Callable[[], Value]) -> Value
 
 def discard(program: nn.Module, name: str) -> str:
     """Give up what was compiled under a name."""
-    _COMPILED[type(program)][name, signature(program)] = DIFFERENT
-    return DIFFERENT
+    _COMPILED[type(program)][name, signature(program)] = RESULTS_DIFFER
+    return RESULTS_DIFFER
 
 
 def _tensors(program: nn.Module) -> dict[str, Tensor]:
@@ -258,7 +258,7 @@ def _signature(program: nn.Module) -> tuple[Any, ...]:
         (at, name, _content(value))
         for at, module in program.named_modules()
         for name, value in _settings(module)
-        if isinstance(value, SETTING)
+        if isinstance(value, SETTING_KINDS)
     ]
     tensors = _tensors(program)
     names = first_names(tensors)
@@ -270,7 +270,7 @@ def _signature(program: nn.Module) -> tuple[Any, ...]:
 def _content(value: Any) -> Any:
     """What a setting tells; of a tensor the numbers, or which it is if there are many."""
     if isinstance(value, dict):
-        return tuple((repr(name), _content(part)) for name, part in value.items() if isinstance(part, SETTING))
+        return tuple((repr(name), _content(part)) for name, part in value.items() if isinstance(part, SETTING_KINDS))
     if isinstance(value, tuple | list):
         return type(value).__name__, *map(_content, value)
     if isinstance(value, np.ndarray):

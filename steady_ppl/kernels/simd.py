@@ -12,7 +12,7 @@ from typing import Any
 from llvmlite import ir
 
 FLOAT, INTEGER = ir.FloatType(), ir.IntType(32)
-FLAGS = ("contract", "nsz")
+FAST_MATH_FLAGS = ("contract", "nsz")
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Lanes:
 
     def _do(self, name: str, other: Any) -> Lanes:
         left, right = number(self).pair(number(other) if isinstance(other, Lanes) else other)
-        return Lanes(self.builder, getattr(self.builder, name)(left.value, right.value, flags=FLAGS))
+        return Lanes(self.builder, getattr(self.builder, name)(left.value, right.value, flags=FAST_MATH_FLAGS))
 
     def compare(self, how: str, other: Any) -> Lanes:
         """A truth value; false where either is not a number, except for "!="."""

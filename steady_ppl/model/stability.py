@@ -13,7 +13,7 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import MAX_SUBSTEPS, Held, advance, with_substeps, within_row
 from steady_ppl.utils.random import seeded
 
-GROWTH = 1.1  # of a deviation over a row, from which it counts
+MIN_GROWTH = 1.1  # of a deviation over a row, from which it counts
 SUBSTEP_FACTOR = 16  # times as many substeps, at which it must not grow nearly as much
 ROW_SPACING_FACTOR = 1000.0  # times, by which rows are moved apart to see whether actuators look at time
 LONG_STEP_RATIO = 1.5  # times the usual step, from which the message names a row's length
@@ -45,7 +45,7 @@ def divergence(program: Program, data: Trajectories, rows: int | None = None) ->
     worst = int(growth.argmax())
     control, time, step = given
     once = _eigenvalues(with_substeps(program, 1), state, (control, time, step / program.substeps))
-    if once is None or float(growth[worst]) <= GROWTH:
+    if once is None or float(growth[worst]) <= MIN_GROWTH:
         return None
     there = once.flatten(0, -2)[worst]
     fastest = there[(there - 1).abs().argmax()]

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "black")  # Okabe and Ito
-MARKS = "os^Dvx+"
+MARKERS = "os^Dvx+"
 
 
 def open_loop_picture(found: Proof, *, of: str | None = None, axes: Axes | None = None) -> Axes:
@@ -39,7 +39,7 @@ def open_loop_picture(found: Proof, *, of: str | None = None, axes: Axes | None 
     floor = curves.pop(NOISE_FLOOR, [])
     curves = {name: curve for name, curve in curves.items() if curve}
     for index, (name, curve) in enumerate(curves.items()):
-        mark, color = MARKS[index % len(MARKS)], COLORS[index % len(COLORS)]
+        mark, color = MARKERS[index % len(MARKERS)], COLORS[index % len(COLORS)]
         axes.plot(*zip(*curve, strict=True), f"{mark}-", color=color, ms=4, lw=1.4, label=name)
     axes.set_xscale("log")
     axes.set_yscale("log")

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAX_NUMBERS_SHOWN = 12  # numbers of a parameter that are shown one by one
-DOTS = 90  # an inch, of pictures
+DOTS_PER_INCH = 90  # an inch, of pictures
 SENTENCE, PARAGRAPH = Markup("<p><strong>{}</strong></p>"), Markup("<p>{}</p>")
 
 
@@ -76,7 +76,7 @@ def _(fit: Fit) -> str:
 def _of_result(verdict: Callable[[Any], str], picture: Callable[[Any], Figure], found: Any) -> str:
     """A verdict, its picture, and all figures as text to unfold."""
     file = io.BytesIO()
-    picture(found).savefig(file, format="png", dpi=DOTS)
+    picture(found).savefig(file, format="png", dpi=DOTS_PER_INCH)
     said, image = verdict(found), base64.b64encode(file.getvalue()).decode()
     return str(
         SENTENCE.format(said)

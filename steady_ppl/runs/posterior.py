@@ -36,7 +36,7 @@ DIMENSIONS = ("chain", "draw", *OF_ROW)
 Groups = Mapping[str, xarray.Dataset]
 """Those of ArviZ's InferenceData, which is such a mapping itself."""
 INTERVAL_QUANTILES = (0.05, 0.95)
-SUFFIXES = (".csv", ".parquet", ".nc")
+STATES_SUFFIXES = (".csv", ".parquet", ".nc")
 
 
 def posterior(program: Program, data: Trajectories, **settings: Any) -> arviz.InferenceData:
@@ -186,8 +186,8 @@ def states_frame(posterior: Groups) -> pd.DataFrame:
 
 def require_states_file(path: Path) -> None:
     """Raise UsageError for another suffix than those of a table or of netCDF."""
-    if path.suffix.lower() not in SUFFIXES:
-        raise UsageError(f"{path}: states are written as {', '.join(SUFFIXES)}")
+    if path.suffix.lower() not in STATES_SUFFIXES:
+        raise UsageError(f"{path}: states are written as {', '.join(STATES_SUFFIXES)}")
 
 
 def write_states(posterior: Groups, path: Path) -> None:

@@ -23,17 +23,17 @@ from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoo
 
 from steady_ppl.errors import ComputationError, UsageError
 from steady_ppl.runs.fit import packages
-from steady_ppl.studies.job import CHANGED, Job, JobFiles, differing, digest_of, run
+from steady_ppl.studies.job import OUTDATED, Job, JobFiles, differing, digest_of, run
 from steady_ppl.utils.cores import ONE_THREAD
 from steady_ppl.utils.text import one_line, shown
 
 ResultRow = dict[str, Any]
 Say = Callable[[str], None]
 
-WORKER_WAIT = 30  # s for the first worker, and between looks at whether there still is one
+WORKER_WAIT_SECONDS = 30  # for the first worker, and between looks at whether there still is one
 MAX_UNLOADED = 3  # processes in a row that die while they load, after which no other is started
-TRIES = 3  # of a job whose workers die; the scheduler itself tries it so often as it is set, four times at first
-HOLD, LONGEST_HOLD = 10, 60  # s for which a worker that is not used holds what it is given, or it would get it all
+MAX_TRIES = 3  # of a job whose workers die; the scheduler itself tries it so often as it is set, four times at first
+HOLD_SECONDS, MAX_HOLD_SECONDS = 10, 60  # that a worker which is not used holds what it is given, or it would get all
 MIN_REFUSED_JOBS = 4  # jobs whose files are others, at which a worker has been refused if its files alone are
 MAX_LOST_JOBS = 10  # jobs that Dask gives up while nothing is begun
 
@@ -71,7 +71,7 @@ class Local(Executor):
         with warnings.catch_warnings():
             # loky replaces a process that has grown, and says so where it is given its next job
             warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
-            for workers in (*[self.workers] * (TRIES - 1), 1):
+            for workers in (*[self.workers] * (MAX_TRIES - 1), 1):
                 died: list[Job] = []
                 yield from _rows(left, min(workers, len(left)), died, say)
                 left = died
@@ -160,7 +160,7 @@ class Cluster(Executor):
             if name.partition(".")[0] in ("distributed", "tornado", "asyncio"):  # a lost connection is said in one line
                 logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         try:
-            self.client.wait_for_workers(1, timeout=WORKER_WAIT)
+            self.client.wait_for_workers(1, timeout=WORKER_WAIT_SECONDS)
             self._require_alike(address)
         except (TimeoutError, UsageError) as error:
             self.client.close()
@@ -228,7 +228,7 @@ class Cluster(Executor):
         """What has ended, with a line when there is no worker left to end anything."""
         while not sent.running.has_ready():
             time.sleep(0.05)
-            if time.monotonic() - self.looked > WORKER_WAIT:
+            if time.monotonic() - self.looked > WORKER_WAIT_SECONDS:
                 alone = not self._workers().keys() - sent.refused
                 if alone and not self.deserted:
                     say("the cluster has no worker left: start some, or stop this and go on later")
@@ -238,7 +238,7 @@ class Cluster(Executor):
     def _usable(self, answer: Answer, job: Job, sent: _Sent, say: Say) -> ResultRow | None:
         """Its row; None, and the job is sent again, where the worker is unlike this machine."""
         reason = answer.unlike
-        if answer.row.get("reason") == CHANGED and JobFiles().is_of(job):
+        if answer.row.get("reason") == OUTDATED and JobFiles().is_of(job):
             reason = "other files than there are here"
             sent.attempts.begun[job.key] -= 1  # only its files were looked at
         if not reason:
@@ -300,7 +300,7 @@ class Attempts:
         self.in_vain = 0 if self.begun[key] > self.before[key] else self.in_vain + 1
         if self.in_vain > MAX_LOST_JOBS:
             raise ComputationError("workers die before they begin")
-        return self.begun[key] >= TRIES
+        return self.begun[key] >= MAX_TRIES
 
 
 _changed = Counter[str]()  # on a worker: jobs whose files were others there, by topic
@@ -322,15 +322,15 @@ def computed(job: Job, here: Mapping[str, str], topic: str) -> Answer:
     if worker.state.nthreads > 1:
         unlike = f"{worker.state.nthreads} threads, which would take turns"
     if unlike or topic in _held:
-        time.sleep(min(HOLD * 2.0 ** _held[topic], LONGEST_HOLD))
+        time.sleep(min(HOLD_SECONDS * 2.0 ** _held[topic], MAX_HOLD_SECONDS))
         hold(topic)
         return Answer(worker.address, unlike or "been refused", {})
     worker.log_event(topic, job.key)
     row = run(job)
-    if row.get("reason") == CHANGED:
+    if row.get("reason") == OUTDATED:
         _changed[topic] += 1
         if 1 < _changed[topic] <= MIN_REFUSED_JOBS:  # it would get everything before it is refused
-            time.sleep(HOLD)
+            time.sleep(HOLD_SECONDS)
     return Answer(worker.address, "", row)
 
 

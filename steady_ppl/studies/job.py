@@ -41,10 +41,10 @@ from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import one_line
 
 PARTS = ("train", "valid", "test")
-LOGS = ("vrpn-pose.csv", "vesc_drive.csv")
-TABLES = (".csv", ".parquet")
+LOG_FILES = ("vrpn-pose.csv", "vesc_drive.csv")
+TABLE_SUFFIXES = (".csv", ".parquet")
 ERRORS = ("forward", "forward_mean", "state_estimation")
-CHANGED = "its program, recipe or table is not what it was when the study was begun: the same command tries it again"
+OUTDATED = "its program, recipe or table is not what it was when the study was begun: the same command tries it again"
 HELD_OUT = "valid_log_likelihood"  # of validation drives
 IN_LIMITS = "in_limits"  # how large what is missing is, in detection limits
 FIGURES = {
@@ -162,9 +162,9 @@ def _data_files(data: Mapping[str, Any]) -> list[Path]:
     """The tables or logs of a job that are there; none where its drives are simulated."""
     files: list[Path] = []
     if "tables" in data:
-        files = [Path(data["tables"]) / f"{part}{ending}" for part in PARTS for ending in TABLES]
+        files = [Path(data["tables"]) / f"{part}{ending}" for part in PARTS for ending in TABLE_SUFFIXES]
     if "alpha_truck" in data:
-        files = [Path(data["alpha_truck"]) / part / log for part in PARTS for log in LOGS]
+        files = [Path(data["alpha_truck"]) / part / log for part in PARTS for log in LOG_FILES]
     return [file for file in files if file.exists()]
 
 
@@ -210,7 +210,7 @@ def run(job: Job) -> dict[str, Any]:
             if JobFiles().is_of(job):
                 found = {"outcome": "done", **TASKS[job.task](job)}
             else:
-                found = {"outcome": "failed", "reason": CHANGED}
+                found = {"outcome": "failed", "reason": OUTDATED}
         except (Exception, SystemExit) as error:  # a study goes on without this job
             found = {"outcome": "failed", "reason": one_line(error)}
         spent = {"seconds": time.perf_counter() - began, "peak_mib": _peak_mib(), "packages": in_words(packages())}
@@ -377,7 +377,7 @@ def told_settings(job: Job) -> dict[str, Any]:
 
 
 def _table(folder: Path, part: str) -> Path:
-    files = [folder / f"{part}{ending}" for ending in TABLES]
+    files = [folder / f"{part}{ending}" for ending in TABLE_SUFFIXES]
     found = [file for file in files if file.is_file()]
     if not found:
         raise DataError(f"{folder} has no {' and no '.join(file.name for file in files)}")

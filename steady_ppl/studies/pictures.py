@@ -15,16 +15,16 @@ from pandas.api.types import infer_dtype
 from scipy import stats
 
 from steady_ppl.errors import UsageError
-from steady_ppl.plotting.comparison import COLORS, MARKS
+from steady_ppl.plotting.comparison import COLORS, MARKERS
 from steady_ppl.studies.job import IN_LIMITS
 from steady_ppl.studies.plan import MAX_MAGNITUDE, Picture, Plan
 from steady_ppl.studies.table import NUMERIC_KINDS
 from steady_ppl.utils.text import printable
 
-SIZES = (-1.0, 0.0, *(1.25 ** (place - 0.5) for place in range(-6, 12)), math.inf)
+SIZE_EDGES = (-1.0, 0.0, *(1.25 ** (place - 0.5) for place in range(-6, 12)), math.inf)
 """Ends of ranges of what is missing, in detection limits: each a quarter wider than the one before, one of them around
 a limit; the first is of drives that lack nothing."""
-SHARES = ("found", "right", "in_class")
+SHARE_COLUMNS = ("found", "right", "in_class")
 PUBLISHED = "published"  # in the legend
 PUBLISHED_LOOK: dict[str, Any] = {"ls": "--", "marker": "*", "ms": 7, "lw": 0.9, "alpha": 0.6}
 
@@ -142,7 +142,7 @@ def _panel(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str,
 def _look(index: int) -> dict[str, Any]:
     """A colour, a mark and a line that no other of the first 49 has together."""
     turn, place = divmod(index, len(COLORS))
-    return {"color": COLORS[place], "marker": MARKS[(place + turn) % len(MARKS)], "ls": ("-", "-.")[turn % 2]}
+    return {"color": COLORS[place], "marker": MARKERS[(place + turn) % len(MARKERS)], "ls": ("-", "-.")[turn % 2]}
 
 
 def _published(axes: Axes, points: Sequence[Sequence[float]], color: str, name: str) -> None:
@@ -179,7 +179,7 @@ def _scale(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str,
         if len(values) <= 12:
             axes.set_xticks(values, [f"{value:g}" for value in values])
             axes.minorticks_off()
-    if column in SHARES:
+    if column in SHARE_COLUMNS:
         axes.set_ylim(-0.05, 1.05)
         return
     heights = [height for _, rows in lines for _, height, *_ in points(rows, picture.x, column)]
@@ -196,7 +196,7 @@ def points(rows: pd.DataFrame, x: str, y: str) -> list[tuple[float, float, float
     rows = rows[rows[x].notna() & rows[y].notna()]
     share = infer_dtype(rows[y]) == "boolean"
     found = []
-    for _, part in rows.groupby(pd.cut(rows[x], SIZES), observed=True) if x == IN_LIMITS else rows.groupby(x):
+    for _, part in rows.groupby(pd.cut(rows[x], SIZE_EDGES), observed=True) if x == IN_LIMITS else rows.groupby(x):
         values = part[y].astype(float)
         middle = float(values.mean())
         if share:

@@ -17,7 +17,7 @@ from steady_ppl.runs.fit import packages
 from steady_ppl.runs.recipes import find_recipe, require_settings
 from steady_ppl.smc.simulate import simulate
 from steady_ppl.studies.executors import Executor, ResultRow, Say
-from steady_ppl.studies.job import CHANGED, ERRORS, drives, in_words, told, told_settings, truth, without_effect
+from steady_ppl.studies.job import ERRORS, OUTDATED, drives, in_words, told, told_settings, truth, without_effect
 from steady_ppl.studies.plan import STUDY_RECORD, Plan, record_plan, recorded_plan
 from steady_ppl.studies.table import read_results, study_table
 
@@ -44,7 +44,7 @@ def run_study(plan: Plan, folder: Path, place: Executor, *, again: bool = False,
         record_plan(plan, folder)
         rows = read_results(folder).to_dict("records")
         tried_again = {
-            row["key"] for row in rows if row["outcome"] == "failed" and (again or row.get("reason") == CHANGED)
+            row["key"] for row in rows if row["outcome"] == "failed" and (again or row.get("reason") == OUTDATED)
         }
         kept = {row["key"]: row["outcome"] for row in rows if row["key"] not in tried_again}
         left = {key: job for key, job in wanted.items() if key not in kept}

@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 Result = tuple[Mapping[str, "Tensor"], Mapping[str, Any]]  # tensors, and what JSON can hold
 Job = Callable[[], Result]
 MAX_PROCESSES = 8  # at once: each has memory of its own
-MIN_PATIENCE, MAX_SLOWER = 10.0, 5.0  # seconds, and times its own share's, that this process waits for another
+MIN_PATIENCE_SECONDS, MAX_SLOWDOWN = 10.0, 5.0  # and times its own share's, that this process waits for another
 DIE_WITH_PARENT = 1  # of Linux's prctl
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-END = b"whole"
-POOLS = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")
-ONE_THREAD = dict.fromkeys([*(f"{name}_NUM_THREADS" for name in POOLS), "VECLIB_MAXIMUM_THREADS"], "1")
+ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+END_MARK = b"whole"
+THREAD_POOLS = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")
+ONE_THREAD = dict.fromkeys([*(f"{name}_NUM_THREADS" for name in THREAD_POOLS), "VECLIB_MAXIMUM_THREADS"], "1")
 """Environment of a process whose libraries have one thread each; they read it as they load."""
 
 _lock = threading.Lock()
@@ -92,7 +92,7 @@ def side_by_side(jobs: Sequence[Job]) -> list[Result]:
             children[-1].begin()
         began = time.monotonic()
         found = {index: jobs[index]() for index in shares[0]}
-        patience = MIN_PATIENCE + MAX_SLOWER * (time.monotonic() - began)
+        patience = MIN_PATIENCE_SECONDS + MAX_SLOWDOWN * (time.monotonic() - began)
         for child in children:
             found.update(child.results(patience))
         return [found[index] if index in found else jobs[index]() for index in range(len(jobs))]
@@ -125,16 +125,16 @@ class _Child:
 
             ctypes.CDLL(None).prctl(DIE_WITH_PARENT, signal.SIGKILL)
             signal.set_wakeup_fd(-1)
-            for ending in SIGNALS:
+            for ending in ENDING_SIGNALS:
                 signal.signal(ending, signal.SIG_DFL)
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
             if self.file is not None and os.getppid() == parent:
                 _most.set(1)
                 for index in self.share:
                     tensors, values = self.jobs[index]()
                     content = packed(tensors, {"values": json.dumps(values)})
                     self.file.write(len(content).to_bytes(8, "little") + content)
-                self.file.write(END)
+                self.file.write(END_MARK)
                 self.file.flush()
         finally:
             os._exit(0)
@@ -148,8 +148,8 @@ class _Child:
         if not wait([self.handle], patience):
             return {}
         size = self.file.seek(0, os.SEEK_END)
-        self.file.seek(max(0, size - len(END)))
-        if self.file.read() != END:
+        self.file.seek(max(0, size - len(END_MARK)))
+        if self.file.read() != END_MARK:
             return {}
         self.file.seek(0)
         found: dict[int, Result] = {}
@@ -176,7 +176,7 @@ class _Child:
 @contextmanager
 def _no_signals() -> Iterator[None]:
     """Keep signals until the block has ended: an interrupt in a child would unwind its parent's stack."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
     try:
         yield
     finally:

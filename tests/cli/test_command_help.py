@@ -46,7 +46,7 @@ def test_every_command_has_examples_that_parse(command, capsys: pytest.CaptureFi
     for example in "\n".join(command.examples).replace("\\\n", " ").splitlines():
         program, found, *words = shlex.split(example.partition(" | ")[0])
         assert (program, found) == ("steady", name)
-        words = [word for word in words[: (*words, ">").index(">")] if word not in command_line.EVERYWHERE]
+        words = [word for word in words[: (*words, ">").index(">")] if word not in command_line.GLOBAL_OPTIONS]
         parser.make_context(name, words)
 
 
@@ -144,7 +144,7 @@ def two_seconds() -> None:
 def test_progress_is_drawn_on_a_terminal_only_and_cleared(monkeypatch, is_terminal: bool) -> None:
     screen = Terminal() if is_terminal else io.StringIO()
     monkeypatch.setattr("sys.stderr", screen)
-    monkeypatch.setattr(progress_line, "PATIENCE", 0.1)
+    monkeypatch.setattr(progress_line, "PATIENCE_SECONDS", 0.1)
     with progress_line.progress_line() as line, listening(line):
         two_seconds()
         shown = screen.getvalue()
@@ -153,7 +153,7 @@ def test_progress_is_drawn_on_a_terminal_only_and_cleared(monkeypatch, is_termin
         return
     assert "first … 0 s so far" in shown or "first … 1 s so far" in shown
     assert "second … about to end" in shown or "second … about 1 s left" in shown
-    assert shown.endswith(progress_line.CLEAR)
+    assert shown.endswith(progress_line.CLEAR_LINE)
 
 
 @pytest.mark.parametrize("width", [2, 30])
@@ -162,10 +162,10 @@ def test_progress_keeps_to_one_row_of_a_narrow_terminal(monkeypatch, width: int)
     screen.fileno = lambda: 2
     monkeypatch.setattr("sys.stderr", screen)
     monkeypatch.setattr("os.get_terminal_size", lambda _: os.terminal_size((width, 24)))
-    monkeypatch.setattr(progress_line, "PATIENCE", 0.1)
+    monkeypatch.setattr(progress_line, "PATIENCE_SECONDS", 0.1)
     with progress_line.progress_line() as line, listening(line), stages(("a stage whose name is long", 1)) as begin:
         begin()
         time.sleep(0.7)
-    drawn = screen.getvalue().split(progress_line.CLEAR)
+    drawn = screen.getvalue().split(progress_line.CLEAR_LINE)
     assert max(map(len, drawn)) == width - 1 and any(said.startswith("…") for said in drawn)
     assert width == 2 or any(said.endswith("s so far") for said in drawn)

@@ -14,7 +14,7 @@ from examples import MODELS
 from small import commands, contents, steady
 
 from steady_ppl import read_table
-from steady_ppl.cli.make import NEXT
+from steady_ppl.cli.make import NEXT_COMMANDS
 
 ROOT = MODELS.parent
 
@@ -23,7 +23,7 @@ def test_it_copies_the_rooms_and_simulates_drives(tmp_path: Path, capsys, refuse
     lab = tmp_path / "lab"
     assert steady("init", lab) == 0
     said = capsys.readouterr().out
-    assert "train.csv" in said and all(line in said for line in NEXT)
+    assert "train.csv" in said and all(line in said for line in NEXT_COMMANDS)
     for room in ("models", "inference", "notebooks", "studies"):
         ours = {name: text for name, text in contents(lab / room).items() if "__pycache__" not in name}
         kinds = (".py", ".ipynb", ".toml")

@@ -14,7 +14,7 @@ from small_studies import STUDY, written
 from steady_ppl.errors import ComputationError
 from steady_ppl.runs.fit import packages
 from steady_ppl.studies import executors
-from steady_ppl.studies.executors import TRIES, Attempts, Local
+from steady_ppl.studies.executors import MAX_TRIES, Attempts, Local
 from steady_ppl.studies.plan import read_plan
 from steady_ppl.studies.runner import run_study
 from steady_ppl.studies.table import TABLE, read_results
@@ -75,7 +75,7 @@ def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(t
         and found.loc[13, "reason"] == "its worker died each time that it was tried"
     )
     begun = {seed: (tmp_path / "marks" / str(seed)).stat().st_size for seed in (1, 7, 13)}
-    assert begun == {1: 2, 7: 2, 13: TRIES}
+    assert begun == {1: 2, 7: 2, 13: MAX_TRIES}
     assert sorted(file.name for file in out.iterdir()) == [TABLE, "study.json"]
     assert run_study(plan, out, Local(workers)) == 3  # what has failed is left
     assert (tmp_path / "marks" / "7").stat().st_size == begun[7]
@@ -100,8 +100,8 @@ def test_a_deadly_job_takes_nothing_with_it_and_is_tried_after_the_others(tmp_pa
     assert [(row["seed"], row["outcome"]) for row in found[4:]] == [(13, "failed")]
     assert {(row["seed"], row["outcome"]) for row in found[:4]} == {(seed, "done") for seed in (1, 2, 3, 5)}
     begun = {int(mark.name): mark.stat().st_size for mark in (tmp_path / "marks").iterdir()}
-    assert begun == {1: 1, 2: 1, 3: 1, 5: 1, 13: TRIES}
-    assert said == [f"a worker died of {jobs[0].label}"] * TRIES
+    assert begun == {1: 1, 2: 1, 3: 1, 5: 1, 13: MAX_TRIES}
+    assert said == [f"a worker died of {jobs[0].label}"] * MAX_TRIES
 
 
 def test_workers_that_die_before_they_begin_end_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

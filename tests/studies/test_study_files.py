@@ -17,7 +17,7 @@ from steady_ppl.data.table import write_table
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.model.loading import load_program
 from steady_ppl.smc.simulate import simulate
-from steady_ppl.studies.job import CHANGED, in_limits, planted, run, told_settings
+from steady_ppl.studies.job import OUTDATED, in_limits, planted, run, told_settings
 from steady_ppl.studies.plan import read_plan
 from steady_ppl.studies.runner import require_runnable
 
@@ -284,9 +284,9 @@ def test_what_was_changed_while_a_study_went_on_is_no_result(tmp_path: Path):
     assert run(job)["outcome"] == "done"
     with (folder / "mine.py").open("a") as file:
         file.write("# changed\n")
-    assert run(job)["reason"] == CHANGED
+    assert run(job)["reason"] == OUTDATED
     (folder / "mine.py").unlink()
-    assert run(job)["reason"] == CHANGED
+    assert run(job)["reason"] == OUTDATED
 
 
 def test_a_wave_is_the_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -15,7 +15,7 @@ from small_studies import row, written
 
 from steady_ppl.errors import RunError
 from steady_ppl.studies.executors import Local
-from steady_ppl.studies.job import CHANGED
+from steady_ppl.studies.job import OUTDATED
 from steady_ppl.studies.plan import STUDY_RECORD, read_plan, record_plan, recorded_plan
 from steady_ppl.studies.runner import run_study
 from steady_ppl.studies.table import ARRIVED, EARLIER, TABLE, StudyTable, read_results, study_table
@@ -184,7 +184,7 @@ def test_files_that_had_changed_are_tried_again_by_the_same_command(tmp_path: Pa
     plan, out = read_plan(written(tmp_path)), tmp_path / "out"
     plan = replace(plan, jobs=plan.jobs[:2])
     with study_table(out) as table:
-        table.add(row(plan.jobs[0].key, "failed", reason=CHANGED, seconds=0.0))
+        table.add(row(plan.jobs[0].key, "failed", reason=OUTDATED, seconds=0.0))
         table.add(row(plan.jobs[1].key, "failed", reason="no"))
     assert run_study(plan, out, Local(1)) == 1
     assert read_results(out)["outcome"].tolist() == ["failed", "done"]

@@ -95,7 +95,7 @@ def test_an_error_here_ends_the_other_processes(tmp_path):
 
 def test_a_process_that_hangs_is_not_waited_for(monkeypatch):
     mine, held = os.getpid(), threading.Lock()
-    monkeypatch.setattr(cores, "MIN_PATIENCE", 0.2)
+    monkeypatch.setattr(cores, "MIN_PATIENCE_SECONDS", 0.2)
 
     def wait(index):
         if os.getpid() != mine:
