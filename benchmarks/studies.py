@@ -19,7 +19,7 @@ from pathlib import Path
 import pandas as pd
 
 from steady_ppl.studies.job import HELD_OUT, IN_LIMITS
-from steady_ppl.studies.pictures import SIZE_EDGES, chosen, points
+from steady_ppl.studies.pictures import SIZE_EDGES, best_settings, points
 from steady_ppl.studies.plan import Picture
 from steady_ppl.studies.table import TABLE
 
@@ -126,7 +126,7 @@ def observation_noise(rows: pd.DataFrame) -> tuple[str, Musts]:
 
 def of_best_settings(rows: pd.DataFrame) -> pd.DataFrame:
     """Of each method's settings those with the largest log p(y) of valid drives, at each noise."""
-    return chosen(Picture(SIGMA, [ERROR], chosen_by=HELD_OUT), rows)
+    return best_settings(Picture(SIGMA, [ERROR], chosen_by=HELD_OUT), rows)
 
 
 def _ramps(tried: pd.DataFrame) -> list[str]:

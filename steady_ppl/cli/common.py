@@ -1,14 +1,13 @@
 """What the commands share: programs, runs and their labels, JSON, refusals of the system."""
 
 import errno
-import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import steady_ppl as st
 from steady_ppl.errors import ComputationError, SteadyError, UsageError
-from steady_ppl.utils.files import whole_file
+from steady_ppl.utils.files import finite_json, whole_file
 from steady_ppl.utils.text import shown, tell
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
@@ -45,22 +44,15 @@ def program_from(model: str, seed: int, substeps: int | None = None) -> Any:
 
 def write_json(path: Path, content: Any) -> None:
     """Write a file whole or not at all; a figure that is not finite is an error, JSON has no word for it."""
-    text = _as_json(content, str(path)) + "\n"
+    text = finite_json(content, str(path), indent=1) + "\n"
     with whole_file(path) as beside:
         beside.write_text(text)
-
-
-def _as_json(content: Any, place: str) -> str:
-    try:
-        return json.dumps(content, indent=1, allow_nan=False)
-    except ValueError as error:
-        raise ComputationError(f"{place} is not written: a figure is not finite, the program has blown up") from error
 
 
 def present(text: str, content: Any, json_file: Path | None) -> None:
     """Print the text and write the figures beside it, or print the figures alone if the file is `-`."""
     if json_file is not None and str(json_file) == "-":
-        tell(_as_json(content, "the output"))
+        tell(finite_json(content, "the output", indent=1))
         return
     tell(text)
     if json_file is not None:

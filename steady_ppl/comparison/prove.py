@@ -18,8 +18,8 @@ from steady_ppl.comparison.scores import (
     Judged,
     ProgramScores,
     as_row,
+    judge_constant_velocity,
     judge_program,
-    keeping_velocity,
     noise_floor,
 )
 from steady_ppl.data.table import refuse_long
@@ -95,7 +95,7 @@ def prove(
             judged[name] = judged[same] if same else judge_program(name, program, data, known_start, seed, path)
         begin()
         before, true = judged[reference], judged.get(truth or "")
-        coasting = keeping_velocity(before) if with_constant_velocity else None
+        coasting = judge_constant_velocity(before) if with_constant_velocity else None
     if isinstance(coasting, Judged):
         judged[CONSTANT_VELOCITY] = coasting
     floor = noise_floor(true, seed) if true else None
@@ -108,7 +108,7 @@ def prove(
     drives = before.problem.data
     horizons = named_horizons(drives, PROOF_HORIZONS_SECONDS)
     notes += drives.uneven_steps + diagnose_units(before.problem.program, drives)
-    notes += _few_starts(drives, horizons, known_start) + unfinished(rows) + _blown_up(found) + far_off(found, data)
+    notes += _few_rows(drives, horizons, known_start) + unconverged(rows) + _blown_up(found) + doubtful(found, data)
     return Proof(found, reference, horizons, drives.median_step, len(data), known_start, seed, notes)
 
 
@@ -118,7 +118,7 @@ def _counted(judged: Iterable[Judged]) -> dict[int, Tensor]:
     return {horizon: torch.stack([row[horizon].observed for row in rows]).all(0) for horizon in rows[0]}
 
 
-def unfinished(rows: Mapping[str, Program | Fit]) -> list[str]:
+def unconverged(rows: Mapping[str, Program | Fit]) -> list[str]:
     """Which rows are fits that had not converged, so that a difference may be one of training."""
     return [
         f"{name} had not converged when its fit ended: part of what it differs by may be training"
@@ -151,7 +151,7 @@ def _require(programs: Mapping[str, Program], reference: str, truth: str | None,
     refuse_long(data)
 
 
-def _few_starts(data: Trajectories, horizons: Mapping[str, int], known_start: bool) -> list[str]:
+def _few_rows(data: Trajectories, horizons: Mapping[str, int], known_start: bool) -> list[str]:
     """Say where an error goes by the first rows only."""
     notes, length = [], data.time.shape[0]
     for name, horizon in horizons.items():
@@ -169,7 +169,7 @@ def _blown_up(rows: Mapping[str, ProgramScores]) -> list[str]:
     return notes
 
 
-def far_off(rows: Mapping[str, ProgramScores], data: Trajectories) -> list[str]:
+def doubtful(rows: Mapping[str, ProgramScores], data: Trajectories) -> list[str]:
     """Drives on which the linearised program's log p(y) is not to be trusted, the worst of each row."""
     notes = []
     for name, row in rows.items():

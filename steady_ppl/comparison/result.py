@@ -11,7 +11,7 @@ from torch import Tensor
 from steady_ppl.comparison.scores import BANDED_HORIZONS, COVERAGE, RESAMPLES, Change, Key, ProgramScores, paired
 from steady_ppl.effects import attached
 from steady_ppl.model.program import error_groups
-from steady_ppl.utils.late import Displayed
+from steady_ppl.utils.hooks import Displayed
 from steady_ppl.utils.text import TEXT_WIDTH, aligned, number
 
 NAME_COLUMNS = 20  # characters of a row's name
@@ -82,7 +82,7 @@ class Proof(Displayed):
         bands = [name for name in BANDED_HORIZONS if name in horizons]
         shown = [name if i else f"in 90 % band, {name}" for i, name in enumerate(bands)]
         header = ["", "log p(y) [nats]", "difference [nats]", "by particles", *shown]
-        lines += _table([header, *([row["row"], *_likely(row, bands)] for row in rows)])
+        lines += _table([header, *([row["row"], *_likelihood_cells(row, bands)] for row in rows)])
         lines += ["", "root mean square error of predictions ahead, and by how much it differs"]
         units_of = {("measurement", of): of for of in rows[0]["measurement"]}
         units_of |= {("state", of): unit for of, unit in content["units"].items()}
@@ -172,7 +172,7 @@ def with_interval(value: float, interval: Sequence[float], digits: int, unit: st
     return f"{value:+.{digits}f}{unit} [{low}, {high}]".replace("-", "−")
 
 
-def _likely(row: Mapping[str, Any], bands: Sequence[str]) -> list[str]:
+def _likelihood_cells(row: Mapping[str, Any], bands: Sequence[str]) -> list[str]:
     change = (row["against_reference"] or {}).get("log_likelihood")
     said = with_interval(change["difference"], change["interval"], 1) if change else ""
     cells = [number(row["log_likelihood"], ".1f"), said, number(row["neglected"], "+.2f")]

@@ -164,7 +164,7 @@ def judge(problem: Problem, ahead: Lookahead, kernels: bool | None = None) -> Ju
     return Judged(problem, ahead, tracked, predictions, states)
 
 
-def keeping_velocity(before: Judged) -> Judged | str:
+def judge_constant_velocity(before: Judged) -> Judged | str:
     """A program without any acceleration but noise, of the size under which the measurements are most likely."""
     unseen = before.problem.without_truth()
     found = constant_velocity(unseen, before.tracked, [1])

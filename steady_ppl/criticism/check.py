@@ -24,7 +24,7 @@ from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.predict import named_horizons, predict
-from steady_ppl.kernels.rows import in_plain_torch, without_kernels
+from steady_ppl.kernels.rows import fallback_notes, kernel_failures
 from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.runs.diagnostics import diagnose_units
@@ -72,7 +72,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     parts = (("finding paths", 1), ("comparing time steps", 1), ("simulating drives", 2), ("judging", 2))
     with stages(*parts) as begin:
         begin()
-        with seeded(seed, "check"), without_kernels() as uncompiled:
+        with seeded(seed, "check"), kernel_failures() as uncompiled:
             ahead = problem.find_and_smooth()
             path = ahead.linearization.path
             real = problem.track(path, passes=1)
@@ -94,7 +94,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         both = Residuals.joined([ours, theirs])
         misfit = judge(both, time, controls, _pairs(program, ours), dispersion)
     notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
-    notes += in_plain_torch(uncompiled)
+    notes += fallback_notes(uncompiled)
     notes += run.uneven_steps + diagnose_units(program, run)
     notes += [f"refitted to these drives, {step.note}"] if step.note else []
     notes += [step.uncompared] if step.uncompared else []

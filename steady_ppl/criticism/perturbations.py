@@ -133,10 +133,10 @@ class _Scores:
     def of_actuators(self) -> Named:
         """Other controls than those commanded, as the program would answer to them: one's, and all together."""
         together: dict[str, list[Tensor]] = {}
-        for index, (name, answer) in enumerate(zip(self.program.control_names, self.answers, strict=True)):
-            if answer is None:
+        for index, (name, response) in enumerate(zip(self.program.control_names, self.responses, strict=True)):
+            if response is None:
                 continue
-            along = (answer * self.arrival).sum(-1)
+            along = (response * self.arrival).sum(-1)
             for word, shape in self._other_than(self.commands[:-1, :, index]).items():
                 score = self.over_rows(shape * along)
                 together.setdefault(word, []).append(score)
@@ -195,8 +195,8 @@ class _Scores:
         along = self.linear.noise / self.linear.noise.norm(dim=-2, keepdim=True).clamp(min=1e-300)
         for channel, (called, noise) in enumerate(zip(self.channels, self.noise.unbind(-1), strict=True)):
             unmoved = []
-            for index, answer in enumerate(self.answers):
-                if answer is None or float((answer * along[..., channel]).sum(-1).norm() / answer.norm()) < 1e-3:
+            for index, response in enumerate(self.responses):
+                if response is None or float((response * along[..., channel]).sum(-1).norm() / response.norm()) < 1e-3:
                     unmoved.append(index)
             for one in unmoved:
                 yield f"{called} acceleration with {name[one]}", self.over_rows(commands[..., one] * noise)
@@ -206,7 +206,7 @@ class _Scores:
                     yield word, self.over_rows((commands[..., one] - commands[..., other]) * noise)
 
     @cached_property
-    def answers(self) -> list[Tensor | None]:
+    def responses(self) -> list[Tensor | None]:
         """How the next state changes with each control, `(T, B, D)`; None where it does not."""
         found: list[Tensor | None] = []
         for index in range(len(self.program.controls)):
@@ -214,9 +214,9 @@ class _Scores:
             change = torch.zeros_like(self.controls)
             change[..., index :: len(self.program.controls)] = size  # in every substep
             more, less = (self._moved(self.controls + sign * change) for sign in (1, -1))
-            answer = wrap_angles(more - less, self.linear.angles) / (2 * size)
-            answer = torch.where(self.data.transitions[..., None], answer, 0.0)
-            found.append(answer if bool((answer.abs() > 1e-9).any()) else None)
+            response = wrap_angles(more - less, self.linear.angles) / (2 * size)
+            response = torch.where(self.data.transitions[..., None], response, 0.0)
+            found.append(response if bool((response.abs() > 1e-9).any()) else None)
         return found
 
     def _moved(self, controls: Tensor) -> Tensor:

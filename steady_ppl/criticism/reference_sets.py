@@ -23,7 +23,7 @@ from steady_ppl.gaussian.smoother import REST_TOLERANCE, means_as_path
 from steady_ppl.likelihood.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.angles import wrap_angles
-from steady_ppl.utils.cores import Result, side_by_side
+from steady_ppl.utils.cores import Output, run_in_parallel
 from steady_ppl.utils.random import seeded
 
 MIN_BAND_SETS = 20  # simulated sets for bands
@@ -57,12 +57,12 @@ def simulate_sets(problem: Problem, starts: Tensor, channels: int, horizons: Seq
     """
     at_once, seed = max(1, MAX_ROWS_OF_BLOCK // problem.data.time.numel()), int(torch.randint(2**31, ()))
 
-    def simulate(number: int, block: Tensor) -> Result:
+    def simulate(number: int, block: Tensor) -> Output:
         with seeded(seed + number, "block"):
             return _block(problem, block, channels, horizons)
 
     jobs = [partial(simulate, number, block) for number, block in enumerate(starts.split(at_once))]
-    blocks = [(tensors, said) for tensors, said in side_by_side(jobs) if tensors]
+    blocks = [(tensors, said) for tensors, said in run_in_parallel(jobs) if tensors]
     sets = sum(len(tensors["values"]) for tensors, _ in blocks)
     if sets < MIN_BAND_SETS:
         what = f"{len(starts) - sets} of {len(starts)} simulated sets blew up"
@@ -82,7 +82,7 @@ def simulate_sets(problem: Problem, starts: Tensor, channels: int, horizons: Seq
     )
 
 
-def _block(problem: Problem, starts: Tensor, channels: int, horizons: Sequence[int]) -> Result:
+def _block(problem: Problem, starts: Tensor, channels: int, horizons: Sequence[int]) -> Output:
     """What `SimulatedSets` has of some sets, each tensor with the sets or their drives in front, and the names in it;
     nothing where every set blew up."""
     program, sets = problem.program, len(starts)

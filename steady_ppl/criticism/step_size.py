@@ -53,7 +53,7 @@ class StepTrial:
         change = other.values - self.values
         return 0.5 * float(change @ torch.linalg.pinv(self.covariance) @ change)
 
-    def farthest(self, other: StepTrial) -> str:
+    def largest_difference(self, other: StepTrial) -> str:
         """The watched number that differs most from the other trial's, and by how much, in words."""
         spread = self.covariance.diagonal().clamp(min=1e-300).sqrt()
         apart = ((other.values - self.values) / spread).abs()
@@ -107,9 +107,9 @@ class StepCheck:
                 if gain > MIN_GAIN:
                     said += f", the last doubling {gain:.0f} of them: more substeps may gain more"
                 else:
-                    said += f", the last doubling moves {suited.farthest(coarser)}: more may move it on"
+                    said += f", the last doubling moves {suited.largest_difference(coarser)}: more may move it on"
         elif self.too_coarse and suited.shift(own) > MAX_SHIFT:
-            said = f"move {suited.farthest(own)}"
+            said = f"move {suited.largest_difference(own)}"
         else:
             return ""
         return f"the program's own time step is too coarse: {self._finer_steps(said)}"
@@ -119,7 +119,7 @@ class StepCheck:
         """What is to be noted where a finer step moves parameters a little; empty otherwise."""
         if not self.too_coarse or self.sentence:
             return ""
-        return self._finer_steps(f"move {self.suited.farthest(self.trials[0])}")
+        return self._finer_steps(f"move {self.suited.largest_difference(self.trials[0])}")
 
     def _finer_steps(self, effect: str) -> str:
         finer, own = self.suited.substeps, self.trials[0].substeps

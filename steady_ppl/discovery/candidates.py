@@ -29,7 +29,7 @@ from steady_ppl.errors import FilterError
 from steady_ppl.likelihood.parameters import Element, elements
 from steady_ppl.likelihood.scores import measured, smoothed, typical_spreads
 from steady_ppl.model.program import Program
-from steady_ppl.utils.journal import piece
+from steady_ppl.utils.journal import journaled
 from steady_ppl.utils.random import seeded
 
 MIN_LEADERS, MIN_ALIAS_CORRELATION = 6, 0.85  # how many are refitted, and those whose columns are so like the first's
@@ -132,7 +132,7 @@ def screen_program(now: Refit, declared: Program, *, sets: int, seed: int, withh
     if not fold.known_start:
         with seeded(seed, "starts"):
             starts = ahead.draws(sets)[1][:, 0].to(starts)
-    simulated, _ = piece(lambda: ({"scores": simulate_scores(problem, starts, parts, columns, seed=seed)}, {}))
+    simulated, _ = journaled(lambda: ({"scores": simulate_scores(problem, starts, parts, columns, seed=seed)}, {}))
     tests = screen(observed, simulated["scores"], len(parts), columns, away)
     information, first = {"": tests.information[: len(parts), : len(parts)]}, len(parts)
     for column in columns:
@@ -155,7 +155,7 @@ def leaders(screened: Screened, first: bool) -> list[Tested]:
     best = [i for i, _ in alive[:MIN_LEADERS]]
     near = [i for i, tested in alive if tested.p_value < NEAR_FAMILY_LEVEL]
     few = {*best, *near} if first else {top, *(i for i in best if i in near)}
-    return [tested for i, tested in alive if i in few or float(screened.alike[top, i]) > MIN_ALIAS_CORRELATION]
+    return [tested for i, tested in alive if i in few or float(screened.correlations[top, i]) > MIN_ALIAS_CORRELATION]
 
 
 def fitted(now: Refit, tested: Tested, screening: Screening, threshold: Threshold = NO_THRESHOLD) -> Candidate:
@@ -229,7 +229,7 @@ def at_its_best_place(now: Refit, candidate: Candidate) -> Candidate:
         for _ in range(MAX_COORDINATE_SWEEPS):
             before = len(fits)
             for name in at.profiled:
-                try_all(_beside(fits[-1][0], grid, name, share))
+                try_all(_neighbours(fits[-1][0], grid, name, share))
             if len(fits) == before:
                 break
     for variant, best in reversed(fits):
@@ -259,7 +259,7 @@ def variance_of_places(now: Refit, candidate: Candidate) -> Tensor:
 
     variance, steps = torch.zeros_like(here), list[_GridStep]()
     for name in at.profiled:
-        beside = zip((1, -1), _beside(at, grid, name, NEIGHBOUR_SHARE), strict=True)
+        beside = zip((1, -1), _neighbours(at, grid, name, NEIGHBOUR_SHARE), strict=True)
         sides = [(sign, variant, *found) for sign, variant in beside if (found := moved_to(variant))]
         if not sides:
             variance = variance + here.square()
@@ -301,7 +301,7 @@ def _grid(now: Refit, candidate: Candidate) -> list[Variant]:
     return [variant for variant in every if variant.name == candidate.variant.name]
 
 
-def _beside(at: Variant, grid: Sequence[Variant], name: str, share: float) -> list[Variant]:
+def _neighbours(at: Variant, grid: Sequence[Variant], name: str, share: float) -> list[Variant]:
     """The effect on either side of a place: by a share of the grid's spacing, or of the value where there is none."""
     value = at.profiled[name]
     values = sorted({float(variant.profiled[name]) for variant in grid})

@@ -22,7 +22,7 @@ from steady_ppl.effects import Effect, Variant
 from steady_ppl.gaussian.lanes import Array
 from steady_ppl.gaussian.predict import on_a_circle
 from steady_ppl.model.interventions import channel_means
-from steady_ppl.model.program import Program, names, units
+from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, row_controls
 
 KNOTS = 7  # of a curve
@@ -82,21 +82,6 @@ def variables(
     found |= {name: control[..., i] for i, name in enumerate(program.control_names)}
     found |= {f"commanded {channel}": value for channel, value in mean.items()}
     return found | {"time": time}
-
-
-def unit_of(program: Program, variable: str) -> str:
-    """Of a variable, as far as the program declares it."""
-    for declared in (program.states, program.controls, program.measurements):
-        if variable in names(declared):
-            return units(declared)[names(declared).index(variable)]
-    if variable == "time":
-        return "s"
-    of_channel = dict(zip(program.channel_names, program.channel_units, strict=True))
-    parts = [part.strip() for part in variable.split("×")]
-    found = [of_channel.get(part.removeprefix("commanded ").removesuffix(" velocity"), "") for part in parts]
-    if variable.startswith("commanded "):
-        return found[0]
-    return " · ".join(unit.replace("/s²", "/s") for unit in found)
 
 
 def knots_of(values: Tensor, circular: bool) -> tuple[float, ...] | None:

@@ -27,7 +27,7 @@ from steady_ppl.likelihood.scores import (
 from steady_ppl.model.interventions import by_channel
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, row_controls
-from steady_ppl.utils.cores import Result, side_by_side
+from steady_ppl.utils.cores import Output, run_in_parallel
 from steady_ppl.utils.random import seeded
 
 TRAJECTORIES_OF_JOB = 400  # that are scored at a time
@@ -234,13 +234,13 @@ def simulate_scores(
     with seeded(seed, "bootstrap"):
         drives, path = simulate_again(program, data, starts, len(program.channels))
 
-    def score(index: Tensor) -> Result:
+    def score(index: Tensor) -> Output:
         part = replace(problem, data=drives.subset(index))
         ahead = part.smooth(ReferencePath(path.states[:, index], path.noise[:, index]), passes=2)
         return {"scores": scores_along(part, ahead, parts, columns), "likely": ahead.log_likelihood}, {}
 
     jobs = [partial(score, index) for index in torch.arange(len(drives)).split(TRAJECTORIES_OF_JOB)]
-    found = [tensors for tensors, _ in side_by_side(jobs)]
+    found = [tensors for tensors, _ in run_in_parallel(jobs)]
     scores, likely = (torch.cat([one[name] for one in found]) for name in ("scores", "likely"))
     scores = scores.unflatten(0, (sets, len(data)))
     whole = torch.isfinite(scores).all(-1).all(-1) & torch.isfinite(likely.view(sets, len(data))).all(-1)

@@ -12,14 +12,13 @@ from torch import Tensor
 from steady_ppl.comparison.scores import RESAMPLES
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.candidates import Candidate, variance_of_places
-from steady_ppl.discovery.curves import unit_of
 from steady_ppl.discovery.refits import Refit, with_states_of
 from steady_ppl.discovery.screening import Tested
 from steady_ppl.discovery.search import MIN_GAIN_OF_CURVE, Found, Search
 from steady_ppl.effects import Variant, attached
 from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.likelihood.problem import Problem
-from steady_ppl.model.program import Program
+from steady_ppl.model.program import Program, unit_of
 from steady_ppl.utils.random import seeded
 
 INTERVAL_COVERAGE = 0.9  # of the intervals of coefficients, and of the band of a curve
@@ -34,7 +33,7 @@ class Finding:
 
     variant: Variant  # the effect, the best of its class
     kind: str  # dynamics, actuator, sensor or noise
-    alike: list[str]  # names of the effects that these drives cannot tell apart, best first
+    aliases: list[str]  # names of the effects that these drives cannot tell apart, best first
     confidence: float | None  # the probability that the right one is among them
     coefficient: list[float]
     sd: list[float]  # standard deviation of each number
@@ -76,7 +75,7 @@ def _finding(search: Search, found: Found) -> Finding:
     return Finding(
         variant=variant,
         kind=effect.verdict,
-        alike=[candidate.variant.name for candidate in found.alike],
+        aliases=[candidate.variant.name for candidate in found.aliases],
         confidence=_confidence(search, found),
         coefficient=values.tolist(),
         sd=(values * spread if is_positive else spread).tolist(),
@@ -109,7 +108,7 @@ def _confidence(search: Search, found: Found) -> float:
     curve = max((c.total for c in search.curves if isinstance(c.refit, Refit)), default=-math.inf)
     rivals = [0.0, found.candidate.total + curve - search.gain - MIN_GAIN_OF_CURVE]
     whole = np.logaddexp.reduce([*totals.values(), *rivals])
-    return float(np.exp(np.logaddexp.reduce([totals[id(c)] for c in found.alike]) - whole))
+    return float(np.exp(np.logaddexp.reduce([totals[id(c)] for c in found.aliases]) - whole))
 
 
 def _departure(search: Search, tested: Tested) -> Finding:
@@ -170,12 +169,12 @@ def next_run(found: Found, seed: int) -> NextRun | None:
 
     Each is simulated with the best member of the class; the others are judged by how much less likely they find it.
     """
-    members = [(c.variant.name, c.refit) for c in found.alike if isinstance(c.refit, Refit)]
+    members = [(c.variant.name, c.refit) for c in found.aliases if isinstance(c.refit, Refit)]
     refits = [refit for _, refit in members]
     data = refits[0].folds[0].drives
     usual = _separation(refits, data.controls, seed)
     better = []
-    for way, controls in _ways(data, seed):
+    for way, controls in _excitations(data, seed):
         apart = _separation(refits, controls.unsqueeze(1).expand_as(data.controls), seed)
         if math.isfinite(apart) and apart > max(0.0, usual):
             better.append((apart, way, controls))
@@ -211,7 +210,7 @@ def _separation(refits: list[Refit], controls: Tensor, seed: int) -> float:
     return min(apart) if all(map(math.isfinite, apart)) else math.nan
 
 
-def _ways(data: Trajectories, seed: int) -> Iterator[tuple[str, Tensor]]:
+def _excitations(data: Trajectories, seed: int) -> Iterator[tuple[str, Tensor]]:
     """Ways of driving: held, stepped and swept between the limits that were driven."""
     driven = data.controls[:-1][data.transitions]
     low, high = driven.amin(0), driven.amax(0)

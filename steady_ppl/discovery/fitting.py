@@ -27,7 +27,7 @@ from steady_ppl.gaussian.smoother import require_found, resting_path
 from steady_ppl.guides.base import Constant
 from steady_ppl.guides.linearized import LookaheadGuide
 from steady_ppl.likelihood.evidence import neglected
-from steady_ppl.likelihood.maximize import Maximum, Term, climb, kept_maximum, maximum_of
+from steady_ppl.likelihood.maximize import Maximum, Term, kept_maximum, maximise_sum, maximum_of
 from steady_ppl.likelihood.parameters import Element, elements, moved, set_values, values_of
 from steady_ppl.likelihood.problem import Problem
 from steady_ppl.likelihood.scores import channel_moments, substep_spreads
@@ -61,7 +61,7 @@ class ByLikelihood:
 
     def judge(self, problem: Problem, path: ReferencePath) -> Judgement:
         """Log p(y) of drives, linearised along a path that is improved from here."""
-        ahead = _at_rest(problem, path)
+        ahead = _smooth(problem, path)
         return Judgement(ahead.log_likelihood, resting_path(ahead, problem.data))
 
 
@@ -78,9 +78,9 @@ class ByDraws:
 
     def fit(self, problem: Problem, path: ReferencePath | None = None, **_: Any) -> Maximum:
         """See `ByLikelihood`."""
-        return kept_maximum(problem.program, lambda: self._climb(problem, path or problem.find_path()))
+        return kept_maximum(problem.program, lambda: self._train(problem, path or problem.find_path()))
 
-    def _climb(self, problem: Problem, path: ReferencePath) -> Maximum:
+    def _train(self, problem: Problem, path: ReferencePath) -> Maximum:
         program, data, known_start = problem.program, problem.data, problem.known_start
         before = self.judge(problem, path)
         guide = LookaheadGuide(
@@ -108,7 +108,7 @@ class ByDraws:
 
     def judge(self, problem: Problem, path: ReferencePath) -> Judgement:
         """See `ByLikelihood`."""
-        ahead = _at_rest(problem, path)
+        ahead = _smooth(problem, path)
         more = _neglected(problem, ahead, particles=JUDGE_PARTICLES)
         return Judgement(ahead.log_likelihood + more, resting_path(ahead, problem.data))
 
@@ -118,14 +118,14 @@ Fitting = ByLikelihood | ByDraws
 
 def is_doubtful(problem: Problem, path: ReferencePath) -> bool:
     """Whether the linearised log p(y) is off by more than half a nat a drive, or no particle filter can say."""
-    ahead = _at_rest(problem, path)
+    ahead = _smooth(problem, path)
     try:
         return float(_neglected(problem, ahead).abs().mean()) > MAX_LINEARISATION_ERROR
     except FilterError:
         return True
 
 
-def _at_rest(problem: Problem, path: ReferencePath) -> Lookahead:
+def _smooth(problem: Problem, path: ReferencePath) -> Lookahead:
     ahead = problem.smooth(path, passes=15, tolerance=0.02)
     require_found(ahead, problem.program, problem.data)
     return ahead
@@ -170,7 +170,7 @@ def with_common_noise(problems: Sequence[Problem], maxima: Sequence[Maximum]) ->
         for term in terms:
             set_values(term.parts, start[term.columns])
         try:
-            ended = climb(terms, information=information, steps=MAX_JOINT_STEPS, precision=JOINT_PRECISION)
+            ended = maximise_sum(terms, information=information, steps=MAX_JOINT_STEPS, precision=JOINT_PRECISION)
             break
         except FilterError:
             if last == len(starts):

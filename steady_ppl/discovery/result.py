@@ -15,7 +15,7 @@ from steady_ppl.discovery.screening import FAMILY_LEVEL, Tested
 from steady_ppl.discovery.search import Search
 from steady_ppl.effects import Variant
 from steady_ppl.runs.fit import Fit
-from steady_ppl.utils.late import Displayed
+from steady_ppl.utils.hooks import Displayed
 from steady_ppl.utils.text import TEXT_WIDTH, aligned, number
 
 CANDIDATES_SHOWN = 12  # candidates in the table
@@ -60,7 +60,7 @@ class Discovery(Displayed):
         """none, dynamics, actuator, sensor, noise or other."""
         if self.findings:
             return self.findings[0].kind
-        return "none" if self.search.rounds[0].quiet else "other"
+        return "none" if self.search.rounds[0].nothing_found else "other"
 
     @property
     def p_value(self) -> float:
@@ -79,7 +79,7 @@ class Discovery(Displayed):
             "p_value": self.p_value,
             "level": FAMILY_LEVEL,
             "effect": first.variant.name if first else None,
-            "class": first.alike if first else [],
+            "class": first.aliases if first else [],
             "confidence": first.confidence if first else None,
             "complete": self.search.is_complete,
             "effects": [_finding(finding) for finding in self.findings],
@@ -190,7 +190,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
     return {
         "effect": finding.variant.name,
         "kind": finding.kind,
-        "class": finding.alike,
+        "class": finding.aliases,
         "confidence": finding.confidence,
         "coefficient": finding.coefficient,
         "sd": finding.sd,
@@ -237,8 +237,8 @@ def _said(finding: Finding, is_complete: bool) -> str:
     pairs = zip(finding.coefficient, finding.interval, strict=True)
     numbers = ", ".join(f"{value:.3g} [{low:.3g}, {high:.3g}]" for value, (low, high) in pairs)
     said = f"{finding.variant.label} = {numbers}{unit}"
-    if len(finding.alike) > 1:
-        said += f", which these drives cannot tell from {' or '.join(finding.alike[1:])}"
+    if len(finding.aliases) > 1:
+        said += f", which these drives cannot tell from {' or '.join(finding.aliases[1:])}"
     if finding.confidence is None:
         return said
     if not is_complete:

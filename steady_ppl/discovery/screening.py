@@ -79,7 +79,7 @@ class Screened:
     p_value: float  # family-wise, of the smallest
     critical: float  # the single p-value below which the family-wise level is kept
     fitted: tuple[float, int]  # Lagrange multiplier of the fitted parameters, large at a bound; how many they are
-    alike: Tensor  # candidate × candidate, the largest canonical correlation of their projected columns
+    correlations: Tensor  # candidate × candidate, the largest canonical correlation of their projected columns
     information: Tensor  # covariance of a set's summed scores, of the parameters and then of the columns, (N, N)
 
 
@@ -132,7 +132,7 @@ def screen(
         p_value=(1 + float((family[1:] <= family[0]).sum())) / len(family),
         critical=critical,
         fitted=(float(scores[0, own] @ (inverse @ scores[0, own])), fitted),
-        alike=_alike(left, [test.place for test in tests]),
+        correlations=_canonical_correlations(left, [test.place for test in tests]),
         information=information,
     )
 
@@ -221,7 +221,7 @@ def _departed(departure: Departure, information: Tensor, scores: Tensor) -> Test
     return Tested(column, nowhere, float(z[0] ** 2), p_values, change, sds, sds, alone=sds, departure=True)
 
 
-def _alike(left: Tensor, places: Sequence[slice]) -> Tensor:
+def _canonical_correlations(left: Tensor, places: Sequence[slice]) -> Tensor:
     """Largest canonical correlations between the candidates' columns."""
 
     def whitening(own: Tensor) -> Tensor:
@@ -230,11 +230,11 @@ def _alike(left: Tensor, places: Sequence[slice]) -> Tensor:
         return torch.linalg.inv(torch.linalg.cholesky(own + 1e-10 * torch.diag(own.diagonal())))
 
     whitened = [whitening(left[place, place]) for place in places]
-    alike = torch.eye(len(places), dtype=torch.float64)
+    correlations = torch.eye(len(places), dtype=torch.float64)
     for j, i in itertools.combinations(range(len(places)), 2):
         across = whitened[i] @ left[places[i], places[j]] @ whitened[j].T
-        alike[i, j] = alike[j, i] = float(torch.linalg.matrix_norm(across, 2).clamp(max=1.0))
-    return alike
+        correlations[i, j] = correlations[j, i] = float(torch.linalg.matrix_norm(across, 2).clamp(max=1.0))
+    return correlations
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any
 
 from llvmlite import ir
 
-from steady_ppl.kernels.graph import PARTICLE, Each, NotCompilable, Product, ScalarGraph
+from steady_ppl.kernels.graph import PARTICLE, Elementwise, NotCompilable, Product, ScalarGraph
 from steady_ppl.kernels.simd import FLOAT, OPERATIONS, Lanes
 
 KERNEL_NAME = "kernel"  # of its module and its function
@@ -200,7 +200,7 @@ class _Writer:
         """Compute a vector as a whole and keep it."""
         what = self.graph.vectors[vector]
         place = self._reserve(WIDE, what.length)
-        if isinstance(what, Each) or (whole := self.graph.whole_vector(what.x)) is None:
+        if isinstance(what, Elementwise) or (whole := self.graph.whole_vector(what.x)) is None:
             self._prepare(vector)
             with self._loop(LONG(what.length)) as k:
                 value = self._element(vector, k, {})
@@ -234,7 +234,7 @@ class _Writer:
         what = self.graph.vectors[vector]
         if vector in self.stored:
             return
-        if isinstance(what, Each):
+        if isinstance(what, Elementwise):
             for kind, n in what.operands:
                 if kind == "vector":
                     self._prepare(n)

@@ -51,7 +51,7 @@ class Product:
 
 
 @dataclass(frozen=True)
-class Each:
+class Elementwise:
     """An operation on each element of vectors."""
 
     length: int
@@ -66,7 +66,7 @@ class ScalarGraph:
     levels_of_inputs: dict[str, int]
     scalars: list[Scalar] = field(default_factory=list)
     levels: list[int] = field(default_factory=list)  # what each scalar depends on
-    vectors: list[Product | Each] = field(default_factory=list)
+    vectors: list[Product | Elementwise] = field(default_factory=list)
     outputs: list[int] = field(default_factory=list)  # the scalars to be returned, in order
     parameters: list[int] = field(default_factory=list)  # places on the tape whose values the kernel takes, in order
     numbers: dict[Scalar, int] = field(default_factory=dict)  # where each is in `scalars`
@@ -96,13 +96,13 @@ class ScalarGraph:
     def constant(self, value: float) -> int:
         return self.scalar("constant", float(value))
 
-    def vector(self, vector: Product | Each) -> list[int]:
+    def vector(self, vector: Product | Elementwise) -> list[int]:
         """The elements of a new vector."""
         self.vectors.append(vector)
         return self.elements("vector", len(self.vectors) - 1, vector.length)
 
     def elements(self, kind: str, number: int, length: int) -> list[int]:
-        """The scalars of an operand, as in `Each`."""
+        """The scalars of an operand, as in `Elementwise`."""
         if kind == "scalar":
             return [number] * length
         if kind == "parameters":
@@ -114,7 +114,7 @@ class ScalarGraph:
         length = len(operands[0])
         kinds = [self._as_whole(operand) for operand in operands]
         if length > 16 and all(kinds) and any(kind and kind[0] == "vector" for kind in kinds):
-            return self.vector(Each(length, operation, tuple(kind for kind in kinds if kind)))
+            return self.vector(Elementwise(length, operation, tuple(kind for kind in kinds if kind)))
         return [self.scalar(operation, *elements) for elements in zip(*operands, strict=True)]
 
     def _as_whole(self, operand: Sequence[int]) -> tuple[str, int] | None:
@@ -183,14 +183,14 @@ class ScalarGraph:
         return found["scalar"], found["vector"]
 
     def _operands(self, kind: str, number: int) -> list[tuple[str, int]]:
-        """What one scalar or vector is computed from, as in `Each`."""
+        """What one scalar or vector is computed from, as in `Elementwise`."""
         if kind == "scalar":
             operation, arguments = self.scalars[number]
             if operation == "element":
                 return [("vector", arguments[0])]
             return [] if operation in LEAVES else [("scalar", argument) for argument in arguments]
         vector = self.vectors[number]
-        if isinstance(vector, Each):
+        if isinstance(vector, Elementwise):
             return list(vector.operands)
         whole, run = self.whole_vector(vector.x), self.run_of_parameters(vector.bias)
         x = [("scalar", n) for n in vector.x] if whole is None else [("vector", whole)]
@@ -220,7 +220,7 @@ class Tangents:
     def _of_elements(self, vector: int) -> None:
         graph, what = self.graph, self.graph.vectors[vector]
         elements = graph.elements("vector", vector, what.length)
-        if isinstance(what, Each):
+        if isinstance(what, Elementwise):
             operands = [graph.elements(kind, n, what.length) for kind, n in what.operands]
             found = self._rule(what.operation, operands, elements)
         elif self._of_all(what.bias or ()) is not None:
@@ -285,7 +285,7 @@ def _atan2(d: Tangents, value: Values, y: Values, x: Values) -> tuple[Values, ..
     return d.do("div", x, square), d.do("neg", d.do("div", y, square))
 
 
-def _leg(d: Tangents, x: Values) -> Values:
+def _asin_slope(d: Tangents, x: Values) -> Values:
     return d.do("rsqrt", d.do("sub", 1.0, d.do("mul", x, x)))
 
 
@@ -314,8 +314,8 @@ PARTIALS: dict[str, Callable[..., tuple[Values | None, ...]]] = {
     "tanh": lambda d, value, x: (d.do("sub", 1.0, d.do("mul", value, value)),),
     "silu": _silu,
     "atan": lambda d, value, x: (d.do("reciprocal", d.do("add", d.do("mul", x, x), 1.0)),),
-    "asin": lambda d, value, x: (_leg(d, x),),
-    "acos": lambda d, value, x: (d.do("neg", _leg(d, x)),),
+    "asin": lambda d, value, x: (_asin_slope(d, x),),
+    "acos": lambda d, value, x: (d.do("neg", _asin_slope(d, x)),),
     "atan2": _atan2,
     "hypot": lambda d, value, x, y: (_over(d, x, value), _over(d, y, value)),
     "pow": lambda d, value, x, y: (

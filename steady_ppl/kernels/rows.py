@@ -22,7 +22,7 @@ _WHY: ContextVar[dict[str, str] | None] = ContextVar("why functions had no kerne
 
 
 @contextmanager
-def without_kernels() -> Iterator[dict[str, str]]:
+def kernel_failures() -> Iterator[dict[str, str]]:
     """Why functions of the block had no kernel where there were rows enough for one, by the functions' names."""
     found: dict[str, str] = {}
     token = _WHY.set(found)
@@ -32,8 +32,8 @@ def without_kernels() -> Iterator[dict[str, str]]:
         _WHY.reset(token)
 
 
-def in_plain_torch(why: Mapping[str, str]) -> list[str]:
-    """What `without_kernels` gave, as a note for who waits for the result."""
+def fallback_notes(why: Mapping[str, str]) -> list[str]:
+    """What `kernel_failures` gave, as a note for who waits for the result."""
     names = {reason: [name for name in why if why[name] == reason] for reason in why.values()}
     parts = [f"{', '.join(names[reason])}: {reason}" for reason in names]
     return [f"computed in plain torch, without compiled kernels: {'; '.join(parts)}"] if parts else []
@@ -130,8 +130,8 @@ def _computed(
     runs = _RUNS.setdefault(program, Counter())
     runs[method] += 1
     if runs[method] <= 2 or runs[method] % COMPARED_EVERY == 0:
-        plain = function(*(_a_few(value) for value in arguments.values()))
-        if not close(_a_few(values), plain):
+        plain = function(*(_subsample(value) for value in arguments.values()))
+        if not close(_subsample(values), plain):
             return _noted(name, discard(program, compiled_as))
     return method, values, rest
 
@@ -143,7 +143,7 @@ def _noted(name: str, reason: str) -> str:
     return reason
 
 
-def _a_few(values: Tensor) -> Tensor:
+def _subsample(values: Tensor) -> Tensor:
     """Some sixteen of all rows, `(1, ·, ·)`."""
     return values.flatten(0, 1)[None, :: max(1, values.shape[0] * values.shape[1] // SIMD_LANES)]
 

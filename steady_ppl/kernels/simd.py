@@ -247,7 +247,7 @@ def remainder(x: Lanes, y: Lanes) -> Lanes:
     return (abs(rest) < abs(y)).where(rest, rest - y)
 
 
-def _other_leg(x: Lanes) -> Lanes:
+def _cos_of_asin(x: Lanes) -> Lanes:
     return ((1.0 - x) * (x + 1.0)).call("sqrt")
 
 
@@ -258,8 +258,8 @@ OPERATIONS: dict[str, Any] = {
     "cos": lambda x: _turned(x, 1),
     "tan": lambda x: _turned(x, 0) / _turned(x, 1),
     "atan": lambda x: atan2(x, x.like(1.0)),
-    "asin": lambda x: atan2(x, _other_leg(x)),
-    "acos": lambda x: atan2(_other_leg(x), x),
+    "asin": lambda x: atan2(x, _cos_of_asin(x)),
+    "acos": lambda x: atan2(_cos_of_asin(x), x),
     "hypot": lambda x, y: (x * x + y * y).call("sqrt"),
     "softplus": lambda x: maximum(x, x.like(0.0)) + log1p(exp(-abs(x))),
     "silu": lambda x: x * sigmoid(x),

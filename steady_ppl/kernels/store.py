@@ -60,7 +60,7 @@ def machine_code(key: str, text: Callable[[], str]) -> Any:
         if folder is not None and kept is None and made:
             _write(folder, name, made.pop())
             if name.startswith(SWEEP_PREFIX):
-                _forget(folder)
+                _evict(folder)
         return engine
 
 
@@ -128,7 +128,7 @@ def _write(folder: int, name: str, code: bytes) -> None:
             os.unlink(beside, dir_fd=folder)
 
 
-def _forget(folder: int) -> None:
+def _evict(folder: int) -> None:
     """Remove the files that were used longest ago until three quarters of the bound are left: the last one is for what
     is written until the folder is next looked through."""
     found = []
@@ -166,7 +166,7 @@ def _open_folder() -> int:
     above it are checked too: who can write there can put another folder of the user's in its place."""
     if not hasattr(os, "geteuid") or os.open not in os.supports_dir_fd:
         raise _NotKept("this system does not say who owns a folder")
-    place = _place()
+    place = _folder_path()
     try:
         above = place.parent.resolve()
         for folder in (*reversed(place.parents), *reversed(above.parents), above):
@@ -186,7 +186,7 @@ def _open_folder() -> int:
     raise _NotKept(f"{place} is another user's, or others can write there")
 
 
-def _place() -> Path:
+def _folder_path() -> Path:
     """Where the folder is to be."""
     named = os.environ.get(ENVIRONMENT_VARIABLE, "")
     if named == "off":

@@ -153,7 +153,7 @@ def adapt(program: Program, shape: NormalShape, judge: LogLikelihood, count: int
             begin()
             shapes.append(_shaped(shapes[-1], values, log_weights) if shapes else shape)
             new = shapes[-1].draws(round(share * count))
-            values, judged = torch.cat([values, new]), torch.cat([judged, weighed(program, new, judge)])
+            values, judged = torch.cat([values, new]), torch.cat([judged, log_posterior(program, new, judge)])
             drawn = torch.tensor(ROUND_SHARES[: len(shapes)], dtype=values.dtype).log()
             mixture = torch.stack([one.density(values) for one in shapes]) + drawn[:, None]
             log_weights = judged - mixture.logsumexp(0)
@@ -194,7 +194,7 @@ def linearised(problem: Problem, path: ReferencePath) -> LogLikelihood:
     return judge
 
 
-def weighed(program: Program, values: Tensor, judge: LogLikelihood) -> Tensor:
+def log_posterior(program: Program, values: Tensor, judge: LogLikelihood) -> Tensor:
     """log p(y) and log prior of values `(K, P)`, `(K,)`: minus infinity where the program blows up.
 
     Raises:

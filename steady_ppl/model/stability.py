@@ -101,7 +101,7 @@ def is_step(program: Program, data: Trajectories) -> bool:
     """
     if not bool(data.transitions.any()) or counts_rows(program):
         return False
-    state, (control, time, step) = _some(program, data)
+    state, (control, time, step) = _probe_points(program, data)
     own = with_substeps(program, 1)
     changes = []
     for short in (step, step / STEP_DIVISOR):
@@ -145,7 +145,7 @@ def can_be_cut(program: Program, data: Trajectories) -> bool:
     """Return whether rows of drives, as returned by `for_program`, can be taken in substeps: `require_convergence`."""
     if not bool(data.transitions.any()):
         return True
-    state, given = _some(program, data)
+    state, given = _probe_points(program, data)
     try:
         require_convergence(program, state, *given)
     except ProgramError:
@@ -179,7 +179,7 @@ def require_convergence(program: Program, state: Tensor, control: Tensor, time: 
         )
 
 
-def _some(program: Program, data: Trajectories) -> tuple[Tensor, _Given]:
+def _probe_points(program: Program, data: Trajectories) -> tuple[Tensor, _Given]:
     """States from a program's start, `(PROBED_STATES, R, 1, D)`, and what is given in rows of the longest drive."""
     drive = int(data.transitions.sum(0).argmax())
     rows = torch.where(data.transitions[:, drive])[0]

@@ -10,8 +10,9 @@ import numpy as np
 import torch
 
 from steady_ppl.criticism.baselines import Reference
-from steady_ppl.criticism.result import Check, subject, unit_of, verdict
+from steady_ppl.criticism.result import Check, subject, verdict
 from steady_ppl.errors import UsageError
+from steady_ppl.model.program import unit_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -64,7 +65,7 @@ def predictions(found: Check, drive: int, component: int, axes: Axes) -> None:
         at, middle, half = _joined(time, *(values[:, drive, component] for values in band(found, name)))
         axes.fill_between(at, middle - half, middle + half, color=color, alpha=0.18, lw=0)
         axes.plot(at, middle, color=color, lw=1, label=f"{name} ahead, 90 % band")
-    axes.plot(time, measured(found)[:, drive, component], ".", color=DATA_COLOR, ms=3, label="measured")
+    axes.plot(time, measured_values(found)[:, drive, component], ".", color=DATA_COLOR, ms=3, label="measured")
     name, unit = found.program.measurement_names[component], found.program.measurement_units[component]
     axes.set_ylabel(f"{name} [{unit}]" if unit else name)
 
@@ -78,7 +79,7 @@ def _joined(time: np.ndarray, middle: np.ndarray, half: np.ndarray) -> tuple[np.
     return np.insert(time, breaks, np.nan), np.insert(middle, breaks, np.nan), np.insert(half, breaks, np.nan)
 
 
-def measured(found: Check) -> np.ndarray:
+def measured_values(found: Check) -> np.ndarray:
     """What was measured, `(T + 1, B, K)`, NaN where it was not."""
     data = found.data
     return np.where(data.observed.numpy(force=True), data.measurements.double().numpy(force=True), np.nan)
@@ -93,7 +94,7 @@ def band(found: Check, horizon: str) -> tuple[np.ndarray, np.ndarray]:
     prediction = found.predictions[rows]
     there = prediction.observed.numpy(force=True)
     middle, half = np.full((2, *found.data.measurements.shape), np.nan)
-    middle[rows:] = np.where(there, measured(found)[rows:] - prediction.error.numpy(force=True), np.nan)
+    middle[rows:] = np.where(there, measured_values(found)[rows:] - prediction.error.numpy(force=True), np.nan)
     half[rows:] = 1.645 * np.sqrt(np.where(there, prediction.variance.numpy(force=True), np.nan))
     jumps = np.abs(np.diff(middle, axis=0, prepend=middle[:1])) > np.maximum(np.pi, 3 * np.nan_to_num(half))
     return np.where(jumps, np.nan, middle), half
@@ -146,7 +147,7 @@ def regime_panel(found: Check, axes: Axes) -> None:
         if cell in stand_out:
             axes.plot(sum(cell.where[variable]) / 2, z, "k*", ms=6)
     axes.axhline(0, color="black", lw=0.6)
-    unit = unit_of(found, variable)
+    unit = unit_of(found.program, variable)
     axes.set(xlabel=f"{variable} [{unit}]" if unit else variable, ylabel="simulated sd")
     what = "in which regime" if stand_out else "strongest regime, not significant"
     axes.set_title(f"{what}: mean residual of {subject(found, strongest.residual)} (grey: ±2)")

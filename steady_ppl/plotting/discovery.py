@@ -51,7 +51,7 @@ class Group(NamedTuple):
     heading: str
     candidates: list[Candidate]
     chosen: list[str]
-    alike: list[str]
+    aliases: list[str]
 
 
 def discovery_picture(found: Discovery) -> Figure:
@@ -149,15 +149,15 @@ def _groups(found: Discovery) -> list[Group]:
         return [Group("", candidates, [_label(search.curve.variant)] if search.curve else [], [])] if candidates else []
     ordered = sorted(search.found, key=lambda one: -one.candidate.total)
     chosen = [_label(one.candidate.variant) for one in ordered]
-    alike = [[_label(candidate.variant) for candidate in one.alike] for one in ordered]
+    aliases = [[_label(candidate.variant) for candidate in one.aliases] for one in ordered]
     if len(ordered) == 1:
-        return [Group("", _fitted(ordered[0].candidates), chosen, alike[0])]
+        return [Group("", _fitted(ordered[0].candidates), chosen, aliases[0])]
     alone = Group("each alone", _fitted(search.rounds[0].candidates), chosen, [])
     if all(len(one.candidates) == 1 for one in ordered):
         together = [candidate for one in ordered for candidate in _fitted(one.candidates)]
         return [alone, Group("each beside the others", together, chosen, [])]
     groups = []
-    for own, one, like in zip(chosen, ordered, alike, strict=True):
+    for own, one, like in zip(chosen, ordered, aliases, strict=True):
         others = [label for label in chosen if label != own]
         beside = others[0] if len(others) == 1 else f"the other {len(others)}"
         groups.append(Group(f"beside {beside}", _fitted(one.candidates), [own], like))
@@ -169,7 +169,7 @@ def _of_group(group: Group, seed: int) -> list[GainRow]:
     rows = [GainRow("", 0.0, None, OTHER_COLOR, group.heading)] if group.heading else []
     for candidate in group.candidates:
         label = _label(candidate.variant)
-        color = CHOSEN_COLOR if label in group.chosen else ALIAS_COLOR if label in group.alike else OTHER_COLOR
+        color = CHOSEN_COLOR if label in group.chosen else ALIAS_COLOR if label in group.aliases else OTHER_COLOR
         rows.append(GainRow(label, candidate.total, gain_interval(candidate, seed), color))
     return rows
 

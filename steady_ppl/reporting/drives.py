@@ -11,7 +11,7 @@ from steady_ppl.criticism.residual_maps import Cell
 from steady_ppl.criticism.result import Check, place, subject
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.program import Program, names, units
-from steady_ppl.plotting.check import band, measured, strips
+from steady_ppl.plotting.check import band, measured_values, strips
 from steady_ppl.runs.fit import Fit
 from steady_ppl.runs.posterior import drawn_states
 from steady_ppl.utils.angles import nearest_turn
@@ -134,7 +134,7 @@ class Shown:
         return packed(np.asarray(values)[:: self.every, self.drives].transpose(1, 2, 0))
 
 
-def chosen(checks: list[Check], numbers: int = MAX_PACKED_NUMBERS) -> Shown:
+def chosen_drives(checks: list[Check], numbers: int = MAX_PACKED_NUMBERS) -> Shown:
     """As many drives as there is room for, those whose strips stand out most in any run first."""
     first = checks[0]
     rows, count = first.data.time.shape
@@ -152,7 +152,7 @@ def _columns(found: Check) -> int:
     return 2 * horizons * len(found.residuals) + len(found.program.measurement_names) + 4 * states + 2 * PATHS_SHOWN
 
 
-def given(found: Check, shown: Shown) -> dict[str, Any]:
+def common_data(found: Check, shown: Shown) -> dict[str, Any]:
     """What is the same for every run: the time and the controls, of which a drive's last is followed by nothing."""
     data = found.data
     acting = torch.cat([data.transitions, torch.zeros_like(data.transitions[:1])])
@@ -165,7 +165,7 @@ def given(found: Check, shown: Shown) -> dict[str, Any]:
     }
 
 
-def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: int, seed: int) -> dict[str, Any]:
+def data_of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: int, seed: int) -> dict[str, Any]:
     """Measurements, predictions with their bands, quantiles of the posterior of the states given all measurements, the
     truth, where the table has it, and the maps of misfit; a run's components are its program's, in their order."""
     bands = {name: map(shown.of, band(found, name)) for name in ("one step", list(found.horizons)[-1])}
@@ -180,7 +180,7 @@ def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: 
     truth = _truth(found.program, table.subset(shown.drives), quantiles[1])
     return {
         "measurements": _components(found.program.measurements),
-        "measured": shown.of(measured(found)),
+        "measured": shown.of(measured_values(found)),
         "truth": None if truth is None else all_of_them.of(truth),
         "predictions": [{"ahead": name, "middle": middle, "half": half} for name, (middle, half) in bands.items()],
         "states": _components(found.program.states),

@@ -25,7 +25,7 @@ from steady_ppl.runs.folder import FINISHED, PARAMETERS, POSTERIOR, RUN_RECORD, 
 from steady_ppl.training.loop import Trained
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.files import whole_file
-from steady_ppl.utils.late import Displayed
+from steady_ppl.utils.hooks import Displayed
 from steady_ppl.utils.tensor_files import read_tensors, write_tensors
 
 if TYPE_CHECKING:
@@ -231,3 +231,8 @@ def packages() -> dict[str, str]:
         except PackageNotFoundError:
             found[package] = "not installed as a package"
     return found
+
+
+def packages_text() -> str:
+    """Packages and their versions."""
+    return ", ".join(f"{name} {number}" for name, number in packages().items())

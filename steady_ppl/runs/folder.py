@@ -89,17 +89,17 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
         raise RunError(f"{folder} has no {CHECKPOINT} to resume from, nor the {JOURNAL} of a search")
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
-        with only_writer(folder):
+        with exclusive_writer(folder):
             for name in (BACKUP, JOURNAL):
                 if (folder / name).is_symlink():  # out of the run, to files that are somebody else's to remove
                     raise RunError(f"{folder}: {name} in it is a link: remove the link, or choose another folder")
             if not resume:
-                _put_aside(folder)
+                _back_up(folder)
             try:
                 yield folder
             except BaseException:
                 if not resume:
-                    _clean_up(folder)
+                    _roll_back(folder)
                 raise
             if (folder / BACKUP).is_dir():
                 _remove(folder / BACKUP)
@@ -111,7 +111,7 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
 
 
 @contextmanager
-def only_writer(folder: Path) -> Iterator[None]:
+def exclusive_writer(folder: Path) -> Iterator[None]:
     """Make a folder and keep other processes from writing to it. The lock is the process's own: it ends with it,
     however it ends."""
     lock = FileLock(folder / LOCK)
@@ -129,7 +129,7 @@ def only_writer(folder: Path) -> Iterator[None]:
         lock.release()
 
 
-def _put_aside(folder: Path) -> None:
+def _back_up(folder: Path) -> None:
     aside = folder / BACKUP
     if aside.is_dir():  # of an overwriting fit that was killed: it, not what that fit left, is the finished run
         _remove(folder)
@@ -147,7 +147,7 @@ def _put_aside(folder: Path) -> None:
         raise RunError(f"{folder} cannot be written: {error.strerror}") from error
 
 
-def _clean_up(folder: Path) -> None:
+def _roll_back(folder: Path) -> None:
     """Undo what a failed block wrote."""
     aside, checkpoint = folder / BACKUP, folder / CHECKPOINT
     if not aside.is_dir():
@@ -208,12 +208,12 @@ def read_discovery(source: Path) -> dict[str, Any] | None:
     if not file.is_file():
         return None
     found = read_json(file, RunError)
-    if problem := mismatch(found, DISCOVERY_FORM) or _unlike(found):
+    if problem := mismatch(found, DISCOVERY_FORM) or _inconsistency(found):
         raise RunError(f"{file} is not what `steady discover` writes: {problem}")
     return found
 
 
-def _unlike(found: Mapping[str, Any]) -> str | None:
+def _inconsistency(found: Mapping[str, Any]) -> str | None:
     """A candidate that was chosen and has another number of coefficients alone than together with the others."""
     chosen = {one["effect"]: len(one["coefficient"]) for one in found["effects"]}
     for i, one in enumerate(found["candidates"]):

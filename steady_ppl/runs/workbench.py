@@ -39,7 +39,7 @@ def make_workbench(folder: Path) -> list[Path]:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder} exists and is not empty: choose another folder")
     bench = workbench()
-    with empty_again(folder):
+    with cleared_on_failure(folder):
         for file in sorted(file for room in FOLDERS for file in (bench / room).rglob("*") if file.is_file()):
             place = file.relative_to(bench)
             if not LEFT_OUT & {*place.parts}:
@@ -49,7 +49,7 @@ def make_workbench(folder: Path) -> list[Path]:
 
 
 @contextmanager
-def empty_again(folder: Path) -> Iterator[None]:
+def cleared_on_failure(folder: Path) -> Iterator[None]:
     """Make a folder for the block that fills it. If it fails, what is in the folder is removed where that was missing
     or empty before, with the folders that were made for it. UsageError: something in it cannot be written."""
     made = [place for place in (folder, *folder.parents) if not place.exists()]

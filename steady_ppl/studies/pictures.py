@@ -52,7 +52,7 @@ def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
     own = own.assign(**{name: _numbers(own, name) for name in picture.columns})
     own = own.iloc[np.argsort([order[key] for key in own["key"]], kind="stable")]
     if picture.chosen_by:
-        own = chosen(picture, own)
+        own = best_settings(picture, own)
     figure = Figure(figsize=(5.4 * len(picture.y), 5.4), layout="constrained")
     figure.suptitle(printable(plan.title), fontsize=11, parse_math=False)
     lines = _lines(picture, own)
@@ -82,7 +82,7 @@ def _numbers(rows: pd.DataFrame, name: str) -> pd.Series:
     return numbers.where(numbers.abs() <= MAX_MAGNITUDE)
 
 
-def chosen(picture: Picture, rows: pd.DataFrame) -> pd.DataFrame:
+def best_settings(picture: Picture, rows: pd.DataFrame) -> pd.DataFrame:
     """Of each method's settings on the same data those whose mean of `chosen_by` is largest, by the seeds that all of
     them have; settings with which more of these have failed come last, and what is beyond every number does so too."""
     settings = [name for name in rows if str(name).startswith("settings.")]

@@ -113,8 +113,8 @@ def read_plan(path: Path, data: Path | None = None) -> Plan:
 
 
 def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
-    problem = mismatch(content, PLAN_FORM) or _surplus(content) or _undrawable(content["title"], content.get("picture"))
-    if problem is not None:
+    problem = mismatch(content, PLAN_FORM) or _unknown(content)
+    if problem := problem or _undrawable(content["title"], content.get("picture")):
         raise UsageError(problem)
     task = content.get("task", "fit")
     if task not in TASKS:
@@ -145,7 +145,7 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
     return Plan(content["title"], task, jobs, picture)
 
 
-def _surplus(content: Mapping[str, Any]) -> str | None:
+def _unknown(content: Mapping[str, Any]) -> str | None:
     """A name that means nothing, so that one that is misspelt does not pass for a default."""
     places = [("", content, PLAN_FORM), *(("method.", one, METHOD_FORM) for one in content["method"])]
     places += [("picture.", content["picture"], PICTURE_FORM)] if "picture" in content else []

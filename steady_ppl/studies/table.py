@@ -18,7 +18,7 @@ from pandas.api.types import infer_dtype
 from pyarrow.types import is_boolean, is_floating, is_integer, is_large_string, is_null, is_string
 
 from steady_ppl.errors import RunError
-from steady_ppl.runs.folder import only_writer
+from steady_ppl.runs.folder import exclusive_writer
 from steady_ppl.utils.files import require_file, whole_file
 from steady_ppl.utils.text import printable
 
@@ -74,7 +74,7 @@ class StudyTable:
 def study_table(folder: Path) -> Iterator[StudyTable]:
     """The table of a study for the block that fills it, whole at its end however that comes; RunError where the folder
     cannot be made, or another process writes to it."""
-    with only_writer(folder):
+    with exclusive_writer(folder):
         arrived = folder / ARRIVED
         if arrived.is_symlink():
             raise RunError(f"{arrived} is a link: results are kept in a folder of the study's own")

@@ -3,9 +3,10 @@
 The engine's tensors are small. Torch's threads wait for one another by spinning: on a busy machine two took 20 to 55
 times the CPU time of one. On quiet cores two helped a filter of 100,000 particles in plain torch alone, 3.5 to 2.5 s.
 
-Coarse jobs run side by side, in processes that are forked: they have what this one has, so that nothing is sent to
-them, and their results come back as safetensors. On other systems than Linux, off the main thread, or where CUDA is in
-use, no fork is safe, and jobs run one after another. This module loads no torch, which reads `ONE_THREAD` as it loads.
+Coarse computations run in parallel, in processes that are forked: they have what this one has, so that nothing is sent
+to them, and their results come back as safetensors. On other systems than Linux, off the main thread, or where CUDA is
+in use, no fork is safe, and they run one after another. This module loads no torch, which reads `ONE_THREAD` as it
+loads.
 """
 
 import ctypes
@@ -26,8 +27,8 @@ from typing import IO, TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torch import Tensor
 
-Result = tuple[Mapping[str, "Tensor"], Mapping[str, Any]]  # tensors, and what JSON can hold
-Job = Callable[[], Result]
+Output = tuple[Mapping[str, "Tensor"], Mapping[str, Any]]  # tensors, and what JSON can hold
+Computation = Callable[[], Output]
 MAX_PROCESSES = 8  # at once: each has memory of its own
 MIN_PATIENCE_SECONDS, MAX_SLOWDOWN = 10.0, 5.0  # and times its own share's, that this process waits for another
 DIE_WITH_PARENT = 1  # of Linux's prctl
@@ -69,7 +70,7 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def one_core() -> Iterator[None]:
-    """Run all jobs of the block in this process, for example where many such processes run."""
+    """Run all computations of the block in this process, for example where many such processes run."""
     token = _most.set(1)
     try:
         yield
@@ -77,32 +78,32 @@ def one_core() -> Iterator[None]:
         _most.reset(token)
 
 
-def side_by_side(jobs: Sequence[Job]) -> list[Result]:
-    """What jobs return, in their order. They draw no random numbers, print nothing and change nothing that is shared.
+def run_in_parallel(computations: Sequence[Computation]) -> list[Output]:
+    """What they return, in their order. They draw no random numbers, print nothing and change nothing that is shared.
 
-    Jobs whose process fails, hangs or cannot be had are run here, where their errors are raised as any other.
+    Those whose process fails, hangs or cannot be had are run here, where their errors are raised as any other.
     """
     with one_thread(), ExitStack() as ends:  # of two threads one would be missing after a fork
-        processes = max(1, min(_most.get(), _cores(), len(jobs)))
-        shares = [range(first, len(jobs), processes) for first in range(processes)]
+        processes = max(1, min(_most.get(), _cores(), len(computations)))
+        shares = [range(first, len(computations), processes) for first in range(processes)]
         children = []
         for share in shares[1:]:
-            children.append(_Child(jobs, share))
+            children.append(_Child(computations, share))
             ends.callback(children[-1].end)
             children[-1].begin()
         began = time.monotonic()
-        found = {index: jobs[index]() for index in shares[0]}
+        found = {index: computations[index]() for index in shares[0]}
         patience = MIN_PATIENCE_SECONDS + MAX_SLOWDOWN * (time.monotonic() - began)
         for child in children:
             found.update(child.results(patience))
-        return [found[index] if index in found else jobs[index]() for index in range(len(jobs))]
+        return [found[index] if index in found else computations[index]() for index in range(len(computations))]
 
 
 class _Child:
-    """A forked process that runs a share of the jobs, and the memory in which it leaves their results."""
+    """A forked process that runs a share of the computations, and the memory in which it leaves their results."""
 
-    def __init__(self, jobs: Sequence[Job], share: Sequence[int]) -> None:
-        self.jobs, self.share = jobs, share
+    def __init__(self, computations: Sequence[Computation], share: Sequence[int]) -> None:
+        self.computations, self.share = computations, share
         self.pid, self.handle = 0, -1  # a handle stays that of the process when its number is another's
         self.file: IO[bytes] | None = None
 
@@ -131,7 +132,7 @@ class _Child:
             if self.file is not None and os.getppid() == parent:
                 _most.set(1)
                 for index in self.share:
-                    tensors, values = self.jobs[index]()
+                    tensors, values = self.computations[index]()
                     content = packed(tensors, {"values": json.dumps(values)})
                     self.file.write(len(content).to_bytes(8, "little") + content)
                 self.file.write(END_MARK)
@@ -139,8 +140,8 @@ class _Child:
         finally:
             os._exit(0)
 
-    def results(self, patience: float) -> dict[int, Result]:
-        """By the jobs' numbers, when it has ended; nothing if it failed, or does not end within so many seconds."""
+    def results(self, patience: float) -> dict[int, Output]:
+        """By their numbers, when it has ended; nothing if it failed, or does not end within so many seconds."""
         from steady_ppl.utils.tensor_files import unpacked
 
         if self.file is None or self.handle < 0:
@@ -152,7 +153,7 @@ class _Child:
         if self.file.read() != END_MARK:
             return {}
         self.file.seek(0)
-        found: dict[int, Result] = {}
+        found: dict[int, Output] = {}
         for index in self.share:
             tensors, text = unpacked(self.file.read(int.from_bytes(self.file.read(8), "little")))
             found[index] = tensors, json.loads(text["values"])

@@ -4,7 +4,7 @@ The computation must be deterministic: a piece is known by its number alone. The
 goes on has the inputs of the one that was killed.
 
     with journal(folder):
-        tensors, numbers = piece(compute)     # read from the folder if it is there, else computed and written
+        tensors, numbers = journaled(compute)     # read from the folder if it is there, else computed and written
 """
 
 import itertools
@@ -20,10 +20,10 @@ import torch
 from torch import Tensor
 
 from steady_ppl.errors import FilterError, RunError
+from steady_ppl.utils.cores import Output
 from steady_ppl.utils.schema import ANYTHING, TEXT, mismatch
 from steady_ppl.utils.tensor_files import read_tensors, write_tensors
 
-Piece = tuple[Mapping[str, Tensor], Mapping[str, Any]]
 RANDOM_STATE = "random state"  # of torch, after the piece
 ENTRY_FORM = ({"values": {str: ANYTHING}}, {"failed": TEXT})
 
@@ -46,7 +46,7 @@ def journal(folder: Path) -> Iterator[None]:
     shutil.rmtree(folder)
 
 
-def piece(compute: Callable[[], Piece]) -> Piece:
+def journaled(compute: Callable[[], Output]) -> Output:
     """The next piece: tensors, and what JSON can hold. A `FilterError` is a result like any other. Outside of a journal
     nothing is kept."""
     files = _files.get()
@@ -75,7 +75,7 @@ def _read(file: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, said
 
 
-def _write(file: Path, compute: Callable[[], Piece]) -> None:
+def _write(file: Path, compute: Callable[[], Output]) -> None:
     tensors: Mapping[str, Tensor] = {}
     try:
         tensors, values = compute()

@@ -3,12 +3,13 @@
 import shlex
 import sys
 import unicodedata
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 
 # what moves the cursor, colours, renames the window, turns lines round, is not seen, or cannot be written at all
 INVISIBLE = ("Cc", "Cf", "Cs", "Zl", "Zp")  # categories of Unicode: control, format, half of a pair, line separators
+Say = Callable[[str], None]  # tells a person one line
 TEXT_WIDTH = 100  # characters of a line in the text of a result
 MAX_LINE_LENGTH = 1000  # characters of a line that is said; a file that somebody gives can put more into it
 

@@ -77,7 +77,7 @@ def test_a_search_that_finds_nothing_to_add_is_its_end(tmp_path: Path, monkeypat
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(demo, "run", lambda command, arguments: "")
     with pytest.raises(ComputationError, match="nothing to add.*No effect is missing"):
-        demo.discover(demo.Tour(STEADY, [].append), QUICK)
+        demo.discover(demo.Demo(STEADY, [].append), QUICK)
 
 
 def test_it_goes_over_its_own_folder_only(tmp_path: Path) -> None:

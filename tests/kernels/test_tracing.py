@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from steady_ppl.kernels import jit, rows as rows_by_kernels
 from steady_ppl.kernels.lowering import Tape
-from steady_ppl.kernels.rows import Slopes, in_plain_torch, on_all_rows, slopes_on_all_rows, without_kernels
+from steady_ppl.kernels.rows import Slopes, fallback_notes, kernel_failures, on_all_rows, slopes_on_all_rows
 
 STATES = torch.linspace(-2.0, 2.0, 90).view(10, 3, 3)
 Lines = Callable[[Any, Tensor], Tensor]
@@ -242,12 +242,12 @@ def test_why_there_is_no_kernel_is_noted_once_a_function():
         pass
 
     program, given = Sorting(), {"state": torch.randn(4, 5, 3)}
-    with without_kernels() as why:
+    with kernel_failures() as why:
         for _ in range(2):
             assert isinstance(on_all_rows(program, "sorted", lambda state: state.sort(-1).values, given), str)
-        with without_kernels() as inner:
+        with kernel_failures() as inner:
             on_all_rows(program, "sorted twice", lambda state: state.sort(-1).values, given)
     assert list(why) == ["sorted"] and list(inner) == ["sorted twice"]
-    (note,) = in_plain_torch({"one": "a", "two": "b", "three": "a"})
+    (note,) = fallback_notes({"one": "a", "two": "b", "three": "a"})
     assert note == "computed in plain torch, without compiled kernels: one, three: a; two: b"
-    assert in_plain_torch({}) == []
+    assert fallback_notes({}) == []

@@ -182,7 +182,7 @@ def test_a_cluster_gives_up_every_job_that_kills_and_none_that_only_waited():
     for key in [*deadly, "waits"]:
         attempts.sent(key)
     for key in 4 * deadly:
-        attempts.hear(key)
+        attempts.note_begun(key)
     assert all(attempts.killed(key) for key in deadly)  # all at once
     assert not attempts.killed("waits")
     assert not any(attempts.killed("waits") for _ in range(9))
@@ -194,7 +194,7 @@ def test_jobs_that_a_machine_takes_along_once_are_tried_again():
     attempts = Attempts()
     for key in map(str, range(40)):  # of a scheduler that tries once
         attempts.sent(key)
-        attempts.hear(key)
+        attempts.note_begun(key)
     assert not any(attempts.killed(str(place)) for place in range(40))
 
 

@@ -17,7 +17,7 @@ from steady_ppl.data.table import write_table
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.model.loading import load_program
 from steady_ppl.smc.simulate import simulate
-from steady_ppl.studies.job import OUTDATED, in_limits, planted, run, told_settings
+from steady_ppl.studies.job import OUTDATED, in_limits, planted_effect, run, settings_with_noise
 from steady_ppl.studies.plan import read_plan
 from steady_ppl.studies.runner import require_runnable
 
@@ -190,7 +190,7 @@ def discover(**settings: object) -> str:
 )
 def test_what_is_planted_is_told_from_where_it_is_absent(tmp_path: Path, effect: str, name: str, value: list):
     text = discover().replace('["", "linear_drag=0.5"]', f'"{effect}"')
-    variant, found = planted(read_plan(written(tmp_path, text)).jobs[0])
+    variant, found = planted_effect(read_plan(written(tmp_path, text)).jobs[0])
     assert (variant.name if variant else "") == name and found == pytest.approx(value)
 
 
@@ -271,7 +271,7 @@ def test_every_program_of_a_job_knows_the_noise_of_the_bearings(tmp_path: Path):
     text += f'[[method]]\nname = "by hand"\nprogram = "{hovercraft}"\nrecipe = "fit-hand"\n'
     text += f'settings = {{hand = "{hovercraft}", lineages = 2}}\n'
     (tmp_path / "study.toml").write_text(text)
-    settings = told_settings(read_plan(tmp_path / "study.toml").jobs[0])
+    settings = settings_with_noise(read_plan(tmp_path / "study.toml").jobs[0])
     assert settings["hand"].bearing_sd == pytest.approx(math.radians(20)) and settings["lineages"] == 2
 
 

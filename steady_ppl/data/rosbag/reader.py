@@ -10,7 +10,7 @@ import math
 import os
 import re
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +26,6 @@ from steady_ppl.errors import DataError, SteadyError, UsageError
 from steady_ppl.utils.files import require_file
 from steady_ppl.utils.text import one_line
 
-Say = Callable[[str], None]
 FIELD_LIST_COLUMNS = 110  # characters of a list of fields
 TEXT_TYPES = ("string", "wstring", "wchar")
 

@@ -67,7 +67,7 @@ def _stretches(control: Series, last: int) -> list[tuple[int, int]]:
     return list(zip(first.tolist(), end.tolist(), strict=True))
 
 
-def held_pauses(series: Sequence[Series], step: float) -> Iterator[str]:
+def long_holds(series: Sequence[Series], step: float) -> Iterator[str]:
     """What is to be said of controls that are held, or interpolated, for far longer than commands usually last."""
     measured = [one.times[-1] for one in series if one.column.kind == "y" and len(one.times)]
     for control in series:
