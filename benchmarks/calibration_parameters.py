@@ -22,9 +22,9 @@ from steady_ppl.likelihood.parameter_posterior import (
     about_maximum,
     adapt,
     linearised,
+    log_posterior,
     own_values,
     resampled,
-    weighed,
 )
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import for_program
@@ -82,8 +82,8 @@ def ranked(seed: int) -> dict:
         judge = linearised(problem, maximum.path)
         values, log_weights = adapt(program, shape, judge, VALUES)
         some = torch.randperm(VALUES)[:BLIND_VALUES]
-        density = weighed(program, values[some], judge) - log_weights[some]
-        blindly = weighed(program, values[some], blind(data)) - density
+        density = log_posterior(program, values[some], judge) - log_weights[some]
+        blindly = log_posterior(program, values[some], blind(data)) - density
         record = {"names": list(maximum.names), "truth": own_values(truth).tolist()}
         for name, (at, weights) in {
             "linearised": (values, log_weights),

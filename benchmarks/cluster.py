@@ -34,7 +34,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 from dask_cluster import Dask, wait_for  # noqa: E402
 
 from steady_ppl.runs.fit import packages  # noqa: E402
-from steady_ppl.studies.executors import Cluster, Executor, Local, computed  # noqa: E402
+from steady_ppl.studies.executors import Cluster, Executor, Local, compute_on_worker  # noqa: E402
 from steady_ppl.studies.job import Job  # noqa: E402
 from steady_ppl.studies.plan import read_plan  # noqa: E402
 from steady_ppl.studies.runner import run_study  # noqa: E402
@@ -177,7 +177,7 @@ def _sent_bytes(job: Job) -> int:
     """What goes to a worker with a job."""
     from distributed.protocol import serialize
 
-    _, frames = serialize((computed, job, packages(), "steady-study-" + 32 * "0"))
+    _, frames = serialize((compute_on_worker, job, packages(), "steady-study-" + 32 * "0"))
     return sum(memoryview(frame).nbytes for frame in frames)
 
 

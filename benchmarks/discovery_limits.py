@@ -173,7 +173,7 @@ def _planting(variant: Variant, limit: Array) -> Planting:
 def _related(screened: Screened) -> dict[str, dict[str, float]]:
     """Correlations of effects' scores by name, the largest first."""
     called = [None if tested.is_curve else tested.variant.name for tested in screened.tested]
-    rows = {name: row for name, row in zip(called, screened.alike.tolist(), strict=True) if name}
+    rows = {name: row for name, row in zip(called, screened.correlations.tolist(), strict=True) if name}
     related = {}
     for name in sorted(rows):
         others = sorted(zip(rows[name], called, strict=True), key=lambda pair: -pair[0])

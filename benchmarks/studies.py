@@ -19,7 +19,7 @@ from pathlib import Path
 import pandas as pd
 
 from steady_ppl.studies.job import HELD_OUT, IN_LIMITS
-from steady_ppl.studies.pictures import SIZES, chosen, points
+from steady_ppl.studies.pictures import SIZE_EDGES, best_settings, points
 from steady_ppl.studies.plan import Picture
 from steady_ppl.studies.table import TABLE
 
@@ -126,7 +126,7 @@ def observation_noise(rows: pd.DataFrame) -> tuple[str, Musts]:
 
 def of_best_settings(rows: pd.DataFrame) -> pd.DataFrame:
     """Of each method's settings those with the largest log p(y) of valid drives, at each noise."""
-    return chosen(Picture(SIGMA, [ERROR], chosen_by=HELD_OUT), rows)
+    return best_settings(Picture(SIGMA, [ERROR], chosen_by=HELD_OUT), rows)
 
 
 def _ramps(tried: pd.DataFrame) -> list[str]:
@@ -228,7 +228,7 @@ def discovery(rows: pd.DataFrame) -> tuple[str, Musts]:
         "|---|---|---|---|---|---|",
     ]
     shares = {column: {place: of for place, *of in points(done, IN_LIMITS, column)} for column in columns}
-    ranges = done.groupby(pd.cut(done[IN_LIMITS], SIZES), observed=True).size()
+    ranges = done.groupby(pd.cut(done[IN_LIMITS], SIZE_EDGES), observed=True).size()
     for place, (ends, searches) in zip(shares["found"], ranges.items(), strict=True):
         cells = [_share(*shares[column][place]) if place in shares[column] else "" for column in columns]
         size = "0" if ends.right == 0 else f"{ends.left:.2f} to {ends.right:.2f}"

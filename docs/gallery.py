@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from steady_ppl import Program, Trajectories, load_program, simulate
 from steady_ppl.effects import Effect, catalogue
-from steady_ppl.model.program import for_program, names, units
+from steady_ppl.model.program import for_program, names, unit_of, units
 
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
@@ -160,11 +160,6 @@ def most_changed(effect: Effect, program: Program, drives: list[Trajectories]) -
     worst = max(share, key=lambda name: share[name])
     unit = "rad/s" if worst == "yaw" or "rad/s" in unit_of(program, program.motion.get(worst, ("", ""))[1]) else "m/s"
     return f"{worst} velocity [{unit}]", [one[worst].numpy() for one in velocities]
-
-
-def unit_of(program: Program, state: str) -> str:
-    """The unit of a state component."""
-    return dict(zip(names(program.states), units(program.states), strict=True)).get(state, "")
 
 
 if __name__ == "__main__":

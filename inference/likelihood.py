@@ -17,7 +17,7 @@ from steady_ppl import (
     seeded,
     why_not_linear,
 )
-from steady_ppl.kernels.rows import in_plain_torch, without_kernels
+from steady_ppl.kernels.rows import fallback_notes, kernel_failures
 from steady_ppl.utils.progress import stages
 
 from .steady import doubts
@@ -70,9 +70,9 @@ def fit(
         except FilterError as error:
             notes.append(f"as declared, the program cannot follow the held-out drives: {error}")
         begin()
-        with seeded(seed, "paths"), without_kernels() as why:
+        with seeded(seed, "paths"), kernel_failures() as why:
             maximum = fit_by_likelihood(program, data, known_start=known_start)
-        notes += in_plain_torch(why)
+        notes += fallback_notes(why)
         begin()
         judge(maximum.steps)
         begin()

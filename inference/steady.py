@@ -24,7 +24,7 @@ from steady_ppl import (
     train,
     why_not_linear,
 )
-from steady_ppl.smc.genealogy import few_starts
+from steady_ppl.smc.genealogy import degeneracy_note
 
 # What the paper and its authors' code use, best with AuthorsHovercraft or AuthorsTruck; hours on two cores:
 # steady.fit(program, table, valid, **PAPER). They kept the single best validation, by a bootstrap of 100,000 particles
@@ -132,7 +132,7 @@ def fit(
     trained = train(program, e_step, data, validation, optimization, known_start=known_start, seed=seed, **run)
     if e_step.in_plain_torch:
         notes.append(f"the E steps ran in plain torch, without compiled kernels: {e_step.in_plain_torch}")
-    scarce = few_starts(trained.history[-1].get("roots", math.inf) if trained.history else math.inf)
+    scarce = degeneracy_note(trained.history[-1].get("roots", math.inf) if trained.history else math.inf)
     if scarce:
         notes.append(scarce + (", or try guide=lookahead" if guide == "bootstrap" else ""))
     blown_up = sum("weights_blown_up" in entry for entry in trained.history)

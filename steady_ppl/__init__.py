@@ -3,31 +3,21 @@
 `__init__.pyi` lists the public names. Each is imported when it is first used, so that `steady --help` loads no torch.
 """
 
+from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
 import lazy_loader
 
-from steady_ppl.utils import late
+from steady_ppl.utils import hooks
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
-def _html(value: Any) -> str:
-    from steady_ppl.plotting.notebook import html
-
-    return html(value)
+def _imported_when_called(module: str, name: str) -> Callable[..., Any]:
+    return lambda *arguments, **options: getattr(import_module(module, __name__), name)(*arguments, **options)
 
 
-def _attach_listed(program: Any) -> Any:
-    from steady_ppl.effects.attach import attach_listed
-
-    return attach_listed(program)
-
-
-def _with_effect(program: Any, *arguments: Any, **options: Any) -> Any:
-    from steady_ppl.effects.attach import with_effect
-
-    return with_effect(program, *arguments, **options)
-
-
-late.html, late.attach_listed, late.with_effect = _html, _attach_listed, _with_effect
+hooks.html = _imported_when_called(".plotting.notebook", "html")
+hooks.attach_listed = _imported_when_called(".effects.attach", "attach_listed")
+hooks.with_effect = _imported_when_called(".effects.attach", "with_effect")

@@ -1,18 +1,17 @@
 """What the commands share: programs, runs and their labels, JSON, refusals of the system."""
 
 import errno
-import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import steady_ppl as st
 from steady_ppl.errors import ComputationError, SteadyError, UsageError
-from steady_ppl.utils.files import whole_file
+from steady_ppl.utils.files import finite_json, whole_file
 from steady_ppl.utils.text import shown, tell
 
-FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
-MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "Storage size calculation overflowed")
+NO_SPACE = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "Storage size calculation overflowed")
 
 
 def fit_or_program(source: str, program: str | None, seed: int = 0, substeps: int | None = None) -> Any:
@@ -45,22 +44,15 @@ def program_from(model: str, seed: int, substeps: int | None = None) -> Any:
 
 def write_json(path: Path, content: Any) -> None:
     """Write a file whole or not at all; a figure that is not finite is an error, JSON has no word for it."""
-    text = _as_json(content, str(path)) + "\n"
+    text = finite_json(content, str(path), indent=1) + "\n"
     with whole_file(path) as beside:
         beside.write_text(text)
-
-
-def _as_json(content: Any, place: str) -> str:
-    try:
-        return json.dumps(content, indent=1, allow_nan=False)
-    except ValueError as error:
-        raise ComputationError(f"{place} is not written: a figure is not finite, the program has blown up") from error
 
 
 def present(text: str, content: Any, json_file: Path | None) -> None:
     """Print the text and write the figures beside it, or print the figures alone if the file is `-`."""
     if json_file is not None and str(json_file) == "-":
-        tell(_as_json(content, "the output"))
+        tell(finite_json(content, "the output", indent=1))
         return
     tell(text)
     if json_file is not None:
@@ -122,8 +114,8 @@ def as_refusal(error: Exception) -> SteadyError | None:
     """
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return UsageError(f"{shown(str(error.filename), 100)}: {error.strerror}")
-    if isinstance(error, OSError) and error.errno in FULL:  # numba says no name of its cache
+    if isinstance(error, OSError) and error.errno in NO_SPACE:  # numba says no name of its cache
         return UsageError(f"a file cannot be written: {error.strerror}")
-    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(w in str(error) for w in MEMORY)):
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(w in str(error) for w in NO_MEMORY)):
         return ComputationError("this needs more memory than there is: take fewer or shorter drives, or less of each")
     return None

@@ -20,15 +20,13 @@ import typer
 
 import steady_ppl as st
 from steady_ppl.errors import ComputationError, RunError
-from steady_ppl.runs.workbench import TRUTH, empty_again, workbench
+from steady_ppl.runs.workbench import TRUE_PROGRAM, cleared_on_failure, workbench
 from steady_ppl.utils.files import read_json
-from steady_ppl.utils.text import aligned, tell
-
-WIDTH = 100
+from steady_ppl.utils.text import TEXT_WIDTH, aligned, tell
 
 
 @dataclass
-class Tour:
+class Demo:
     """Runs commands, tells of them, and remembers what they said."""
 
     command: Any  # `steady`, as typer makes it
@@ -57,7 +55,7 @@ class Tour:
         step = self.steps[-1]
         step["seconds"], step["result"] = round(time.perf_counter() - step.pop("began"), 1), text
         said = f"{text} ({step['seconds']:.0f} s)"
-        self.say(textwrap.fill(said, WIDTH, initial_indent="   → ", subsequent_indent="     "))
+        self.say(textwrap.fill(said, TEXT_WIDTH, initial_indent="   → ", subsequent_indent="     "))
 
 
 def run(command: Any, arguments: Sequence[str]) -> str:
@@ -72,9 +70,9 @@ def run(command: Any, arguments: Sequence[str]) -> str:
     return said.getvalue()
 
 
-RECORD = "demo.json"  # of a demonstration; a folder without one is not a demonstration's
-OWNERS = "models/hovercraft.py"
-BEGINNING = (
+DEMO_RECORD = "demo.json"  # of a demonstration; a folder without one is not a demonstration's
+OWNER_PROGRAM = "models/hovercraft.py"
+INTRODUCTION = (
     "A hovercraft whose owner's program knows no drag. What it did is known only by noisy bearings to four landmarks, "
     "the controls, and where each drive began (--known-start: exactly, as in the paper)."
 )
@@ -108,90 +106,90 @@ def demonstrate(
         ComputationError: the search ended with nothing that can be added.
     """
     began = time.perf_counter()
-    tour = Tour(command, say, force=out.exists())
+    demo = Demo(command, say, force=out.exists())
     _open(out, force)
-    say(textwrap.fill(BEGINNING, WIDTH))
+    say(textwrap.fill(INTRODUCTION, TEXT_WIDTH))
     say(f"\n   $ cd {shlex.quote(str(out))}")
     with chdir(out):
-        record_drives(tour, size)
-        tour.step("Fit the owner's program, which has none")
-        tour.result(_fit(tour, OWNERS, "before"))
-        tour.step("Compare: does it explain even the drives that it was fitted to?")
+        record_drives(demo, size)
+        demo.step("Fit the owner's program, which has none")
+        demo.result(_fit(demo, OWNER_PROGRAM, "before"))
+        demo.step("Compare: does it explain even the drives that it was fitted to?")
         sets = size.calibration
-        tour.steady(f"check runs/before train.csv{sets} --json check.json --picture check.png", keep="check.txt")
-        tour.result(read_json(Path("check.json"), RunError)["verdict"])
-        grown = add(tour, discover(tour, size))
-        tour.step("Fit again, in the same way, on the same drives; and the true structure, as the yardstick")
-        said = _fit(tour, grown, "after")
-        _fit(tour, TRUTH, "oracle")
-        tour.result(said)
-        prove(tour)
-        tour.step("See it: everything on one page")
-        tour.steady(f"report runs/before runs/after test.csv --discovery runs/found{sets} --out report.html")
-        tour.result("report.html: open it in a browser, it needs no network.")
-        hidden = f"What had been hidden: {st.load_program(TRUTH)}."
-        say(textwrap.fill(hidden, WIDTH, initial_indent="\n   ", subsequent_indent="   "))
-        _write_record({"status": "finished", "seconds": round(time.perf_counter() - began, 1), "steps": tour.steps})
+        demo.steady(f"check runs/before train.csv{sets} --json check.json --picture check.png", keep="check.txt")
+        demo.result(read_json(Path("check.json"), RunError)["verdict"])
+        grown = add(demo, discover(demo, size))
+        demo.step("Fit again, in the same way, on the same drives; and the true structure, as the yardstick")
+        said = _fit(demo, grown, "after")
+        _fit(demo, TRUE_PROGRAM, "oracle")
+        demo.result(said)
+        prove(demo)
+        demo.step("See it: everything on one page")
+        demo.steady(f"report runs/before runs/after test.csv --discovery runs/found{sets} --out report.html")
+        demo.result("report.html: open it in a browser, it needs no network.")
+        hidden = f"What had been hidden: {st.load_program(TRUE_PROGRAM)}."
+        say(textwrap.fill(hidden, TEXT_WIDTH, initial_indent="\n   ", subsequent_indent="   "))
+        _write_record({"status": "finished", "seconds": round(time.perf_counter() - began, 1), "steps": demo.steps})
     say(f"\n{out}: report.html; check, discovery and proof as .png, .txt and .json; drives; runs; {grown}")
     say(f"{time.perf_counter() - began:.0f} s in all")
 
 
-def record_drives(tour: Tour, size: Size) -> None:
+def record_drives(demo: Demo, size: Size) -> None:
     """Simulate drives of a hovercraft with drag, and forget its poses."""
-    tour.step("Record drives, of a hovercraft that does have drag")
+    demo.step("Record drives, of a hovercraft that does have drag")
     for seed, (name, count) in enumerate((("train", size.train), ("valid", size.valid), ("test", size.test)), 1):
-        tour.steady(f"simulate {TRUTH} --trajectories {count} --seed {seed} --out {name}.csv")
+        demo.steady(f"simulate {TRUE_PROGRAM} --trajectories {count} --seed {seed} --out {name}.csv")
     for table in ("train.csv", "valid.csv"):
         st.write_table(st.read_table(table).without_truth(keep_start=True), table)
-    tour.result(
+    demo.result(
         f"{size.train} drives to fit and {size.valid} to choose by: of both only controls, bearings and the first "
         f"state are kept. {size.test} more are locked away for the proof, with their poses, to judge by. The "
         "hovercraft moves in steps of 5 ms, its programs in those of the rows."
     )
 
 
-def discover(tour: Tour, size: Size) -> list[str]:
+def discover(demo: Demo, size: Size) -> list[str]:
     """Which effects are missing, as the run's record names them."""
     from steady_ppl.runs.folder import read_record
 
-    tour.step("Discover: which physical effect is missing?")
-    tour.steady(
+    demo.step("Discover: which physical effect is missing?")
+    demo.steady(
         f"discover runs/before train.csv --valid valid.csv{size.calibration} --out runs/found "
         "--json discovery.json --picture discovery.png",
         keep="discovery.txt",
     )
     sentence = read_json(Path("discovery.json"), RunError)["sentence"]
-    tour.result(sentence)
+    demo.result(sentence)
     effects = read_record(Path("runs/found"))["effects"]
     if not effects:
         raise ComputationError(f"there is nothing to add, and the demonstration ends here: {sentence}")
     return effects
 
 
-def add(tour: Tour, effects: Sequence[str]) -> str:
+def add(demo: Demo, effects: Sequence[str]) -> str:
     """Write the program with the effects beside the owner's."""
-    tour.step("Add: write the program with it")
+    demo.step("Add: write the program with it")
     names = dict.fromkeys(effect.split(":")[0].split("=")[0] for effect in effects)
     grown = f"models/hovercraft_with_{'_and_'.join(names)}.py"
-    said = tour.steady(f"add runs/found --out {grown}").splitlines()
+    said = demo.steady(f"add runs/found --out {grown}").splitlines()
     equations = [line for line in said[1:] if "$" not in line]
-    tour.result(f"{'; '.join(equations)}. It is a Pyro program like any other.")
+    demo.result(f"{'; '.join(equations)}. It is a Pyro program like any other.")
     return grown
 
 
-def prove(tour: Tour) -> None:
+def prove(demo: Demo) -> None:
     """Before and after on the locked drives."""
-    tour.step("Prove: on the locked drives, which nothing has seen so far")
-    tour.steady(
-        f"prove runs/before runs/after test.csv --oracle runs/oracle --truth {TRUTH} "
+    demo.step("Prove: on the locked drives, which nothing has seen so far")
+    demo.steady(
+        f"prove runs/before runs/after test.csv --oracle runs/oracle --truth {TRUE_PROGRAM} "
         "--json proof.json --picture proof.png",
         keep="proof.txt",
     )
     figures = read_json(Path("proof.json"), RunError)
-    tour.result(figures["verdict"])
-    tour.say("")
+    demo.result(figures["verdict"])
+    demo.say("")
     for line in _summary(figures):
-        tour.say(f"     {line}")
+        demo.say(f"     {line}")
 
 
 def _summary(figures: Mapping[str, Any]) -> list[str]:
@@ -213,26 +211,26 @@ def _summary(figures: Mapping[str, Any]) -> list[str]:
     return aligned(lines)
 
 
-def _fit(tour: Tour, program: str, run: str) -> str:
+def _fit(demo: Demo, program: str, run: str) -> str:
     """The fitted program, in a line."""
-    said = tour.steady(f"fit {program} train.csv --valid valid.csv --known-start --out runs/{run}")
+    said = demo.steady(f"fit {program} train.csv --valid valid.csv --known-start --out runs/{run}")
     return said.splitlines()[0].removeprefix(f"runs/{run}: ") + "."
 
 
 def _open(out: Path, force: bool) -> None:
     """Make the folder, mark it as a demonstration's, and put the owner's program there."""
-    if out.exists() and not force and not (out / RECORD).is_file():
+    if out.exists() and not force and not (out / DEMO_RECORD).is_file():
         raise RunError(f"{out} exists and is no demo's: choose another folder, or --force to write into it")
-    source = workbench() / OWNERS
-    with empty_again(out):
+    source = workbench() / OWNER_PROGRAM
+    with cleared_on_failure(out):
         (out / "models").mkdir(exist_ok=True)
-        shutil.copyfile(source, out / OWNERS)
+        shutil.copyfile(source, out / OWNER_PROGRAM)
         with chdir(out):
             _write_record({"status": "running"})
 
 
 def _write_record(content: Mapping[str, Any]) -> None:
-    Path(RECORD).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    Path(DEMO_RECORD).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def demo(

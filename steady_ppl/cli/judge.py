@@ -154,7 +154,7 @@ def states(
     """
     from steady_ppl.runs.diagnostics import diagnose_units
     from steady_ppl.runs.posterior import drawn_states, require_states_file, write_states
-    from steady_ppl.smc.genealogy import few_starts
+    from steady_ppl.smc.genealogy import degeneracy_note
 
     require_states_file(out)
     require_place(out)
@@ -163,7 +163,7 @@ def states(
     posterior = drawn_states(fit.program, drives, **settings)
     write_states(posterior, out)
     tell(f"{out}: {len(drives)} drives, {draws} draws of each")
-    scarce = few_starts(float(posterior["sample_stats"]["roots"].min()))
+    scarce = degeneracy_note(float(posterior["sample_stats"]["roots"].min()))
     say(*diagnose_units(fit.program, st.for_program(fit.program, drives)), *([scarce] if scarce else []))
 
 
@@ -202,7 +202,7 @@ def report(
     words = ["steady", "report", *map(str, arguments)]
     words += [word for name, value in [*given, ("--out", out)] if value is not None for word in (name, str(value))]
     digest = fingerprint(drives)
-    how = [*_made(runs, discovery), f"# {table}: sha256 of its drives {digest[:16]}…", shlex.join(words)]
+    how = [*_commands_of(runs, discovery), f"# {table}: sha256 of its drives {digest[:16]}…", shlex.join(words)]
     st.report(
         fits,
         drives,
@@ -216,11 +216,11 @@ def report(
     tell(f"{out}: {', '.join(labels)} on {len(drives)} drives")
 
 
-def _made(runs: list[Path], discovery: Path | None) -> list[str]:
+def _commands_of(runs: list[Path], discovery: Path | None) -> list[str]:
     """How each of the runs, and what was discovered, were made, by which command if one did."""
-    from steady_ppl.runs.folder import RECORD, read_record
+    from steady_ppl.runs.folder import RUN_RECORD, read_record
 
-    if discovery is not None and (discovery / RECORD).is_file() and discovery not in runs:
+    if discovery is not None and (discovery / RUN_RECORD).is_file() and discovery not in runs:
         runs = [*runs[:1], discovery, *runs[1:]]
     made = []
     for run in runs:

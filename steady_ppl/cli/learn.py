@@ -13,7 +13,7 @@ from steady_ppl.errors import RunError, UsageError
 from steady_ppl.utils.files import require_picture, require_place, write_picture
 from steady_ppl.utils.text import is_quiet, say, shown, tell
 
-WORDS = {"true": True, "false": False, "none": None}
+LITERALS = {"true": True, "false": False, "none": None}
 RECIPES = ("steady", "likelihood", "steady-minus", "svi", "hand", "fit-hand", "fit-tv", "fit-truth")
 Device = Literal["cpu", "cuda"]
 GuideName = Literal["lookahead", "gaussian", "bootstrap", "network", "mean-field", "smoother"]
@@ -95,7 +95,7 @@ def _settings(pairs: list[str], found: dict[str, Any]) -> dict[str, Any]:
         try:
             found[name] = ast.literal_eval(word)
         except (ValueError, SyntaxError):
-            found[name] = WORDS.get(word, word)
+            found[name] = LITERALS.get(word, word)
         if isinstance(found[name], int) and abs(found[name]) > options.MAX_COUNT:
             raise UsageError(f"--set {shown(pair, 60)}: expected a whole number up to {options.MAX_COUNT}")
     return found

@@ -20,10 +20,10 @@ from steady_ppl.utils.cores import ONE_THREAD
 from steady_ppl.utils.progress import listening
 from steady_ppl.utils.text import commanded, one_line, quietly, say, tell
 
-INTERRUPTED = 130  # what typer returns for Ctrl-C
+INTERRUPTED_CODE = 130  # what typer returns for Ctrl-C
 # left out of the help, which then fits one screen; as --debug, which the line of an unexpected error names
-COMPLETION = ("install_completion", "show_completion")
-EVERYWHERE = {"--debug": "debug", "--quiet": "quiet", "-q": "quiet"}  # before or after the command
+COMPLETION_OPTIONS = ("install_completion", "show_completion")
+GLOBAL_OPTIONS = {"--debug": "debug", "--quiet": "quiet", "-q": "quiet"}  # before or after the command
 
 
 class Command:
@@ -154,17 +154,17 @@ def options(
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    asked = {EVERYWHERE[argument] for argument in arguments if argument in EVERYWHERE}
-    arguments = [argument for argument in arguments if argument not in EVERYWHERE]
+    asked = {GLOBAL_OPTIONS[argument] for argument in arguments if argument in GLOBAL_OPTIONS}
+    arguments = [argument for argument in arguments if argument not in GLOBAL_OPTIONS]
     command = typer.main.get_command(app)
     for option in command.params:
-        if isinstance(option, typer.core.TyperOption) and option.name in COMPLETION:
+        if isinstance(option, typer.core.TyperOption) and option.name in COMPLETION_OPTIONS:
             option.hidden = True
     words = ["steady", *(word for word in arguments if word not in ("--resume", "--force"))]
     with quietly("quiet" in asked), commanded(words), progress_line() as line, listening(line):
         try:
             code = command.main(arguments, prog_name="steady", standalone_mode=False) or 0
-            if code == INTERRUPTED:
+            if code == INTERRUPTED_CODE:
                 raise KeyboardInterrupt
             return code
         except KeyboardInterrupt:

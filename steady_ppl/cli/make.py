@@ -14,7 +14,7 @@ from steady_ppl.errors import UsageError
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.text import say, tell
 
-NEXT = (
+NEXT_COMMANDS = (
     "steady fit models/hovercraft.py train.csv --valid valid.csv --known-start --recipe likelihood --out runs/first",
     "steady check runs/first test.csv",
     "steady discover runs/first train.csv --valid valid.csv --out runs/found",
@@ -28,7 +28,7 @@ def init(folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder 
 
     tables = make_workbench(folder)
     tell(f"{folder}: {', '.join(f'{room}/' for room in FOLDERS)}, {', '.join(table.name for table in tables)}")
-    tell("\n".join(["", "next:", f"  cd {shlex.quote(str(folder))}", *(f"  {line}" for line in NEXT)]))
+    tell("\n".join(["", "next:", f"  cd {shlex.quote(str(folder))}", *(f"  {line}" for line in NEXT_COMMANDS)]))
 
 
 def import_bag(

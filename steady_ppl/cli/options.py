@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-MAX_COUNT = 10**9
+MAX_COUNT = 10**9  # of whatever an option counts
 
 
 def count(help: str, least: int = 1) -> Any:

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 
 from steady_ppl.utils.text import is_quiet, printable
 
-PATIENCE = 2.0  # s, before anything is said
-CLEAR = "\r\x1b[K"
+PATIENCE_SECONDS = 2.0  # before anything is said
+CLEAR_LINE = "\r\x1b[K"
 
 
 class _Line:
@@ -37,15 +37,15 @@ class _Line:
         while not self.ended.wait(0.5):
             with self.lock:
                 now = time.monotonic()
-                if self.doing and now - self.begun > PATIENCE:
+                if self.doing and now - self.begun > PATIENCE_SECONDS:
                     said = in_words(self.doing, self.share, self.since - self.begun, now - self.begun)
-                    print(f"{CLEAR}{_end(printable(said))}", end="", file=sys.stderr, flush=True)
+                    print(f"{CLEAR_LINE}{_end(printable(said))}", end="", file=sys.stderr, flush=True)
                     self.drawn = True
 
     def clear(self) -> None:
         """Leave an empty line."""
         if self.drawn:
-            print(CLEAR, end="", file=sys.stderr, flush=True)
+            print(CLEAR_LINE, end="", file=sys.stderr, flush=True)
             self.drawn = False
 
 

@@ -32,8 +32,8 @@ from steady_ppl.utils.text import aligned, number
 
 Errors = dict[str, float]
 OPEN_LOOP = {"open_loop_1s": 1.0, "open_loop_3s": 3.0}  # s ahead
-OPEN_LOOP_DRAWS = 64
-OF_STATES = {"forward": "forward", "mean": "forward_mean", "state": "state_estimation"}  # column of the table → errors
+OPEN_LOOP_DRAWS = 64  # filtered particles of a row, each the start of an open loop
+ERRORS_OF_STATES = {"forward": "forward", "mean": "forward_mean", "state": "state_estimation"}  # column → errors
 
 
 @one_thread()
@@ -175,7 +175,7 @@ def table_of(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> str
     """The results as a table of text, a line a program: the start where it is known to some only, log p(y), errors of
     the first two groups of states, and errors in measurement space."""
     groups = list(next((r["forward"] for r in results if r["forward"]), {}))[:2]
-    columns = {f"{name} {group}": (of, group) for name, of in OF_STATES.items() for group in groups}
+    columns = {f"{name} {group}": (of, group) for name, of in ERRORS_OF_STATES.items() for group in groups}
     columns |= {name: ("measurement", name) for name in ("one_step", *OPEN_LOOP, "coverage_90")}
     lines = [["", "start", "log p(y)", *columns]]
     for label, result in zip(labels, results, strict=True):

@@ -11,15 +11,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from steady_ppl.comparison.result import FLOOR, Proof
+from steady_ppl.comparison.result import CONSTANT_VELOCITY, NOISE_FLOOR, Proof
 from steady_ppl.comparison.scores import (
     MIN_DRIVES,
-    SECONDS,
+    PROOF_HORIZONS_SECONDS,
     Judged,
     ProgramScores,
     as_row,
+    judge_constant_velocity,
     judge_program,
-    keeping_velocity,
     noise_floor,
 )
 from steady_ppl.data.table import refuse_long
@@ -33,7 +33,6 @@ from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
 
-CONSTANT_VELOCITY = "constant velocity"
 MAX_NEGLECTED = 2.0  # nats of a drive's log p(y) between a particle filter and the linearised program
 
 
@@ -96,20 +95,20 @@ def prove(
             judged[name] = judged[same] if same else judge_program(name, program, data, known_start, seed, path)
         begin()
         before, true = judged[reference], judged.get(truth or "")
-        coasting = keeping_velocity(before) if with_constant_velocity else None
+        coasting = judge_constant_velocity(before) if with_constant_velocity else None
     if isinstance(coasting, Judged):
         judged[CONSTANT_VELOCITY] = coasting
     floor = noise_floor(true, seed) if true else None
-    absent = {CONSTANT_VELOCITY: coasting, FLOOR: floor}
+    absent = {CONSTANT_VELOCITY: coasting, NOISE_FLOOR: floor}
     notes += [f"no row {name!r}: {why}" for name, why in absent.items() if isinstance(why, str)]
     counted = _counted(judged.values())
     found = {name: as_row(row, counted) for name, row in judged.items()}
     if isinstance(floor, Judged):
-        found[FLOOR] = as_row(floor, _counted([floor]))
+        found[NOISE_FLOOR] = as_row(floor, _counted([floor]))
     drives = before.problem.data
-    horizons = named_horizons(drives, SECONDS)
+    horizons = named_horizons(drives, PROOF_HORIZONS_SECONDS)
     notes += drives.uneven_steps + diagnose_units(before.problem.program, drives)
-    notes += _few_starts(drives, horizons, known_start) + unfinished(rows) + _blown_up(found) + far_off(found, data)
+    notes += _few_rows(drives, horizons, known_start) + unconverged(rows) + _blown_up(found) + doubtful(found, data)
     return Proof(found, reference, horizons, drives.median_step, len(data), known_start, seed, notes)
 
 
@@ -119,7 +118,7 @@ def _counted(judged: Iterable[Judged]) -> dict[int, Tensor]:
     return {horizon: torch.stack([row[horizon].observed for row in rows]).all(0) for horizon in rows[0]}
 
 
-def unfinished(rows: Mapping[str, Program | Fit]) -> list[str]:
+def unconverged(rows: Mapping[str, Program | Fit]) -> list[str]:
     """Which rows are fits that had not converged, so that a difference may be one of training."""
     return [
         f"{name} had not converged when its fit ended: part of what it differs by may be training"
@@ -134,7 +133,7 @@ def _require(programs: Mapping[str, Program], reference: str, truth: str | None,
     for name in (reference, truth):
         if name is not None and name not in programs:
             raise UsageError(f"there is no row {name!r}; the rows are {', '.join(programs)}")
-    for taken in {FLOOR, CONSTANT_VELOCITY} & programs.keys():
+    for taken in {NOISE_FLOOR, CONSTANT_VELOCITY} & programs.keys():
         raise UsageError(f"a row cannot be called {taken!r}: that is the name of a row of its own")
     ours = programs[reference].measurement_names
     for name, program in programs.items():
@@ -152,7 +151,7 @@ def _require(programs: Mapping[str, Program], reference: str, truth: str | None,
     refuse_long(data)
 
 
-def _few_starts(data: Trajectories, horizons: Mapping[str, int], known_start: bool) -> list[str]:
+def _few_rows(data: Trajectories, horizons: Mapping[str, int], known_start: bool) -> list[str]:
     """Say where an error goes by the first rows only."""
     notes, length = [], data.time.shape[0]
     for name, horizon in horizons.items():
@@ -170,7 +169,7 @@ def _blown_up(rows: Mapping[str, ProgramScores]) -> list[str]:
     return notes
 
 
-def far_off(rows: Mapping[str, ProgramScores], data: Trajectories) -> list[str]:
+def doubtful(rows: Mapping[str, ProgramScores], data: Trajectories) -> list[str]:
     """Drives on which the linearised program's log p(y) is not to be trusted, the worst of each row."""
     notes = []
     for name, row in rows.items():

@@ -8,16 +8,16 @@ from typing import Any
 
 from torch import Tensor
 
-from steady_ppl.comparison.scores import BANDS, COVERAGE, RESAMPLES, Change, Key, ProgramScores, paired
+from steady_ppl.comparison.scores import BANDED_HORIZONS, COVERAGE, RESAMPLES, Change, Key, ProgramScores, paired
 from steady_ppl.effects import attached
 from steady_ppl.model.program import error_groups
-from steady_ppl.utils.late import Displayed
-from steady_ppl.utils.text import aligned, number
+from steady_ppl.utils.hooks import Displayed
+from steady_ppl.utils.text import TEXT_WIDTH, aligned, number
 
-WIDTH, NAME = 100, 20
-FLOOR = "noise floor"
-POSSIBLE = (FLOOR, "constant velocity", "oracle", "truth")
-JUDGED = {  # the signs of what log p(y) and the error gained
+NAME_COLUMNS = 20  # characters of a row's name
+NOISE_FLOOR, CONSTANT_VELOCITY = "noise floor", "constant velocity"  # rows that `prove` adds
+BASELINE_ROWS = (NOISE_FLOOR, CONSTANT_VELOCITY, "oracle", "truth")  # that show what is possible
+PHRASES_OF_SIGNS = {  # the signs of what log p(y) and the error gained
     (0, 0): ("is not shown to help", "is not shown to be better than"),
     (1, 1): ("helps", "is better than"),
     (-1, -1): ("makes it worse", "is worse than"),
@@ -78,11 +78,11 @@ class Proof(Displayed):
         far = horizons[1:] or horizons
         drives = f"{self.trajectories} drives; differences are from {self.reference}"
         said = f"{drives}, with {COVERAGE:.0%} intervals bootstrapped over drives"
-        lines = [*textwrap.wrap(content["verdict"], WIDTH), "", said, ""]
-        bands = [name for name in BANDS if name in horizons]
+        lines = [*textwrap.wrap(content["verdict"], TEXT_WIDTH), "", said, ""]
+        bands = [name for name in BANDED_HORIZONS if name in horizons]
         shown = [name if i else f"in 90 % band, {name}" for i, name in enumerate(bands)]
         header = ["", "log p(y) [nats]", "difference [nats]", "by particles", *shown]
-        lines += _table([header, *([row["row"], *_likely(row, bands)] for row in rows)])
+        lines += _table([header, *([row["row"], *_likelihood_cells(row, bands)] for row in rows)])
         lines += ["", "root mean square error of predictions ahead, and by how much it differs"]
         units_of = {("measurement", of): of for of in rows[0]["measurement"]}
         units_of |= {("state", of): unit for of, unit in content["units"].items()}
@@ -91,9 +91,9 @@ class Proof(Displayed):
             header = [f"{title} [{unit}]" if unit else title, *far, *(f"{name}, differs" for name in far)]
             cells = [[row["row"], *_errors(row, kind, of, far)] for row in rows if of in row[kind]]
             lines += [*_table([header, *cells]), ""] if cells else []
-        lines += _scales([row for row in rows if row["row"] != FLOOR])
+        lines += _scales([row for row in rows if row["row"] != NOISE_FLOOR])
         for note in self.notes:
-            lines += textwrap.wrap(f"note: {note}", WIDTH)
+            lines += textwrap.wrap(f"note: {note}", TEXT_WIDTH)
         return "\n".join(lines)
 
     def __repr__(self) -> str:
@@ -108,7 +108,7 @@ def units_of_states(found: Proof) -> dict[str, str]:
 
 
 def _against_reference(found: Proof, name: str) -> dict[str, Any] | None:
-    if name in (found.reference, FLOOR):
+    if name in (found.reference, NOISE_FLOOR):
         return None
     return _by_key(found, {key: change and dict(vars(change)) for key, change in changes(found, name).items()})
 
@@ -136,7 +136,7 @@ def changes(found: Proof, name: str) -> dict[Key, Change | None]:
 def verdict(found: Proof) -> str:
     """One sentence on the last row but the reference and, if there are others, those that show what is possible."""
     others = [name for name in found.rows if name != found.reference]
-    name = next((name for name in reversed(others) if name not in POSSIBLE), others[0])
+    name = next((name for name in reversed(others) if name not in BASELINE_ROWS), others[0])
     changed = changes(found, name)
     likely = changed[Key("log_likelihood", "", 0)]
     horizon = next(h for h in ("3 s", "1 s", "10 s", "one step") if h in found.horizons)
@@ -147,7 +147,7 @@ def verdict(found: Proof) -> str:
         if differs := _differs(vars(change) if change else None):
             parts.append(f"{horizon.replace(' ', '-')} open-loop error{where} {differs}")
     gained = _sign([likely]), -_sign([*errors.values()])
-    alone, between = JUDGED[gained if gained in JUDGED else (sum(gained), sum(gained))]
+    alone, between = PHRASES_OF_SIGNS[gained if gained in PHRASES_OF_SIGNS else (sum(gained), sum(gained))]
     added = _added(found.rows[found.reference], found.rows[name])
     said = f"Adding {added} {alone}" if added else f"{name} {between} {found.reference}"
     return f"{said}: {', '.join(parts)}."
@@ -172,7 +172,7 @@ def with_interval(value: float, interval: Sequence[float], digits: int, unit: st
     return f"{value:+.{digits}f}{unit} [{low}, {high}]".replace("-", "−")
 
 
-def _likely(row: Mapping[str, Any], bands: Sequence[str]) -> list[str]:
+def _likelihood_cells(row: Mapping[str, Any], bands: Sequence[str]) -> list[str]:
     change = (row["against_reference"] or {}).get("log_likelihood")
     said = with_interval(change["difference"], change["interval"], 1) if change else ""
     cells = [number(row["log_likelihood"], ".1f"), said, number(row["neglected"], "+.2f")]
@@ -210,9 +210,9 @@ def _scales(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _table(rows: Sequence[Sequence[str]]) -> list[str]:
     """Aligned rows, the header first; columns that find no room go into a second table below."""
-    cut = [[name if len(name) <= NAME else f"{name[: NAME - 1]}…", *cells] for name, *cells in rows]
+    cut = [[name if len(name) <= NAME_COLUMNS else f"{name[: NAME_COLUMNS - 1]}…", *cells] for name, *cells in rows]
     ends = itertools.accumulate(2 + max(map(len, column)) for column in zip(*cut, strict=True))
-    room = max(2, sum(end - 2 <= WIDTH for end in ends))
+    room = max(2, sum(end - 2 <= TEXT_WIDTH for end in ends))
     lines = aligned([row[:room] for row in cut])
     if room < len(cut[0]):
         lines += ["", *_table([[row[0], *row[room:]] for row in rows])]

@@ -25,13 +25,13 @@ from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, error_groups, for_program
 from steady_ppl.utils.random import seeded
 
-SECONDS = (1.0, 3.0, 10.0)
-BANDS = ("one step", "1 s", "3 s")
-DRAWN = 12  # horizons of the picture
-SETS, CELLS = 20, 100_000  # simulated sets for the noise floor, and rows of all their drives at most
+PROOF_HORIZONS_SECONDS = (1.0, 3.0, 10.0)  # ahead, besides one step
+BANDED_HORIZONS = ("one step", "1 s", "3 s")  # whose predictions have 90 % bands
+CURVE_HORIZONS = 12  # horizons of the picture
+MAX_FLOOR_SETS, MAX_FLOOR_ROWS = 20, 100_000  # simulated sets for the noise floor, and rows of all their drives
 MIN_SHARE_OF_ROWS = 0.9  # of all rows; a bearing's noise grows beside its landmark
-RESAMPLES, COVERAGE = 2000, 0.95  # of the bootstrap
-MIN_DRIVES = 5
+RESAMPLES, COVERAGE = 2000, 0.95  # resamples of the drives, and of intervals over them
+MIN_DRIVES = 5  # drives for such an interval
 Scales = dict[str, dict[str, float | None]]  # "channels" and "measurements" → component → σ, None where there is none
 
 
@@ -150,10 +150,10 @@ def judge(problem: Problem, ahead: Lookahead, kernels: bool | None = None) -> Ju
     """Track along a path that was found and compare what is predicted from every row with measurements and truth."""
     program, data, unseen = problem.program, problem.data, problem.without_truth()
     tracked = track(unseen, ahead.linearization.path, kernels=kernels)
-    named = named_horizons(data, SECONDS)
+    named = named_horizons(data, PROOF_HORIZONS_SECONDS)
     longest, states = max(named.values()), dict[tuple[str, int], tuple[Tensor, Tensor]]()
-    horizons = {round(rows) for rows in np.geomspace(1, longest, DRAWN).tolist()} | set(named.values())
-    bands = [named[name] for name in BANDS if name in named]
+    horizons = {round(rows) for rows in np.geomspace(1, longest, CURVE_HORIZONS).tolist()} | set(named.values())
+    bands = [named[name] for name in BANDED_HORIZONS if name in named]
     predictions = predict(program, unseen.data, tracked, sorted(horizons), bands=bands)
     if data.states is not None and has_truth(data):
         for horizon, state in states_ahead(program, unseen.data, tracked, longest):
@@ -165,7 +165,7 @@ def judge(problem: Problem, ahead: Lookahead, kernels: bool | None = None) -> Ju
     return Judged(problem, ahead, tracked, predictions, states)
 
 
-def keeping_velocity(before: Judged) -> Judged | str:
+def judge_constant_velocity(before: Judged) -> Judged | str:
     """A program without any acceleration but noise, of the size under which the measurements are most likely."""
     unseen = before.problem.without_truth()
     found = constant_velocity(unseen, before.tracked, [1])
@@ -185,7 +185,7 @@ def noise_floor(true: Judged, seed: int) -> Judged | str:
     """The program that made the drives on drives of its own: what noise alone leaves."""
     unseen = true.problem.without_truth()
     program, data = unseen.program, unseen.data
-    sets = max(1, min(SETS, CELLS // data.time.numel()))
+    sets = max(1, min(MAX_FLOOR_SETS, MAX_FLOOR_ROWS // data.time.numel()))
     with seeded(seed, "noise floor"):
         _, drawn, _ = true.ahead.draws(sets)
         starts = data.known_start.expand(sets, -1, -1) if unseen.known_start else drawn[:, 0]

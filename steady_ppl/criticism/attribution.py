@@ -14,14 +14,14 @@ import numpy as np
 import torch
 
 from steady_ppl.criticism.perturbations import Direction
-from steady_ppl.criticism.residual_maps import ALPHA, standardise, tail_p_value
+from steady_ppl.criticism.residual_maps import CHECK_LEVEL, standardise, tail_p_value
 
 Array = np.ndarray[Any, Any]
-KINDS = ("sensor", "actuator", "dynamics")
-LEVEL_OF_TEST = ALPHA / 4  # of the mean, the parameters, the noise and the maps together at the level (Bonferroni)
+FAULT_KINDS = ("sensor", "actuator", "dynamics")  # of directions
+LEVEL_OF_TEST = CHECK_LEVEL / 4  # of mean, parameters, noise and maps, which together keep the level (Bonferroni)
 MIN_GAIN_OF_KIND = 3.0  # nats of log p(y) between the best kind and the next
 SCATTER = "scatter of "  # begins the names of mean squares
-STEPS = 4
+MAX_DIRECTIONS = 4  # of a kind, that are picked one after the other
 MAX_INFORMATIVE_SD = 100.0  # so far off the scores say nothing of what would be nearest to the drives
 MAX_SCORE_SD = 5.0  # standard deviations of one drive's score, more where most drives' are large
 MIN_GAIN_OF_DIRECTION = 2.0  # nats that another direction of the same kind must bring
@@ -62,7 +62,7 @@ class Scored:
         members = np.array([own == kind for own in self.kinds])
         picked: list[int] = []
         nats: list[float] = []
-        for step in range(min(STEPS, len(z))):
+        for step in range(min(MAX_DIRECTIONS, len(z))):
             spread = correlation.diagonal()
             left = np.where(members & (spread > 0.02), z**2 / np.maximum(spread, 0.02), 0.0)
             j = int(left.argmax())
@@ -169,7 +169,7 @@ def attribute(scores: Scored, parameters: Scored, noise: dict[str, Array], maps_
     }
     dispersion = float(scores.dispersion[0].mean())
     widened = math.sqrt(min(max(1.0, dispersion), float(widest[0, 0])))
-    by_kind = {kind: scores.explaining(kind, widened) for kind in KINDS if kind in scores.kinds}
+    by_kind = {kind: scores.explaining(kind, widened) for kind in FAULT_KINDS if kind in scores.kinds}
     explained = {kind: nats for kind, (_, nats) in by_kind.items()}
     best = max(explained, key=lambda kind: explained[kind])
     others = [nats for kind, nats in explained.items() if kind != best]

@@ -18,7 +18,7 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance, joined, sample_channels
 from steady_ppl.utils.angles import wrap
 
-MULTIPLES = (0.5, 1.0, 2.0, 4.0, 8.0)
+NOISE_MULTIPLES = (0.5, 1.0, 2.0, 4.0, 8.0)  # of the channels' root mean squares, that are scanned
 DEFINITION = (
     "the program with every channel's mean replaced by zero, so that it ignores the controls and keeps its velocity; "
     "its channel noise is the one of a scan under which these measurements are most likely"
@@ -98,7 +98,7 @@ def constant_velocity(problem: Problem, tracked: Tracked, horizons: Sequence[int
     if torch.allclose(moved, coasted, rtol=1e-6, atol=1e-7):
         return "the program's channels have no mean that could be taken away"
     best: tuple[float, ConstantVelocity, Tracked] | None = None
-    for multiple in MULTIPLES:
+    for multiple in NOISE_MULTIPLES:
         coasting = ConstantVelocity(program, (multiple * sizes).tolist())
         start = ReferencePath(path.states, (values / (multiple * sizes)).to(values.dtype))
         found = track(replace(problem, program=coasting), start, passes=3, kernels=False)

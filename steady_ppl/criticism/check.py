@@ -15,7 +15,7 @@ import torch
 from steady_ppl.criticism.attribution import SCATTER, attribute, scored
 from steady_ppl.criticism.baselines import constant_velocity, last_measurement
 from steady_ppl.criticism.perturbations import directions
-from steady_ppl.criticism.reference_sets import MIN_SETS, residuals, simulate_sets
+from steady_ppl.criticism.reference_sets import MIN_BAND_SETS, residuals, simulate_sets
 from steady_ppl.criticism.residual_maps import Residuals, judge
 from steady_ppl.criticism.result import Check
 from steady_ppl.criticism.step_size import check_step
@@ -27,7 +27,7 @@ from steady_ppl.gaussian.kalman import track
 from steady_ppl.gaussian.linearize import why_not_linear
 from steady_ppl.gaussian.predict import named_horizons, predict
 from steady_ppl.gaussian.smoother import find_and_smooth
-from steady_ppl.kernels.rows import in_plain_torch, without_kernels
+from steady_ppl.kernels.rows import fallback_notes, kernel_failures
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.runs.diagnostics import diagnose_units
@@ -36,7 +36,7 @@ from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
-SECONDS = (1.0, 3.0)
+CHECK_HORIZONS_SECONDS = (1.0, 3.0)  # ahead, besides one step
 MAX_RESIDUAL_SD = 4.0  # of a single residual; beside a landmark the linearised program knows no more
 
 
@@ -64,18 +64,18 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     program = fit.program
     problem = Problem.of_table(program, data, fit.known_start)
     run = problem.data
-    if simulations < MIN_SETS:
-        raise UsageError(f"got {simulations} simulations: bands need at least {MIN_SETS}, and 100 are better")
+    if simulations < MIN_BAND_SETS:
+        raise UsageError(f"got {simulations} simulations: bands need at least {MIN_BAND_SETS}, and 100 are better")
     if run.time.shape[0] < 2 or not bool(run.observed[1:].any()):
         raise DataError("nothing to compare: no trajectory has a measurement after its first row")
     refuse_long(run)
     if (why := why_not_linear(problem.program, problem.data, known_start=problem.known_start)) is not None:
         raise UsageError(f"check needs a program that can be linearised: {why.split(': looking')[0]}")
-    horizons = named_horizons(run, SECONDS)
+    horizons = named_horizons(run, CHECK_HORIZONS_SECONDS)
     parts = (("finding paths", 1), ("comparing time steps", 1), ("simulating drives", 2), ("judging", 2))
     with stages(*parts) as begin:
         begin()
-        with seeded(seed, "check"), without_kernels() as uncompiled:
+        with seeded(seed, "check"), kernel_failures() as uncompiled:
             ahead = find_and_smooth(problem)
             path = ahead.linearization.path
             real = track(problem, path, passes=1)
@@ -97,7 +97,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         both = Residuals.joined([ours, theirs])
         misfit = judge(both, time, controls, _pairs(program, ours), dispersion)
     notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
-    notes += in_plain_torch(uncompiled)
+    notes += fallback_notes(uncompiled)
     notes += run.uneven_steps + diagnose_units(program, run)
     notes += [f"refitted to these drives, {step.note}"] if step.note else []
     notes += [step.uncompared] if step.uncompared else []

@@ -24,10 +24,10 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, row_controls
 from steady_ppl.utils.angles import wrap, wrap_angles
 
-LAG = 0.3  # s
+LAG_SECONDS = 0.3
 DEAD_ZONE, SATURATION_KNEE = 0.2, 0.6  # of the largest command
 NOT_SUMMED = ("offset of", "curvature in")  # in the controls' own units
-MAX_PARAMETERS = 40  # parameters; a network's are not looked at one by one
+MAX_SCORED_PARAMETERS = 40  # parameters; a network's are not looked at one by one
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class _Scores:
 
     def of_parameters(self) -> Named:
         """The program's own parameters, where they move the mean."""
-        if not 0 < sum(value.numel() for value in self.program.parameters()) <= MAX_PARAMETERS:
+        if not 0 < sum(value.numel() for value in self.program.parameters()) <= MAX_SCORED_PARAMETERS:
             return
         parts = elements(self.program, frozen=True)
         for part, score in zip(parts, (self._pushed_by(parts) + self._shifted_by(parts)).unbind(-1), strict=True):
@@ -133,10 +133,10 @@ class _Scores:
     def of_actuators(self) -> Named:
         """Other controls than those commanded, as the program would answer to them: one's, and all together."""
         together: dict[str, list[Tensor]] = {}
-        for index, (name, answer) in enumerate(zip(self.program.control_names, self.answers, strict=True)):
-            if answer is None:
+        for index, (name, response) in enumerate(zip(self.program.control_names, self.responses, strict=True)):
+            if response is None:
                 continue
-            along = (answer * self.arrival).sum(-1)
+            along = (response * self.arrival).sum(-1)
             for word, shape in self._other_than(self.commands[:-1, :, index]).items():
                 score = self.over_rows(shape * along)
                 together.setdefault(word, []).append(score)
@@ -157,7 +157,7 @@ class _Scores:
             "dead zone of": -command.clamp(-DEAD_ZONE * most, DEAD_ZONE * most),
             "saturation of": command.clamp(-SATURATION_KNEE * most, SATURATION_KNEE * most) - command,
             "delay of": -change,
-            "lag of": lagged(command.unsqueeze(-1), time, torch.tensor(LAG)).squeeze(-1) - command,
+            "lag of": lagged(command.unsqueeze(-1), time, torch.tensor(LAG_SECONDS)).squeeze(-1) - command,
         }
         speed = next(iter(self.program.velocities(self.states).values()), None)
         if speed is not None:
@@ -195,8 +195,8 @@ class _Scores:
         along = self.linear.noise / self.linear.noise.norm(dim=-2, keepdim=True).clamp(min=1e-300)
         for channel, (called, noise) in enumerate(zip(self.channels, self.noise.unbind(-1), strict=True)):
             unmoved = []
-            for index, answer in enumerate(self.answers):
-                if answer is None or float((answer * along[..., channel]).sum(-1).norm() / answer.norm()) < 1e-3:
+            for index, response in enumerate(self.responses):
+                if response is None or float((response * along[..., channel]).sum(-1).norm() / response.norm()) < 1e-3:
                     unmoved.append(index)
             for one in unmoved:
                 yield f"{called} acceleration with {name[one]}", self.over_rows(commands[..., one] * noise)
@@ -206,7 +206,7 @@ class _Scores:
                     yield word, self.over_rows((commands[..., one] - commands[..., other]) * noise)
 
     @cached_property
-    def answers(self) -> list[Tensor | None]:
+    def responses(self) -> list[Tensor | None]:
         """How the next state changes with each control, `(T, B, D)`; None where it does not."""
         found: list[Tensor | None] = []
         for index in range(len(self.program.controls)):
@@ -214,9 +214,9 @@ class _Scores:
             change = torch.zeros_like(self.controls)
             change[..., index :: len(self.program.controls)] = size  # in every substep
             more, less = (self._moved(self.controls + sign * change) for sign in (1, -1))
-            answer = wrap_angles(more - less, self.linear.angles) / (2 * size)
-            answer = torch.where(self.data.transitions[..., None], answer, 0.0)
-            found.append(answer if bool((answer.abs() > 1e-9).any()) else None)
+            response = wrap_angles(more - less, self.linear.angles) / (2 * size)
+            response = torch.where(self.data.transitions[..., None], response, 0.0)
+            found.append(response if bool((response.abs() > 1e-9).any()) else None)
         return found
 
     def _moved(self, controls: Tensor) -> Tensor:

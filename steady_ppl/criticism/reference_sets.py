@@ -23,13 +23,13 @@ from steady_ppl.gaussian.smoother import REST_TOLERANCE, means_as_path, smooth
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.angles import wrap_angles
-from steady_ppl.utils.cores import Result, side_by_side
+from steady_ppl.utils.cores import Output, run_in_parallel
 from steady_ppl.utils.random import seeded
 
-MIN_SETS = 20  # sets
+MIN_BAND_SETS = 20  # simulated sets for bands
 MAX_ROWS_OF_BLOCK = 100_000  # of all drives of a block: the memory of larger arrays takes longer to get than to fill
 ROUNDING = 1e-5  # of a state, in single precision
-LINEARISATIONS = 4  # of drives that need them: beside a landmark the truth is far from the mode
+MAX_LINEARISATIONS = 4  # of drives that need them: beside a landmark the truth is far from the mode
 
 
 @dataclass(frozen=True)
@@ -57,14 +57,14 @@ def simulate_sets(problem: Problem, starts: Tensor, channels: int, horizons: Seq
     """
     at_once, seed = max(1, MAX_ROWS_OF_BLOCK // problem.data.time.numel()), int(torch.randint(2**31, ()))
 
-    def simulate(number: int, block: Tensor) -> Result:
+    def simulate(number: int, block: Tensor) -> Output:
         with seeded(seed + number, "block"):
             return _block(problem, block, channels, horizons)
 
     jobs = [partial(simulate, number, block) for number, block in enumerate(starts.split(at_once))]
-    blocks = [(tensors, said) for tensors, said in side_by_side(jobs) if tensors]
+    blocks = [(tensors, said) for tensors, said in run_in_parallel(jobs) if tensors]
     sets = sum(len(tensors["values"]) for tensors, _ in blocks)
-    if sets < MIN_SETS:
+    if sets < MIN_BAND_SETS:
         what = f"{len(starts) - sets} of {len(starts)} simulated sets blew up"
         raise FilterError(f"{what}: the fitted program does not even explain drives of its own")
 
@@ -82,7 +82,7 @@ def simulate_sets(problem: Problem, starts: Tensor, channels: int, horizons: Seq
     )
 
 
-def _block(problem: Problem, starts: Tensor, channels: int, horizons: Sequence[int]) -> Result:
+def _block(problem: Problem, starts: Tensor, channels: int, horizons: Sequence[int]) -> Output:
     """What `SimulatedSets` has of some sets, each tensor with the sets or their drives in front, and the names in it;
     nothing where every set blew up."""
     program, sets = problem.program, len(starts)
@@ -117,7 +117,7 @@ def _tracked(problem: Problem, truth: ReferencePath) -> tuple[ReferencePath, Tra
     if bool(far.any()):
         index = far.nonzero().flatten()
         begin = ReferencePath(truth.states[:, index], truth.noise[:, index])
-        path = smooth(problem.subset(index), begin, passes=LINEARISATIONS).linearization.path
+        path = smooth(problem.subset(index), begin, passes=MAX_LINEARISATIONS).linearization.path
         near.states[:, index], near.noise[:, index] = path.states, path.noise
         tracked = track(problem, near, passes=1)
     return near, tracked

@@ -22,11 +22,11 @@ from scipy import special
 
 from steady_ppl.errors import DataError
 
-STRIPS, BINS, BINS_OF_PAIRS = 10, 5, 4
+MAX_TIME_STRIPS, REGIME_BINS, PAIR_BINS = 10, 5, 4  # of a drive, and ranges of a variable alone or of two each
 MIN_RESIDUALS = 8  # residuals in a cell
 LAGS = (0, 1, 2, 5, 10)  # rows
-MIN_SHARE_OF_SETS = 0.5  # of the simulated sets that must have a cell, too
-ALPHA = 0.05
+MIN_SHARE_OF_SETS_WITH_CELL = 0.5  # of the simulated sets that must have a cell, too
+CHECK_LEVEL = 0.05  # of false discoveries among cells, and of all tests of `attribution` together
 
 Array = np.ndarray[Any, Any]
 
@@ -134,7 +134,7 @@ def judge(both: Residuals, time: Array, controls: dict[str, Array], pairs: Seque
     p_values = 2 * special.stdtr(freedom, -np.abs(z))
     rates = np.stack([_adjusted(row) for row in p_values])
     simes = rates.min(1)
-    level = min(ALPHA, float(np.quantile(simes[1:], ALPHA, method="lower")))  # the tails of t are a model, too
+    level = min(CHECK_LEVEL, float(np.quantile(simes[1:], CHECK_LEVEL, method="lower")))  # t's tails are a model, too
     chosen = np.flatnonzero(rates[0] <= level)
     findings = [SignificantCell(cells[i], float(z[0, i]), float(p_values[0, i])) for i in chosen]
     return Misfit(
@@ -180,7 +180,7 @@ def _all_cells(data: Residuals, time: Array, controls: dict[str, Array], pairs: 
     """Every cell; its statistic is the sum over the root of the count."""
     inside = data.there[0].any(-1)
     drives = np.broadcast_to(np.arange(time.shape[1]), time.shape)
-    edges = np.linspace(0, time[inside].max() * (1 + 1e-9) + 1e-9, min(STRIPS, max(1, len(time) // 5)) + 1)
+    edges = np.linspace(0, time[inside].max() * (1 + 1e-9) + 1e-9, min(MAX_TIME_STRIPS, max(1, len(time) // 5)) + 1)
     strip = np.clip(np.searchsorted(edges, time, side="right") - 1, 0, len(edges) - 2)
     strips = [{"time": (float(a), float(b))} for a, b in itertools.pairwise(edges)]
     each = [{"drive": drive} for drive in range(time.shape[1])]
@@ -192,11 +192,11 @@ def _all_cells(data: Residuals, time: Array, controls: dict[str, Array], pairs: 
         yield from _sums(data, "drive and time", drives * len(strips) + strip, both)
     sorted_by = {name: value[None] for name, value in controls.items()} | data.variables
     for name, values in sorted_by.items():
-        labels, ranges = _binned(values, inside, BINS)
+        labels, ranges = _binned(values, inside, REGIME_BINS)
         if ranges:
             yield from _sums(data, "regime", labels, [{name: between} for between in ranges])
     for first, second in pairs:
-        (one, ranges), (other, across) = (_binned(sorted_by[name], inside, BINS_OF_PAIRS) for name in (first, second))
+        (one, ranges), (other, across) = (_binned(sorted_by[name], inside, PAIR_BINS) for name in (first, second))
         if ranges and across:
             where = [{first: a, second: b} for a in ranges for b in across]
             yield from _sums(data, "pair", one * len(across) + other, where)
@@ -232,7 +232,7 @@ def _sums(data: Residuals, kind: str, labels: Array, where: list[dict[str, Any]]
             raw = np.bincount(index[0][there[0]], data.raw[..., residual][there[0]], minlength=len(where))
             mean = (raw / np.maximum(count[0], 1)).tolist()
         for cell, place in enumerate(where):
-            if enough[0, cell] and enough[1:, cell].mean() > MIN_SHARE_OF_SETS:
+            if enough[0, cell] and enough[1:, cell].mean() > MIN_SHARE_OF_SETS_WITH_CELL:
                 yield Cell(kind, residual, place, int(count[0, cell]), mean[cell]), average[:, cell]
 
 

@@ -16,8 +16,8 @@ from steady_ppl.data.frozen_sensors import Stretch
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction
-from steady_ppl.model.program import Program
-from steady_ppl.utils.late import Displayed
+from steady_ppl.model.program import Program, unit_of
+from steady_ppl.utils.hooks import Displayed
 from steady_ppl.utils.text import aligned, number
 
 MAX_FINDINGS_SHOWN = 8  # findings in the table
@@ -264,19 +264,9 @@ def place(found: Check, cell: Cell) -> str:
         elif key == "time":
             words.append(f"between {value[0]:.1f} and {value[1]:.1f} s")
         else:
-            span = f"{key} is between {value[0]:.3g} and {value[1]:.3g} {unit_of(found, key)}".rstrip()
+            span = f"{key} is between {value[0]:.3g} and {value[1]:.3g} {unit_of(found.program, key)}".rstrip()
             words.append(f"{'and' if words else 'while'} {span}")
     return "".join(f" {word}" for word in words)
-
-
-def unit_of(found: Check, variable: str) -> str:
-    """Of a control, a state component, or a channel's velocity; empty where it is not declared."""
-    program = found.program
-    moving = [f"{name} velocity" for name in program.channel_names]
-    of = dict(zip(moving, (unit.replace("/s²", "/s") for unit in program.channel_units), strict=True))
-    of |= zip(program.state_names, program.state_units, strict=True)
-    of |= zip(program.control_names, program.control_units, strict=True)
-    return of.get(variable, "")
 
 
 def _plain(found: Check, key: str, value: Any) -> Any:

@@ -29,9 +29,9 @@ from steady_ppl.utils.random import seeded
 MIN_GAIN = 3.0  # nats, of all drives together, from which a finer step counts
 MAX_SHIFT = 2.0  # nats that watched parameters of another step lie below the maximum: two standard deviations
 MAX_DECREMENT = 1.0  # nats that a scoring step may promise; beyond it more steps may gain far more
-PRECISION = 0.005  # nats, of refits
+REFIT_PRECISION = 0.005  # nats
 MAX_SUBSTEPS_TRIED = 32  # of a trial, unless more are asked for; a program may always be tried at twice its own
-REFITS = 25  # scoring steps of a fit
+MAX_REFIT_STEPS = 25  # scoring steps of a fit
 UNKNOWN = "whether the time step suits is not known"
 
 
@@ -53,7 +53,7 @@ class StepTrial:
         change = other.values - self.values
         return 0.5 * float(change @ torch.linalg.pinv(self.covariance) @ change)
 
-    def farthest(self, other: StepTrial) -> str:
+    def largest_difference(self, other: StepTrial) -> str:
         """The watched number that differs most from the other trial's, and by how much, in words."""
         spread = self.covariance.diagonal().clamp(min=1e-300).sqrt()
         apart = ((other.values - self.values) / spread).abs()
@@ -107,9 +107,9 @@ class StepCheck:
                 if gain > MIN_GAIN:
                     said += f", the last doubling {gain:.0f} of them: more substeps may gain more"
                 else:
-                    said += f", the last doubling moves {suited.farthest(coarser)}: more may move it on"
+                    said += f", the last doubling moves {suited.largest_difference(coarser)}: more may move it on"
         elif self.too_coarse and suited.shift(own) > MAX_SHIFT:
-            said = f"move {suited.farthest(own)}"
+            said = f"move {suited.largest_difference(own)}"
         else:
             return ""
         return f"the program's own time step is too coarse: {self._finer_steps(said)}"
@@ -119,7 +119,7 @@ class StepCheck:
         """What is to be noted where a finer step moves parameters a little; empty otherwise."""
         if not self.too_coarse or self.sentence:
             return ""
-        return self._finer_steps(f"move {self.suited.farthest(self.trials[0])}")
+        return self._finer_steps(f"move {self.suited.largest_difference(self.trials[0])}")
 
     def _finer_steps(self, effect: str) -> str:
         finer, own = self.suited.substeps, self.trials[0].substeps
@@ -200,12 +200,12 @@ def check_step(
         if steps:
             with seeded(substeps, "wider noise"):
                 path = widen_noise(problem, path)
-        maximum = maximise(problem, path, steps=steps, precision=PRECISION)
+        maximum = maximise(problem, path, steps=steps, precision=REFIT_PRECISION)
         return _trial(changed, maximum, names)
 
     def again(coarse: StepTrial, fine: StepTrial) -> StepTrial:
         try:
-            found = trial(coarse.substeps, fine.program, fine.path, REFITS)
+            found = trial(coarse.substeps, fine.program, fine.path, MAX_REFIT_STEPS)
         except FilterError:  # it diverges with these parameters, or these drives do not tell them apart
             return coarse
         return found if found.log_likelihood > coarse.log_likelihood - MIN_GAIN else coarse
@@ -236,7 +236,7 @@ def check_step(
         go_on = True
         while go_on and 2 * trials[-1].substeps <= most:
             coarse = trials[-1]
-            fine = trial(2 * coarse.substeps, coarse.program, coarse.path, REFITS)
+            fine = trial(2 * coarse.substeps, coarse.program, coarse.path, MAX_REFIT_STEPS)
             trials.append(fine)
             if refits and _differs(coarse, fine, max_shift):  # several maxima of one program are no matter of its step
                 trials[-2] = again(coarse, fine)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 
-MIN_ROWS = 12  # rows of a stretch
+MIN_STRETCH_ROWS = 12  # rows of a stretch
 MAX_DEVIATION = 1e-6  # of the column's range over all drives, by which a row may be beside the line
 RowRange = tuple[int, int, int, str]  # drive, first and last row, column
 
@@ -88,7 +88,7 @@ def _columns(data: Trajectories) -> list[tuple[str, Tensor, Tensor]]:
 
 def _runs(time: Tensor, values: Tensor, there: Tensor) -> list[tuple[int, int, int]]:
     """Drive, first and last row of every stretch on a line over time."""
-    if len(values) < MIN_ROWS or int(there.sum()) < MIN_ROWS:
+    if len(values) < MIN_STRETCH_ROWS or int(there.sum()) < MIN_STRETCH_ROWS:
         return []
     seen = values[there]
     reach = MAX_DEVIATION * float(seen.max() - seen.min())
@@ -100,7 +100,7 @@ def _runs(time: Tensor, values: Tensor, there: Tensor) -> list[tuple[int, int, i
     for drive in straight.any(0).nonzero().flatten().tolist():
         edges = torch.diff(straight[:, drive].int(), prepend=torch.zeros(1).int(), append=torch.zeros(1).int())
         begins, ends = (edges == 1).nonzero().flatten().tolist(), (edges == -1).nonzero().flatten().tolist()
-        runs += [(drive, b, e + 1) for b, e in zip(begins, ends, strict=True) if e + 2 - b >= MIN_ROWS]
+        runs += [(drive, b, e + 1) for b, e in zip(begins, ends, strict=True) if e + 2 - b >= MIN_STRETCH_ROWS]
     return runs
 
 

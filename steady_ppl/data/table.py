@@ -27,7 +27,7 @@ from steady_ppl.utils.text import shown
 
 SEPARATORS = {";": "semicolons", "\t": "tabs"}  # of other programs' CSV
 MAX_PIECES = 1_000_000  # of all drives
-MAX_ROWS = 20_000  # of a drive that is looked at as a whole
+MAX_DRIVE_ROWS = 20_000  # of a drive that is looked at as a whole
 
 
 def read_table(path: str | Path) -> Trajectories:
@@ -300,11 +300,11 @@ def from_arrays(drives: Sequence[Mapping[str, Any]], labels: Sequence[str] | Non
 
 
 def refuse_long(data: Trajectories) -> None:
-    """Raise DataError, naming the longest trajectory, where it has more than `MAX_ROWS` rows."""
+    """Raise DataError, naming the longest trajectory, where it has more than `MAX_DRIVE_ROWS` rows."""
     longest = int(data.lengths.argmax())
     label, rows = data.labels[longest], int(data.lengths[longest])
-    if rows > MAX_ROWS:
-        what = f"trajectory {label} has {rows} rows, and at most {MAX_ROWS} are looked at in one piece"
+    if rows > MAX_DRIVE_ROWS:
+        what = f"trajectory {label} has {rows} rows, and at most {MAX_DRIVE_ROWS} are looked at in one piece"
         how = "cut it by `steady data cut TABLE --seconds 60 --out PIECES`"
         raise DataError(f"{what}: {how}", trajectory=label)
 

@@ -25,12 +25,12 @@ from steady_ppl.utils.files import require_file
 from steady_ppl.utils.random import seeded
 
 LANDMARKS = ((-1.230314, -0.606814), (0.797073, 0.889471), (-3.496525, 0.207874), (0.0, 6.0))  # m, as published
-FRAMES = 100  # rows a trajectory, which spans a little more than 10 s
-LONGEST_HEADER = 1_000_000  # characters; the reader takes minutes for a line of ten million
-LATEST = 2**33  # s since 1970, whose nanoseconds fit into 64 bits
-STAMP = ("header.stamp.secs", "header.stamp.nsecs")
-POSE = ("pose.position.x", "pose.position.y", "pose.orientation.z", "pose.orientation.w")
-COMMAND = ("twist.linear.x", "twist.angular.z")
+TRAJECTORY_ROWS = 100  # of a trajectory, which spans a little more than 10 s
+MAX_HEADER_LENGTH = 1_000_000  # characters; the reader takes minutes for a line of ten million
+MAX_STAMP_SECONDS = 2**33  # s since 1970, whose nanoseconds fit into 64 bits
+STAMP_COLUMNS = ("header.stamp.secs", "header.stamp.nsecs")
+POSE_COLUMNS = ("pose.position.x", "pose.position.y", "pose.orientation.z", "pose.orientation.w")
+COMMAND_COLUMNS = ("twist.linear.x", "twist.angular.z")
 
 
 def read_alpha_truck(
@@ -71,8 +71,8 @@ def read_alpha_truck(
     folder = Path(folder)
     if not folder.is_dir():
         raise DataError(f"{folder.name}: no such folder; expected one with vrpn-pose.csv and vesc_drive.csv")
-    pose_stamps, pose = _read_log(folder / "vrpn-pose.csv", POSE)
-    command_stamps, command = _read_log(folder / "vesc_drive.csv", COMMAND)
+    pose_stamps, pose = _read_log(folder / "vrpn-pose.csv", POSE_COLUMNS)
+    command_stamps, command = _read_log(folder / "vesc_drive.csv", COMMAND_COLUMNS)
     begin, end = max(pose_stamps[0], command_stamps[0]), min(pose_stamps[-1], command_stamps[-1])
     window = (end - begin) * 1e-9
     count = int(window) // 10
@@ -80,8 +80,8 @@ def read_alpha_truck(
         overlap = f"overlap by {window:.3g} s" if window > 0 else f"do not overlap (they are {-window:.3g} s apart)"
         raise DataError(f"{folder.name}: vrpn-pose.csv and vesc_drive.csv {overlap}, expected 10 s or more")
 
-    grid = np.linspace(0.0, window, FRAMES * count)
-    step = window / (FRAMES * count - 1)
+    grid = np.linspace(0.0, window, TRAJECTORY_ROWS * count)
+    step = window / (TRAJECTORY_ROWS * count - 1)
 
     def resample(stamps: np.ndarray, values: np.ndarray, at: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.interp(at, (stamps - begin) * 1e-9, values))
@@ -101,16 +101,16 @@ def read_alpha_truck(
     change[:, 2] = wrap(change[:, 2])
     states = torch.cat([poses(grid), change / spans], -1)
     controls = torch.stack([resample(command_stamps, values, grid) for values in command.T], -1)
-    states, controls = (block.unflatten(0, (count, FRAMES)).transpose(0, 1) for block in (states, controls))
+    states, controls = (block.unflatten(0, (count, TRAJECTORY_ROWS)).transpose(0, 1) for block in (states, controls))
 
     with seeded(seed, "bearings", folder.resolve().name):
         bearings = bearings_to(landmarks, states, sd=math.radians(sigma_degrees)).sample()
     return Trajectories(
-        time=(torch.arange(FRAMES, dtype=torch.float64) * step)[:, None].repeat(1, count),
+        time=(torch.arange(TRAJECTORY_ROWS, dtype=torch.float64) * step)[:, None].repeat(1, count),
         controls=controls,
         measurements=bearings,
         observed=torch.ones_like(bearings, dtype=torch.bool),
-        lengths=torch.full((count,), FRAMES),
+        lengths=torch.full((count,), TRAJECTORY_ROWS),
         states=states,
         control_names=("speed", "turn"),
         measurement_names=tuple(f"bearing_{i}" for i in range(len(landmarks))),
@@ -124,8 +124,8 @@ def _read_log(path: Path, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarra
     require_file(path, DataError)
     try:
         with path.open("rb") as file:
-            if len(file.readline(LONGEST_HEADER + 1)) > LONGEST_HEADER:
-                raise DataError(f"{where}: the first line has more than {LONGEST_HEADER} characters: is it a log?")
+            if len(file.readline(MAX_HEADER_LENGTH + 1)) > MAX_HEADER_LENGTH:
+                raise DataError(f"{where}: the first line has more than {MAX_HEADER_LENGTH} characters: is it a log?")
         log = pd.read_csv(path, low_memory=False)
     except FileNotFoundError as error:
         raise DataError(f"{where}: there is no such file") from error
@@ -133,7 +133,7 @@ def _read_log(path: Path, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarra
         raise DataError(f"{where}: the log is empty") from error
     except (OSError, ValueError) as error:
         raise DataError(f"{where}: cannot be read as csv: {str(error).partition(chr(10))[0]}") from error
-    for column in (*STAMP, *columns):
+    for column in (*STAMP_COLUMNS, *columns):
         if column not in log.columns:
             raise DataError(f"{where}: column {column} is missing", column=column)
         numbers, bad = parse_cells(log[column])
@@ -143,10 +143,10 @@ def _read_log(path: Path, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarra
         log[column] = numbers
     if len(log) == 0:
         raise DataError(f"{where}: the log has no rows")
-    for column, most in zip(STAMP, (LATEST, 10**9), strict=True):
+    for column, most in zip(STAMP_COLUMNS, (MAX_STAMP_SECONDS, 10**9), strict=True):
         for row in np.flatnonzero((log[column] < 0) | (log[column] >= most))[:1].tolist():
             problem = f"got {log[column].iloc[row]:g}, expected a part of a time stamp, 0 to {most}"
             fail(where, problem, column=column, row=row + 1)
-    stamps = log[STAMP[0]].to_numpy(np.int64) * 10**9 + log[STAMP[1]].to_numpy(np.int64)
+    stamps = log[STAMP_COLUMNS[0]].to_numpy(np.int64) * 10**9 + log[STAMP_COLUMNS[1]].to_numpy(np.int64)
     order = stamps.argsort(kind="stable")
     return stamps[order], log[list(columns)].to_numpy(np.float64)[order]

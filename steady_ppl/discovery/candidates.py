@@ -23,24 +23,24 @@ from steady_ppl.discovery.refits import (
     judged_fits,
     refit_with,
 )
-from steady_ppl.discovery.screening import ALPHA, Screened, Tested, departures, screen
+from steady_ppl.discovery.screening import FAMILY_LEVEL, Screened, Tested, departures, screen
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood.parameters import Element, elements
 from steady_ppl.likelihood.scores import measured, smoothed, typical_spreads
 from steady_ppl.model.program import Program
-from steady_ppl.utils.journal import piece
+from steady_ppl.utils.journal import journaled
 from steady_ppl.utils.random import seeded
 
-LEADERS, ALIKE = 6, 0.85  # how many are refitted at least, and whose columns correlate so much with the first
+MIN_LEADERS, MIN_ALIAS_CORRELATION = 6, 0.85  # how many are refitted, and those whose columns are so like the first's
 TIE_NATS = 2.0  # of held-out log p(y) within which two candidates cannot be told apart
 CLEAR_GAIN = 10.0  # nats of held-out log p(y) for which a test need only be near the family's level
-NEAR_ALPHA = ALPHA / 5  # p-value of a single test that is near it
+NEAR_FAMILY_LEVEL = FAMILY_LEVEL / 5  # p-value of a single test that is near it
 MIN_STATISTIC_TO_RETRY = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
-LINEAR = ("push", "command", "history", "measured", "viewpoint")
+LINEAR_FORMS = ("push", "command", "history", "measured", "viewpoint")  # of effects in proportion to the coefficient
 MIN_GAIN_OF_PLACE = 0.3  # nats by which another knee or place has to be likelier
-PASSES = 4  # along all knees and places in turns, with steps of one size
+MAX_COORDINATE_SWEEPS = 4  # along all knees and places in turns, with steps of one size
 NEIGHBOUR_SHARE = 0.25  # of the grid's spacing, at which a place's likelihood is compared with its neighbours'
 
 
@@ -95,7 +95,7 @@ class Candidate:
         The gain alone says little: beside a fit that ended short of its best, anything gains that moves the parameters.
         """
         if self.total > CLEAR_GAIN:
-            return self.tested.p_value <= max(critical, NEAR_ALPHA)
+            return self.tested.p_value <= max(critical, NEAR_FAMILY_LEVEL)
         return self.total > TIE_NATS and self.tested.p_value <= critical
 
     @property
@@ -133,7 +133,7 @@ def screen_program(now: Refit, declared: Program, *, sets: int, seed: int, withh
     if not fold.known_start:
         with seeded(seed, "starts"):
             starts = ahead.draws(sets)[1][:, 0].to(starts)
-    simulated, _ = piece(lambda: ({"scores": simulate_scores(problem, starts, parts, columns, seed=seed)}, {}))
+    simulated, _ = journaled(lambda: ({"scores": simulate_scores(problem, starts, parts, columns, seed=seed)}, {}))
     tests = screen(observed, simulated["scores"], len(parts), columns, away)
     information, first = {"": tests.information[: len(parts), : len(parts)]}, len(parts)
     for column in columns:
@@ -153,16 +153,16 @@ def leaders(screened: Screened, first: bool) -> list[Tested]:
     if not alive:
         return []
     top = alive[0][0]
-    best = [i for i, _ in alive[:LEADERS]]
-    near = [i for i, tested in alive if tested.p_value < NEAR_ALPHA]
+    best = [i for i, _ in alive[:MIN_LEADERS]]
+    near = [i for i, tested in alive if tested.p_value < NEAR_FAMILY_LEVEL]
     few = {*best, *near} if first else {top, *(i for i in best if i in near)}
-    return [tested for i, tested in alive if i in few or float(screened.alike[top, i]) > ALIKE]
+    return [tested for i, tested in alive if i in few or float(screened.correlations[top, i]) > MIN_ALIAS_CORRELATION]
 
 
 def fitted(now: Refit, tested: Tested, screening: Screening, threshold: Threshold = NO_THRESHOLD) -> Candidate:
     """A program with a candidate, by the screening that tested it; see `refit_with` for `threshold`."""
     effect = tested.variant.effect
-    known = screening.information[_key(tested.column)] if effect.null == 0 and effect.form in LINEAR else None
+    known = screening.information[_key(tested.column)] if effect.null == 0 and effect.form in LINEAR_FORMS else None
 
     def fit(start: Any) -> Candidate:
         return judged(now, tested, refit_with(now, tested.variant, start, information=known, threshold=threshold))
@@ -227,10 +227,10 @@ def at_its_best_place(now: Refit, candidate: Candidate) -> Candidate:
 
     try_all(variant for variant in grid if variant.label != candidate.variant.label)
     for share in (0.5, 0.25):
-        for _ in range(PASSES):
+        for _ in range(MAX_COORDINATE_SWEEPS):
             before = len(fits)
             for name in at.profiled:
-                try_all(_beside(fits[-1][0], grid, name, share))
+                try_all(_neighbours(fits[-1][0], grid, name, share))
             if len(fits) == before:
                 break
     for variant, best in reversed(fits):
@@ -260,7 +260,7 @@ def variance_of_places(now: Refit, candidate: Candidate) -> Tensor:
 
     variance, steps = torch.zeros_like(here), list[_GridStep]()
     for name in at.profiled:
-        beside = zip((1, -1), _beside(at, grid, name, NEIGHBOUR_SHARE), strict=True)
+        beside = zip((1, -1), _neighbours(at, grid, name, NEIGHBOUR_SHARE), strict=True)
         sides = [(sign, variant, *found) for sign, variant in beside if (found := moved_to(variant))]
         if not sides:
             variance = variance + here.square()
@@ -302,7 +302,7 @@ def _grid(now: Refit, candidate: Candidate) -> list[Variant]:
     return [variant for variant in every if variant.name == candidate.variant.name]
 
 
-def _beside(at: Variant, grid: Sequence[Variant], name: str, share: float) -> list[Variant]:
+def _neighbours(at: Variant, grid: Sequence[Variant], name: str, share: float) -> list[Variant]:
     """The effect on either side of a place: by a share of the grid's spacing, or of the value where there is none."""
     value = at.profiled[name]
     values = sorted({float(variant.profiled[name]) for variant in grid})

@@ -22,14 +22,14 @@ from steady_ppl.effects import Effect, Variant
 from steady_ppl.gaussian.lanes import Array
 from steady_ppl.gaussian.predict import on_a_circle
 from steady_ppl.model.interventions import channel_means
-from steady_ppl.model.program import Program, names, units
+from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, row_controls
 
-KNOTS = 7
-REACH = 0.4  # of the variable's range over which heights are alike
+KNOTS = 7  # of a curve
+LENGTH_SCALE = 0.4  # of the heights' prior, in the range of the variable
 MIN_HEIGHT = 1e-15  # height of a curve whose square is still a number in single precision
 HEIGHT_SD = 1.5  # prior standard deviation of the heights, in the noise's
-NAME = "curve"
+CURVE = "curve"  # the name of these effects
 ADDITIVE, COMMANDED = "", "what is commanded"  # what a curve is multiplied with
 
 
@@ -82,21 +82,6 @@ def variables(
     found |= {name: control[..., i] for i, name in enumerate(program.control_names)}
     found |= {f"commanded {channel}": value for channel, value in mean.items()}
     return found | {"time": time}
-
-
-def unit_of(program: Program, variable: str) -> str:
-    """Of a variable, as far as the program declares it."""
-    for declared in (program.states, program.controls, program.measurements):
-        if variable in names(declared):
-            return units(declared)[names(declared).index(variable)]
-    if variable == "time":
-        return "s"
-    of_channel = dict(zip(program.channel_names, program.channel_units, strict=True))
-    parts = [part.strip() for part in variable.split("×")]
-    found = [of_channel.get(part.removeprefix("commanded ").removesuffix(" velocity"), "") for part in parts]
-    if variable.startswith("commanded "):
-        return found[0]
-    return " · ".join(unit.replace("/s²", "/s") for unit in found)
 
 
 def knots_of(values: Tensor, circular: bool) -> tuple[float, ...] | None:
@@ -170,7 +155,7 @@ def over_reading(self: Any, state: Tensor, measured: Tensor, c: Tensor, chosen: 
 
 
 def _effect(form: str, variable: str, knots: Sequence[float], spread: float, unit: str, circular: bool) -> Effect:
-    at, reach = torch.tensor(knots, dtype=torch.float64), REACH * (knots[-1] - knots[0])
+    at, reach = torch.tensor(knots, dtype=torch.float64), LENGTH_SCALE * (knots[-1] - knots[0])
     apart = (at.unsqueeze(1) - at).abs()
     if circular:
         apart, reach = 2 * (apart / 2).sin().abs(), 1.0
@@ -179,7 +164,7 @@ def _effect(form: str, variable: str, knots: Sequence[float], spread: float, uni
     zeros = torch.zeros(len(knots))
     normal = dist.Normal(zeros, 1.0).to_event(1)  # turned by `root`: `MultivariateNormal` loads sympy, half a second
     return Effect(
-        name=NAME,
+        name=CURVE,
         form=form,
         equation=rf"f(\text{{{variable}}})",
         text=f"a curve over {variable}, straight between knots",

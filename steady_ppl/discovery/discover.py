@@ -9,7 +9,8 @@ from typing import Any
 
 import torch
 
-from steady_ppl.comparison.prove import far_off, prove
+from steady_ppl.comparison.prove import doubtful, prove
+from steady_ppl.comparison.scores import MIN_DRIVES
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories, joined
 from steady_ppl.discovery.candidates import TIE_NATS
@@ -21,7 +22,7 @@ from steady_ppl.discovery.search import MAX_EFFECTS, Found, Search, Settings, se
 from steady_ppl.effects import of_name, record, restore, written_class
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.linearize import why_not_linear
-from steady_ppl.kernels.rows import in_plain_torch, without_kernels
+from steady_ppl.kernels.rows import fallback_notes, kernel_failures
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
@@ -34,8 +35,8 @@ from steady_ppl.utils.journal import journal
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
 
-FITTED_FURTHER = 10.0  # nats that fitting a run further may gain before it is said
-MIN_DRIVES, MIN_SETS = 5, 50
+MAX_UNREPORTED_GAIN = 10.0  # nats that fitting a run further may gain before it is said
+MIN_SETS = 50  # simulated sets for the calibration
 NOT_CONVERGED = "the program's own fit has not converged: no ranking below is to be trusted"
 
 
@@ -109,15 +110,15 @@ def discover(
         kept = f"{len(valid)} of the {len(train) + len(valid)} drives were kept to choose by"
         notes.append(f"the tables were mixed: {kept}" if mix else f"no validation drives were given: {kept}")
     problem, choosing = (Problem.of_table(program, table, known_start) for table in (train, valid))
-    require(problem, choosing.data, simulations)
+    require_searchable(problem, choosing.data, simulations)
     with stages(("", 8), ("comparing before and after", 1), ("looking for a better next drive", 1)) as begin:
         begin()
-        with seeded(seed, "search"), without_kernels() as why:
+        with seeded(seed, "search"), kernel_failures() as why:
             found = search(problem, choosing.data, Settings(declared, simulations, seed=seed, withheld=withheld))
         begin()
         shape = shape_of(found, program)
         effects = [] if shape else findings(found)
-        final = found.base if shape or found.rounds[0].quiet else found.final
+        final = found.base if shape or found.rounds[0].nothing_found else found.final
         settings = {"simulations": simulations, "seed": seed}
         fits = [Fit(refit.mean_program(), "discover", settings, seed, known_start) for refit in (found.base, final)]
         better = found.curve.refit if found.curve else found.final
@@ -125,20 +126,20 @@ def discover(
         rows = {"before": found.base.judges.programs[0], "after": better.judges.programs[0]}
         proof = prove(rows, choosing.data, known_start=known_start, with_constant_velocity=False, seed=seed)
         begin()
-        unclear = [] if shape else [one for one in found.found if len(one.alike) > 1]
+        unclear = [] if shape else [one for one in found.found if len(one.aliases) > 1]
         largest = max(unclear, key=lambda one: one.candidate.total, default=None)
         proposed = next_run(largest, seed) if largest else None
-    notes += in_plain_torch(why)
+    notes += fallback_notes(why)
     if largest and proposed is None:
-        alike = " from ".join(candidate.variant.name for candidate in largest.alike[:2])
-        notes.append(f"no way of driving that was tried tells {alike} better than these drives do")
-    notes += diagnose_units(program, problem.data) + _notes(found) + far_off(proof.rows, choosing.data)
+        both = " from ".join(candidate.variant.name for candidate in largest.aliases[:2])
+        notes.append(f"no way of driving that was tried tells {both} better than these drives do")
+    notes += diagnose_units(program, problem.data) + _notes(found) + doubtful(proof.rows, choosing.data)
     return Discovery(found, effects, shape, proposed, proof, fits[0], fits[1], _doubts(found, is_fitted), notes)
 
 
 def _doubts(found: Search, is_fitted: bool) -> list[str]:
     doubts = [] if found.base.converged else [NOT_CONVERGED]
-    if is_fitted and found.gained > FITTED_FURTHER:
+    if is_fitted and found.gained > MAX_UNREPORTED_GAIN:
         doubts.append(
             f"the run had not converged: fitting it further gained {found.gained:.0f} nats on these drives, before "
             "anything was added. What follows begins from there; `steady prove` against the run would count them as "
@@ -185,12 +186,12 @@ def _notes(found: Search) -> list[str]:
         notes.append(f"the search stops at {MAX_EFFECTS} effects: add them, fit, and discover again from there")
     if not found.is_complete:
         notes.append("something is left that no effect of the catalogue brings: the tests were not quiet at the end")
-    notes += [f"{one.candidate.variant.label}: {said}" for one in found.found if (said := _of_one_drive(one))]
+    notes += [f"{one.candidate.variant.label}: {said}" for one in found.found if (said := _note_of_one_drive(one))]
     symptoms = [one.variant.label for one in found.rounds[0].candidates if one.against_its_sign and one.total > 0]
     return notes + [f"{label} would help with a sign that physics rules out: a symptom" for label in symptoms]
 
 
-def _of_one_drive(found: Found) -> str:
+def _note_of_one_drive(found: Found) -> str:
     """Which drive carries a gain alone, if one does."""
     gain, refit = found.candidate.gain, found.candidate.refit
     if isinstance(refit, str) or found.candidate.total - float(gain.max()) > TIE_NATS:
@@ -200,7 +201,7 @@ def _of_one_drive(found: Found) -> str:
     return f"without drive {drives[int(gain.argmax())]} nothing would be left of its gain: look at that drive"
 
 
-def require(problem: Problem, valid: Trajectories, simulations: int) -> None:
+def require_searchable(problem: Problem, valid: Trajectories, simulations: int) -> None:
     """Refuse what cannot be searched: the faults that `discover` raises."""
     program, train = problem.program, problem.data
     if simulations < MIN_SETS:
@@ -217,7 +218,7 @@ def require(problem: Problem, valid: Trajectories, simulations: int) -> None:
         if drives.time.shape[0] < 3 or not bool(drives.observed[1:].any()):
             raise DataError(f"the {name} drives have no measurements after their first rows")
         refuse_long(drives)
-    if both := shared(train, valid):
+    if both := shared_drives(train, valid):
         some = ", ".join(both[:3]) + (" …" if len(both) > 3 else "")
         raise UsageError(
             f"{len(both)} of the validation drives are training drives as well ({some}): nothing could be judged "
@@ -233,16 +234,16 @@ def require(problem: Problem, valid: Trajectories, simulations: int) -> None:
         )
 
 
-def shared(one: Trajectories, other: Trajectories) -> list[str]:
+def shared_drives(one: Trajectories, other: Trajectories) -> list[str]:
     """Labels of those of the second drives whose measurements are also among the first."""
 
-    def measured(data: Trajectories, index: int) -> bytes:
+    def content(data: Trajectories, index: int) -> bytes:
         rows = int(data.lengths[index])
         seen = data.observed[:rows, index]
         return torch.where(seen, data.measurements[:rows, index], 0.0).numpy().tobytes() + seen.numpy().tobytes()
 
-    known = {measured(one, index) for index in range(len(one))}
-    return [label for index, label in enumerate(other.labels) if measured(other, index) in known]
+    known = {content(one, index) for index in range(len(one))}
+    return [label for index, label in enumerate(other.labels) if content(other, index) in known]
 
 
 def unexcited(program: Program, data: Trajectories) -> list[str]:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.discovery.curves import NAME as CURVE, by_height, multiplier, over_reading, over_state, variables
+from steady_ppl.discovery.curves import CURVE, by_height, multiplier, over_reading, over_state, variables
 from steady_ppl.effects import Variant
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
@@ -28,11 +28,11 @@ from steady_ppl.model.interventions import by_channel
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, row_controls
-from steady_ppl.utils.cores import Result, side_by_side
+from steady_ppl.utils.cores import Output, run_in_parallel
 from steady_ppl.utils.random import seeded
 
-PART = 400  # trajectories at a time
-MIN_SHARE_OF_SETS = 0.8  # share of the simulated sets that must not blow up
+TRAJECTORIES_OF_JOB = 400  # that are scored at a time
+MIN_SHARE_OF_FINITE_SETS = 0.8  # share of the simulated sets that must not blow up
 
 
 @dataclass(frozen=True)
@@ -235,17 +235,17 @@ def simulate_scores(
     with seeded(seed, "bootstrap"):
         drives, path = simulate_again(program, data, starts, len(program.channels))
 
-    def score(index: Tensor) -> Result:
+    def score(index: Tensor) -> Output:
         part = replace(problem, data=drives.subset(index))
         ahead = smooth(part, ReferencePath(path.states[:, index], path.noise[:, index]), passes=2)
         return {"scores": scores_along(part, ahead, parts, columns), "likely": ahead.log_likelihood}, {}
 
-    jobs = [partial(score, index) for index in torch.arange(len(drives)).split(PART)]
-    found = [tensors for tensors, _ in side_by_side(jobs)]
+    jobs = [partial(score, index) for index in torch.arange(len(drives)).split(TRAJECTORIES_OF_JOB)]
+    found = [tensors for tensors, _ in run_in_parallel(jobs)]
     scores, likely = (torch.cat([one[name] for one in found]) for name in ("scores", "likely"))
     scores = scores.unflatten(0, (sets, len(data)))
     whole = torch.isfinite(scores).all(-1).all(-1) & torch.isfinite(likely.view(sets, len(data))).all(-1)
-    if int(whole.sum()) < MIN_SHARE_OF_SETS * sets:
+    if int(whole.sum()) < MIN_SHARE_OF_FINITE_SETS * sets:
         raise FilterError(
             f"{int((~whole).sum())} of {sets} simulated sets blew up: the fitted program does not even explain "
             "drives of its own"

@@ -9,9 +9,9 @@ import torch
 from scipy import special
 from torch import Tensor
 
+from steady_ppl.comparison.scores import RESAMPLES
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.candidates import Candidate, variance_of_places
-from steady_ppl.discovery.curves import unit_of
 from steady_ppl.discovery.refits import Refit, with_states_of
 from steady_ppl.discovery.screening import Tested
 from steady_ppl.discovery.search import MIN_GAIN_OF_CURVE, Found, Search
@@ -19,14 +19,13 @@ from steady_ppl.effects import Variant, attached
 from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.model.problem import Problem
-from steady_ppl.model.program import Program
+from steady_ppl.model.program import Program, unit_of
 from steady_ppl.utils.random import seeded
 
-INTERVAL = 0.9
-HALF_WIDTH = float(-special.ndtri((1 - INTERVAL) / 2))  # standard deviations on either side of it
-RESAMPLES = 2000
-DRIVES = 24  # simulated for each proposal
-TYPES = 3  # of every way of driving
+INTERVAL_COVERAGE = 0.9  # of the intervals of coefficients, and of the band of a curve
+HALF_WIDTH = float(-special.ndtri((1 - INTERVAL_COVERAGE) / 2))  # of such an interval, in standard deviations
+MAX_SIMULATED_DRIVES = 24  # of each proposed excitation
+EXCITATIONS_OF_KIND = 3  # that are held, pushed, stepped and swung
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class Finding:
 
     variant: Variant  # the effect, the best of its class
     kind: str  # dynamics, actuator, sensor or noise
-    alike: list[str]  # names of the effects that these drives cannot tell apart, best first
+    aliases: list[str]  # names of the effects that these drives cannot tell apart, best first
     confidence: float | None  # the probability that the right one is among them
     coefficient: list[float]
     sd: list[float]  # standard deviation of each number
@@ -77,7 +76,7 @@ def _finding(search: Search, found: Found) -> Finding:
     return Finding(
         variant=variant,
         kind=effect.verdict,
-        alike=[candidate.variant.name for candidate in found.alike],
+        aliases=[candidate.variant.name for candidate in found.aliases],
         confidence=_confidence(search, found),
         coefficient=values.tolist(),
         sd=(values * spread if is_positive else spread).tolist(),
@@ -110,7 +109,7 @@ def _confidence(search: Search, found: Found) -> float:
     curve = max((c.total for c in search.curves if isinstance(c.refit, Refit)), default=-math.inf)
     rivals = [0.0, found.candidate.total + curve - search.gain - MIN_GAIN_OF_CURVE]
     whole = np.logaddexp.reduce([*totals.values(), *rivals])
-    return float(np.exp(np.logaddexp.reduce([totals[id(c)] for c in found.alike]) - whole))
+    return float(np.exp(np.logaddexp.reduce([totals[id(c)] for c in found.aliases]) - whole))
 
 
 def _departure(search: Search, tested: Tested) -> Finding:
@@ -126,7 +125,7 @@ def shape_of(search: Search, program: Program) -> Shape | None:
         return None
     variant = curve.variant
     heights = curve.refit.coefficient(variant)
-    width = float(-special.ndtri((1 - INTERVAL) / 2 / len(heights))) * math.sqrt(curve.refit.first_share)
+    width = float(-special.ndtri((1 - INTERVAL_COVERAGE) / 2 / len(heights))) * math.sqrt(curve.refit.first_share)
     channel = variant.at.partition("~")[0]
     variable = variant.options.get("variable", "reading")
     about = program.measurement_names[0] if channel == "all" else channel
@@ -171,12 +170,12 @@ def next_run(found: Found, seed: int) -> NextRun | None:
 
     Each is simulated with the best member of the class; the others are judged by how much less likely they find it.
     """
-    members = [(c.variant.name, c.refit) for c in found.alike if isinstance(c.refit, Refit)]
+    members = [(c.variant.name, c.refit) for c in found.aliases if isinstance(c.refit, Refit)]
     refits = [refit for _, refit in members]
     data = refits[0].folds[0].drives
     usual = _separation(refits, data.controls, seed)
     better = []
-    for way, controls in _ways(data, seed):
+    for way, controls in _excitations(data, seed):
         apart = _separation(refits, controls.unsqueeze(1).expand_as(data.controls), seed)
         if math.isfinite(apart) and apart > max(0.0, usual):
             better.append((apart, way, controls))
@@ -197,7 +196,7 @@ def next_run(found: Found, seed: int) -> NextRun | None:
 def _separation(refits: list[Refit], controls: Tensor, seed: int) -> float:
     """Nats a drive by which the first member is told from the nearest other."""
     fold, (program, *others) = refits[0].folds[0], [refit.judges.programs[0] for refit in refits]
-    count = min(DRIVES, len(fold.drives))
+    count = min(MAX_SIMULATED_DRIVES, len(fold.drives))
     drives = replace(fold.drives.subset(range(count)), controls=controls[:, :count].contiguous())
     starts = fold.path.states[0, :count].unsqueeze(0)
     with seeded(seed, "next run"):
@@ -212,7 +211,7 @@ def _separation(refits: list[Refit], controls: Tensor, seed: int) -> float:
     return min(apart) if all(map(math.isfinite, apart)) else math.nan
 
 
-def _ways(data: Trajectories, seed: int) -> Iterator[tuple[str, Tensor]]:
+def _excitations(data: Trajectories, seed: int) -> Iterator[tuple[str, Tensor]]:
     """Ways of driving: held, stepped and swept between the limits that were driven."""
     driven = data.controls[:-1][data.transitions]
     low, high = driven.amin(0), driven.amax(0)
@@ -220,7 +219,7 @@ def _ways(data: Trajectories, seed: int) -> Iterator[tuple[str, Tensor]]:
     time = torch.arange(rows).to(driven) / max(1, rows - 1)
     middle = (low + high) / 2
     with seeded(seed, "ways of driving"):
-        for index in range(TYPES):
+        for index in range(EXCITATIONS_OF_KIND):
             held = torch.where(torch.rand(count) < 0.5, low, high)
             yield f"hold {index + 1}: one level throughout", held.expand(rows, count).clone()
             least = torch.zeros_like(low).clamp(low, high)

@@ -27,7 +27,7 @@ from steady_ppl.gaussian.smoother import find_path, require_found, resting_path,
 from steady_ppl.guides.base import Constant
 from steady_ppl.guides.linearized import LookaheadGuide
 from steady_ppl.likelihood.evidence import neglected
-from steady_ppl.likelihood.maximize import Maximum, Term, climb, kept_maximum, maximise
+from steady_ppl.likelihood.maximize import Maximum, Term, kept_maximum, maximise, maximise_sum
 from steady_ppl.likelihood.parameters import Element, elements, moved, set_values, values_of
 from steady_ppl.likelihood.scores import channel_moments, substep_spreads
 from steady_ppl.model.problem import Problem
@@ -36,11 +36,11 @@ from steady_ppl.training.loop import Optimization, Validation, train
 from steady_ppl.utils.random import seeded
 
 MAX_LINEARISATION_ERROR = 0.5  # nats a drive by which the linearised log p(y) may be off
-PARTICLES, JUDGING = 100, 400  # of the guide and of the judge: see docs/discovery.md, step 4
+GUIDE_PARTICLES, JUDGE_PARTICLES = 100, 400  # of the guide and of the judge: see docs/discovery.md, step 4
 NOISE_FORMS = ("spread", "colour")  # of effects that are process noise
 PROBE_MOVE = 0.1  # by how much a number is moved
-ALIKE_TOLERANCE = 1e-3  # what its effect on log spreads may vary by from row to row
-STEPS, PRECISION = 25, 0.01  # scoring steps of the sum at most, and nats that another would gain
+SPREAD_TOLERANCE = 1e-3  # by which log spreads may change otherwise in one row than in another
+MAX_JOINT_STEPS, JOINT_PRECISION = 25, 0.01  # scoring steps of the sum at most, and nats that another would gain
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class ByLikelihood:
 
     def judge(self, problem: Problem, path: ReferencePath) -> Judgement:
         """Log p(y) of drives, linearised along a path that is improved from here."""
-        ahead = _at_rest(problem, path)
+        ahead = _smooth(problem, path)
         return Judgement(ahead.log_likelihood, resting_path(ahead, problem.data))
 
 
@@ -78,13 +78,13 @@ class ByDraws:
 
     def fit(self, problem: Problem, path: ReferencePath | None = None, **_: Any) -> Maximum:
         """See `ByLikelihood`."""
-        return kept_maximum(problem.program, lambda: self._climb(problem, path or find_path(problem)))
+        return kept_maximum(problem.program, lambda: self._train(problem, path or find_path(problem)))
 
-    def _climb(self, problem: Problem, path: ReferencePath) -> Maximum:
+    def _train(self, problem: Problem, path: ReferencePath) -> Maximum:
         program, data, known_start = problem.program, problem.data, problem.known_start
         before = self.judge(problem, path)
         guide = LookaheadGuide(
-            program, particles=PARTICLES, tempering=Constant(), known_start=known_start, search_again=math.inf
+            program, particles=GUIDE_PARTICLES, tempering=Constant(), known_start=known_start, search_again=math.inf
         )
         guide.remember(before.path, data)
         optimization = Optimization(self.steps, learning_rate=self.learning_rate, averaging=0.95)
@@ -108,8 +108,8 @@ class ByDraws:
 
     def judge(self, problem: Problem, path: ReferencePath) -> Judgement:
         """See `ByLikelihood`."""
-        ahead = _at_rest(problem, path)
-        more = _neglected(problem, ahead, particles=JUDGING)
+        ahead = _smooth(problem, path)
+        more = _neglected(problem, ahead, particles=JUDGE_PARTICLES)
         return Judgement(ahead.log_likelihood + more, resting_path(ahead, problem.data))
 
 
@@ -118,14 +118,14 @@ Fitting = ByLikelihood | ByDraws
 
 def is_doubtful(problem: Problem, path: ReferencePath) -> bool:
     """Whether the linearised log p(y) is off by more than half a nat a drive, or no particle filter can say."""
-    ahead = _at_rest(problem, path)
+    ahead = _smooth(problem, path)
     try:
         return float(_neglected(problem, ahead).abs().mean()) > MAX_LINEARISATION_ERROR
     except FilterError:
         return True
 
 
-def _at_rest(problem: Problem, path: ReferencePath) -> Lookahead:
+def _smooth(problem: Problem, path: ReferencePath) -> Lookahead:
     ahead = smooth(problem, path, passes=15, tolerance=0.02)
     require_found(ahead, problem)
     return ahead
@@ -170,7 +170,7 @@ def with_common_noise(problems: Sequence[Problem], maxima: Sequence[Maximum]) ->
         for term in terms:
             set_values(term.parts, start[term.columns])
         try:
-            ended = climb(terms, information=information, steps=STEPS, precision=PRECISION)
+            ended = maximise_sum(terms, information=information, steps=MAX_JOINT_STEPS, precision=JOINT_PRECISION)
             break
         except FilterError:
             if last == len(starts):
@@ -194,9 +194,9 @@ def noise_numbers(program: Program, data: Trajectories, path: ReferencePath) -> 
         with moved(part, PROBE_MOVE):
             mean_there, spread_there = _moments(program, data, path)
         change = (spread_there / spread).log().nan_to_num(0.0, 0.0, 0.0)
-        alike = ((change - change.mean(1, keepdim=True)).abs() < ALIKE_TOLERANCE).all()
-        still = ((mean_there - mean).abs() <= ALIKE_TOLERANCE * spread).all()
-        return bool(alike & still & (change.abs() > ALIKE_TOLERANCE).any())
+        alike = ((change - change.mean(1, keepdim=True)).abs() < SPREAD_TOLERANCE).all()
+        still = ((mean_there - mean).abs() <= SPREAD_TOLERANCE * spread).all()
+        return bool(alike & still & (change.abs() > SPREAD_TOLERANCE).any())
 
     return {index for index, part in enumerate(elements(program)) if is_noise(part)}
 

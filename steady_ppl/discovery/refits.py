@@ -88,7 +88,7 @@ class Fits:
 
     def mean_coefficient(self, variant: Variant) -> Tensor:
         """An effect's coefficient in these fits, whose noise is each fold's own."""
-        return self.mean([coefficient(program, _there(program, variant)).detach().clone() for program in self.programs])
+        return self.mean(_coefficients(self.programs, variant))
 
     def mean(self, values: Sequence[Tensor]) -> Tensor:
         """Of values of the folds, weighted by their drives."""
@@ -107,7 +107,7 @@ class Refit(Fits):
 
     def coefficients(self, variant: Variant) -> list[Tensor]:
         """An effect's coefficient on each fold."""
-        return [coefficient(program, _there(program, variant)).detach().clone() for program in self.judges.programs]
+        return _coefficients(self.judges.programs, variant)
 
     def coefficient(self, variant: Variant) -> Tensor:
         """Its mean over the folds: nearly that of a fit to all drives together."""
@@ -134,7 +134,7 @@ class Refit(Fits):
 
     def in_common(self, variant: Variant) -> int:
         """How many numbers of an effect's coefficient all drives told, those that judge it as well."""
-        name = _there(self.program, variant).parameter
+        name = _as_attached(self.program, variant).parameter
         return sum(common.split("[")[0] == name for common in self.judges.common)
 
 
@@ -192,18 +192,18 @@ def first_by_draws(given: Program, fitted: list[Program], folds: list[Fold], see
     likelier = [ranked[0] for ranked in starts]
     as_given = [start for ranked in starts for start in ranked if start.program is given]
 
-    def climbed(begun: list[Start]) -> Refit:
+    def fit_from(begun: list[Start]) -> Refit:
         one, other = (start.path for start in begun)
         along = [replace(folds[0], path=one, held_out_path=other), replace(folds[1], path=other, held_out_path=one)]
         programs = [copy.deepcopy(start.program) for start in begun]
         return _refit(programs, along, fitting=FIRST_BY_DRAWS)
 
     try:
-        refit = climbed(likelier)
+        refit = fit_from(likelier)
     except FilterError:
         if len(as_given) < len(folds) or all(start.program is given for start in likelier):
             raise
-        refit = climbed(as_given)
+        refit = fit_from(as_given)
     return replace(refit, fitting=BY_DRAWS)
 
 
@@ -332,7 +332,11 @@ def _information(maximum: Maximum, parts: Sequence[Element]) -> Tensor | None:
     return maximum.information[index][:, index]
 
 
-def _there(program: Program, variant: Variant) -> Variant:
+def _coefficients(programs: Sequence[Program], variant: Variant) -> list[Tensor]:
+    return [coefficient(program, _as_attached(program, variant)).detach().clone() for program in programs]
+
+
+def _as_attached(program: Program, variant: Variant) -> Variant:
     """The effect as a program has it, where its coefficient may have another name."""
     return next(known for known in attached(program) if known.name == variant.name)
 

@@ -11,15 +11,15 @@ import numpy as np
 from steady_ppl.comparison.result import Proof
 from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.finding import Finding, NextRun, Shape, gain_interval
-from steady_ppl.discovery.screening import ALPHA, Tested
+from steady_ppl.discovery.screening import FAMILY_LEVEL, Tested
 from steady_ppl.discovery.search import Search
 from steady_ppl.effects import Variant
 from steady_ppl.runs.fit import Fit
-from steady_ppl.utils.late import Displayed
-from steady_ppl.utils.text import aligned, number
+from steady_ppl.utils.hooks import Displayed
+from steady_ppl.utils.text import TEXT_WIDTH, aligned, number
 
-WIDTH, SHOWN = 100, 12
-IN_WORDS = {
+CANDIDATES_SHOWN = 12  # candidates in the table
+VERDICT_PHRASES = {
     "none": "No effect is missing as far as these drives can tell",
     "dynamics": "The dynamics lack",
     "actuator": "The actuators lack",
@@ -60,7 +60,7 @@ class Discovery(Displayed):
         """none, dynamics, actuator, sensor, noise or other."""
         if self.findings:
             return self.findings[0].kind
-        return "none" if self.search.rounds[0].quiet else "other"
+        return "none" if self.search.rounds[0].nothing_found else "other"
 
     @property
     def p_value(self) -> float:
@@ -77,9 +77,9 @@ class Discovery(Displayed):
             "verdict": self.verdict,
             "sentence": sentence(self),
             "p_value": self.p_value,
-            "level": ALPHA,
+            "level": FAMILY_LEVEL,
             "effect": first.variant.name if first else None,
-            "class": first.alike if first else [],
+            "class": first.aliases if first else [],
             "confidence": first.confidence if first else None,
             "complete": self.search.is_complete,
             "effects": [_finding(finding) for finding in self.findings],
@@ -101,7 +101,7 @@ class Discovery(Displayed):
 
     def __str__(self) -> str:
         said = [*(f"warning: {doubt}" for doubt in self.doubts), sentence(self)]
-        lines = [line for paragraph in said for line in textwrap.wrap(paragraph, WIDTH)]
+        lines = [line for paragraph in said for line in textwrap.wrap(paragraph, TEXT_WIDTH)]
         for finding in self.findings:
             lines += ["", f"{finding.variant.name}: {finding.variant.effect.text}", f"  {finding.variant.effect.feels}"]
         if shape := self.shape:
@@ -111,12 +111,12 @@ class Discovery(Displayed):
         lines += ["", *_table(self)]
         if run := self.next_run:
             asked = f"To tell {' from '.join(run.between[:2])}, drive {run.way}: {run.separation:.1f} nats a drive, "
-            lines += ["", *textwrap.wrap(f"{asked}against {run.usual:.1f} of drives such as these.", WIDTH)]
+            lines += ["", *textwrap.wrap(f"{asked}against {run.usual:.1f} of drives such as these.", TEXT_WIDTH)]
         notes = self.notes
         if self.verdict != "none":
             lines += ["", "On the validation drives:", str(self.proof)]
             notes = [note for note in notes if note not in self.proof.notes]
-        return "\n".join(lines + [line for note in notes for line in textwrap.wrap(f"note: {note}", WIDTH)])
+        return "\n".join(lines + [line for note in notes for line in textwrap.wrap(f"note: {note}", TEXT_WIDTH)])
 
     def __repr__(self) -> str:
         return f"Discovery({sentence(self)!r})"
@@ -190,7 +190,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
     return {
         "effect": finding.variant.name,
         "kind": finding.kind,
-        "class": finding.alike,
+        "class": finding.aliases,
         "confidence": finding.confidence,
         "coefficient": finding.coefficient,
         "sd": finding.sd,
@@ -213,7 +213,7 @@ def sentence(found: Discovery) -> str:
 
 
 def _verdict(found: Discovery) -> str:
-    start, p_value, shape = IN_WORDS[found.verdict], f"(p = {found.p_value:.2g})", found.shape
+    start, p_value, shape = VERDICT_PHRASES[found.verdict], f"(p = {found.p_value:.2g})", found.shape
     if found.verdict == "none":
         return f"{start} {p_value}; the limits below say what could not have been seen."
     if shape is not None:
@@ -224,7 +224,7 @@ def _verdict(found: Discovery) -> str:
     clauses: list[str] = []
     for kind in dict.fromkeys(finding.kind for finding in found.findings):
         said = [_said(finding, found.search.is_complete) for finding in found.findings if finding.kind == kind]
-        words = IN_WORDS[kind] if not clauses else IN_WORDS[kind][0].lower() + IN_WORDS[kind][1:]
+        words = VERDICT_PHRASES[kind] if not clauses else VERDICT_PHRASES[kind][0].lower() + VERDICT_PHRASES[kind][1:]
         clauses.append(f"{words} {' and '.join(said)}")
     if not found.search.is_complete:
         clauses.append("they do not explain all, so that an effect nobody has named may stand behind these names")
@@ -237,8 +237,8 @@ def _said(finding: Finding, is_complete: bool) -> str:
     pairs = zip(finding.coefficient, finding.interval, strict=True)
     numbers = ", ".join(f"{value:.3g} [{low:.3g}, {high:.3g}]" for value, (low, high) in pairs)
     said = f"{finding.variant.label} = {numbers}{unit}"
-    if len(finding.alike) > 1:
-        said += f", which these drives cannot tell from {' or '.join(finding.alike[1:])}"
+    if len(finding.aliases) > 1:
+        said += f", which these drives cannot tell from {' or '.join(finding.aliases[1:])}"
     if finding.confidence is None:
         return said
     if not is_complete:
@@ -250,7 +250,7 @@ def _said(finding: Finding, is_complete: bool) -> str:
 def _table(found: Discovery) -> list[str]:
     header = ["candidate", "kind", "test", "p", "held-out gain", "one step", "± sd", "limit", "unit"]
     tests = ranked(found)
-    rows, rest = [header, *(_line(found, tested) for tested in tests[:SHOWN])], tests[SHOWN:]
+    rows, rest = [header, *(_line(found, tested) for tested in tests[:CANDIDATES_SHOWN])], tests[CANDIDATES_SHOWN:]
     more = _limits(found, rest) if found.verdict == "none" else [f"and {len(rest)} more"] * bool(rest)
     return aligned(rows, left=(0, 1, len(header) - 1)) + more
 
@@ -266,7 +266,7 @@ def _limits(found: Discovery, tested: Sequence[Tested]) -> list[str]:
             unit = "" if one.variant.unit == "1" or limit == "–" else " " + one.variant.unit
             below.append(f"{one.variant.name} {'of no limit' if limit == '–' else limit}{unit}")
     said = [("and below their limits", below), ("not testable", never)]
-    return [line for text, names in said if names for line in textwrap.wrap(f"{text}: {'; '.join(names)}", WIDTH)]
+    return [line for text, names in said if names for line in textwrap.wrap(f"{text}: {'; '.join(names)}", TEXT_WIDTH)]
 
 
 def _line(found: Discovery, tested: Tested) -> list[str]:

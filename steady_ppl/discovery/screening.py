@@ -19,7 +19,7 @@ import torch
 from scipy import optimize, special
 from torch import Tensor
 
-from steady_ppl.discovery.curves import NAME as CURVE, prior_covariance
+from steady_ppl.discovery.curves import CURVE, prior_covariance
 from steady_ppl.discovery.effect_scores import Column
 from steady_ppl.discovery.refits import Fold, Refit, as_declared
 from steady_ppl.effects import Variant, attached, catalogue
@@ -27,7 +27,7 @@ from steady_ppl.likelihood.parameters import Element, on_both_sides
 from steady_ppl.likelihood.scores import measured, substep_spreads
 from steady_ppl.model.program import Program
 
-ALPHA, POWER = 0.05, 0.95
+FAMILY_LEVEL, POWER = 0.05, 0.95  # of the tests of all candidates together, and at a detection limit
 MIN_SHARE_OF_INFORMATION = 1e-4  # of a column, that the fitted parameters must leave for it to be tested
 CONTAINED = "the fitted parameters already explain it"
 UNEXCITED = "these drives never excite it"
@@ -79,7 +79,7 @@ class Screened:
     p_value: float  # family-wise, of the smallest
     critical: float  # the single p-value below which the family-wise level is kept
     fitted: tuple[float, int]  # Lagrange multiplier of the fitted parameters, large at a bound; how many they are
-    alike: Tensor  # candidate × candidate, the largest canonical correlation of their projected columns
+    correlations: Tensor  # candidate × candidate, the largest canonical correlation of their projected columns
     information: Tensor  # covariance of a set's summed scores, of the parameters and then of the columns, (N, N)
 
 
@@ -132,14 +132,14 @@ def screen(
         p_value=(1 + float((family[1:] <= family[0]).sum())) / len(family),
         critical=critical,
         fitted=(float(scores[0, own] @ (inverse @ scores[0, own])), fitted),
-        alike=_alike(left, [test.place for test in tests]),
+        correlations=_canonical_correlations(left, [test.place for test in tests]),
         information=information,
     )
 
 
 def _critical(simulated: np.ndarray) -> float:
     """The largest p-value below which the family's own p-value, (1 + sets as extreme) / (1 + sets), keeps the level."""
-    allowed = int(ALPHA * (len(simulated) + 1)) - 1
+    allowed = int(FAMILY_LEVEL * (len(simulated) + 1)) - 1
     return float(np.nextafter(np.sort(simulated)[max(0, allowed)], 0.0))
 
 
@@ -221,7 +221,7 @@ def _departed(departure: Departure, information: Tensor, scores: Tensor) -> Test
     return Tested(column, nowhere, float(z[0] ** 2), p_values, change, sds, sds, alone=sds, departure=True)
 
 
-def _alike(left: Tensor, places: Sequence[slice]) -> Tensor:
+def _canonical_correlations(left: Tensor, places: Sequence[slice]) -> Tensor:
     """Largest canonical correlations between the candidates' columns."""
 
     def whitening(own: Tensor) -> Tensor:
@@ -230,11 +230,11 @@ def _alike(left: Tensor, places: Sequence[slice]) -> Tensor:
         return torch.linalg.inv(torch.linalg.cholesky(own + 1e-10 * torch.diag(own.diagonal())))
 
     whitened = [whitening(left[place, place]) for place in places]
-    alike = torch.eye(len(places), dtype=torch.float64)
+    correlations = torch.eye(len(places), dtype=torch.float64)
     for j, i in itertools.combinations(range(len(places)), 2):
         across = whitened[i] @ left[places[i], places[j]] @ whitened[j].T
-        alike[i, j] = alike[j, i] = float(torch.linalg.matrix_norm(across, 2).clamp(max=1.0))
-    return alike
+        correlations[i, j] = correlations[j, i] = float(torch.linalg.matrix_norm(across, 2).clamp(max=1.0))
+    return correlations
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from steady_ppl.criticism.step_size import StepCheck, check_step
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.candidates import (
     CLEAR_GAIN,
-    NEAR_ALPHA,
+    NEAR_FAMILY_LEVEL,
     TIE_NATS,
     Candidate,
     Screening,
@@ -35,7 +35,7 @@ from steady_ppl.discovery.refits import (
     judged_fits,
     refit_with,
 )
-from steady_ppl.discovery.screening import ALPHA, Tested
+from steady_ppl.discovery.screening import FAMILY_LEVEL, Tested
 from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
 from steady_ppl.model.problem import Problem
@@ -47,7 +47,7 @@ MIN_GAIN_OF_CURVE = 3.0  # nats by which a curve must be better than named effec
 MAX_NATS_BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
 MAX_NATS_OF_RIVAL = 12.0  # nats behind the best in its round, with which one is fitted again beside other effects
 SAME_MAXIMUM = 0.2  # nats within which fits from two starts have ended at the same place
-MIN_NATS_OF_RUNAWAY = 25.0  # nats above every fit that it is a part of, from which a fit is not to be believed
+MIN_NATS_OF_DIVERGENCE = 25.0  # nats above every fit that it is a part of, from which a fit is not to be believed
 MAX_SHIFT_OF_SIZES = 0.08  # nats by which twice the substeps may move what is reported: 0.4 standard deviations
 MAX_SUBSTEPS_OF_FIT = 128  # of a fitted program, at most: what a coarser step leaves would be named as an effect
 MAX_EFFECTS, MAX_CURVES = 5, 3  # effects in a program, and adding curves that are fitted
@@ -82,9 +82,9 @@ class Round:
     chosen: Candidate | None  # what is added, None when the round ends the search
 
     @property
-    def quiet(self) -> bool:
+    def nothing_found(self) -> bool:
         """Whether the tests found nothing."""
-        return self.screening.tests.p_value > ALPHA
+        return self.screening.tests.p_value > FAMILY_LEVEL
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Found:
     without: Refit  # the program without it
 
     @property
-    def alike(self) -> list[Candidate]:
+    def aliases(self) -> list[Candidate]:
         """Those that these drives cannot tell from the best, itself first."""
         best = self.candidate.total
         close = [c for c in self.candidates if c.total >= best - TIE_NATS]
@@ -211,7 +211,7 @@ def _rounds(found: Search, settings: Settings) -> Search:
                     found.diverged = [label for label in labels(found.final) if label not in labels(final)]
                     found.found, found.final = before, final
         begin()
-        if len(found.rounds) > 1 and not found.rounds[1].quiet and not found.curves:
+        if len(found.rounds) > 1 and not found.rounds[1].nothing_found and not found.curves:
             found.curves = _curves(found)
     return found
 
@@ -219,7 +219,7 @@ def _rounds(found: Search, settings: Settings) -> Search:
 def _add_best(found: Search, screening: Screening, index: int) -> bool:
     """Fit what the tests of a round point at and add the best, if it brings enough; whether anything was added."""
     found.rounds.append(Round(screening, [], None))
-    if found.rounds[-1].quiet or index == MAX_EFFECTS:
+    if found.rounds[-1].nothing_found or index == MAX_EFFECTS:
         return False
     candidates = _refits(found.final, screening, index == 0)
     able = [c for c in candidates if c.is_judged and not c.against_its_sign]
@@ -227,7 +227,7 @@ def _add_best(found: Search, screening: Screening, index: int) -> bool:
     if index == 0 and best is None:
         found.curves = _curves(found)
         if found.curve is None and not found.departed:  # neither can be what the tests found
-            best = next((c for c in able if c.total > TIE_NATS and c.tested.p_value <= NEAR_ALPHA), None)
+            best = next((c for c in able if c.total > TIE_NATS and c.tested.p_value <= NEAR_FAMILY_LEVEL), None)
     found.rounds[-1] = Round(screening, candidates, best)
     if best is None:
         return False
@@ -323,7 +323,7 @@ def _without(search: Search, found: Found) -> Refit | str:
     near = fit_near(search.base, search.final, [other.variant for other in others])
     if isinstance(afresh, str) or isinstance(near, str):
         return afresh if isinstance(near, str) else judged_fits(near)
-    most = max(_objective(search.final), _objective(afresh)) + MIN_NATS_OF_RUNAWAY  # more: it has run away
+    most = max(_objective(search.final), _objective(afresh)) + MIN_NATS_OF_DIVERGENCE  # more: it has run away
     likelier = judged_fits(near) if _objective(afresh) + SAME_MAXIMUM < _objective(near) < most else afresh
     return afresh if isinstance(likelier, str) else likelier
 

@@ -21,7 +21,7 @@ from steady_ppl.model import interventions
 from steady_ppl.model.program import Program, names
 
 Methods = dict[str, Any]
-_GROWN: WeakKeyDictionary[type[Program], WeakValueDictionary[Variant, type[Program]]] = WeakKeyDictionary()
+_CLASSES: WeakKeyDictionary[type[Program], WeakValueDictionary[Variant, type[Program]]] = WeakKeyDictionary()
 
 
 def with_effect(
@@ -62,12 +62,12 @@ def attach(program: Program, variant: Variant, value: Value | None = None) -> Pr
 
 def _class_with(base: type[Program], variant: Variant) -> type[Program]:
     """A program's class with an effect; the same one for the same effect, so that kernels are shared."""
-    known = _GROWN.setdefault(base, WeakValueDictionary())
+    known = _CLASSES.setdefault(base, WeakValueDictionary())
     grown = known.get(variant)
     if grown is None:
         title = "".join(part.capitalize() for part in variant.parameter.split("_"))
         about = {"__module__": base.__module__, "__doc__": base.__doc__, "attached": {variant.parameter: variant}}
-        methods = _AROUND[variant.effect.form](base, variant)
+        methods = _METHODS_OF_FORM[variant.effect.form](base, variant)
         known[variant] = grown = type(f"{base.__name__}With{title}", (base,), {**about, **methods})
     return grown
 
@@ -224,7 +224,7 @@ def _widened(program: Any, act: Any, state: Tensor, control: Tensor, time: Tenso
     return interventions.widened(program, act(state, control, time, step))
 
 
-_AROUND: dict[str, Callable[[Any, Variant], Methods]] = {
+_METHODS_OF_FORM: dict[str, Callable[[Any, Variant], Methods]] = {
     "push": _push,
     "command": _command,
     "history": _history,

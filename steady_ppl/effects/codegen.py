@@ -23,7 +23,7 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.validate import probe
 from steady_ppl.utils.files import whole_file
 
-WIDTH = 120  # characters of a line
+CODE_COLUMNS = 120  # characters of a line
 
 
 def write_program(program: Program, path: str | Path, *, force: bool = False) -> list[str]:
@@ -55,14 +55,14 @@ def _program_text(program: Program, class_name: str, base: type[Program], module
     *most, last = (variant.name for variant in added(program))
     listed = f"{', '.join(most)} and {last}" if most else last
     title = f'"""{base.__name__} with {listed}, as `steady add` wrote it."""'
-    lines = [title if len(title) <= WIDTH else f'"""{base.__name__} with effects, as `steady add` wrote it."""', ""]
+    lines = [title if len(title) <= CODE_COLUMNS else title.replace(listed, "effects"), ""]
     lines += ["from torch import tensor", ""] if any("tensor(" in line for line in values) else []
     lines += [f"from .{module} import {base.__name__}", "", "", f"class {class_name}({base.__name__}):"]
     lines += [f"    {line}" if line else "" for line in _docstring(program, base, listed)]
     quoted = [f'"{_named(program, variant)}"' for variant in added(program)]
     line = f"    effects = ({', '.join(quoted)}{',' if len(quoted) == 1 else ''})"
     long = ["    effects = (", *(f"        {one}," for one in quoted), "    )"]
-    lines += ["", *([line] if len(line) <= WIDTH else long)]
+    lines += ["", *([line] if len(line) <= CODE_COLUMNS else long)]
     if program.substeps != base.substeps:
         lines.append(f"    substeps = {program.substeps}")
     if values:
@@ -78,8 +78,8 @@ def _docstring(program: Program, base: type[Program], listed: str) -> list[str]:
         effect, told = variant.effect, ", ".join(f"{k} {v:.6g}" for k, v in variant.profiled.items())
         lines.append(f"{variant.parameter}: {effect.text}" + (f", {told}" if told else ""))
         lines.append(f"    c in {variant.unit}; {effect.feels}" if variant.unit != "1" else f"    {effect.feels}")
-    first = textwrap.wrap(f'"""{base.__name__} with {listed}.', WIDTH - 4)
-    wrapper = textwrap.TextWrapper(WIDTH - 4, subsequent_indent="    ", replace_whitespace=False)
+    first = textwrap.wrap(f'"""{base.__name__} with {listed}.', CODE_COLUMNS - 4)
+    wrapper = textwrap.TextWrapper(CODE_COLUMNS - 4, subsequent_indent="    ", replace_whitespace=False)
     wrapped = [part for line in lines for part in wrapper.wrap(line)]
     return [*first, "", *(line.replace("\\", "\\\\").replace('"""', "'''") for line in wrapped), '"""']
 
@@ -120,7 +120,7 @@ def _carried_over(program: Program, base: type[Program]) -> tuple[list[str], lis
             continue
         text = str(_numbers(value)).replace("'", "").replace("inf", 'float("inf")')
         line = f"self.{name} = tensor({text})"
-        lines.append(line if len(line) <= WIDTH - 8 else f"{line}  # fmt: skip  # noqa: E501")
+        lines.append(line if len(line) <= CODE_COLUMNS - 8 else f"{line}  # fmt: skip  # noqa: E501")
     if lines:
         lines.insert(0, "# where its own parameters begin; they are learned as before")
     before = fresh.state_dict()

@@ -31,7 +31,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError
 from steady_ppl.model.program import Program
 
-VERDICTS = {
+VERDICT_OF_FORM = {
     "push": "dynamics",
     **dict.fromkeys(("command", "history"), "actuator"),
     **dict.fromkeys(("measured", "viewpoint"), "sensor"),
@@ -107,7 +107,7 @@ class Effect:
         typical = self.typical if isinstance(self.typical, tuple) else (self.typical,)
         felt = any(typical) and all(map(math.isfinite, typical))
         for holds, problem in (
-            (self.form in VERDICTS, f"no form {self.form!r}; there are {', '.join(VERDICTS)}"),
+            (self.form in VERDICT_OF_FORM, f"no form {self.form!r}; there are {', '.join(VERDICT_OF_FORM)}"),
             ("c" in inspect.signature(self.function).parameters, "its function takes no coefficient c"),
             (len(typical) == self.size, f"{len(typical)} typical numbers for {self.size} components"),
             (felt, f"its typical coefficient is {self.typical}: none would feel it"),
@@ -120,7 +120,7 @@ class Effect:
     @property
     def verdict(self) -> str:
         """dynamics, actuator, sensor or noise."""
-        return VERDICTS[self.form]
+        return VERDICT_OF_FORM[self.form]
 
     @property
     def size(self) -> int:

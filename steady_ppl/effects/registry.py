@@ -10,11 +10,11 @@ from steady_ppl.effects.catalogue.forces import FORCES
 from steady_ppl.effects.catalogue.noise import NOISE
 from steady_ppl.effects.catalogue.sensors import SENSORS
 from steady_ppl.effects.catalogue.wheels import WHEELS
-from steady_ppl.effects.declaration import VERDICTS, Effect, Variant
+from steady_ppl.effects.declaration import VERDICT_OF_FORM, Effect, Variant
 from steady_ppl.errors import UsageError
 from steady_ppl.model.program import Program
 
-HEAD = """# Effects
+PAGE_HEAD = """# Effects
 
 What `steady effects` prints. `steady simulate MODEL --effect NAME[:AT][:OPTION=NUMBER][=NUMBER[,NUMBER]]` adds one to \
 a simulation, `steady add` writes it into a program, `program.with_effect(NAME, VALUE)` does so in Python. `c` is the \
@@ -134,8 +134,8 @@ def _numbers(text: str, numbers: str, most: int | None = None) -> tuple[float, .
 
 def page(program: Program | None = None) -> str:
     """All effects, or those that a program could have and why it could not have the others, in Markdown."""
-    lines = [HEAD]
-    for verdict in dict.fromkeys(VERDICTS.values()):
+    lines = [PAGE_HEAD]
+    for verdict in dict.fromkeys(VERDICT_OF_FORM.values()):
         chosen = [effect for effect in catalogue(program) if effect.verdict == verdict]
         if chosen:
             header = ["name", *(["at"] * bool(program)), "equation", "unit of c", "typical c", "options", "feels"]

@@ -22,8 +22,8 @@ from steady_ppl.smc.genealogy import Paths, event_dims
 from steady_ppl.utils.angles import wrap_angles
 
 TYPICAL_E_STEPS = 100  # of E steps are in a training
-PASSES = 30  # of Gauss and Newton's method
-AT_REST = 1e-9  # of a channel's size and unit, by which noise may still move when it is found
+MAX_GAUSS_NEWTON_STEPS = 30
+NOISE_TOLERANCE = 1e-9  # of a channel's size and unit, by which noise may still move when it is found
 Tempering = Callable[[float], float]  # a schedule: the observation weight at a share of the training, 0 to 1
 
 
@@ -179,7 +179,7 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
 
     Raises:
         DataError: a state is unknown.
-        ProgramError: no noise is found within `PASSES`, or the start is not one site.
+        ProgramError: no noise is found within `MAX_GAUSS_NEWTON_STEPS`, or the start is not one site.
     """
     states = data.states
     if states is None or not bool(torch.isfinite(states[data.rows]).all()):
@@ -195,13 +195,13 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
 
     channels = torch.eye(step_size(program)).to(before)
     noise = before.new_zeros(*before.shape[:-1], len(channels))
-    for _ in range(PASSES):
+    for _ in range(MAX_GAUSS_NEWTON_STEPS):
         base, _ = run(noise)
         effect = torch.stack([run(noise + channel)[0] - base for channel in channels], -1)
         difference = wrap_angles(after - base, program.angle_indices)
         change = (torch.linalg.pinv(effect) @ difference.unsqueeze(-1)).squeeze(-1)
         noise = noise + change
-        if not bool((change.abs() > AT_REST * (1 + noise.abs())).any()):
+        if not bool((change.abs() > NOISE_TOLERANCE * (1 + noise.abs())).any()):
             break
     else:
         raise ProgramError(

@@ -25,7 +25,7 @@ from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.angles import wrap
 
-WORTH_COMPILING = 200  # rows of all trajectories together; a training linearises them hundreds of times
+GUIDE_ROWS_WORTH_COMPILING = 200  # rows of all trajectories together; a training linearises them hundreds of times
 
 
 class LinearizedGuide(PathGuide):
@@ -98,7 +98,7 @@ class LinearizedGuide(PathGuide):
 
     def _smooth(self, data: Trajectories, progress: float) -> Lookahead:
         path = ReferencePath(self._recall("states", data), self._recall("noise", data))
-        weight, kernels = self.tempering(progress), data.time.numel() >= WORTH_COMPILING
+        weight, kernels = self.tempering(progress), data.time.numel() >= GUIDE_ROWS_WORTH_COMPILING
         problem = Problem(self.program, data, self.known_start)
         return smooth(problem, path, observation_weight=weight, passes=self.passes, kernels=kernels)
 
@@ -128,7 +128,7 @@ class GaussianGuide(LinearizedGuide):
         ahead, figures = self.look_ahead(data, progress)
         problem = Problem(self.program, data, self.known_start)
         require_found(ahead, problem)
-        paths = smoother_paths(problem, ahead, self.draws, kernels=data.time.numel() >= WORTH_COMPILING)
+        paths = smoother_paths(problem, ahead, self.draws, kernels=data.time.numel() >= GUIDE_ROWS_WORTH_COMPILING)
         self.in_plain_torch = self.in_plain_torch or paths.in_plain_torch
         self.keep(paths, data)
         return figures

@@ -1,6 +1,6 @@
 """Writes the code of a kernel from its scalar graph.
 
-Each instruction works on `LANES` particles at once; what does not differ between them is computed once a trajectory.
+An instruction works on `SIMD_LANES` particles at once; what does not differ between them is computed once a trajectory.
 """
 
 from collections.abc import Sequence
@@ -9,12 +9,12 @@ from typing import Any
 
 from llvmlite import ir
 
-from steady_ppl.kernels.graph import PARTICLE, Each, NotCompilable, Product, ScalarGraph
+from steady_ppl.kernels.graph import PARTICLE, Elementwise, NotCompilable, Product, ScalarGraph
 from steady_ppl.kernels.simd import FLOAT, OPERATIONS, Lanes
 
-NAME = "kernel"
-LANES = 16
-WIDE, LONG = ir.VectorType(FLOAT, LANES), ir.IntType(64)
+KERNEL_NAME = "kernel"  # of its module and its function
+SIMD_LANES = 16  # particles of one instruction
+WIDE, LONG = ir.VectorType(FLOAT, SIMD_LANES), ir.IntType(64)
 POINTER = FLOAT.as_pointer()
 
 
@@ -32,9 +32,9 @@ class _Writer:
 
     def __init__(self, graph: ScalarGraph, inputs: Sequence[str], columns: dict[str, int]) -> None:
         self.graph, self.columns = graph, columns
-        self.module = ir.Module(NAME)
+        self.module = ir.Module(KERNEL_NAME)
         kind = ir.FunctionType(ir.VoidType(), [POINTER] * (len(inputs) + 2) + [LONG.as_pointer(), POINTER, *[LONG] * 3])
-        function = ir.Function(self.module, kind, NAME)
+        function = ir.Function(self.module, kind, KERNEL_NAME)
         for argument in function.args[: len(inputs) + 4]:
             argument.add_attribute("noalias")
         self.parameters, self.uniform, *data = function.args[: len(inputs) + 2]
@@ -89,15 +89,15 @@ class _Writer:
             for vector in self.bases:
                 self._base(vector)
             shared = dict(self.values)
-            with self._loop(self.particles, LANES) as i:
-                last = builder.sub(self.particles, LONG(LANES))
+            with self._loop(self.particles, SIMD_LANES) as i:
+                last = builder.sub(self.particles, LONG(SIMD_LANES))
                 beyond = builder.icmp_signed(">", i, last)
                 self.at = builder.add(self.row, builder.select(beyond, last, i))  # the last block overlaps
                 self._gather()
                 for number in sorted(self.needed):
                     self.scalar(number)
                 for k, number in enumerate(graph.outputs):
-                    value = self.scalar(number).spread(LANES)
+                    value = self.scalar(number).spread(SIMD_LANES)
                     if value.element == ir.IntType(1):
                         raise NotCompilable("a truth value as a result")
                     place = self._wide(self.out, builder.add(builder.mul(LONG(k), self.stride), self.at))
@@ -126,7 +126,7 @@ class _Writer:
             with moved:
                 from_row = [builder.add(start, self.row) for start in starts]
                 gathered = [ir.Constant(WIDE, ir.Undefined)] * len(wanted)
-                for lane in range(LANES):
+                for lane in range(SIMD_LANES):
                     index = builder.load(builder.gep(self.ancestors, [builder.add(self.at, LONG(lane))]))
                     for j, start in enumerate(from_row):
                         value = builder.load(builder.gep(pointer, [builder.add(start, index)]))
@@ -200,11 +200,11 @@ class _Writer:
         """Compute a vector as a whole and keep it."""
         what = self.graph.vectors[vector]
         place = self._reserve(WIDE, what.length)
-        if isinstance(what, Each) or (whole := self.graph.whole_vector(what.x)) is None:
+        if isinstance(what, Elementwise) or (whole := self.graph.whole_vector(what.x)) is None:
             self._prepare(vector)
             with self._loop(LONG(what.length)) as k:
                 value = self._element(vector, k, {})
-                self.builder.store(value.spread(LANES).value, self.builder.gep(place, [k]))
+                self.builder.store(value.spread(SIMD_LANES).value, self.builder.gep(place, [k]))
         elif what.length > 8:
             if whole not in self.stored:
                 self._vector(whole)
@@ -220,7 +220,7 @@ class _Writer:
         builder = self.builder
         sums = [self._reserve(WIDE, 1) for _ in rows]
         for row, total in zip(rows, sums, strict=True):
-            builder.store(self._bias(product, row).spread(LANES).value, total)
+            builder.store(self._bias(product, row).spread(SIMD_LANES).value, total)
         with self._loop(LONG(self.graph.vectors[whole].length)) as k:
             value = self._element(whole, k, {})
             for row, total in zip(rows, sums, strict=True):
@@ -234,7 +234,7 @@ class _Writer:
         what = self.graph.vectors[vector]
         if vector in self.stored:
             return
-        if isinstance(what, Each):
+        if isinstance(what, Elementwise):
             for kind, n in what.operands:
                 if kind == "vector":
                     self._prepare(n)

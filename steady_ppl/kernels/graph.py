@@ -17,12 +17,12 @@ from torch import Tensor
 
 from steady_ppl.errors import SteadyError
 
-PARAMETERS, TRAJECTORY, PARTICLE = range(3)  # what a value depends on
+PARAMETERS_ALONE, TRAJECTORY, PARTICLE = range(3)  # what a value depends on
 LEAVES = ("input", "parameter", "constant", "element")
-UNROLLED = 48  # the largest matrix whose product is written out element by element
-TOO_LONG = 3000  # scalar operations; compiling more takes longer than a fit
-FLAT = {"round", "floor", "ceil", "sign", "gt", "ge", "lt", "le", "eq", "ne"}  # their derivatives are zero
-FLAT |= {"logical_and", "logical_or", "logical_not"}
+MAX_UNROLLED_ELEMENTS = 48  # of the largest matrix whose product is written out element by element
+MAX_OPERATIONS = 3000  # scalar operations; compiling more takes longer than a fit
+ZERO_DERIVATIVE = {"round", "floor", "ceil", "sign", "gt", "ge", "lt", "le", "eq", "ne"}  # their derivatives are zero
+ZERO_DERIVATIVE |= {"logical_and", "logical_or", "logical_not"}
 Values = list[int]  # a scalar, or the elements of a vector
 
 
@@ -51,7 +51,7 @@ class Product:
 
 
 @dataclass(frozen=True)
-class Each:
+class Elementwise:
     """An operation on each element of vectors."""
 
     length: int
@@ -66,7 +66,7 @@ class ScalarGraph:
     levels_of_inputs: dict[str, int]
     scalars: list[Scalar] = field(default_factory=list)
     levels: list[int] = field(default_factory=list)  # what each scalar depends on
-    vectors: list[Product | Each] = field(default_factory=list)
+    vectors: list[Product | Elementwise] = field(default_factory=list)
     outputs: list[int] = field(default_factory=list)  # the scalars to be returned, in order
     parameters: list[int] = field(default_factory=list)  # places on the tape whose values the kernel takes, in order
     numbers: dict[Scalar, int] = field(default_factory=dict)  # where each is in `scalars`
@@ -77,13 +77,13 @@ class ScalarGraph:
         scalar = Scalar(operation, arguments)
         if scalar not in self.numbers:
             self.operations += operation not in LEAVES
-            if self.operations > TOO_LONG:
-                raise NotCompilable(f"more than {TOO_LONG} operations a particle")
+            if self.operations > MAX_OPERATIONS:
+                raise NotCompilable(f"more than {MAX_OPERATIONS} operations a particle")
             match operation:
                 case "input":
                     level = self.levels_of_inputs[arguments[0]]
                 case "parameter" | "constant":
-                    level = PARAMETERS
+                    level = PARAMETERS_ALONE
                 case "element":
                     level = PARTICLE
                 case _:
@@ -96,13 +96,13 @@ class ScalarGraph:
     def constant(self, value: float) -> int:
         return self.scalar("constant", float(value))
 
-    def vector(self, vector: Product | Each) -> list[int]:
+    def vector(self, vector: Product | Elementwise) -> list[int]:
         """The elements of a new vector."""
         self.vectors.append(vector)
         return self.elements("vector", len(self.vectors) - 1, vector.length)
 
     def elements(self, kind: str, number: int, length: int) -> list[int]:
-        """The scalars of an operand, as in `Each`."""
+        """The scalars of an operand, as in `Elementwise`."""
         if kind == "scalar":
             return [number] * length
         if kind == "parameters":
@@ -114,7 +114,7 @@ class ScalarGraph:
         length = len(operands[0])
         kinds = [self._as_whole(operand) for operand in operands]
         if length > 16 and all(kinds) and any(kind and kind[0] == "vector" for kind in kinds):
-            return self.vector(Each(length, operation, tuple(kind for kind in kinds if kind)))
+            return self.vector(Elementwise(length, operation, tuple(kind for kind in kinds if kind)))
         return [self.scalar(operation, *elements) for elements in zip(*operands, strict=True)]
 
     def _as_whole(self, operand: Sequence[int]) -> tuple[str, int] | None:
@@ -152,7 +152,7 @@ class ScalarGraph:
         """A matrix `(O, I)` of scalars' numbers times the vector x, plus a bias."""
         rows, columns = matrix.shape
         whole = self._strided(matrix)
-        if rows * columns > UNROLLED and whole is not None:
+        if rows * columns > MAX_UNROLLED_ELEMENTS and whole is not None:
             return self.vector(Product(rows, *whole, tuple(bias) if bias else None, tuple(x)))
         result = []
         for k, row in enumerate(matrix.tolist()):
@@ -183,14 +183,14 @@ class ScalarGraph:
         return found["scalar"], found["vector"]
 
     def _operands(self, kind: str, number: int) -> list[tuple[str, int]]:
-        """What one scalar or vector is computed from, as in `Each`."""
+        """What one scalar or vector is computed from, as in `Elementwise`."""
         if kind == "scalar":
             operation, arguments = self.scalars[number]
             if operation == "element":
                 return [("vector", arguments[0])]
             return [] if operation in LEAVES else [("scalar", argument) for argument in arguments]
         vector = self.vectors[number]
-        if isinstance(vector, Each):
+        if isinstance(vector, Elementwise):
             return list(vector.operands)
         whole, run = self.whole_vector(vector.x), self.run_of_parameters(vector.bias)
         x = [("scalar", n) for n in vector.x] if whole is None else [("vector", whole)]
@@ -220,7 +220,7 @@ class Tangents:
     def _of_elements(self, vector: int) -> None:
         graph, what = self.graph, self.graph.vectors[vector]
         elements = graph.elements("vector", vector, what.length)
-        if isinstance(what, Each):
+        if isinstance(what, Elementwise):
             operands = [graph.elements(kind, n, what.length) for kind, n in what.operands]
             found = self._rule(what.operation, operands, elements)
         elif self._of_all(what.bias or ()) is not None:
@@ -241,10 +241,10 @@ class Tangents:
     def _rule(self, operation: str, operands: Sequence[Values], value: Values) -> Values | None:
         """The chain rule, for scalars and for all elements of vectors."""
         tangents = [self._of_all(operand) for operand in operands]
-        if operation in FLAT or all(tangent is None for tangent in tangents):
+        if operation in ZERO_DERIVATIVE or all(tangent is None for tangent in tangents):
             return None
-        if operation in CHOICES:
-            condition, yes, no = CHOICES[operation](self, operands, tangents)
+        if operation in SELECTIONS:
+            condition, yes, no = SELECTIONS[operation](self, operands, tangents)
             zero = self.constants(0.0, value)
             return self.do("where", condition, zero if yes is None else yes, zero if no is None else no)
         if operation not in PARTIALS:
@@ -285,7 +285,7 @@ def _atan2(d: Tangents, value: Values, y: Values, x: Values) -> tuple[Values, ..
     return d.do("div", x, square), d.do("neg", d.do("div", y, square))
 
 
-def _leg(d: Tangents, x: Values) -> Values:
+def _asin_slope(d: Tangents, x: Values) -> Values:
     return d.do("rsqrt", d.do("sub", 1.0, d.do("mul", x, x)))
 
 
@@ -314,8 +314,8 @@ PARTIALS: dict[str, Callable[..., tuple[Values | None, ...]]] = {
     "tanh": lambda d, value, x: (d.do("sub", 1.0, d.do("mul", value, value)),),
     "silu": _silu,
     "atan": lambda d, value, x: (d.do("reciprocal", d.do("add", d.do("mul", x, x), 1.0)),),
-    "asin": lambda d, value, x: (_leg(d, x),),
-    "acos": lambda d, value, x: (d.do("neg", _leg(d, x)),),
+    "asin": lambda d, value, x: (_asin_slope(d, x),),
+    "acos": lambda d, value, x: (d.do("neg", _asin_slope(d, x)),),
     "atan2": _atan2,
     "hypot": lambda d, value, x, y: (_over(d, x, value), _over(d, y, value)),
     "pow": lambda d, value, x, y: (
@@ -326,7 +326,7 @@ PARTIALS: dict[str, Callable[..., tuple[Values | None, ...]]] = {
 }
 
 # those that pass one operand on: which, and the derivatives that are passed on with it
-CHOICES: dict[str, Callable[[Tangents, Any, Any], Any]] = {
+SELECTIONS: dict[str, Callable[[Tangents, Any, Any], Any]] = {
     "where": lambda d, operands, tangents: (operands[0], tangents[1], tangents[2]),
     "relu": lambda d, operands, tangents: (d.do("gt", operands[0], 0.0), tangents[0], None),
     "maximum": lambda d, operands, tangents: (d.do("gt", *operands), *tangents),

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from steady_ppl.kernels.codegen import LANES, NAME, source
+from steady_ppl.kernels.codegen import KERNEL_NAME, SIMD_LANES, source
 from steady_ppl.kernels.graph import PARTICLE, TRAJECTORY, NotCompilable, ScalarGraph, derivatives
 from steady_ppl.kernels.lowering import Translation, first_names, where
 from steady_ppl.kernels.store import machine_code
@@ -24,8 +24,8 @@ TRACES = 32  # of one method of programs of one class; each takes some hundredth
 KERNELS = 256  # that are kept in memory
 MAX_NUMBERS_READ = 1000  # numbers of a tensor that are looked at one by one
 KEEPS_CHANGING = "its settings or tensors change from run to run"
-DIFFERENT = "its kernel and its own lines come to different numbers"
-SETTING = bool | int | float | str | tuple | list | dict | np.ndarray | Tensor
+RESULTS_DIFFER = "its kernel and its own lines come to different numbers"
+SETTING_KINDS = bool | int | float | str | tuple | list | dict | np.ndarray | Tensor
 TORCH_ATTRIBUTES = vars(nn.Module()).keys() - {"training"}  # where torch keeps parameters, buffers and hooks
 Value = TypeVar("Value")
 Array = np.ndarray
@@ -45,7 +45,7 @@ class Kernel:
         self.outputs = outputs
         self._engine = machine_code(key, text)
         arguments = [ctypes.c_void_p] * (inputs + 4) + [ctypes.c_int64] * 3
-        self._call = ctypes.CFUNCTYPE(None, *arguments)(self._engine.get_function_address(NAME))
+        self._call = ctypes.CFUNCTYPE(None, *arguments)(self._engine.get_function_address(KERNEL_NAME))
 
     def __call__(
         self, parameters: Array, uniform: Array, inputs: Sequence[Array], ancestors: Array | None, out: Array
@@ -55,7 +55,7 @@ class Kernel:
         Args:
             parameters: `(P,)` what the graph takes of them.
             uniform: `(B, columns)`.
-            inputs: each `(elements, B, N)`, N at least `LANES`.
+            inputs: each `(elements, B, N)`, N at least `SIMD_LANES`.
             ancestors: `(B, N)` int64, where the first input is looked up; None: at each particle itself.
             out: `(outputs, B, N)`, overwritten; shares no memory with the inputs.
         """
@@ -63,7 +63,7 @@ class Kernel:
         for array in (parameters, uniform, *inputs, out):
             assert array.dtype == np.float32 and array.flags.c_contiguous
         assert len(out) == self.outputs and len(uniform) == trajectories
-        assert particles >= LANES and all(array.shape[1:] == out.shape[1:] for array in inputs)
+        assert particles >= SIMD_LANES and all(array.shape[1:] == out.shape[1:] for array in inputs)
         assert ancestors is None or (ancestors.dtype == np.int64 and ancestors.flags.c_contiguous)
         pointers = [parameters.ctypes.data, uniform.ctypes.data, *(array.ctypes.data for array in inputs)]
         which = None if ancestors is None else ancestors.ctypes.data
@@ -211,8 +211,8 @@ def compiled(program: nn.Module, name: str, build: Callable[[], Value]) -> Value
 
 def discard(program: nn.Module, name: str) -> str:
     """Give up what was compiled under a name."""
-    _COMPILED[type(program)][name, signature(program)] = DIFFERENT
-    return DIFFERENT
+    _COMPILED[type(program)][name, signature(program)] = RESULTS_DIFFER
+    return RESULTS_DIFFER
 
 
 def _tensors(program: nn.Module) -> dict[str, Tensor]:
@@ -258,7 +258,7 @@ def _signature(program: nn.Module) -> tuple[Any, ...]:
         (at, name, _content(value))
         for at, module in program.named_modules()
         for name, value in _settings(module)
-        if isinstance(value, SETTING)
+        if isinstance(value, SETTING_KINDS)
     ]
     tensors = _tensors(program)
     names = first_names(tensors)
@@ -270,7 +270,7 @@ def _signature(program: nn.Module) -> tuple[Any, ...]:
 def _content(value: Any) -> Any:
     """What a setting tells; of a tensor the numbers, or which it is if there are many."""
     if isinstance(value, dict):
-        return tuple((repr(name), _content(part)) for name, part in value.items() if isinstance(part, SETTING))
+        return tuple((repr(name), _content(part)) for name, part in value.items() if isinstance(part, SETTING_KINDS))
     if isinstance(value, tuple | list):
         return type(value).__name__, *map(_content, value)
     if isinstance(value, np.ndarray):

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from steady_ppl.kernels.codegen import LANES
+from steady_ppl.kernels.codegen import SIMD_LANES
 from steady_ppl.kernels.jit import Method, Number, close, compiled, discard
 
 COMPARED_EVERY = 16  # of a program's runs on all rows; the first two are compared as well
@@ -22,7 +22,7 @@ _WHY: ContextVar[dict[str, str] | None] = ContextVar("why functions had no kerne
 
 
 @contextmanager
-def without_kernels() -> Iterator[dict[str, str]]:
+def kernel_failures() -> Iterator[dict[str, str]]:
     """Why functions of the block had no kernel where there were rows enough for one, by the functions' names."""
     found: dict[str, str] = {}
     token = _WHY.set(found)
@@ -32,8 +32,8 @@ def without_kernels() -> Iterator[dict[str, str]]:
         _WHY.reset(token)
 
 
-def in_plain_torch(why: Mapping[str, str]) -> list[str]:
-    """What `without_kernels` gave, as a note for who waits for the result."""
+def fallback_notes(why: Mapping[str, str]) -> list[str]:
+    """What `kernel_failures` gave, as a note for who waits for the result."""
     names = {reason: [name for name in why if why[name] == reason] for reason in why.values()}
     parts = [f"{', '.join(names[reason])}: {reason}" for reason in names]
     return [f"computed in plain torch, without compiled kernels: {'; '.join(parts)}"] if parts else []
@@ -114,8 +114,8 @@ def _computed(
         kernels = rows * trajectories >= ROWS_WORTH_COMPILING
     if not kernels:
         return None
-    if rows * trajectories < LANES:
-        return f"fewer than {LANES} rows"
+    if rows * trajectories < SIMD_LANES:
+        return f"fewer than {SIMD_LANES} rows"
     if first.device.type != "cpu" or first.dtype != torch.float32:
         return f"{str(first.dtype).removeprefix('torch.')} on {first.device.type}"
     examples = {at: value[:1, :1].unsqueeze(0).clone() for at, value in arguments.items()}
@@ -130,8 +130,8 @@ def _computed(
     runs = _RUNS.setdefault(program, Counter())
     runs[method] += 1
     if runs[method] <= 2 or runs[method] % COMPARED_EVERY == 0:
-        plain = function(*(_a_few(value) for value in arguments.values()))
-        if not close(_a_few(values), plain):
+        plain = function(*(_subsample(value) for value in arguments.values()))
+        if not close(_subsample(values), plain):
             return _noted(name, discard(program, compiled_as))
     return method, values, rest
 
@@ -143,9 +143,9 @@ def _noted(name: str, reason: str) -> str:
     return reason
 
 
-def _a_few(values: Tensor) -> Tensor:
+def _subsample(values: Tensor) -> Tensor:
     """Some sixteen of all rows, `(1, ·, ·)`."""
-    return values.flatten(0, 1)[None, :: max(1, values.shape[0] * values.shape[1] // LANES)]
+    return values.flatten(0, 1)[None, :: max(1, values.shape[0] * values.shape[1] // SIMD_LANES)]
 
 
 def _run(method: Method, program: nn.Module, arguments: dict[str, Tensor], rows: int, trajectories: int) -> Tensor:

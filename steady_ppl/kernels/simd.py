@@ -12,7 +12,7 @@ from typing import Any
 from llvmlite import ir
 
 FLOAT, INTEGER = ir.FloatType(), ir.IntType(32)
-FLAGS = ("contract", "nsz")
+FAST_MATH_FLAGS = ("contract", "nsz")
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Lanes:
 
     def _do(self, name: str, other: Any) -> Lanes:
         left, right = number(self).pair(number(other) if isinstance(other, Lanes) else other)
-        return Lanes(self.builder, getattr(self.builder, name)(left.value, right.value, flags=FLAGS))
+        return Lanes(self.builder, getattr(self.builder, name)(left.value, right.value, flags=FAST_MATH_FLAGS))
 
     def compare(self, how: str, other: Any) -> Lanes:
         """A truth value; false where either is not a number, except for "!="."""
@@ -247,7 +247,7 @@ def remainder(x: Lanes, y: Lanes) -> Lanes:
     return (abs(rest) < abs(y)).where(rest, rest - y)
 
 
-def _other_leg(x: Lanes) -> Lanes:
+def _cos_of_asin(x: Lanes) -> Lanes:
     return ((1.0 - x) * (x + 1.0)).call("sqrt")
 
 
@@ -258,8 +258,8 @@ OPERATIONS: dict[str, Any] = {
     "cos": lambda x: _turned(x, 1),
     "tan": lambda x: _turned(x, 0) / _turned(x, 1),
     "atan": lambda x: atan2(x, x.like(1.0)),
-    "asin": lambda x: atan2(x, _other_leg(x)),
-    "acos": lambda x: atan2(_other_leg(x), x),
+    "asin": lambda x: atan2(x, _cos_of_asin(x)),
+    "acos": lambda x: atan2(_cos_of_asin(x), x),
     "hypot": lambda x, y: (x * x + y * y).call("sqrt"),
     "softplus": lambda x: maximum(x, x.like(0.0)) + log1p(exp(-abs(x))),
     "silu": lambda x: x * sigmoid(x),

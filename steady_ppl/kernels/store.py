@@ -23,12 +23,12 @@ from typing import Any
 import llvmlite
 from llvmlite import binding
 
-VARIABLE = "STEADY_KERNEL_CACHE"
+ENVIRONMENT_VARIABLE = "STEADY_KERNEL_CACHE"
 MAX_BYTES = 64 * 2**20  # bytes of all files; the least recently used ones go
-AN_HOUR = 3600.0  # a use is noted once in it, to save writes
+USE_INTERVAL_SECONDS = 3600.0  # a use is noted once in it, to save writes
 MAGIC = b"steady-ppl kernel 1\n"  # the format of a file: this, the digest of its name and code, its code
 FILE_NAME = re.compile(r"[0-9a-f]{64}(\.[0-9a-f]{16}\.partial)?")  # the names of files; others are left alone
-DIGEST = sha256().digest_size
+DIGEST_BYTES = sha256().digest_size
 SWEEP_PREFIX = "0"  # how names begin whose writing is followed by a look through the folder: one in sixteen
 OTHERS_CAN_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
@@ -60,7 +60,7 @@ def machine_code(key: str, text: Callable[[], str]) -> Any:
         if folder is not None and kept is None and made:
             _write(folder, name, made.pop())
             if name.startswith(SWEEP_PREFIX):
-                _forget(folder)
+                _evict(folder)
         return engine
 
 
@@ -104,12 +104,12 @@ def _read(folder: int, name: str) -> bytes | None:
             if not stat.S_ISREG(about.st_mode) or about.st_uid != os.geteuid() or about.st_mode & OTHERS_CAN_WRITE:
                 return None
             whole = opened.read()
-            if abs(time.time() - about.st_mtime) > AN_HOUR:
+            if abs(time.time() - about.st_mtime) > USE_INTERVAL_SECONDS:
                 with suppress(OSError):  # a disk that cannot be written to can be read
                     os.utime(file)
     except OSError:
         return None
-    start = len(MAGIC) + DIGEST
+    start = len(MAGIC) + DIGEST_BYTES
     code = whole[start:]
     return code if whole[:start] == MAGIC + _digest(name, code) else None
 
@@ -128,7 +128,7 @@ def _write(folder: int, name: str, code: bytes) -> None:
             os.unlink(beside, dir_fd=folder)
 
 
-def _forget(folder: int) -> None:
+def _evict(folder: int) -> None:
     """Remove the files that were used longest ago until three quarters of the bound are left: the last one is for what
     is written until the folder is next looked through."""
     found = []
@@ -166,7 +166,7 @@ def _open_folder() -> int:
     above it are checked too: who can write there can put another folder of the user's in its place."""
     if not hasattr(os, "geteuid") or os.open not in os.supports_dir_fd:
         raise _NotKept("this system does not say who owns a folder")
-    place = _place()
+    place = _folder_path()
     try:
         above = place.parent.resolve()
         for folder in (*reversed(place.parents), *reversed(above.parents), above):
@@ -186,14 +186,14 @@ def _open_folder() -> int:
     raise _NotKept(f"{place} is another user's, or others can write there")
 
 
-def _place() -> Path:
+def _folder_path() -> Path:
     """Where the folder is to be."""
-    named = os.environ.get(VARIABLE, "")
+    named = os.environ.get(ENVIRONMENT_VARIABLE, "")
     if named == "off":
-        raise _NotKept(f"{VARIABLE} is off")
+        raise _NotKept(f"{ENVIRONMENT_VARIABLE} is off")
     if named:
         if not Path(named).is_absolute():
-            raise _NotKept(f"{VARIABLE} is no absolute path")
+            raise _NotKept(f"{ENVIRONMENT_VARIABLE} is no absolute path")
         return Path(named)
     cache = os.environ.get("XDG_CACHE_HOME", "")
     if Path(cache).is_absolute():

@@ -26,8 +26,8 @@ from steady_ppl.likelihood.parameters import Element, elements, on_both_sides, s
 from steady_ppl.likelihood.scores import parameter_scores, smoothed, widens
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
-from steady_ppl.utils.cores import one_thread
-from steady_ppl.utils.journal import Piece, piece
+from steady_ppl.utils.cores import Output, one_thread
+from steady_ppl.utils.journal import journaled
 from steady_ppl.utils.progress import stages
 
 PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
@@ -87,7 +87,7 @@ def maximise(
 
     def compute() -> Maximum:
         terms = [Term.alone(problem, path or find_path(problem))]
-        (found,) = climb(terms, information=information, steps=steps, precision=precision, hopeless=hopeless)
+        (found,) = maximise_sum(terms, information=information, steps=steps, precision=precision, hopeless=hopeless)
         return found
 
     return kept_maximum(problem.program, compute)
@@ -96,14 +96,14 @@ def maximise(
 def kept_maximum(program: Program, find: Callable[[], Maximum]) -> Maximum:
     """A maximum as a piece of a journal: what `find` returns, with the program moved there."""
 
-    def compute() -> Piece:
+    def compute() -> Output:
         found = find()
         tensors = {name: getattr(found, name) for name in ("log_likelihood", "information")}
         tensors |= {"states": found.path.states, "noise": found.path.noise}
         tensors |= {f"program/{name}": value for name, value in program.state_dict().items()}
         return tensors, {name: getattr(found, name) for name in ("objective", "names", "steps", "decrement", "gained")}
 
-    tensors, values = piece(compute)
+    tensors, values = journaled(compute)
     program.load_state_dict({name: tensors[f"program/{name}"] for name in program.state_dict()})
     path = ReferencePath(tensors["states"], tensors["noise"])
     values = {**values, "names": tuple(values["names"])}
@@ -127,7 +127,7 @@ class Term:
 
 
 @torch.no_grad()
-def climb(
+def maximise_sum(
     terms: Sequence[Term],
     *,
     information: Tensor | None = None,
@@ -153,7 +153,7 @@ def climb(
     for term in terms:
         reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
     is_given = information is not None
-    information = _of_drives(here) if information is None else _regularised(information)
+    information = _by_cross_products(here) if information is None else _regularised(information)
     taken, decrement, passes = 0, 0.0, PASSES
     rises = deque[float](maxlen=3)  # of log p(y) by the last steps
     with stages(*(("", SHARE_THAT_GOES_ON**step) for step in range(steps + 1))) as begin:
@@ -161,7 +161,7 @@ def climb(
             begin()
             move, singular = torch.linalg.solve_ex(information, here.gradient)
             if not singular and not float(here.gradient @ move) >= 0:  # it has ceased to be positive
-                information = _of_drives(here)
+                information = _by_cross_products(here)
                 move, singular = torch.linalg.solve_ex(information, here.gradient)
             if singular:
                 raise FilterError(
@@ -169,7 +169,7 @@ def climb(
                 )
             decrement = 0.5 * float(here.gradient @ move)
             if is_given and decrement < precision:  # by what was known elsewhere: seen here as well?
-                is_given, own = False, _of_drives(here)
+                is_given, own = False, _by_cross_products(here)
                 seen, _ = torch.linalg.solve_ex(own, here.gradient)
                 more = 0.5 * float(here.gradient @ seen)
                 few_drives = len(here.scores) < 2 * len(own)  # they know too little
@@ -181,9 +181,9 @@ def climb(
             move = move * min(1.0, 1 / max(1e-9, float((move.abs() / reach).max())))
             against = move * here.gradient < 0
             move = torch.where(against, move.clamp(-SHARE_AGAINST_SCORE * reach, SHARE_AGAINST_SCORE * reach), move)
-            share, there = _searched(here, move, passes)
+            share, there = _line_search(here, move, passes)
             if there is not None:
-                information = _updated(information, share * move, here.gradient - there.gradient)
+                information = _bfgs_update(information, share * move, here.gradient - there.gradient)
                 rises.append(there.log_likelihood - here.log_likelihood)
                 here = there
             elif passes == STALLED_PASSES:
@@ -191,7 +191,7 @@ def climb(
             else:
                 passes = STALLED_PASSES
                 here = _linearised([at.term for at in here.terms], passes)
-                information = _of_drives(here)
+                information = _by_cross_products(here)
                 rises.append(math.inf)  # along other paths
     return [
         Maximum(
@@ -208,7 +208,7 @@ def climb(
     ]
 
 
-def _searched(here: _LinearizedObjective, move: Tensor, passes: int) -> tuple[float, _LinearizedObjective | None]:
+def _line_search(here: _LinearizedObjective, move: Tensor, passes: int) -> tuple[float, _LinearizedObjective | None]:
     """The share of a move that does not fall, and where it leads; None where none does and nothing is moved."""
     share, terms = 1.0 if bool(torch.isfinite(move).all()) else 0.0, [at.term for at in here.terms]
     before = [values_of(term.parts) for term in terms]
@@ -224,7 +224,7 @@ def _searched(here: _LinearizedObjective, move: Tensor, passes: int) -> tuple[fl
     return 0.0, None
 
 
-def _of_drives(here: _LinearizedObjective) -> Tensor:
+def _by_cross_products(here: _LinearizedObjective) -> Tensor:
     """The information by the cross products of the drives' scores."""
     by_drive = here.scores - here.scores.mean(0)
     information = by_drive.T @ by_drive
@@ -328,7 +328,7 @@ def log_prior(program: Program, shares: Mapping[str, float] | None = None) -> fl
     )
 
 
-def _updated(information: Tensor, step: Tensor, fall: Tensor) -> Tensor:
+def _bfgs_update(information: Tensor, step: Tensor, fall: Tensor) -> Tensor:
     """The BFGS update with `fall` of the score along `step`, damped where no positive curvature is seen (Powell)."""
     through = information @ step
     expected, seen = float(step @ through), float(step @ fall)

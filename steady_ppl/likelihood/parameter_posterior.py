@@ -35,8 +35,8 @@ from steady_ppl.utils.random import seeded
 if TYPE_CHECKING:
     import arviz
 
-FREEDOM = 5.0  # of the Student t: its tails are heavier than those of any posterior that data tell
-ROUNDS = (0.25, 0.25, 0.5)  # shares of the values; each round draws about what those before found
+DEGREES_OF_FREEDOM = 5.0  # of the Student t: its tails are heavier than those of any posterior that data tell
+ROUND_SHARES = (0.25, 0.25, 0.5)  # shares of the values; each round draws about what those before found
 MIN_EFFECTIVE_DRAWS = 4  # effective values a number, for which the weights that shape the next round are tempered
 MAX_TAIL_INDEX = 0.7  # Pareto tail index above which weights are not to be trusted (Vehtari et al. 2024)
 
@@ -125,14 +125,14 @@ class NormalShape:
     def draws(self, count: int) -> Tensor:
         """Values `(K, P)`."""
         size = len(self.centre)
-        student = torch.distributions.Chi2(torch.tensor(FREEDOM, dtype=torch.float64)).sample((count, 1))
-        white = torch.randn(count, size, dtype=torch.float64) * (FREEDOM / student).sqrt()
+        student = torch.distributions.Chi2(torch.tensor(DEGREES_OF_FREEDOM, dtype=torch.float64)).sample((count, 1))
+        white = torch.randn(count, size, dtype=torch.float64) * (DEGREES_OF_FREEDOM / student).sqrt()
         return self.centre + white @ self.root.T
 
     def density(self, values: Tensor) -> Tensor:
         """Its logarithm `(K,)` at values `(K, P)`, but for a constant that all shapes share."""
         white = torch.linalg.solve(self.root, (values - self.centre).T)
-        tail = -0.5 * (FREEDOM + len(self.centre)) * torch.log1p(white.square().sum(0) / FREEDOM)
+        tail = -0.5 * (DEGREES_OF_FREEDOM + len(self.centre)) * torch.log1p(white.square().sum(0) / DEGREES_OF_FREEDOM)
         return tail - torch.linalg.slogdet(self.root)[1]
 
 
@@ -149,13 +149,13 @@ def adapt(program: Program, shape: NormalShape, judge: LogLikelihood, count: int
     shapes: list[NormalShape] = []
     values, judged = shape.centre.new_empty(0, len(shape.centre)), shape.centre.new_empty(0)
     log_weights = judged
-    with stages(*(("", share) for share in ROUNDS)) as begin:
-        for share in ROUNDS:
+    with stages(*(("", share) for share in ROUND_SHARES)) as begin:
+        for share in ROUND_SHARES:
             begin()
             shapes.append(_shaped(shapes[-1], values, log_weights) if shapes else shape)
             new = shapes[-1].draws(round(share * count))
-            values, judged = torch.cat([values, new]), torch.cat([judged, weighed(program, new, judge)])
-            drawn = torch.tensor(ROUNDS[: len(shapes)], dtype=values.dtype).log()
+            values, judged = torch.cat([values, new]), torch.cat([judged, log_posterior(program, new, judge)])
+            drawn = torch.tensor(ROUND_SHARES[: len(shapes)], dtype=values.dtype).log()
             mixture = torch.stack([one.density(values) for one in shapes]) + drawn[:, None]
             log_weights = judged - mixture.logsumexp(0)
     return values, log_weights
@@ -195,7 +195,7 @@ def linearised(problem: Problem, path: ReferencePath) -> LogLikelihood:
     return judge
 
 
-def weighed(program: Program, values: Tensor, judge: LogLikelihood) -> Tensor:
+def log_posterior(program: Program, values: Tensor, judge: LogLikelihood) -> Tensor:
     """log p(y) and log prior of values `(K, P)`, `(K,)`: minus infinity where the program blows up.
 
     Raises:

@@ -13,7 +13,7 @@ from steady_ppl.errors import UsageError
 from steady_ppl.kernels.jit import Number
 from steady_ppl.model.program import Program
 
-MAX_PARAMETERS = 60  # parameters that are screened one by one; networks have more
+MAX_LEARNABLE_NUMBERS = 60  # parameters that are screened one by one; networks have more
 MIN_RELATIVE_MOVE = 1e-3  # of a number, by which differences move it at least: single precision has seven digits
 Result = TypeVar("Result")
 
@@ -48,7 +48,7 @@ def elements(program: Program, *, frozen: bool = False) -> list[Element]:
         for index, value in enumerate(parameter.detach().flatten().tolist()):
             label = f"{name}[{index}]" if parameter.numel() > 1 else name
             found.append(Element(parameter, index, max(steps.get(name, 0.01), MIN_RELATIVE_MOVE * abs(value)), label))
-    if len(found) > MAX_PARAMETERS:
+    if len(found) > MAX_LEARNABLE_NUMBERS:
         raise UsageError(
             f"program {type(program).__name__} has {len(found)} learnable numbers: a network cannot be looked at "
             "parameter by parameter. Fit it with the recipe steady; discover the effects that are missing from a "

@@ -54,7 +54,7 @@ def _parted(source: str) -> tuple[str, str]:
     return (path, class_name) if class_name.isidentifier() and path else (source, "")
 
 
-class _AsWritten(SourceFileLoader):
+class _UncachedLoader(SourceFileLoader):
     """Compiles what the file says now: a cache goes by size and whole seconds, which misses a digit edited quickly."""
 
     def get_code(self, fullname: str) -> CodeType:
@@ -72,7 +72,7 @@ def run_file(file: Path) -> ModuleType:
     sys.modules[package] = parent = ModuleType(package)
     parent.__path__ = [str(folder)]
     name = f"{package}.{file.stem}"
-    spec = importlib.util.spec_from_file_location(name, file, loader=_AsWritten(name, str(file)))
+    spec = importlib.util.spec_from_file_location(name, file, loader=_UncachedLoader(name, str(file)))
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module

@@ -17,7 +17,7 @@ from pyro.nn import PyroModule, PyroParam, PyroSample
 from torch import Tensor
 
 from steady_ppl.errors import DataError, ProgramError
-from steady_ppl.utils import late
+from steady_ppl.utils import hooks
 
 if TYPE_CHECKING:
     from steady_ppl.data.trajectories import Trajectories
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 MIN_STEP, MAX_STEP = 1e-10, 1e9  # s between two rows; beyond these the time has another unit
 
 
-def _then_effects(init: Callable[..., None]) -> Callable[..., None]:
+def _with_listed_effects(init: Callable[..., None]) -> Callable[..., None]:
     """An `__init__` after which the program, once the outermost is done, has the effects that its class lists."""
 
     @wraps(init)
@@ -38,7 +38,7 @@ def _then_effects(init: Callable[..., None]) -> Callable[..., None]:
             if outermost:
                 self.__dict__.pop("_begun", None)
         if outermost and self.effects:
-            late.attach_listed(self)
+            hooks.attach_listed(self)
 
     wrapped.attaches_effects = True  # type: ignore[attr-defined]
     return wrapped
@@ -154,7 +154,7 @@ class Program(PyroModule):
     step: float = 0.1
     simulated_step: float = 0.005
 
-    @_then_effects
+    @_with_listed_effects
     def __init__(self) -> None:
         # parameters belong to this object, not to Pyro's global store, where a second program would find them
         with pyro.settings.context(module_local_params=True):
@@ -163,7 +163,7 @@ class Program(PyroModule):
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         if not getattr(cls.__init__, "attaches_effects", False):
-            cls.__init__ = _then_effects(cls.__init__)  # type: ignore[method-assign]
+            cls.__init__ = _with_listed_effects(cls.__init__)  # type: ignore[method-assign]
 
     def __setattr__(self, name: str, value: Any) -> None:
         hidden = isinstance(value, PyroParam | PyroSample | torch.nn.Parameter) and hasattr(type(self), name)
@@ -252,7 +252,7 @@ class Program(PyroModule):
 
     def with_effect(self, effect: Any, value: Any = None, **where: Any) -> Program:
         """A copy with a physical effect added, its coefficient a learnable parameter; see `effects.attach`."""
-        return late.with_effect(self, effect, value, **where)
+        return hooks.with_effect(self, effect, value, **where)
 
     def example_controls(self, time: Tensor) -> Tensor:
         """Controls of simulated drives, `(rows, trajectories, U)` at times `(rows, trajectories)`; zero by default."""
@@ -277,6 +277,20 @@ def error_groups(program: Program) -> dict[str, tuple[int, ...]]:
     order = program.state_names
     groups = program.error_groups or {name: (name,) for name in order}
     return {group: tuple(order.index(name) for name in members) for group, members in groups.items()}
+
+
+def unit_of(program: Program, variable: str) -> str:
+    """Of what a program declares, time, a channel's velocity or what is commanded of it, or a product of velocities;
+    empty where it is not declared."""
+    declared = (*program.measurements, *program.controls, *program.states)
+    found = {"time": "s"} | dict(zip(names(declared), units(declared), strict=True))
+    if variable in found:
+        return found[variable]
+    of_channel = dict(zip(program.channel_names, program.channel_units, strict=True))
+    if variable.startswith("commanded "):
+        return of_channel.get(variable.removeprefix("commanded "), "")
+    parts = [of_channel.get(part.strip().removesuffix(" velocity"), "") for part in variable.split("×")]
+    return " · ".join(unit.replace("/s²", "/s") for unit in parts)
 
 
 def for_program(program: Program, data: Trajectories) -> Trajectories:

@@ -13,13 +13,13 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import MAX_SUBSTEPS, Held, advance, with_substeps, within_row
 from steady_ppl.utils.random import seeded
 
-GROWTH = 1.1  # of a deviation over a row, from which it counts
+MIN_GROWTH = 1.1  # of a deviation over a row, from which it counts
 SUBSTEP_FACTOR = 16  # times as many substeps, at which it must not grow nearly as much
 ROW_SPACING_FACTOR = 1000.0  # times, by which rows are moved apart to see whether actuators look at time
 LONG_STEP_RATIO = 1.5  # times the usual step, from which the message names a row's length
 STEP_DIVISOR = 64  # times, by which a step is shortened to see whether its result follows
-STATES, ROWS = 64, 16  # at which a transition is looked at
-COMMANDS = 256  # rows of commands, at which actuators are looked at
+PROBED_STATES, PROBED_ROWS = 64, 16  # at which a transition is looked at
+PROBED_COMMAND_ROWS = 256  # rows of commands, at which actuators are looked at
 MAX_SUBSTEPS_AHEAD = 1600  # substeps that a program moves on to see where it comes: of 100 rows where it takes one
 _Given = tuple[Tensor, Tensor, Tensor]  # control, time and step
 
@@ -45,7 +45,7 @@ def divergence(program: Program, data: Trajectories, rows: int | None = None) ->
     worst = int(growth.argmax())
     control, time, step = given
     once = _eigenvalues(with_substeps(program, 1), state, (control, time, step / program.substeps))
-    if once is None or float(growth[worst]) <= GROWTH:
+    if once is None or float(growth[worst]) <= MIN_GROWTH:
         return None
     there = once.flatten(0, -2)[worst]
     fastest = there[(there - 1).abs().argmax()]
@@ -73,7 +73,7 @@ def _eigenvalues(program: Program, state: Tensor, given: _Given) -> Tensor | Non
 
 
 def _visited(finer: Program, data: Trajectories, steps: Tensor) -> tuple[Tensor, _Given]:
-    """States that a program comes to, `(STATES, R, 1, D)`, and control, time and step of these rows.
+    """States that a program comes to, `(PROBED_STATES, R, 1, D)`, and control, time and step of these rows.
 
     The longest row of all is looked at from the start; the others are of the drive that it belongs to.
     """
@@ -87,7 +87,7 @@ def _visited(finer: Program, data: Trajectories, steps: Tensor) -> tuple[Tensor,
         if not bool(ahead.isfinite().all()):
             break
         states.append(ahead)
-    chosen = torch.linspace(0, len(states) - 1, min(ROWS, len(states))).long()
+    chosen = torch.linspace(0, len(states) - 1, min(PROBED_ROWS, len(states))).long()
     looked = torch.cat([longest.to(rows), rows[chosen.to(rows.device)]])
     return torch.cat([states[0], *(states[index] for index in chosen.tolist())], 1), _given(data, drive, looked)
 
@@ -101,7 +101,7 @@ def is_step(program: Program, data: Trajectories) -> bool:
     """
     if not bool(data.transitions.any()) or counts_rows(program):
         return False
-    state, (control, time, step) = _some(program, data)
+    state, (control, time, step) = _probe_points(program, data)
     own = with_substeps(program, 1)
     changes = []
     for short in (step, step / STEP_DIVISOR):
@@ -127,8 +127,8 @@ def counts_rows(program: Program) -> bool:
         return False
     like = next(program.parameters(), torch.zeros(()))
     with seeded("commands"):
-        commands = torch.randn(COMMANDS, 1, len(program.controls)).to(like)
-    times = program.step * torch.arange(COMMANDS).to(like).unsqueeze(-1)
+        commands = torch.randn(PROBED_COMMAND_ROWS, 1, len(program.controls)).to(like)
+    times = program.step * torch.arange(PROBED_COMMAND_ROWS).to(like).unsqueeze(-1)
     other = torch.cat([commands[:1] + 1.0, commands[1:]])
 
     def counts(act: Callable[[Program, Tensor, Tensor], Tensor]) -> bool:
@@ -145,7 +145,7 @@ def can_be_cut(program: Program, data: Trajectories) -> bool:
     """Return whether rows of drives, as returned by `for_program`, can be taken in substeps: `require_convergence`."""
     if not bool(data.transitions.any()):
         return True
-    state, given = _some(program, data)
+    state, given = _probe_points(program, data)
     try:
         require_convergence(program, state, *given)
     except ProgramError:
@@ -179,11 +179,11 @@ def require_convergence(program: Program, state: Tensor, control: Tensor, time: 
         )
 
 
-def _some(program: Program, data: Trajectories) -> tuple[Tensor, _Given]:
-    """States from a program's start, `(STATES, R, 1, D)`, and what is given in rows of the longest drive."""
+def _probe_points(program: Program, data: Trajectories) -> tuple[Tensor, _Given]:
+    """States from a program's start, `(PROBED_STATES, R, 1, D)`, and what is given in rows of the longest drive."""
     drive = int(data.transitions.sum(0).argmax())
     rows = torch.where(data.transitions[:, drive])[0]
-    rows = rows[torch.linspace(0, len(rows) - 1, min(ROWS, len(rows)), device=rows.device).long()]
+    rows = rows[torch.linspace(0, len(rows) - 1, min(PROBED_ROWS, len(rows)), device=rows.device).long()]
     return _starts(program, len(rows)), _given(data, drive, rows)
 
 
@@ -192,8 +192,8 @@ def _given(data: Trajectories, drive: int, rows: Tensor | slice) -> _Given:
 
 
 def _starts(program: Program, rows: int) -> Tensor:
-    """States from a program's start, `(STATES, rows, 1, D)`."""
-    left = torch.Size((STATES, rows, 1))
+    """States from a program's start, `(PROBED_STATES, rows, 1, D)`."""
+    left = torch.Size((PROBED_STATES, rows, 1))
     with seeded("starts"), running(*left):
         return broadcast_event(program.initial(), left, 1)
 

@@ -17,8 +17,8 @@ from steady_ppl.model.stability import require_convergence
 from steady_ppl.model.substeps import MAX_SUBSTEPS, is_count
 from steady_ppl.utils.text import one_line
 
-DRAWS, ROWS, TRAJECTORIES = 7, 11, 13
-LEFT = (DRAWS, ROWS, TRAJECTORIES)
+DRAWS, ROWS, TRAJECTORIES = 7, 11, 13  # of the probe, all different
+LEFT = (DRAWS, ROWS, TRAJECTORIES)  # its batch shape
 
 
 def probe(program: Program) -> None:

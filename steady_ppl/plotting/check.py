@@ -10,16 +10,17 @@ import numpy as np
 import torch
 
 from steady_ppl.criticism.baselines import Reference
-from steady_ppl.criticism.result import Check, subject, unit_of, verdict
+from steady_ppl.criticism.result import Check, subject, verdict
 from steady_ppl.errors import UsageError
+from steady_ppl.model.program import unit_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MEASURED, NEAR, FAR, REFERENCE, FLOOR_COLOR = "black", "#0072b2", "#d55e00", "#cc79a7", "#009e73"
-COMPONENTS = 4  # panels at most
-WIDTH = 165  # letters of a line over the whole width
+DATA_COLOR, NEAR_COLOR, FAR_COLOR, BASELINE_COLOR, FLOOR_COLOR = "black", "#0072b2", "#d55e00", "#cc79a7", "#009e73"
+MAX_COMPONENTS_SHOWN = 4  # panels
+CHECK_TITLE_COLUMNS = 165  # letters of its line over the whole width
 
 
 def check_picture(found: Check) -> Figure:
@@ -27,7 +28,7 @@ def check_picture(found: Check) -> Figure:
     import matplotlib.pyplot as plt
 
     with plt.rc_context({"axes.titlesize": 9, "axes.labelsize": 8}):
-        shown = min(COMPONENTS, len(found.program.measurement_names))
+        shown = min(MAX_COMPONENTS_SHOWN, len(found.program.measurement_names))
         figure = plt.Figure(figsize=(13, 2.2 * max(shown, 3) + 1.3), layout="constrained")
         left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1.25, 1), squeeze=False))
         drive = representative(found)
@@ -37,7 +38,7 @@ def check_picture(found: Check) -> Figure:
         panels[0].set_title(f"measured and predicted, drive {found.data.labels[drive]}", parse_math=False)
         panels[-1].set_xlabel("time [s]")
         left.legend(*panels[0].get_legend_handles_labels(), fontsize=8, ncols=3, loc="outside lower center")
-        figure.suptitle("\n".join(textwrap.wrap(verdict(found), WIDTH)), fontsize=10)
+        figure.suptitle("\n".join(textwrap.wrap(verdict(found), CHECK_TITLE_COLUMNS)), fontsize=10)
         above, regime, against = right.subplots(3, 1, height_ratios=(1.2, 1, 1))
         where_and_when(found, above)
         regime_panel(found, regime)
@@ -60,11 +61,11 @@ def predictions(found: Check, drive: int, component: int, axes: Axes) -> None:
     data = found.data
     time = data.elapsed[:, drive].numpy(force=True)
     last = list(found.horizons)[-1]
-    for name, color in zip(dict.fromkeys(("one step", last)), (NEAR, FAR), strict=False):
+    for name, color in zip(dict.fromkeys(("one step", last)), (NEAR_COLOR, FAR_COLOR), strict=False):
         at, middle, half = _joined(time, *(values[:, drive, component] for values in band(found, name)))
         axes.fill_between(at, middle - half, middle + half, color=color, alpha=0.18, lw=0)
         axes.plot(at, middle, color=color, lw=1, label=f"{name} ahead, 90 % band")
-    axes.plot(time, measured(found)[:, drive, component], ".", color=MEASURED, ms=3, label="measured")
+    axes.plot(time, measured_values(found)[:, drive, component], ".", color=DATA_COLOR, ms=3, label="measured")
     name, unit = found.program.measurement_names[component], found.program.measurement_units[component]
     axes.set_ylabel(f"{name} [{unit}]" if unit else name)
 
@@ -78,7 +79,7 @@ def _joined(time: np.ndarray, middle: np.ndarray, half: np.ndarray) -> tuple[np.
     return np.insert(time, breaks, np.nan), np.insert(middle, breaks, np.nan), np.insert(half, breaks, np.nan)
 
 
-def measured(found: Check) -> np.ndarray:
+def measured_values(found: Check) -> np.ndarray:
     """What was measured, `(T + 1, B, K)`, NaN where it was not."""
     data = found.data
     return np.where(data.observed.numpy(force=True), data.measurements.double().numpy(force=True), np.nan)
@@ -93,7 +94,7 @@ def band(found: Check, horizon: str) -> tuple[np.ndarray, np.ndarray]:
     prediction = found.predictions[rows]
     there = prediction.observed.numpy(force=True)
     middle, half = np.full((2, *found.data.measurements.shape), np.nan)
-    middle[rows:] = np.where(there, measured(found)[rows:] - prediction.error.numpy(force=True), np.nan)
+    middle[rows:] = np.where(there, measured_values(found)[rows:] - prediction.error.numpy(force=True), np.nan)
     half[rows:] = 1.645 * np.sqrt(np.where(there, prediction.variance.numpy(force=True), np.nan))
     jumps = np.abs(np.diff(middle, axis=0, prepend=middle[:1])) > np.maximum(np.pi, 3 * np.nan_to_num(half))
     return np.where(jumps, np.nan, middle), half
@@ -140,13 +141,13 @@ def regime_panel(found: Check, axes: Axes) -> None:
     chosen = [(cell, z) for cell, z in cells if cell.residual == strongest.residual and variable in cell.where]
     for cell, z in chosen:
         axes.fill_between(cell.where[variable], -2, 2, color="0.85", lw=0)
-        axes.plot(cell.where[variable], [z, z], color=NEAR, lw=3, solid_capstyle="butt")
+        axes.plot(cell.where[variable], [z, z], color=NEAR_COLOR, lw=3, solid_capstyle="butt")
     stand_out = [one.cell for one in found.misfit.significant if one.cell.map == "regime"]
     for cell, z in chosen:
         if cell in stand_out:
             axes.plot(sum(cell.where[variable]) / 2, z, "k*", ms=6)
     axes.axhline(0, color="black", lw=0.6)
-    unit = unit_of(found, variable)
+    unit = unit_of(found.program, variable)
     axes.set(xlabel=f"{variable} [{unit}]" if unit else variable, ylabel="simulated sd")
     what = "in which regime" if stand_out else "strongest regime, not significant"
     axes.set_title(f"{what}: mean residual of {subject(found, strongest.residual)} (grey: ±2)")
@@ -162,11 +163,11 @@ def against_references(found: Check, axes: Axes) -> None:
         relative = [_relative(*errors[horizon], found.floor[horizon].mean(0)) for horizon in horizons]
         axes.plot(seconds, relative, style, color=color, label=label, ms=4)
 
-    line({ahead: (one.error, one.observed) for ahead, one in found.predictions.items()}, "o-", NEAR, "program")
+    line({ahead: (one.error, one.observed) for ahead, one in found.predictions.items()}, "o-", NEAR_COLOR, "program")
     line(found.held, "s:", "0.5", "last measurement")
     if isinstance(found.reference, Reference):
         theirs = {ahead: (one.error, one.observed) for ahead, one in found.reference.predictions.items()}
-        line(theirs, "^--", REFERENCE, "constant velocity")
+        line(theirs, "^--", BASELINE_COLOR, "constant velocity")
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("{x:g}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from steady_ppl.comparison.result import FLOOR, Proof, units_of_states
+from steady_ppl.comparison.result import NOISE_FLOOR, Proof, units_of_states
 from steady_ppl.errors import UsageError
 
 if TYPE_CHECKING:
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "black")  # Okabe and Ito
-MARKS = "os^Dvx+"
+MARKERS = "os^Dvx+"
 
 
 def open_loop_picture(found: Proof, *, of: str | None = None, axes: Axes | None = None) -> Axes:
@@ -36,10 +36,10 @@ def open_loop_picture(found: Proof, *, of: str | None = None, axes: Axes | None 
     import matplotlib.pyplot as plt
 
     axes = axes if axes is not None else plt.subplots(figsize=(6, 4), layout="constrained")[1]
-    floor = curves.pop(FLOOR, [])
+    floor = curves.pop(NOISE_FLOOR, [])
     curves = {name: curve for name, curve in curves.items() if curve}
     for index, (name, curve) in enumerate(curves.items()):
-        mark, color = MARKS[index % len(MARKS)], COLORS[index % len(COLORS)]
+        mark, color = MARKERS[index % len(MARKERS)], COLORS[index % len(COLORS)]
         axes.plot(*zip(*curve, strict=True), f"{mark}-", color=color, ms=4, lw=1.4, label=name)
     axes.set_xscale("log")
     axes.set_yscale("log")
@@ -50,7 +50,7 @@ def open_loop_picture(found: Proof, *, of: str | None = None, axes: Axes | None 
     if floor:
         seconds, errors = zip(*floor, strict=True)
         lowest = 0.8 * min(error for curve in (floor, *curves.values()) for _, error in curve)
-        axes.fill_between(seconds, lowest, errors, color="0.85", lw=0, label=FLOOR, zorder=0)
+        axes.fill_between(seconds, lowest, errors, color="0.85", lw=0, label=NOISE_FLOOR, zorder=0)
         axes.set_ylim(bottom=lowest)
     axes.set_xlabel("predicted ahead [s]")
     unit, what = (states[of], of) if of in states else (of, "measured")

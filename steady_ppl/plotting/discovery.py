@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-CHOSEN, ALIKE, OTHER, LIMIT = "#d55e00", "#e69f00", "#0072b2", "#009e73"  # Okabe and Ito
+CHOSEN_COLOR, ALIAS_COLOR, OTHER_COLOR, LIMIT_COLOR = "#d55e00", "#e69f00", "#0072b2", "#009e73"  # Okabe and Ito
 MAX_CANDIDATES = 9  # candidates of a group
 MAX_OTHERS = 20  # effects that were not found, beside those that were
-WIDTH = 125  # letters of a line over the whole width
-SMALL = 8  # points, of letters
-TICKS = 400  # of the rug
+DISCOVERY_TITLE_COLUMNS = 125  # letters of its line over the whole width
+LETTER_POINTS = 8  # size of small letters
+MAX_RUG_TICKS = 400
 
 
 class GainRow(NamedTuple):
@@ -51,7 +51,7 @@ class Group(NamedTuple):
     heading: str
     candidates: list[Candidate]
     chosen: list[str]
-    alike: list[str]
+    aliases: list[str]
 
 
 def discovery_picture(found: Discovery) -> Figure:
@@ -75,7 +75,7 @@ def discovery_picture(found: Discovery) -> Figure:
         left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
         tests(found, left)
         coefficients(found, right, rest=len(_remaining(found)))
-    figure.suptitle("\n".join(textwrap.wrap(sentence(found), WIDTH)), fontsize=10)
+    figure.suptitle("\n".join(textwrap.wrap(sentence(found), DISCOVERY_TITLE_COLUMNS)), fontsize=10)
     return figure
 
 
@@ -83,24 +83,24 @@ def gains(found: Discovery, axes: Axes) -> None:
     """Held-out log p(y) that each fitted candidate brings, one group for each effect that was found."""
     rows = [row for group in _groups(found) for row in _of_group(group, found.before.seed)]
     most = max(row.value for row in rows if row.label)
-    left = min([-0.25 * most, *(row.interval[0] for row in rows if row.interval and row.color != OTHER)])
+    left = min([-0.25 * most, *(row.interval[0] for row in rows if row.interval and row.color != OTHER_COLOR)])
     for place, row in enumerate(rows):
         if row.value < left:
-            axes.annotate(f"◂ {row.value:.0f}", (left, place), color=row.color, fontsize=SMALL, va="center")
+            axes.annotate(f"◂ {row.value:.0f}", (left, place), color=row.color, fontsize=LETTER_POINTS, va="center")
         elif row.label:
             _point(axes, row, place, hollow=row.interval is None)
-    axes.set_yticks(range(len(rows)), [row.label or row.beside for row in rows], fontsize=SMALL)
+    axes.set_yticks(range(len(rows)), [row.label or row.beside for row in rows], fontsize=LETTER_POINTS)
     for text, row in zip(axes.get_yticklabels(), rows, strict=True):
         text.set_fontweight("normal" if row.label else "bold")
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlim(left - 0.05 * (most - left), None)
     axes.axvline(0, color="black", lw=0.6)
     titled(axes, "what each candidate brings", "held-out log p(y) gained [nats], 95 % interval")
-    kinds = {CHOSEN: "chosen", ALIKE: "cannot be told from it", OTHER: "other candidates"}
+    kinds = {CHOSEN_COLOR: "chosen", ALIAS_COLOR: "cannot be told from it", OTHER_COLOR: "other candidates"}
     for color in [color for color in kinds if any(row.label and row.color == color for row in rows)]:
         axes.plot([], [], "o", color=color, ms=5, label=kinds[color])
     if any(row.label and row.interval is None and row.value >= left for row in rows):
-        axes.plot([], [], "o", mfc="none", color=OTHER, ms=5, label="given up after half the drives")
+        axes.plot([], [], "o", mfc="none", color=OTHER_COLOR, ms=5, label="given up after half the drives")
     axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3)
 
 
@@ -111,9 +111,9 @@ def coefficients(found: Discovery, axes: Axes, rest: int = MAX_OTHERS) -> None:
     for place, row in enumerate(rows):
         _point(axes, row, place)
         axes.text(1.01, place, row.beside, transform=axes.get_yaxis_transform(), fontsize=7, va="center")
-    axes.axvspan(-1, 1, color=LIMIT, alpha=0.15, lw=0)
+    axes.axvspan(-1, 1, color=LIMIT_COLOR, alpha=0.15, lw=0)
     axes.axvline(0, color="black", lw=0.6)
-    axes.set_yticks(range(len(rows)), [row.label for row in rows], fontsize=SMALL)
+    axes.set_yticks(range(len(rows)), [row.label for row in rows], fontsize=LETTER_POINTS)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     if max((abs(row.value) for row in rows), default=0.0) > 8:
         axes.set_xscale("symlog", linthresh=1)
@@ -129,12 +129,12 @@ def tests(found: Discovery, axes: Axes) -> None:
     screened = found.search.rounds[0].screening.tests
     shown = [tested for tested in screened.tested if not tested.untestable]
     for place, tested in enumerate(shown):
-        color = CHOSEN if tested.p_value <= screened.critical else OTHER
+        color = CHOSEN_COLOR if tested.p_value <= screened.critical else OTHER_COLOR
         axes.plot(max(tested.p_value, 1e-16), place, "o", color=color, ms=4)
-    axes.axvline(screened.critical, color=CHOSEN, lw=1, ls="--", label="5 % level of the whole catalogue")
+    axes.axvline(screened.critical, color=CHOSEN_COLOR, lw=1, ls="--", label="5 % level of the whole catalogue")
     axes.set_xscale("log")
     axes.invert_xaxis()
-    axes.set_yticks(range(len(shown)), [_label(tested.variant) for tested in shown], fontsize=SMALL)
+    axes.set_yticks(range(len(shown)), [_label(tested.variant) for tested in shown], fontsize=LETTER_POINTS)
     axes.set_ylim(len(shown) - 0.4, -0.6)
     axes.legend(fontsize=7, loc="lower right")
     about = "p-value of each candidate alone; beyond the line something is missing"
@@ -149,15 +149,15 @@ def _groups(found: Discovery) -> list[Group]:
         return [Group("", candidates, [_label(search.curve.variant)] if search.curve else [], [])] if candidates else []
     ordered = sorted(search.found, key=lambda one: -one.candidate.total)
     chosen = [_label(one.candidate.variant) for one in ordered]
-    alike = [[_label(candidate.variant) for candidate in one.alike] for one in ordered]
+    aliases = [[_label(candidate.variant) for candidate in one.aliases] for one in ordered]
     if len(ordered) == 1:
-        return [Group("", _fitted(ordered[0].candidates), chosen, alike[0])]
+        return [Group("", _fitted(ordered[0].candidates), chosen, aliases[0])]
     alone = Group("each alone", _fitted(search.rounds[0].candidates), chosen, [])
     if all(len(one.candidates) == 1 for one in ordered):
         together = [candidate for one in ordered for candidate in _fitted(one.candidates)]
         return [alone, Group("each beside the others", together, chosen, [])]
     groups = []
-    for own, one, like in zip(chosen, ordered, alike, strict=True):
+    for own, one, like in zip(chosen, ordered, aliases, strict=True):
         others = [label for label in chosen if label != own]
         beside = others[0] if len(others) == 1 else f"the other {len(others)}"
         groups.append(Group(f"beside {beside}", _fitted(one.candidates), [own], like))
@@ -166,10 +166,10 @@ def _groups(found: Discovery) -> list[Group]:
 
 def _of_group(group: Group, seed: int) -> list[GainRow]:
     """A line for the heading, which has no label, and one for each candidate."""
-    rows = [GainRow("", 0.0, None, OTHER, group.heading)] if group.heading else []
+    rows = [GainRow("", 0.0, None, OTHER_COLOR, group.heading)] if group.heading else []
     for candidate in group.candidates:
         label = _label(candidate.variant)
-        color = CHOSEN if label in group.chosen else ALIKE if label in group.alike else OTHER
+        color = CHOSEN_COLOR if label in group.chosen else ALIAS_COLOR if label in group.aliases else OTHER_COLOR
         rows.append(GainRow(label, candidate.total, gain_interval(candidate, seed), color))
     return rows
 
@@ -192,13 +192,13 @@ def _of_finding(found: Discovery, finding: Finding) -> list[GainRow]:
     if first is None or not math.isfinite(absent):
         return []
     values, ends = np.array(finding.coefficient) - absent, np.array(finding.interval) - absent
-    return _in_limits(variant, values, ends, limit_of(found, first), CHOSEN)
+    return _in_limits(variant, values, ends, limit_of(found, first), CHOSEN_COLOR)
 
 
 def _of_test(tested: Tested) -> list[GainRow]:
     half = 1.645 * tested.sd
     ends = np.stack([tested.coefficient - half, tested.coefficient + half], -1)
-    return _in_limits(tested.variant, tested.coefficient, ends, tested.detection_limit, OTHER)
+    return _in_limits(tested.variant, tested.coefficient, ends, tested.detection_limit, OTHER_COLOR)
 
 
 def _in_limits(variant: Variant, values: np.ndarray, ends: np.ndarray, limits: np.ndarray, color: str) -> list[GainRow]:
@@ -252,9 +252,9 @@ def unknown_effect(found: Discovery, *, axes: Axes | None = None) -> Axes:
         axes.axvspan(low, high, color="0.92", lw=0)
     axes.plot([beyond[0], points[0]], [heights[0]] * 2, ":", color="0.4")
     axes.plot([points[-1], beyond[1]], [heights[-1]] * 2, ":", color="0.4", label="hardly visited")
-    axes.fill_between(points, heights - band, heights + band, color=CHOSEN, alpha=0.2, lw=0, label="90 % band")
-    axes.plot(points, heights, "o-", color=CHOSEN, ms=4, label="curve")
-    rug = np.random.default_rng(0).choice(values, min(len(values), TICKS), replace=False)
+    axes.fill_between(points, heights - band, heights + band, color=CHOSEN_COLOR, alpha=0.2, lw=0, label="90 % band")
+    axes.plot(points, heights, "o-", color=CHOSEN_COLOR, ms=4, label="curve")
+    rug = np.random.default_rng(0).choice(values, min(len(values), MAX_RUG_TICKS), replace=False)
     axes.plot(rug, np.full(len(rug), 0.015), "|", color="black", ms=6, alpha=0.3, transform=axes.get_xaxis_transform())
     axes.axhline(0, color="black", lw=0.6)
     times = f", times {shape.times}" if shape.times else ""
@@ -267,9 +267,9 @@ def unknown_effect(found: Discovery, *, axes: Axes | None = None) -> Axes:
 def titled(axes: Axes, title: str, about: str) -> Axes:
     """Title and axis in small letters."""
     axes.set_title(title, fontsize=9)
-    axes.set_xlabel(about, fontsize=SMALL)
-    axes.yaxis.label.set_fontsize(SMALL)
-    axes.tick_params(which="both", labelsize=SMALL)
+    axes.set_xlabel(about, fontsize=LETTER_POINTS)
+    axes.yaxis.label.set_fontsize(LETTER_POINTS)
+    axes.tick_params(which="both", labelsize=LETTER_POINTS)
     return axes
 
 

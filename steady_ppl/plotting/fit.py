@@ -22,7 +22,7 @@ from steady_ppl.utils.angles import nearest_turn
 if TYPE_CHECKING:
     import arviz
 
-BLUE, ORANGE, TRUTH = "#0072b2", "#d55e00", "black"  # Okabe and Ito
+BLUE, ORANGE, BLACK = "#0072b2", "#d55e00", "black"  # Okabe and Ito
 
 
 def posterior_trajectories(
@@ -52,7 +52,7 @@ def posterior_trajectories(
         first = label if index == 0 else None
         axes.plot(*(one.isel(draw=index) for one in draws), color=color, alpha=0.15, lw=0.8, label=first)
     if true is not None:
-        axes.plot(*true, color=TRUTH, lw=1.4, ls="--", label="truth")
+        axes.plot(*true, color=BLACK, lw=1.4, ls="--", label="truth")
     if len(landmarks):
         xs, ys = torch.as_tensor(landmarks).detach().cpu().unbind(-1)
         axes.plot(xs, ys, "^", color=ORANGE, ms=8, label="landmark", clip_on=True)
@@ -141,14 +141,14 @@ def forecast_band(
     axes.fill_between(time[there], low, high, color=color, alpha=0.25, lw=0, label="forecast, 90 %")
     axes.plot(time[there], median, color=color, lw=1.4, label="forecast, median")
     if name in found["observed_data"]:
-        axes.plot(time, found["observed_data"][name].sel(trajectory=trajectory), ".", color=TRUTH, ms=3, label="used")
+        axes.plot(time, found["observed_data"][name].sel(trajectory=trajectory), ".", color=BLACK, ms=3, label="used")
         after = later[name].sel(trajectory=trajectory).values[there]
         if np.isfinite(after).any():
             after = nearest_turn(after, median) if variables[name].attrs["circular"] else after
-            axes.plot(time[there], after, "x", color=TRUTH, ms=4, label="measured later")
+            axes.plot(time[there], after, "x", color=BLACK, ms=4, label="measured later")
     elif f"true_{of}" in found["constant_data"]:
         truth = found["constant_data"][f"true_{of}"].sel(trajectory=trajectory)
-        axes.plot(time, truth, "--", color=TRUTH, label="truth")
+        axes.plot(time, truth, "--", color=BLACK, label="truth")
     axes.set(xlabel="time [s]", ylabel=with_unit(of, variables[name]))
     axes.legend(fontsize=8)
     return axes
@@ -249,7 +249,7 @@ def _bands(
         one.fill_between(time, low, high, color=color, alpha=0.25, lw=0)
         one.plot(time, median, color=color, lw=1.4, label=label)
         if true is not None and not any(line.get_label() == "truth" for line in one.get_lines()):
-            one.plot(time, true[index], color=TRUTH, lw=1.2, ls="--", label="truth")
+            one.plot(time, true[index], color=BLACK, lw=1.2, ls="--", label="truth")
         one.set_ylabel(name)
     axes[-1].set_xlabel("time [s]")
     return axes

@@ -26,8 +26,8 @@ from steady_ppl.runs.fit import Fit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MAX_NUMBERS = 12  # numbers of a parameter that are shown one by one
-DOTS = 90  # an inch, of pictures
+MAX_NUMBERS_SHOWN = 12  # numbers of a parameter that are shown one by one
+DOTS_PER_INCH = 90  # an inch, of pictures
 SENTENCE, PARAGRAPH = Markup("<p><strong>{}</strong></p>"), Markup("<p>{}</p>")
 
 
@@ -76,7 +76,7 @@ def _(fit: Fit) -> str:
 def _of_result(verdict: Callable[[Any], str], picture: Callable[[Any], Figure], found: Any) -> str:
     """A verdict, its picture, and all figures as text to unfold."""
     file = io.BytesIO()
-    picture(found).savefig(file, format="png", dpi=DOTS)
+    picture(found).savefig(file, format="png", dpi=DOTS_PER_INCH)
     said, image = verdict(found), base64.b64encode(file.getvalue()).decode()
     return str(
         SENTENCE.format(said)
@@ -98,7 +98,7 @@ def parameter_rows(program: Program) -> list[tuple[str, str]]:
         value = attrgetter(name)(program)
         numbers = value.flatten().tolist()
         said = ", ".join(f"{number:.4g}" for number in numbers)
-        if len(numbers) > MAX_NUMBERS:
+        if len(numbers) > MAX_NUMBERS_SHOWN:
             said = f"{' × '.join(map(str, value.shape))} numbers from {min(numbers):.4g} to {max(numbers):.4g}"
         rows.append((name, said))
     return rows

@@ -11,16 +11,16 @@ from steady_ppl.criticism.residual_maps import Cell
 from steady_ppl.criticism.result import Check, place, subject
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.program import Program, names, units
-from steady_ppl.plotting.check import band, measured, strips
+from steady_ppl.plotting.check import band, measured_values, strips
 from steady_ppl.runs.fit import Fit
 from steady_ppl.runs.posterior import drawn_states
 from steady_ppl.utils.angles import nearest_turn
 
-MARGIN = 0.5  # s shown before and after a stretch
-LEVELS, MISSING = 65534, -32768  # codes of sixteen bits, which are finer than a screen
-MAX_NUMBERS = 300_000  # of all drives and runs: .8 MB of text
+MARGIN_SECONDS = 0.5  # shown before and after a stretch
+MAX_CODE, MISSING_CODE = 65534, -32768  # codes of sixteen bits, which are finer than a screen
+MAX_PACKED_NUMBERS = 300_000  # of all drives and runs: .8 MB of text
 QUANTILES = (0.05, 0.5, 0.95)
-PATHS = 8  # draws in the plane
+PATHS_SHOWN = 8  # draws in the plane
 DriveInterval = tuple[int, float, float]  # drive, and from when to when
 
 
@@ -71,7 +71,7 @@ def where_to_look(found: Check, cell: Cell) -> DriveInterval | None:
     start, end = cell.where["time"] if "time" in cell.where else _longest(there[:, drive], found, drive)
     if cell.map in ("all", "drive"):
         start, end = 0.0, float(found.data.elapsed[int(found.data.lengths[drive]) - 1, drive])
-    return drive, round(max(0.0, start - MARGIN), 3), round(end + MARGIN, 3)
+    return drive, round(max(0.0, start - MARGIN_SECONDS), 3), round(end + MARGIN_SECONDS, 3)
 
 
 def _rows(found: Check, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
@@ -105,8 +105,8 @@ def packed(values: Any) -> dict[str, Any]:
     values = np.asarray(values, float)
     known = np.isfinite(values)
     low, high = (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 0.0)
-    step = (high - low) / LEVELS or 1.0
-    codes = np.where(known, np.round((np.where(known, values, low) - low) / step) - LEVELS // 2, MISSING)
+    step = (high - low) / MAX_CODE or 1.0
+    codes = np.where(known, np.round((np.where(known, values, low) - low) / step) - MAX_CODE // 2, MISSING_CODE)
     text = base64.b64encode(codes.astype("<i2").tobytes()).decode()
     return {"shape": list(values.shape), "low": low, "step": step, "data": text}
 
@@ -134,7 +134,7 @@ class Shown:
         return packed(np.asarray(values)[:: self.every, self.drives].transpose(1, 2, 0))
 
 
-def chosen(checks: list[Check], numbers: int = MAX_NUMBERS) -> Shown:
+def chosen_drives(checks: list[Check], numbers: int = MAX_PACKED_NUMBERS) -> Shown:
     """As many drives as there is room for, those whose strips stand out most in any run first."""
     first = checks[0]
     rows, count = first.data.time.shape
@@ -149,10 +149,10 @@ def chosen(checks: list[Check], numbers: int = MAX_NUMBERS) -> Shown:
 def _columns(found: Check) -> int:
     """Numbers of a row of a drive that a run adds."""
     horizons, states = min(2, len(found.horizons)), len(found.program.state_names)
-    return 2 * horizons * len(found.residuals) + len(found.program.measurement_names) + 4 * states + 2 * PATHS
+    return 2 * horizons * len(found.residuals) + len(found.program.measurement_names) + 4 * states + 2 * PATHS_SHOWN
 
 
-def given(found: Check, shown: Shown) -> dict[str, Any]:
+def common_data(found: Check, shown: Shown) -> dict[str, Any]:
     """What is the same for every run: the time and the controls, of which a drive's last is followed by nothing."""
     data = found.data
     acting = torch.cat([data.transitions, torch.zeros_like(data.transitions[:1])])
@@ -165,7 +165,7 @@ def given(found: Check, shown: Shown) -> dict[str, Any]:
     }
 
 
-def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: int, seed: int) -> dict[str, Any]:
+def data_of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: int, seed: int) -> dict[str, Any]:
     """Measurements, predictions with their bands, quantiles of the posterior of the states given all measurements, the
     truth, where the table has it, and the maps of misfit; a run's components are its program's, in their order."""
     bands = {name: map(shown.of, band(found, name)) for name in ("one step", list(found.horizons)[-1])}
@@ -176,11 +176,11 @@ def of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, draws: 
     quantiles = np.stack(by_state, -1).swapaxes(1, 2)  # (3, rows, B, D)
     all_of_them = Shown(list(range(len(data))), shown.every, len(data))
     across = [states[i] for i in plane(found.program)]
-    paths = [posterior[name].values[0, draw].T for draw in range(min(PATHS, draws)) for name in across]
+    paths = [posterior[name].values[0, draw].T for draw in range(min(PATHS_SHOWN, draws)) for name in across]
     truth = _truth(found.program, table.subset(shown.drives), quantiles[1])
     return {
         "measurements": _components(found.program.measurements),
-        "measured": shown.of(measured(found)),
+        "measured": shown.of(measured_values(found)),
         "truth": None if truth is None else all_of_them.of(truth),
         "predictions": [{"ahead": name, "middle": middle, "half": half} for name, (middle, half) in bands.items()],
         "states": _components(found.program.states),

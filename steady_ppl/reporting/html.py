@@ -2,7 +2,6 @@
 
 import html
 import inspect
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -19,11 +18,10 @@ from plotly.offline import get_plotlyjs
 from steady_ppl.comparison.result import Proof
 from steady_ppl.criticism.result import Check, strongest
 from steady_ppl.effects import Effect, attached, written_class
-from steady_ppl.errors import ComputationError
 from steady_ppl.plotting.notebook import parameter_rows
 from steady_ppl.reporting.drives import Shown, where_to_look
 from steady_ppl.runs.fit import Fit, versions
-from steady_ppl.utils.files import whole_file
+from steady_ppl.utils.files import finite_json, whole_file
 
 SCRIPTS = ("page.js", "curves.js", "maps.js", "choosing.js")
 
@@ -133,10 +131,7 @@ def _asset(name: str) -> Markup:
 
 def _data(content: Mapping[str, Any]) -> Markup:
     """JSON that cannot end the element that holds it; ComputationError where a figure is not finite."""
-    try:
-        text = json.dumps(content, separators=(",", ":"), allow_nan=False)
-    except ValueError as error:
-        raise ComputationError("the page is not written: a figure is not finite, the program has blown up") from error
+    text = finite_json(content, "the page", separators=(",", ":"))
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
 
 

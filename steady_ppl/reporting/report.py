@@ -3,12 +3,12 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from steady_ppl.comparison.prove import prove, unfinished
+from steady_ppl.comparison.prove import prove, unconverged
 from steady_ppl.comparison.result import Proof
 from steady_ppl.criticism.check import check
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import SteadyError, UsageError
-from steady_ppl.reporting.drives import chosen, given, of_run
+from steady_ppl.reporting.drives import chosen_drives, common_data, data_of_run
 from steady_ppl.reporting.html import Report
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.cores import one_thread
@@ -60,11 +60,11 @@ def report(
         for label, fit in runs.items():
             begin()
             checks[label] = check(fit, data, simulations=simulations, seed=seed)
-        shown = chosen(list(checks.values()))
+        shown = chosen_drives(list(checks.values()))
         drawn = []
         for label, fit in runs.items():
             begin()
-            drawn.append({"label": label, **of_run(checks[label], fit, data, shown, draws=draws, seed=seed)})
+            drawn.append({"label": label, **data_of_run(checks[label], fit, data, shown, draws=draws, seed=seed)})
         begin()
         proof: Proof | str = "There is one run only: name the run before and the one after to compare them."
         if len(runs) > 1:
@@ -79,7 +79,7 @@ def report(
         proof=proof,
         discovery=discovery,
         shown=shown,
-        drives=given(next(iter(checks.values())), shown) | {"runs": drawn},
+        drives=common_data(next(iter(checks.values())), shown) | {"runs": drawn},
         how=list(how),
-        notes=[*notes, *unfinished(runs)],
+        notes=[*notes, *unconverged(runs)],
     )

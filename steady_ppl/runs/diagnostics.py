@@ -20,7 +20,7 @@ COLLAPSED = (
     "something else in the program explains too much; set it back in the program's file and fit again before anything "
     "is tested"
 )
-TURNS = 5 * math.pi  # rad; beyond it a reading on a circle looks like degrees
+MAX_RADIANS = 5 * math.pi  # rad; beyond it a reading on a circle looks like degrees
 
 
 def diagnose_fit(fit: Fit, declared: Mapping[str, Tensor]) -> list[str]:
@@ -70,7 +70,7 @@ def diagnose_units(program: Program, data: Trajectories) -> list[str]:
 
 
 def _degrees(column: str, unit: str, seen: Tensor) -> list[str]:
-    if not len(seen) or not TURNS < float(seen.abs().max()) <= 360:
+    if not len(seen) or not MAX_RADIANS < float(seen.abs().max()) <= 360:
         return []
     between = f"{float(seen.min()):.4g} and {float(seen.max()):.4g}"
     read = "radians" if unit == "rad" else "radians a second"

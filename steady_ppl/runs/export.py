@@ -11,7 +11,7 @@ from steady_ppl.model.handlers import AtMean, broadcast_shapes, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting, advance
 
-PROBED, PUSHES = 200, (1e-3, 1.0, -1e3)  # rows and sizes of a command that is looked for in what acts later
+IMPULSE_ROWS, IMPULSE_SIZES = 200, (1e-3, 1.0, -1e3)  # rows and sizes of a command that is sought in what acts later
 
 
 class Dynamics(nn.Module):
@@ -45,9 +45,9 @@ class Dynamics(nn.Module):
         if type(self.program).actuators is Program.actuators:
             return False
         like = next(self.program.parameters(), torch.zeros(()))
-        elapsed = self.step * torch.arange(PROBED, dtype=like.dtype, device=like.device)[:, None]
-        still = like.new_zeros(PROBED, 1, len(self.control_names))
-        for size in PUSHES:
+        elapsed = self.step * torch.arange(IMPULSE_ROWS, dtype=like.dtype, device=like.device)[:, None]
+        still = like.new_zeros(IMPULSE_ROWS, 1, len(self.control_names))
+        for size in IMPULSE_SIZES:
             once = still.clone()
             once[0] = size
             if not torch.equal(self.program.actuators(once, elapsed)[1:], self.program.actuators(still, elapsed)[1:]):

@@ -22,11 +22,11 @@ from steady_ppl.model.loading import load_program
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import is_count
 from steady_ppl.runs.export import Dynamics
-from steady_ppl.runs.folder import FINISHED, PARAMETERS, POSTERIOR, RECORD, read_record, run_folder, write_record
+from steady_ppl.runs.folder import FINISHED, PARAMETERS, POSTERIOR, RUN_RECORD, read_record, run_folder, write_record
 from steady_ppl.training.loop import Trained
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.files import whole_file
-from steady_ppl.utils.late import Displayed
+from steady_ppl.utils.hooks import Displayed
 from steady_ppl.utils.tensor_files import read_tensors, write_tensors
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ class Fit(Displayed):
         effects.restore(program, record.get("effects", []))
         substeps = record.get("substeps", 1)
         if not is_count(substeps):
-            raise RunError(f"{folder / RECORD} is damaged: {substeps} substeps a row")
+            raise RunError(f"{folder / RUN_RECORD} is damaged: {substeps} substeps a row")
         program.substeps = substeps
         tensors, _ = read_tensors(folder / PARAMETERS)
         expected = {(name, value.shape) for name, value in program.state_dict().items()}
@@ -199,10 +199,10 @@ def _load_recorded(folder: Path, source: dict[str, str] | None, moved: str | Pat
         if not class_name.isidentifier():
             raise ValueError(class_name)
     except (ValueError, OSError) as error:
-        raise RunError(f"{folder / RECORD} is damaged: it does not say which program it is of") from error
+        raise RunError(f"{folder / RUN_RECORD} is damaged: it does not say which program it is of") from error
     if not file.is_file():
         raise RunError(f"{folder}: its program {name} is gone: name it with --program PATH")
-    if any((place / RECORD).exists() for place in file.parents):
+    if any((place / RUN_RECORD).exists() for place in file.parents):
         raise RunError(
             f"{folder}: its program {name} came with a run, and nothing that comes with one is executed: read it, and "
             "name it with --program PATH"
@@ -228,3 +228,8 @@ def packages() -> dict[str, str]:
         except PackageNotFoundError:
             found[package] = "not installed as a package"
     return found
+
+
+def packages_text() -> str:
+    """Packages and their versions."""
+    return ", ".join(f"{name} {number}" for name, number in packages().items())

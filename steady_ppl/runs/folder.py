@@ -13,57 +13,57 @@ from filelock import FileLock, Timeout
 from steady_ppl.errors import RunError
 from steady_ppl.utils import schema
 from steady_ppl.utils.files import read_json, require_file, whole_file
-from steady_ppl.utils.schema import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, Paired, count, mismatch
+from steady_ppl.utils.schema import ANYTHING, BOOL, LINES, NUMBER, TEXT, WHOLE, Paired, count, mismatch
 from steady_ppl.utils.tensor_files import read_tensors
 from steady_ppl.utils.text import command_line
 
-PARAMETERS, RECORD, POSTERIOR = "parameters.safetensors", "run.json", "posterior.nc"
+PARAMETERS, RUN_RECORD, POSTERIOR = "parameters.safetensors", "run.json", "posterior.nc"
 CHECKPOINT, DISCOVERY = "checkpoint.safetensors", "discovery.json"
-FILES = (PARAMETERS, RECORD, POSTERIOR, CHECKPOINT, DISCOVERY)
+FILES = (PARAMETERS, RUN_RECORD, POSTERIOR, CHECKPOINT, DISCOVERY)
 BACKUP, LOCK, JOURNAL = "previous", ".lock", "journal"
 
-FORMAT = 1
+RUN_FORMAT = 1  # number of the record's format
 FINISHED = ("finished", "interrupted")  # what the record of a run that can be used says
-BEGUN_RECORD = {
+BEGUN_RECORD_FORM = {
     "format?": WHOLE,
     "program": ({"class": TEXT, "file": TEXT, "sha256": TEXT}, None),
     "recipe": TEXT,
     "status": TEXT,
     "command?": (TEXT, None),
 }
-FINISHED_RECORD = {
+FINISHED_RECORD_FORM = {
     "effects?": LINES,
     "substeps?": WHOLE,
-    "known_start": TRUTH,
+    "known_start": BOOL,
     "seed": WHOLE,
     "settings": {str: ANYTHING},
     "kept_step": (WHOLE, None),
     "history": [{str: ANYTHING}],
     "notes": LINES,
 }
-PAIR, NUMBERS = [NUMBER, NUMBER], (NUMBER, [(NUMBER, None)], None)
-CANDIDATE = {
+PAIR_FORM, NUMBERS_FORM = [NUMBER, NUMBER], (NUMBER, [(NUMBER, None)], None)
+CANDIDATE_FORM = {
     **dict.fromkeys(("effect", "kind", "unit"), TEXT),
     **dict.fromkeys(("p_value", "absent", "heldout_gain"), (NUMBER, None)),
-    **dict.fromkeys(("coefficient", "sd", "detection_limit"), NUMBERS),
-    "heldout_gain_ci": (PAIR, None),
+    **dict.fromkeys(("coefficient", "sd", "detection_limit"), NUMBERS_FORM),
+    "heldout_gain_ci": (PAIR_FORM, None),
     "note": (TEXT, None),
 }
-EFFECT = {
+EFFECT_FORM = {
     **dict.fromkeys(("effect", "text", "unit"), TEXT),
     **dict.fromkeys(("confidence", "heldout_gain"), (NUMBER, None)),
     "class": LINES,
     "coefficient": [NUMBER],
-    "interval_90": [PAIR],
+    "interval_90": [PAIR_FORM],
 }
-SHAPE = {"channel": TEXT, "variable": TEXT, "points": [NUMBER], "curve": [NUMBER], "band": [NUMBER]}
-FOUND = {
+SHAPE_FORM = {"channel": TEXT, "variable": TEXT, "points": [NUMBER], "curve": [NUMBER], "band": [NUMBER]}
+DISCOVERY_FORM = {
     "source?": TEXT,
     "sentence": TEXT,
-    "complete?": TRUTH,
-    "candidates": [Paired(CANDIDATE, ("coefficient", "sd"))],
-    "effects": [Paired(EFFECT, ("coefficient", "interval_90"))],
-    "shape": (Paired(SHAPE, ("points", "curve", "band")), None),
+    "complete?": BOOL,
+    "candidates": [Paired(CANDIDATE_FORM, ("coefficient", "sd"))],
+    "effects": [Paired(EFFECT_FORM, ("coefficient", "interval_90"))],
+    "shape": (Paired(SHAPE_FORM, ("points", "curve", "band")), None),
     "doubts": LINES,
     "notes": LINES,
     "next_run": ({"between": LINES, "way": TEXT, "separation": NUMBER, "usual": NUMBER}, None),
@@ -89,17 +89,17 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
         raise RunError(f"{folder} has no {CHECKPOINT} to resume from, nor the {JOURNAL} of a search")
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
-        with only_writer(folder):
+        with exclusive_writer(folder):
             for name in (BACKUP, JOURNAL):
                 if (folder / name).is_symlink():  # out of the run, to files that are somebody else's to remove
                     raise RunError(f"{folder}: {name} in it is a link: remove the link, or choose another folder")
             if not resume:
-                _put_aside(folder)
+                _back_up(folder)
             try:
                 yield folder
             except BaseException:
                 if not resume:
-                    _clean_up(folder)
+                    _roll_back(folder)
                 raise
             if (folder / BACKUP).is_dir():
                 _remove(folder / BACKUP)
@@ -111,7 +111,7 @@ def run_folder(folder: str | Path, *, force: bool = False, resume: bool = False)
 
 
 @contextmanager
-def only_writer(folder: Path) -> Iterator[None]:
+def exclusive_writer(folder: Path) -> Iterator[None]:
     """Make a folder and keep other processes from writing to it. The lock is the process's own: it ends with it,
     however it ends."""
     lock = FileLock(folder / LOCK)
@@ -129,7 +129,7 @@ def only_writer(folder: Path) -> Iterator[None]:
         lock.release()
 
 
-def _put_aside(folder: Path) -> None:
+def _back_up(folder: Path) -> None:
     aside = folder / BACKUP
     if aside.is_dir():  # of an overwriting fit that was killed: it, not what that fit left, is the finished run
         _remove(folder)
@@ -147,7 +147,7 @@ def _put_aside(folder: Path) -> None:
         raise RunError(f"{folder} cannot be written: {error.strerror}") from error
 
 
-def _clean_up(folder: Path) -> None:
+def _roll_back(folder: Path) -> None:
     """Undo what a failed block wrote."""
     aside, checkpoint = folder / BACKUP, folder / CHECKPOINT
     if not aside.is_dir():
@@ -172,8 +172,8 @@ def _remove(folder: Path, files: Sequence[str] = FILES) -> None:
 
 def write_record(folder: Path, record: dict[str, Any]) -> None:
     """Write `run.json`, whole or not at all."""
-    with whole_file(folder / RECORD, RunError) as beside:
-        beside.write_text(json.dumps({"format": FORMAT, "command": command_line(), **record}, indent=1) + "\n")
+    with whole_file(folder / RUN_RECORD, RunError) as beside:
+        beside.write_text(json.dumps({"format": RUN_FORMAT, "command": command_line(), **record}, indent=1) + "\n")
 
 
 def require_same(folder: Path, begun: Mapping[str, Any]) -> None:
@@ -195,9 +195,9 @@ def require_same(folder: Path, begun: Mapping[str, Any]) -> None:
 
 def read_record(folder: Path) -> dict[str, Any]:
     """Read `run.json`; RunError where there is none, it is damaged, or a newer steady-ppl wrote it."""
-    record = schema.read_record(folder / RECORD, BEGUN_RECORD, FORMAT, "a run")
-    if record["status"] in FINISHED and (problem := mismatch(record, FINISHED_RECORD)):
-        raise RunError(f"{folder / RECORD} is damaged: {problem}")
+    record = schema.read_record(folder / RUN_RECORD, BEGUN_RECORD_FORM, RUN_FORMAT, "a run")
+    if record["status"] in FINISHED and (problem := mismatch(record, FINISHED_RECORD_FORM)):
+        raise RunError(f"{folder / RUN_RECORD} is damaged: {problem}")
     return record
 
 
@@ -208,12 +208,12 @@ def read_discovery(source: Path) -> dict[str, Any] | None:
     if not file.is_file():
         return None
     found = read_json(file, RunError)
-    if problem := mismatch(found, FOUND) or _unlike(found):
+    if problem := mismatch(found, DISCOVERY_FORM) or _inconsistency(found):
         raise RunError(f"{file} is not what `steady discover` writes: {problem}")
     return found
 
 
-def _unlike(found: Mapping[str, Any]) -> str | None:
+def _inconsistency(found: Mapping[str, Any]) -> str | None:
     """A candidate that was chosen and has another number of coefficients alone than together with the others."""
     chosen = {one["effect"]: len(one["coefficient"]) for one in found["effects"]}
     for i, one in enumerate(found["candidates"]):

@@ -36,7 +36,7 @@ DIMENSIONS = ("chain", "draw", *OF_ROW)
 Groups = Mapping[str, xarray.Dataset]
 """Those of ArviZ's InferenceData, which is such a mapping itself."""
 INTERVAL_QUANTILES = (0.05, 0.95)
-SUFFIXES = (".csv", ".parquet", ".nc")
+STATES_SUFFIXES = (".csv", ".parquet", ".nc")
 
 
 def posterior(program: Program, data: Trajectories, **settings: Any) -> arviz.InferenceData:
@@ -114,7 +114,7 @@ def drawn_states(
     about = {"program": type(program).__name__, "particles": choice.particles, "filter": choice.name}
     return {
         "posterior": xarray.Dataset(variables, coordinates, about),
-        "sample_stats": _dataset(_health(run, torch.cat(sizes, 1), torch.cat(roots)), coordinates, ("chain", *OF_ROW)),
+        "sample_stats": _dataset(_stats(run, torch.cat(sizes, 1), torch.cat(roots)), coordinates, ("chain", *OF_ROW)),
         "observed_data": _dataset(observed, coordinates, OF_ROW),
         "constant_data": _dataset(_constants(program, run, torch.cat(evidence)), coordinates, OF_ROW),
     }
@@ -146,7 +146,7 @@ def _dataset(variables: Mapping[str, tuple], coordinates: Mapping, names: Sequen
     return xarray.Dataset(variables, {name: coordinates[name] for name in names})
 
 
-def _health(data: Trajectories, sizes: Tensor, roots: Tensor) -> dict[str, tuple]:
+def _stats(data: Trajectories, sizes: Tensor, roots: Tensor) -> dict[str, tuple]:
     """Of the filter, over the one chain."""
     inside = torch.where(data.rows, sizes.to(torch.float64), torch.nan).t().numpy(force=True)
     return {
@@ -186,8 +186,8 @@ def states_frame(posterior: Groups) -> pd.DataFrame:
 
 def require_states_file(path: Path) -> None:
     """Raise UsageError for another suffix than those of a table or of netCDF."""
-    if path.suffix.lower() not in SUFFIXES:
-        raise UsageError(f"{path}: states are written as {', '.join(SUFFIXES)}")
+    if path.suffix.lower() not in STATES_SUFFIXES:
+        raise UsageError(f"{path}: states are written as {', '.join(STATES_SUFFIXES)}")
 
 
 def write_states(posterior: Groups, path: Path) -> None:

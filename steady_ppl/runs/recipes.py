@@ -12,7 +12,7 @@ import torch
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, require
 from steady_ppl.gaussian.linearize import why_not_linear
-from steady_ppl.likelihood.parameters import MAX_PARAMETERS
+from steady_ppl.likelihood.parameters import MAX_LEARNABLE_NUMBERS
 from steady_ppl.model.loading import program_file, run_file
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, for_program
@@ -24,7 +24,7 @@ from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.tensor_files import read_tensors
 
 Recipe = Callable[..., Fit]
-KINDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a word", "None": "none"}
+SETTING_TYPES = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a word", "None": "none"}
 
 
 def recipe_folder() -> Path:
@@ -68,9 +68,9 @@ def require_settings(name: str, recipe: Callable[..., Any], options: Mapping[str
         annotation = inspect.formatannotation(settings[option].annotation)
         kinds = annotation.strip("'").split(" | ")  # by name: a recipe's annotations may not be there to be evaluated
         given = "None" if value is None else type(value).__name__
-        if all(kind in KINDS for kind in kinds):
+        if all(kind in SETTING_TYPES for kind in kinds):
             fits = given in kinds or (given == "int" and "float" in kinds)
-            require(fits, option, repr(value), " or ".join(KINDS[kind] for kind in kinds))
+            require(fits, option, repr(value), " or ".join(SETTING_TYPES[kind] for kind in kinds))
 
 
 def trains(recipe: Recipe) -> bool:
@@ -94,8 +94,8 @@ def suited_recipe(
     if device != "cpu":
         return "steady", f"it computes on {device}"
     count = sum(value.numel() for value in program.parameters() if value.requires_grad)
-    if not 0 < count <= MAX_PARAMETERS:
-        return "steady", f"{count} learnable numbers, where likelihood takes 1 to {MAX_PARAMETERS}"
+    if not 0 < count <= MAX_LEARNABLE_NUMBERS:
+        return "steady", f"{count} learnable numbers, where likelihood takes 1 to {MAX_LEARNABLE_NUMBERS}"
     problem = Problem.of_table(program, table, known_start)
     why = why_not_linear(program, problem.data, known_start=known_start)
     if why is not None:

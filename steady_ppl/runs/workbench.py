@@ -12,8 +12,8 @@ from steady_ppl.utils.progress import stages
 
 FOLDERS = ("models", "inference", "notebooks", "studies")
 LEFT_OUT = {"__pycache__", ".ipynb_checkpoints"}
-DRIVES = {"train": 16, "valid": 16, "test": 32}
-TRUTH = "models/hovercraft.py:HovercraftTruth"
+DRIVES_OF_TABLE = {"train": 16, "valid": 16, "test": 32}
+TRUE_PROGRAM = "models/hovercraft.py:HovercraftTruth"
 
 
 def workbench() -> Path:
@@ -39,7 +39,7 @@ def make_workbench(folder: Path) -> list[Path]:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder} exists and is not empty: choose another folder")
     bench = workbench()
-    with empty_again(folder):
+    with cleared_on_failure(folder):
         for file in sorted(file for room in FOLDERS for file in (bench / room).rglob("*") if file.is_file()):
             place = file.relative_to(bench)
             if not LEFT_OUT & {*place.parts}:
@@ -49,7 +49,7 @@ def make_workbench(folder: Path) -> list[Path]:
 
 
 @contextmanager
-def empty_again(folder: Path) -> Iterator[None]:
+def cleared_on_failure(folder: Path) -> Iterator[None]:
     """Make a folder for the block that fills it. If it fails, what is in the folder is removed where that was missing
     or empty before, with the folders that were made for it. UsageError: something in it cannot be written."""
     made = [place for place in (folder, *folder.parents) if not place.exists()]
@@ -76,10 +76,10 @@ def _simulate_tables(folder: Path) -> list[Path]:
     from steady_ppl.model.loading import load_program
     from steady_ppl.smc.simulate import simulate
 
-    program = load_program(str(folder / TRUTH))
+    program = load_program(str(folder / TRUE_PROGRAM))
     tables = []
-    with stages(*((f"simulating {name}", count) for name, count in DRIVES.items())) as begin:
-        for seed, (name, count) in enumerate(DRIVES.items(), 1):
+    with stages(*((f"simulating {name}", count) for name, count in DRIVES_OF_TABLE.items())) as begin:
+        for seed, (name, count) in enumerate(DRIVES_OF_TABLE.items(), 1):
             begin()
             drives = simulate(program, count, seed=seed)
             tables.append(folder / f"{name}.csv")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.kernels.codegen import LANES
+from steady_ppl.kernels.codegen import SIMD_LANES
 from steady_ppl.kernels.graph import NotCompilable
 from steady_ppl.kernels.jit import Method, close, compiled, discard
 from steady_ppl.model.handlers import Observing, Recording, Standardised, running
@@ -57,8 +57,8 @@ class Stepping:
         return recording.total().squeeze(-2)
 
 
-FILTER = "filter"  # the name of what is compiled for it
-BLOCK = 2**22  # bytes of memory for rows' results, asked for at a time
+FILTER_KERNELS = "filter"  # the name of what is compiled for it
+BLOCK_BYTES = 2**22  # bytes of memory for rows' results, asked for at a time
 
 
 def stepping_for(plain: Stepping, state: Tensor) -> tuple[Stepping, str | None]:
@@ -68,14 +68,14 @@ def stepping_for(plain: Stepping, state: Tensor) -> tuple[Stepping, str | None]:
     """
     if state.device.type != "cpu" or state.dtype != torch.float32:
         return plain, f"{str(state.dtype).removeprefix('torch.')} on {state.device.type}"
-    if state.shape[0] < LANES:
-        return plain, f"fewer than {LANES} particles"
-    methods = compiled(plain.program, FILTER, lambda: _Methods(plain, state))
+    if state.shape[0] < SIMD_LANES:
+        return plain, f"fewer than {SIMD_LANES} particles"
+    methods = compiled(plain.program, FILTER_KERNELS, lambda: _Methods(plain, state))
     if isinstance(methods, str):
         return plain, methods
     stepping = CompiledStepping(methods, plain)
-    if not stepping.agrees(state[:LANES]):
-        return plain, discard(plain.program, FILTER)
+    if not stepping.agrees(state[:SIMD_LANES]):
+        return plain, discard(plain.program, FILTER_KERNELS)
     return stepping, None
 
 
@@ -151,7 +151,7 @@ class CompiledStepping(Stepping):
         of the filter's time; these blocks are used again. A row that is kept keeps its block, at most 4 MiB.
         """
         if not self._rows or self._rows[-1].shape != shape:
-            rows = max(1, min(len(self.moved), BLOCK // (4 * math.prod(shape))))
+            rows = max(1, min(len(self.moved), BLOCK_BYTES // (4 * math.prod(shape))))
             self._rows = list(torch.from_numpy(np.empty((rows, *shape), np.float32)))
         return self._rows.pop()
 

@@ -23,17 +23,16 @@ from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoo
 
 from steady_ppl.errors import ComputationError, UsageError
 from steady_ppl.runs.fit import packages
-from steady_ppl.studies.job import CHANGED, Job, JobFiles, differing, digest_of, run
+from steady_ppl.studies.job import OUTDATED, Job, JobFiles, differing_versions, digest_of, run
 from steady_ppl.utils.cores import ONE_THREAD
-from steady_ppl.utils.text import one_line, shown
+from steady_ppl.utils.text import Say, one_line, shown
 
 ResultRow = dict[str, Any]
-Say = Callable[[str], None]
 
-WORKER_WAIT = 30  # s for the first worker, and between looks at whether there still is one
+WORKER_WAIT_SECONDS = 30  # for the first worker, and between looks at whether there still is one
 MAX_UNLOADED = 3  # processes in a row that die while they load, after which no other is started
-TRIES = 3  # of a job whose workers die; the scheduler itself tries it so often as it is set, four times at first
-HOLD, LONGEST_HOLD = 10, 60  # s for which a worker that is not used holds what it is given, or it would get it all
+MAX_TRIES = 3  # of a job whose workers die; the scheduler itself tries it so often as it is set, four times at first
+HOLD_SECONDS, MAX_HOLD_SECONDS = 10, 60  # that a worker which is not used holds what it is given, or it would get all
 MIN_REFUSED_JOBS = 4  # jobs whose files are others, at which a worker has been refused if its files alone are
 MAX_LOST_JOBS = 10  # jobs that Dask gives up while nothing is begun
 
@@ -53,7 +52,7 @@ class Executor(AbstractContextManager):
         raise NotImplementedError
 
 
-def given_up(job: Job) -> ResultRow:
+def failed_row(job: Job) -> ResultRow:
     """The row of a job that kills its workers."""
     return job.columns | {"outcome": "failed", "reason": "its worker died each time that it was tried"}
 
@@ -71,11 +70,11 @@ class Local(Executor):
         with warnings.catch_warnings():
             # loky replaces a process that has grown, and says so where it is given its next job
             warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
-            for workers in (*[self.workers] * (TRIES - 1), 1):
+            for workers in (*[self.workers] * (MAX_TRIES - 1), 1):
                 died: list[Job] = []
                 yield from _rows(left, min(workers, len(left)), died, say)
                 left = died
-        yield from map(given_up, left)
+        yield from map(failed_row, left)
 
 
 class _Process:
@@ -160,8 +159,8 @@ class Cluster(Executor):
             if name.partition(".")[0] in ("distributed", "tornado", "asyncio"):  # a lost connection is said in one line
                 logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         try:
-            self.client.wait_for_workers(1, timeout=WORKER_WAIT)
-            self._require_alike(address)
+            self.client.wait_for_workers(1, timeout=WORKER_WAIT_SECONDS)
+            self._require_same_versions(address)
         except (TimeoutError, UsageError) as error:
             self.client.close()
             if isinstance(error, UsageError):
@@ -171,7 +170,7 @@ class Cluster(Executor):
     def __exit__(self, *raised: Any) -> None:
         self.client.close(timeout=2)
 
-    def _require_alike(self, address: str) -> None:
+    def _require_same_versions(self, address: str) -> None:
         if several := [name for name, worker in self._workers().items() if worker["nthreads"] > 1]:
             raise UsageError(
                 f"workers with several threads, which would take turns: {shown(', '.join(several), 200)}; start them "
@@ -179,7 +178,7 @@ class Cluster(Executor):
             )
         here = packages()
         for worker, there in self._ask(packages).items():
-            if other := differing(here, there):
+            if other := differing_versions(here, there):
                 raise UsageError(f"the worker {worker} has {other}: results would not be comparable")
 
     def _workers(self) -> dict[str, Any]:
@@ -214,7 +213,7 @@ class Cluster(Executor):
                             yield row
                     elif isinstance(answer, tuple) and isinstance(answer[1], self.killed):
                         if sent.attempts.killed(job.key):
-                            yield given_up(job)
+                            yield failed_row(job)
                         else:
                             sent.send(job)
                     elif isinstance(answer, tuple):
@@ -228,7 +227,7 @@ class Cluster(Executor):
         """What has ended, with a line when there is no worker left to end anything."""
         while not sent.running.has_ready():
             time.sleep(0.05)
-            if time.monotonic() - self.looked > WORKER_WAIT:
+            if time.monotonic() - self.looked > WORKER_WAIT_SECONDS:
                 alone = not self._workers().keys() - sent.refused
                 if alone and not self.deserted:
                     say("the cluster has no worker left: start some, or stop this and go on later")
@@ -238,7 +237,7 @@ class Cluster(Executor):
     def _usable(self, answer: Answer, job: Job, sent: _Sent, say: Say) -> ResultRow | None:
         """Its row; None, and the job is sent again, where the worker is unlike this machine."""
         reason = answer.unlike
-        if answer.row.get("reason") == CHANGED and JobFiles().is_of(job):
+        if answer.row.get("reason") == OUTDATED and JobFiles().is_of(job):
             reason = "other files than there are here"
             sent.attempts.begun[job.key] -= 1  # only its files were looked at
         if not reason:
@@ -246,7 +245,7 @@ class Cluster(Executor):
         if answer.worker not in sent.refused:
             say(f"the worker {answer.worker} is not used: it has {reason}")
             sent.refused.add(answer.worker)
-            self.client.run(hold, sent.topic, workers=[answer.worker], on_error="ignore")
+            self.client.run(mark_unused, sent.topic, workers=[answer.worker], on_error="ignore")
         others = list(self._workers().keys() - sent.refused)  # rather than these; others still may take it from them
         sent.send(job, **({"workers": others, "allow_other_workers": True} if others else {}))
         return None
@@ -269,11 +268,11 @@ class _Sent:
         self.client, self.topic, self.here = client, f"steady-study-{uuid.uuid4().hex}", packages()
         self.jobs, self.attempts, self.refused = dict[Any, Job](), Attempts(), set[str]()
         self.running = as_completed(loop=client.loop, with_results=True, raise_errors=False)
-        client.subscribe_topic(self.topic, lambda event: self.attempts.hear(event[1]))
+        client.subscribe_topic(self.topic, lambda event: self.attempts.note_begun(event[1]))
 
     def send(self, job: Job, **where: Any) -> None:
         self.attempts.sent(job.key)  # before it can be begun
-        future = self.client.submit(computed, job, self.here, self.topic, pure=False, **where)
+        future = self.client.submit(compute_on_worker, job, self.here, self.topic, pure=False, **where)
         self.jobs[future] = job
         self.running.add(future)
 
@@ -283,54 +282,54 @@ class Attempts:
 
     def __init__(self) -> None:
         self.begun = Counter[str]()  # how often each job was, by its key
-        self.before, self.in_vain = dict[str, int](), 0
+        self.before, self.lost_in_a_row = dict[str, int](), 0
 
     def sent(self, key: str) -> None:
         """It is given to the scheduler."""
         self.before[key] = self.begun[key]
 
-    def hear(self, key: str) -> None:
+    def note_begun(self, key: str) -> None:
         """It is begun."""
         self.begun[key] += 1
-        self.in_vain = 0
+        self.lost_in_a_row = 0
 
     def killed(self, key: str) -> bool:
         """Dask has given it up: whether it has been begun so often that it is the one that kills. ComputationError
         where Dask gives up one after the other, and nothing is begun."""
-        self.in_vain = 0 if self.begun[key] > self.before[key] else self.in_vain + 1
-        if self.in_vain > MAX_LOST_JOBS:
+        self.lost_in_a_row = 0 if self.begun[key] > self.before[key] else self.lost_in_a_row + 1
+        if self.lost_in_a_row > MAX_LOST_JOBS:
             raise ComputationError("workers die before they begin")
-        return self.begun[key] >= TRIES
+        return self.begun[key] >= MAX_TRIES
 
 
 _changed = Counter[str]()  # on a worker: jobs whose files were others there, by topic
 _held = Counter[str]()  # on a worker that is not used: how often it has held what it was given, by topic
 
 
-def hold(topic: str) -> None:
+def mark_unused(topic: str) -> None:
     """On a worker: it is not used."""
     _held[topic] += 1
 
 
-def computed(job: Job, here: Mapping[str, str], topic: str) -> Answer:
+def compute_on_worker(job: Job, here: Mapping[str, str], topic: str) -> Answer:
     """On a worker: the row of a job, unless the worker has other packages than `here`, where it is asked. An event of
     the topic says that the job is begun."""
     from distributed import get_worker
 
     worker = get_worker()
-    unlike = differing(here, packages())
+    unlike = differing_versions(here, packages())
     if worker.state.nthreads > 1:
         unlike = f"{worker.state.nthreads} threads, which would take turns"
     if unlike or topic in _held:
-        time.sleep(min(HOLD * 2.0 ** _held[topic], LONGEST_HOLD))
-        hold(topic)
+        time.sleep(min(HOLD_SECONDS * 2.0 ** _held[topic], MAX_HOLD_SECONDS))
+        mark_unused(topic)
         return Answer(worker.address, unlike or "been refused", {})
     worker.log_event(topic, job.key)
     row = run(job)
-    if row.get("reason") == CHANGED:
+    if row.get("reason") == OUTDATED:
         _changed[topic] += 1
         if 1 < _changed[topic] <= MIN_REFUSED_JOBS:  # it would get everything before it is refused
-            time.sleep(HOLD)
+            time.sleep(HOLD_SECONDS)
     return Answer(worker.address, "", row)
 
 

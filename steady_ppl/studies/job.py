@@ -32,7 +32,7 @@ from steady_ppl.errors import DataError, RunError, UsageError
 from steady_ppl.likelihood.evidence import choose_filter, log_likelihood
 from steady_ppl.model.loading import load_program, program_file
 from steady_ppl.model.program import Program, for_program
-from steady_ppl.runs.fit import Fit, packages, sha256
+from steady_ppl.runs.fit import Fit, packages_text, sha256
 from steady_ppl.runs.recipes import find_recipe, recipe_file, require_settings, trains
 from steady_ppl.smc.simulate import simulate
 from steady_ppl.utils.cores import one_core, one_thread
@@ -41,10 +41,10 @@ from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import one_line
 
 PARTS = ("train", "valid", "test")
-LOGS = ("vrpn-pose.csv", "vesc_drive.csv")
-TABLES = (".csv", ".parquet")
+LOG_FILES = ("vrpn-pose.csv", "vesc_drive.csv")
+TABLE_SUFFIXES = (".csv", ".parquet")
 ERRORS = ("forward", "forward_mean", "state_estimation")
-CHANGED = "its program, recipe or table is not what it was when the study was begun: the same command tries it again"
+OUTDATED = "its program, recipe or table is not what it was when the study was begun: the same command tries it again"
 HELD_OUT = "valid_log_likelihood"  # of validation drives
 IN_LIMITS = "in_limits"  # how large what is missing is, in detection limits
 FIGURES = {
@@ -162,9 +162,9 @@ def _data_files(data: Mapping[str, Any]) -> list[Path]:
     """The tables or logs of a job that are there; none where its drives are simulated."""
     files: list[Path] = []
     if "tables" in data:
-        files = [Path(data["tables"]) / f"{part}{ending}" for part in PARTS for ending in TABLES]
+        files = [Path(data["tables"]) / f"{part}{ending}" for part in PARTS for ending in TABLE_SUFFIXES]
     if "alpha_truck" in data:
-        files = [Path(data["alpha_truck"]) / part / log for part in PARTS for log in LOGS]
+        files = [Path(data["alpha_truck"]) / part / log for part in PARTS for log in LOG_FILES]
     return [file for file in files if file.exists()]
 
 
@@ -204,20 +204,20 @@ def run(job: Job) -> dict[str, Any]:
     """
     with _one_at_a_time, one_thread(), one_core():
         began = time.perf_counter()
-        _forget_peak()
+        _reset_peak_memory()
         try:
             # files change while a study goes on, and may be others on another machine
             if JobFiles().is_of(job):
                 found = {"outcome": "done", **TASKS[job.task](job)}
             else:
-                found = {"outcome": "failed", "reason": CHANGED}
+                found = {"outcome": "failed", "reason": OUTDATED}
         except (Exception, SystemExit) as error:  # a study goes on without this job
             found = {"outcome": "failed", "reason": one_line(error)}
-        spent = {"seconds": time.perf_counter() - began, "peak_mib": _peak_mib(), "packages": in_words(packages())}
+        spent = {"seconds": time.perf_counter() - began, "peak_mib": _peak_mib(), "packages": packages_text()}
         return job.columns | spent | found
 
 
-def _forget_peak() -> None:
+def _reset_peak_memory() -> None:
     """Count the most memory from here on, where the system can do that (Linux, but for some containers)."""
     if sys.platform == "linux":
         with suppress(OSError):  # then it is counted from the process's beginning
@@ -236,12 +236,7 @@ def _peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 1024)
 
 
-def in_words(versions: Mapping[str, str]) -> str:
-    """Packages and their versions."""
-    return ", ".join(f"{name} {number}" for name, number in versions.items())
-
-
-def differing(here: Mapping[str, str], there: Mapping[str, str]) -> str:
+def differing_versions(here: Mapping[str, str], there: Mapping[str, str]) -> str:
     """The packages whose versions are other ones there, in words; empty where none is."""
     unlike = [name for name in here if there.get(name) != here[name]]
     return ", ".join(f"{name} {there.get(name, 'none')} (here {here[name]})" for name in unlike)
@@ -252,12 +247,12 @@ def _fit(job: Job) -> dict[str, Any]:
     metres, radians and their rates."""
     data = drives(job)
     with seeded(job.seed, "program"):
-        program = told(load_program(job.program), job)
+        program = with_noise(load_program(job.program), job)
     recipe = find_recipe(job.recipe)
     require_settings(f"recipe {job.recipe}", recipe, job.settings)
     silent = {"progress": False} if trains(recipe) else {}
     began = time.perf_counter()
-    settings, start = told_settings(job), job.known_start
+    settings, start = settings_with_noise(job), job.known_start
     fitted = recipe(program, data["train"], data["valid"], known_start=start, seed=job.seed, **silent, **settings)
     seconds = time.perf_counter() - began
     if fitted.trained and fitted.trained.interrupted:
@@ -289,12 +284,12 @@ def _held_out(fitted: Fit, valid: Trajectories, seed: int) -> float:
 def _discover(job: Job) -> dict[str, Any]:
     """Whether what is missing is named, and how surely."""
     data = drives(job)
-    program, start = told(load_program(job.program), job), job.known_start
+    program, start = with_noise(load_program(job.program), job), job.known_start
     searched = discover(program, data["train"], data["valid"], known_start=start, seed=job.seed, **job.settings)
     figures, first = searched.figures, searched.search.rounds[0].screening.tests.tested
     named = [one["effect"] for one in figures["effects"]]
     classes = [name for one in figures["effects"] for name in one["class"]]
-    variant, value = planted(job)
+    variant, value = planted_effect(job)
     # of the program as its owner has it: beside what was found in its place, hardly any size can be told
     same = [one for one in first if variant and one.variant.name == variant.name and not one.untestable]
     limit = same[0].detection_limit.tolist() if same else None
@@ -330,34 +325,34 @@ def drives(job: Job) -> dict[str, Trajectories]:
     if "alpha_truck" in said:
         folder, degrees = Path(said["alpha_truck"]), said["sigma_deg"]
         return {part: read_alpha_truck(folder / part, seed=job.seed, sigma_degrees=degrees) for part in PARTS}
-    whole = truth(job)
+    whole = simulator(job)
     seeds = {part: 10 * job.seed + i for i, part in enumerate(PARTS, 1)}
     return {part: simulate(whole, said[part], seed=seeds[part]) for part in PARTS if part in said}
 
 
-def without_effect(job: Job) -> Program:
+def base_simulator(job: Job) -> Program:
     """What simulates the drives, without the effect that its owner's program lacks."""
-    return told(load_program(job.data["simulate"]), job)
+    return with_noise(load_program(job.data["simulate"]), job)
 
 
-def truth(job: Job) -> Program:
+def simulator(job: Job) -> Program:
     """What simulates the drives, with the effect that its owner's program lacks."""
-    owner, effect = without_effect(job), job.data["effect"]
+    owner, effect = base_simulator(job), job.data["effect"]
     return with_effects(owner, [effect], say=lambda line: None) if effect else owner
 
 
-def planted(job: Job) -> tuple[Variant | None, list[float]]:
+def planted_effect(job: Job) -> tuple[Variant | None, list[float]]:
     """The effect that the drives of a job have and its owner's program lacks, and how far each component of its
     coefficient is from where it would be absent."""
     if not job.data["effect"]:
         return None, []
     name, at, options, value = parsed(job.data["effect"])
-    variant = chosen_variant(without_effect(job), name, at, **options)
+    variant = chosen_variant(base_simulator(job), name, at, **options)
     coefficient = variant.coefficient(value, torch.zeros(()))
     return variant, (coefficient - variant.effect.null).flatten().tolist()
 
 
-def told(program: Program, job: Job) -> Program:
+def with_noise(program: Program, job: Job) -> Program:
     """With the noise of its bearings, which is known."""
     degrees = job.data.get("sigma_deg")
     if degrees is not None:
@@ -367,17 +362,15 @@ def told(program: Program, job: Job) -> Program:
     return program
 
 
-def told_settings(job: Job) -> dict[str, Any]:
+def settings_with_noise(job: Job) -> dict[str, Any]:
     """Settings whose programs know the noise of the bearings as well."""
     if "sigma_deg" not in job.data:
         return job.settings
-    return {
-        name: told(load_program(value), job) if is_program(value) else value for name, value in job.settings.items()
-    }
+    return {name: with_noise(load_program(one), job) if is_program(one) else one for name, one in job.settings.items()}
 
 
 def _table(folder: Path, part: str) -> Path:
-    files = [folder / f"{part}{ending}" for ending in TABLES]
+    files = [folder / f"{part}{ending}" for ending in TABLE_SUFFIXES]
     found = [file for file in files if file.is_file()]
     if not found:
         raise DataError(f"{folder} has no {' and no '.join(file.name for file in files)}")

@@ -15,16 +15,16 @@ from pandas.api.types import infer_dtype
 from scipy import stats
 
 from steady_ppl.errors import UsageError
-from steady_ppl.plotting.comparison import COLORS, MARKS
+from steady_ppl.plotting.comparison import COLORS, MARKERS
 from steady_ppl.studies.job import IN_LIMITS
-from steady_ppl.studies.plan import MAX_NUMBER, Picture, Plan
-from steady_ppl.studies.table import NUMBERS
+from steady_ppl.studies.plan import MAX_MAGNITUDE, Picture, Plan
+from steady_ppl.studies.table import NUMERIC_KINDS
 from steady_ppl.utils.text import printable
 
-SIZES = (-1.0, 0.0, *(1.25 ** (place - 0.5) for place in range(-6, 12)), math.inf)
+SIZE_EDGES = (-1.0, 0.0, *(1.25 ** (place - 0.5) for place in range(-6, 12)), math.inf)
 """Ends of ranges of what is missing, in detection limits: each a quarter wider than the one before, one of them around
 a limit; the first is of drives that lack nothing."""
-SHARES = ("found", "right", "in_class")
+SHARE_COLUMNS = ("found", "right", "in_class")
 PUBLISHED = "published"  # in the legend
 PUBLISHED_LOOK: dict[str, Any] = {"ls": "--", "marker": "*", "ms": 7, "lw": 0.9, "alpha": 0.6}
 
@@ -52,7 +52,7 @@ def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
     own = own.assign(**{name: _numbers(own, name) for name in picture.columns})
     own = own.iloc[np.argsort([order[key] for key in own["key"]], kind="stable")]
     if picture.chosen_by:
-        own = chosen(picture, own)
+        own = best_settings(picture, own)
     figure = Figure(figsize=(5.4 * len(picture.y), 5.4), layout="constrained")
     figure.suptitle(printable(plan.title), fontsize=11, parse_math=False)
     lines = _lines(picture, own)
@@ -76,13 +76,13 @@ def _numbers(rows: pd.DataFrame, name: str) -> pd.Series:
     kind = infer_dtype(rows[name])
     if kind in ("boolean", "empty"):
         return rows[name].astype(object)
-    if kind not in NUMBERS:
+    if kind not in NUMERIC_KINDS:
         raise UsageError(f"column {name} of the table holds no numbers")
     numbers = rows[name].astype(float)
-    return numbers.where(numbers.abs() <= MAX_NUMBER)
+    return numbers.where(numbers.abs() <= MAX_MAGNITUDE)
 
 
-def chosen(picture: Picture, rows: pd.DataFrame) -> pd.DataFrame:
+def best_settings(picture: Picture, rows: pd.DataFrame) -> pd.DataFrame:
     """Of each method's settings on the same data those whose mean of `chosen_by` is largest, by the seeds that all of
     them have; settings with which more of these have failed come last, and what is beyond every number does so too."""
     settings = [name for name in rows if str(name).startswith("settings.")]
@@ -142,7 +142,7 @@ def _panel(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str,
 def _look(index: int) -> dict[str, Any]:
     """A colour, a mark and a line that no other of the first 49 has together."""
     turn, place = divmod(index, len(COLORS))
-    return {"color": COLORS[place], "marker": MARKS[(place + turn) % len(MARKS)], "ls": ("-", "-.")[turn % 2]}
+    return {"color": COLORS[place], "marker": MARKERS[(place + turn) % len(MARKERS)], "ls": ("-", "-.")[turn % 2]}
 
 
 def _published(axes: Axes, points: Sequence[Sequence[float]], color: str, name: str) -> None:
@@ -179,7 +179,7 @@ def _scale(axes: Axes, picture: Picture, column: str, lines: Sequence[tuple[str,
         if len(values) <= 12:
             axes.set_xticks(values, [f"{value:g}" for value in values])
             axes.minorticks_off()
-    if column in SHARES:
+    if column in SHARE_COLUMNS:
         axes.set_ylim(-0.05, 1.05)
         return
     heights = [height for _, rows in lines for _, height, *_ in points(rows, picture.x, column)]
@@ -196,7 +196,7 @@ def points(rows: pd.DataFrame, x: str, y: str) -> list[tuple[float, float, float
     rows = rows[rows[x].notna() & rows[y].notna()]
     share = infer_dtype(rows[y]) == "boolean"
     found = []
-    for _, part in rows.groupby(pd.cut(rows[x], SIZES), observed=True) if x == IN_LIMITS else rows.groupby(x):
+    for _, part in rows.groupby(pd.cut(rows[x], SIZE_EDGES), observed=True) if x == IN_LIMITS else rows.groupby(x):
         values = part[y].astype(float)
         middle = float(values.mean())
         if share:

@@ -18,16 +18,16 @@ from typing import Any
 from steady_ppl.errors import RunError, UsageError, labelled
 from steady_ppl.studies.job import FIGURES, HELD_OUT, TASKS, Job, JobFiles, is_program, without_folder
 from steady_ppl.utils.files import require_file, whole_file
-from steady_ppl.utils.schema import ANYTHING, LINES, NUMBER, TEXT, TRUTH, WHOLE, mismatch, read_record
+from steady_ppl.utils.schema import ANYTHING, BOOL, LINES, NUMBER, TEXT, WHOLE, mismatch, read_record
 from steady_ppl.utils.text import shown
 
-MOST_PANELS, MOST_PUBLISHED, LONGEST = 12, 100, 1000  # of a picture; characters of its title and labels
-MAX_NUMBER = 1e100  # a number beyond cannot be drawn
-MAX_JOBS, MAX_DRIVES = 100_000, 1_000_000
+MAX_PANELS, MAX_PUBLISHED, MAX_LABEL_LENGTH = 12, 100, 1000  # of a picture; lines of a panel; characters
+MAX_MAGNITUDE = 1e100  # of a number that can be drawn
+MAX_JOBS, MAX_DRIVES = 100_000, 1_000_000  # of a study, and of a table that a job simulates
 
-FORMAT = 1
-RECORD = "study.json"
-PICTURE: dict[str, Any] = {
+STUDY_FORMAT = 1  # number of the record's format
+STUDY_RECORD = "study.json"
+PICTURE_FORM: dict[str, Any] = {
     "x": TEXT,
     "y": LINES,
     "labels?": {str: TEXT},
@@ -35,14 +35,14 @@ PICTURE: dict[str, Any] = {
     "chosen_by?": TEXT,
     "leave_out?": LINES,
 }
-JOB: dict[str, Any] = {
+JOB_FORM: dict[str, Any] = {
     **dict.fromkeys(("task", "method", "program", "recipe", "key", "label"), TEXT),
     "data": {str: ANYTHING},
     "settings": {str: ANYTHING},
     "seed": WHOLE,
-    "known_start": TRUTH,
+    "known_start": BOOL,
 }
-RECORDED = {"title": TEXT, "task": TEXT, "jobs": [JOB], "picture": (PICTURE, None)}
+PLAN_RECORD_FORM = {"title": TEXT, "task": TEXT, "jobs": [JOB_FORM], "picture": (PICTURE_FORM, None)}
 
 Axes = dict[str, list[Any]]
 SOURCES: dict[str, dict[str, Any]] = {
@@ -50,15 +50,15 @@ SOURCES: dict[str, dict[str, Any]] = {
     "alpha_truck": {"sigma_deg": 5.0},
     "tables": {},
 }
-METHOD: dict[str, Any] = {"name": TEXT, "program": TEXT, "recipe?": TEXT, "settings?": {str: ANYTHING}}
-FORM: dict[str, Any] = {
+METHOD_FORM: dict[str, Any] = {"name": TEXT, "program": TEXT, "recipe?": TEXT, "settings?": {str: ANYTHING}}
+PLAN_FORM: dict[str, Any] = {
     "title": TEXT,
     "task?": TEXT,
     "seeds": [WHOLE],
-    "known_start?": TRUTH,
+    "known_start?": BOOL,
     "data": {str: ANYTHING},
-    "picture?": PICTURE,
-    "method": [METHOD],
+    "picture?": PICTURE_FORM,
+    "method": [METHOD_FORM],
 }
 
 
@@ -113,8 +113,8 @@ def read_plan(path: Path, data: Path | None = None) -> Plan:
 
 
 def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
-    problem = mismatch(content, FORM) or _surplus(content) or _undrawable(content["title"], content.get("picture"))
-    if problem is not None:
+    problem = mismatch(content, PLAN_FORM) or _unknown(content)
+    if problem := problem or _undrawable(content["title"], content.get("picture")):
         raise UsageError(problem)
     task = content.get("task", "fit")
     if task not in TASKS:
@@ -145,10 +145,10 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
     return Plan(content["title"], task, jobs, picture)
 
 
-def _surplus(content: Mapping[str, Any]) -> str | None:
+def _unknown(content: Mapping[str, Any]) -> str | None:
     """A name that means nothing, so that one that is misspelt does not pass for a default."""
-    places = [("", content, FORM), *(("method.", one, METHOD) for one in content["method"])]
-    places += [("picture.", content["picture"], PICTURE)] if "picture" in content else []
+    places = [("", content, PLAN_FORM), *(("method.", one, METHOD_FORM) for one in content["method"])]
+    places += [("picture.", content["picture"], PICTURE_FORM)] if "picture" in content else []
     for place, given, form in places:
         known = [key.rstrip("?") for key in form]
         for name in given:
@@ -289,7 +289,7 @@ def _is_plain(value: Any, depth: int = 0) -> bool:
         return True
     if isinstance(value, int):
         return abs(value) < 2**63
-    return isinstance(value, float) and math.isfinite(value) and abs(value) <= MAX_NUMBER
+    return isinstance(value, float) and math.isfinite(value) and abs(value) <= MAX_MAGNITUDE
 
 
 def _beside(folder: Path, name: str) -> str:
@@ -309,36 +309,36 @@ def _undrawable(title: str, picture: Mapping[str, Any] | None) -> str | None:
     """What of a picture of the right form cannot be drawn, in words; None where all can, or there is none."""
     if picture is None:
         return None
-    if not 1 <= len(picture["y"]) <= MOST_PANELS:
-        return f"picture.y has {len(picture['y'])} columns, expected 1 to {MOST_PANELS}"
+    if not 1 <= len(picture["y"]) <= MAX_PANELS:
+        return f"picture.y has {len(picture['y'])} columns, expected 1 to {MAX_PANELS}"
     published = picture.get("published", {})
     texts = [title, *picture.get("labels", {}).values(), *(name for lines in published.values() for name in lines)]
-    if max(map(len, texts)) > LONGEST:
-        return f"picture: a title, label or name of more than {LONGEST} characters"
+    if max(map(len, texts)) > MAX_LABEL_LENGTH:
+        return f"picture: a title, label or name of more than {MAX_LABEL_LENGTH} characters"
     for column, lines in published.items():
-        if len(lines) > MOST_PUBLISHED:
-            return f"picture.published: {column} has {len(lines)} lines, expected at most {MOST_PUBLISHED}"
+        if len(lines) > MAX_PUBLISHED:
+            return f"picture.published: {column} has {len(lines)} lines, expected at most {MAX_PUBLISHED}"
         for name, points in lines.items():
             for point in points:
-                if max(map(abs, point)) > MAX_NUMBER:
+                if max(map(abs, point)) > MAX_MAGNITUDE:
                     return f"picture.published: {column}, {name}: {shown(str(point), 40)} is no point, expected [x, y]"
     return None
 
 
 def record_plan(plan: Plan, folder: Path) -> None:
     """Write the plan beside its results; RunError where it cannot be written."""
-    with whole_file(folder / RECORD, RunError) as beside:
-        beside.write_text(json.dumps({"format": FORMAT, **asdict(plan)}, indent=1) + "\n")
+    with whole_file(folder / STUDY_RECORD, RunError) as beside:
+        beside.write_text(json.dumps({"format": STUDY_FORMAT, **asdict(plan)}, indent=1) + "\n")
 
 
 def recorded_plan(folder: Path) -> Plan:
     """The plan that the results in a folder are of; RunError where there is none, it is damaged, or a newer steady-ppl
     wrote it."""
-    content = read_record(folder / RECORD, RECORDED, FORMAT, "a study")
+    content = read_record(folder / STUDY_RECORD, PLAN_RECORD_FORM, STUDY_FORMAT, "a study")
     picture = content["picture"]
     if problem := _undrawable(content["title"], picture):
-        raise RunError(f"{folder / RECORD} is damaged: {problem}")
+        raise RunError(f"{folder / STUDY_RECORD} is damaged: {problem}")
     if picture is not None:
         picture = Picture(**{one.name: picture[one.name] for one in fields(Picture) if one.name in picture})
-    jobs = tuple(Job(**{name: job[name] for name in JOB}) for job in content["jobs"])
+    jobs = tuple(Job(**{name: job[name] for name in JOB_FORM}) for job in content["jobs"])
     return Plan(content["title"], content["task"], jobs, picture)

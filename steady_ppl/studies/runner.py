@@ -13,13 +13,14 @@ from steady_ppl.discovery.discover import discover
 from steady_ppl.errors import ComputationError, RunError, UsageError, labelled
 from steady_ppl.model.loading import load_program
 from steady_ppl.model.program import Program, error_groups, for_program
-from steady_ppl.runs.fit import packages
+from steady_ppl.runs.fit import packages_text
 from steady_ppl.runs.recipes import find_recipe, require_settings
 from steady_ppl.smc.simulate import simulate
-from steady_ppl.studies.executors import Executor, ResultRow, Say
-from steady_ppl.studies.job import CHANGED, ERRORS, drives, in_words, told, told_settings, truth, without_effect
-from steady_ppl.studies.plan import RECORD, Plan, record_plan, recorded_plan
+from steady_ppl.studies.executors import Executor, ResultRow
+from steady_ppl.studies.job import ERRORS, OUTDATED, base_simulator, drives, settings_with_noise, simulator, with_noise
+from steady_ppl.studies.plan import STUDY_RECORD, Plan, record_plan, recorded_plan
 from steady_ppl.studies.table import read_results, study_table
+from steady_ppl.utils.text import Say
 
 
 def run_study(plan: Plan, folder: Path, place: Executor, *, again: bool = False, say: Say = lambda line: None) -> int:
@@ -44,13 +45,13 @@ def run_study(plan: Plan, folder: Path, place: Executor, *, again: bool = False,
         record_plan(plan, folder)
         rows = read_results(folder).to_dict("records")
         tried_again = {
-            row["key"] for row in rows if row["outcome"] == "failed" and (again or row.get("reason") == CHANGED)
+            row["key"] for row in rows if row["outcome"] == "failed" and (again or row.get("reason") == OUTDATED)
         }
         kept = {row["key"]: row["outcome"] for row in rows if row["key"] not in tried_again}
         left = {key: job for key, job in wanted.items() if key not in kept}
         if kept:
             say(f"{len(kept)} of {len(wanted)} jobs are there already")
-        here = in_words(packages())
+        here = packages_text()
         found = {row.get("packages") for row in rows if row["key"] in kept}  # none of a job that was given up
         if others := sorted(one for one in found - {here} if isinstance(one, str)):
             say(f"some of them were computed with {'; '.join(others)}: here is {here}")
@@ -81,7 +82,7 @@ def run_study(plan: Plan, folder: Path, place: Executor, *, again: bool = False,
 
 def _require_same_study(plan: Plan, folder: Path) -> None:
     """Keep its results from being put aside for those of another."""
-    if (folder / RECORD).exists():
+    if (folder / STUDY_RECORD).exists():
         there = recorded_plan(folder)
         if there.title != plan.title and not {job.key for job in there.jobs} & {job.key for job in plan.jobs}:
             raise RunError(f"{folder} holds another study, {there.title!r}: choose another folder")
@@ -102,19 +103,19 @@ def require_runnable(plan: Plan) -> None:
     programs: list[tuple[str, Program]] = []
     for job in {(job.method, repr(job.settings)): job for job in plan.jobs}.values():
         with labelled(f"method {job.method}"):
-            programs.append((job.method, told(load_program(job.program), job)))
-            told_settings(job)
+            programs.append((job.method, with_noise(load_program(job.program), job)))
+            settings_with_noise(job)
             if job.task == "fit":
                 require_settings(f"recipe {job.recipe}", find_recipe(job.recipe), job.settings)
             else:
                 require_settings("discover", discover, job.settings)
     for job in {repr(job.data): job for job in plan.jobs if "simulate" in job.data}.values():
         with labelled("data"):
-            truth(job)
+            simulator(job)
     first = plan.jobs[0]
     with labelled("data"):
         if "simulate" in first.data:
-            given = simulate(without_effect(first), 1, seed=first.seed)  # an effect changes no column
+            given = simulate(base_simulator(first), 1, seed=first.seed)  # an effect changes no column
         else:
             given = drives(first)["train"]
     for method, program in programs:

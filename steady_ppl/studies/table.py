@@ -15,16 +15,16 @@ import pandas as pd
 import pyarrow
 import pyarrow.parquet
 from pandas.api.types import infer_dtype
-from pyarrow import types
+from pyarrow.types import is_boolean, is_floating, is_integer, is_large_string, is_null, is_string
 
 from steady_ppl.errors import RunError
-from steady_ppl.runs.folder import only_writer
+from steady_ppl.runs.folder import exclusive_writer
 from steady_ppl.utils.files import require_file, whole_file
 from steady_ppl.utils.text import printable
 
 TABLE, EARLIER, ARRIVED = "results.parquet", "earlier.parquet", "arrived"
-KINDS = (types.is_integer, types.is_floating, types.is_boolean, types.is_string, types.is_large_string, types.is_null)
-NUMBERS = ("integer", "floating", "mixed-integer-float")  # as pandas infers them
+COLUMN_TYPES = (is_integer, is_floating, is_boolean, is_string, is_large_string, is_null)
+NUMERIC_KINDS = ("integer", "floating", "mixed-integer-float")  # as pandas infers them
 MIN_RESULTS_BETWEEN_WRITES = 100  # results for which the table is written anew, at least
 
 
@@ -74,7 +74,7 @@ class StudyTable:
 def study_table(folder: Path) -> Iterator[StudyTable]:
     """The table of a study for the block that fills it, whole at its end however that comes; RunError where the folder
     cannot be made, or another process writes to it."""
-    with only_writer(folder):
+    with exclusive_writer(folder):
         arrived = folder / ARRIVED
         if arrived.is_symlink():
             raise RunError(f"{arrived} is a link: results are kept in a folder of the study's own")
@@ -123,7 +123,7 @@ def _read(file: Path) -> pd.DataFrame:
         reason = str(error).partition("\n")[0]
         raise RunError(f"{file} is damaged: {reason}; move it away, and its jobs are computed again") from error
     for column in columns.schema:
-        if not any(fits(column.type) for fits in KINDS):
+        if not any(fits(column.type) for fits in COLUMN_TYPES):
             raise RunError(f"{file} is no table of a study: its column {column.name} holds {column.type}")
     for name in ("key", "outcome"):
         if name not in found or not found[name].map(lambda value: isinstance(value, str)).all():
@@ -135,7 +135,7 @@ def _write(frame: pd.DataFrame, file: Path) -> None:
     """Write a table; a column of several kinds of values becomes text, since Parquet's have one."""
     frame = frame.copy(deep=False)
     for name in frame:
-        if infer_dtype(frame[name]) not in (*NUMBERS, "boolean", "string", "empty"):
+        if infer_dtype(frame[name]) not in (*NUMERIC_KINDS, "boolean", "string", "empty"):
             frame[name] = frame[name].map(_text, na_action="ignore")
     with whole_file(file, RunError) as beside:
         frame.to_parquet(beside, index=False)

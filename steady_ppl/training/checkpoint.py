@@ -15,7 +15,7 @@ from steady_ppl.utils.tensor_files import damaged, read_tensors, write_tensors
 from steady_ppl.utils.text import shown
 
 GROUPS = ("parameters", "averaged", "kept", "memory")  # of tensors of a `Checkpoint`
-NUMBERS = {"step": WHOLE, "history": [{"step": NUMBER}], "kept_step": WHOLE, "best_held_out": [NUMBER]}
+PROGRESS_FORM = {"step": WHOLE, "history": [{"step": NUMBER}], "kept_step": WHOLE, "best_held_out": [NUMBER]}
 """The form of what a checkpoint says in JSON beside its tensors."""
 
 
@@ -38,7 +38,7 @@ def write_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optim
     tensors = {f"{group}/{name}": value for group in GROUPS for name, value in getattr(state, group).items()}
     for index, slots in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer/{index}/{slot}": value for slot, value in slots.items()}
-    numbers = {name: getattr(state, name) for name in NUMBERS}
+    numbers = {name: getattr(state, name) for name in PROGRESS_FORM}
     write_tensors(path, tensors, {name: json.dumps(value) for name, value in numbers.items()})
 
 
@@ -85,10 +85,10 @@ def _shapes(tensors: Mapping[str, Tensor]) -> dict[str, torch.Size]:
 def _numbers(path: Path, text: Mapping[str, str]) -> dict[str, Any]:
     """The text beside the tensors, by name of the state; a RunError where `write_checkpoint` writes no such thing."""
     try:
-        found = {name: json.loads(text[name]) for name in NUMBERS if name in text}
+        found = {name: json.loads(text[name]) for name in PROGRESS_FORM if name in text}
     except (ValueError, RecursionError):
         raise damaged(path, "the text beside the tensors is no JSON") from None
-    problem = mismatch(found, NUMBERS)
+    problem = mismatch(found, PROGRESS_FORM)
     if problem is not None:
         raise damaged(path, problem)
     return found

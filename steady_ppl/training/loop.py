@@ -139,7 +139,7 @@ def train(
 
     Alternates the guide's E step with gradient steps on Pyro's ELBO. For a `PathGuide` that ELBO is STEADY's M-step
     objective (IROS 2022, equation 6); for a guide with parameters it is SVI. Of the validated parameters the latest is
-    kept whose held-out log p(y) is the best so far, or within one standard error of it (see `as_good`).
+    kept whose held-out log p(y) is the best so far, or `within_one_standard_error` of it.
 
     Args:
         program: the state-space model, trained in place.
@@ -242,7 +242,7 @@ def _judge(state: Checkpoint, held_out: list[float], figures: dict[str, float]) 
     if held_out:
         entry["log_likelihood"] = sum(held_out) / len(held_out)
     state.history.append(entry)
-    if as_good(held_out, state.best_held_out):
+    if within_one_standard_error(held_out, state.best_held_out):
         state.kept = {name: value.clone() for name, value in state.averaged.items()}
         state.kept_step = state.step
     if not state.best_held_out or sum(held_out) > sum(state.best_held_out):
@@ -350,7 +350,7 @@ class Validation:
             return log_likelihood(program, self.data, kernels=kernels, **given).tolist()
 
 
-def as_good(candidate: Sequence[float], best: Sequence[float]) -> bool:
+def within_one_standard_error(candidate: Sequence[float], best: Sequence[float]) -> bool:
     """Whether held-out log p(y), of each drive or empty, is no worse than the best, up to one standard error of the
     paired difference (the rule of Breiman et al. 1984, towards the later instead of the smaller model).
 

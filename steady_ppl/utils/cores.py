@@ -3,9 +3,10 @@
 The engine's tensors are small. Torch's threads wait for one another by spinning: on a busy machine two took 20 to 55
 times the CPU time of one. On quiet cores two helped a filter of 100,000 particles in plain torch alone, 3.5 to 2.5 s.
 
-Coarse jobs run side by side, in processes that are forked: they have what this one has, so that nothing is sent to
-them, and their results come back as safetensors. On other systems than Linux, off the main thread, or where CUDA is in
-use, no fork is safe, and jobs run one after another. This module loads no torch, which reads `ONE_THREAD` as it loads.
+Coarse computations run in parallel, in processes that are forked: they have what this one has, so that nothing is sent
+to them, and their results come back as safetensors. On other systems than Linux, off the main thread, or where CUDA is
+in use, no fork is safe, and they run one after another. This module loads no torch, which reads `ONE_THREAD` as it
+loads.
 """
 
 import ctypes
@@ -26,15 +27,15 @@ from typing import IO, TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torch import Tensor
 
-Result = tuple[Mapping[str, "Tensor"], Mapping[str, Any]]  # tensors, and what JSON can hold
-Job = Callable[[], Result]
+Output = tuple[Mapping[str, "Tensor"], Mapping[str, Any]]  # tensors, and what JSON can hold
+Computation = Callable[[], Output]
 MAX_PROCESSES = 8  # at once: each has memory of its own
-MIN_PATIENCE, MAX_SLOWER = 10.0, 5.0  # seconds, and times its own share's, that this process waits for another
+MIN_PATIENCE_SECONDS, MAX_SLOWDOWN = 10.0, 5.0  # and times its own share's, that this process waits for another
 DIE_WITH_PARENT = 1  # of Linux's prctl
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-END = b"whole"
-POOLS = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")
-ONE_THREAD = dict.fromkeys([*(f"{name}_NUM_THREADS" for name in POOLS), "VECLIB_MAXIMUM_THREADS"], "1")
+ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+END_MARK = b"whole"
+THREAD_POOLS = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMBA", "NUMEXPR")
+ONE_THREAD = dict.fromkeys([*(f"{name}_NUM_THREADS" for name in THREAD_POOLS), "VECLIB_MAXIMUM_THREADS"], "1")
 """Environment of a process whose libraries have one thread each; they read it as they load."""
 
 _lock = threading.Lock()
@@ -69,7 +70,7 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def one_core() -> Iterator[None]:
-    """Run all jobs of the block in this process, for example where many such processes run."""
+    """Run all computations of the block in this process, for example where many such processes run."""
     token = _most.set(1)
     try:
         yield
@@ -77,32 +78,32 @@ def one_core() -> Iterator[None]:
         _most.reset(token)
 
 
-def side_by_side(jobs: Sequence[Job]) -> list[Result]:
-    """What jobs return, in their order. They draw no random numbers, print nothing and change nothing that is shared.
+def run_in_parallel(computations: Sequence[Computation]) -> list[Output]:
+    """What they return, in their order. They draw no random numbers, print nothing and change nothing that is shared.
 
-    Jobs whose process fails, hangs or cannot be had are run here, where their errors are raised as any other.
+    Those whose process fails, hangs or cannot be had are run here, where their errors are raised as any other.
     """
     with one_thread(), ExitStack() as ends:  # of two threads one would be missing after a fork
-        processes = max(1, min(_most.get(), _cores(), len(jobs)))
-        shares = [range(first, len(jobs), processes) for first in range(processes)]
+        processes = max(1, min(_most.get(), _cores(), len(computations)))
+        shares = [range(first, len(computations), processes) for first in range(processes)]
         children = []
         for share in shares[1:]:
-            children.append(_Child(jobs, share))
+            children.append(_Child(computations, share))
             ends.callback(children[-1].end)
             children[-1].begin()
         began = time.monotonic()
-        found = {index: jobs[index]() for index in shares[0]}
-        patience = MIN_PATIENCE + MAX_SLOWER * (time.monotonic() - began)
+        found = {index: computations[index]() for index in shares[0]}
+        patience = MIN_PATIENCE_SECONDS + MAX_SLOWDOWN * (time.monotonic() - began)
         for child in children:
             found.update(child.results(patience))
-        return [found[index] if index in found else jobs[index]() for index in range(len(jobs))]
+        return [found[index] if index in found else computations[index]() for index in range(len(computations))]
 
 
 class _Child:
-    """A forked process that runs a share of the jobs, and the memory in which it leaves their results."""
+    """A forked process that runs a share of the computations, and the memory in which it leaves their results."""
 
-    def __init__(self, jobs: Sequence[Job], share: Sequence[int]) -> None:
-        self.jobs, self.share = jobs, share
+    def __init__(self, computations: Sequence[Computation], share: Sequence[int]) -> None:
+        self.computations, self.share = computations, share
         self.pid, self.handle = 0, -1  # a handle stays that of the process when its number is another's
         self.file: IO[bytes] | None = None
 
@@ -125,22 +126,22 @@ class _Child:
 
             ctypes.CDLL(None).prctl(DIE_WITH_PARENT, signal.SIGKILL)
             signal.set_wakeup_fd(-1)
-            for ending in SIGNALS:
+            for ending in ENDING_SIGNALS:
                 signal.signal(ending, signal.SIG_DFL)
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
             if self.file is not None and os.getppid() == parent:
                 _most.set(1)
                 for index in self.share:
-                    tensors, values = self.jobs[index]()
+                    tensors, values = self.computations[index]()
                     content = packed(tensors, {"values": json.dumps(values)})
                     self.file.write(len(content).to_bytes(8, "little") + content)
-                self.file.write(END)
+                self.file.write(END_MARK)
                 self.file.flush()
         finally:
             os._exit(0)
 
-    def results(self, patience: float) -> dict[int, Result]:
-        """By the jobs' numbers, when it has ended; nothing if it failed, or does not end within so many seconds."""
+    def results(self, patience: float) -> dict[int, Output]:
+        """By their numbers, when it has ended; nothing if it failed, or does not end within so many seconds."""
         from steady_ppl.utils.tensor_files import unpacked
 
         if self.file is None or self.handle < 0:
@@ -148,11 +149,11 @@ class _Child:
         if not wait([self.handle], patience):
             return {}
         size = self.file.seek(0, os.SEEK_END)
-        self.file.seek(max(0, size - len(END)))
-        if self.file.read() != END:
+        self.file.seek(max(0, size - len(END_MARK)))
+        if self.file.read() != END_MARK:
             return {}
         self.file.seek(0)
-        found: dict[int, Result] = {}
+        found: dict[int, Output] = {}
         for index in self.share:
             tensors, text = unpacked(self.file.read(int.from_bytes(self.file.read(8), "little")))
             found[index] = tensors, json.loads(text["values"])
@@ -176,7 +177,7 @@ class _Child:
 @contextmanager
 def _no_signals() -> Iterator[None]:
     """Keep signals until the block has ended: an interrupt in a child would unwind its parent's stack."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
     try:
         yield
     finally:

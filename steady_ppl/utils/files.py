@@ -2,14 +2,14 @@
 
 import json
 import os
-import stat
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from stat import S_ISCHR, S_ISDIR, S_ISFIFO, S_ISREG, S_ISSOCK
 from typing import TYPE_CHECKING, Any
 
-from steady_ppl.errors import SteadyError, UsageError
+from steady_ppl.errors import ComputationError, SteadyError, UsageError
 from steady_ppl.utils.text import printable
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def write_picture(figure: "Figure", path: Path) -> None:
         figure.savefig(beside, format=path.suffix.lower()[1:], dpi=150)
 
 
-KINDS = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISCHR, "a device"), (stat.S_ISSOCK, "a socket"))
+FILE_TYPES = ((S_ISDIR, "a folder"), (S_ISFIFO, "a pipe"), (S_ISCHR, "a device"), (S_ISSOCK, "a socket"))
 
 
 def require_file(path: Path, refused: type[SteadyError]) -> None:
@@ -76,9 +76,19 @@ def require_file(path: Path, refused: type[SteadyError]) -> None:
         mode = path.stat().st_mode
     except (OSError, ValueError):
         return
-    if not stat.S_ISREG(mode):
-        what = next((word for test, word in KINDS if test(mode)), "no file")
+    if not S_ISREG(mode):
+        what = next((word for test, word in FILE_TYPES if test(mode)), "no file")
         raise refused(f"{path} is {what}: expected a file")
+
+
+def finite_json(
+    content: Any, place: str, *, indent: int | None = None, separators: tuple[str, str] | None = None
+) -> str:
+    """JSON, which has no word for a figure that is not finite: a ComputationError says what is not written."""
+    try:
+        return json.dumps(content, indent=indent, separators=separators, allow_nan=False)
+    except ValueError as error:
+        raise ComputationError(f"{place} is not written: a figure is not finite, the program has blown up") from error
 
 
 def read_json(path: Path, refused: type[SteadyError]) -> Any:

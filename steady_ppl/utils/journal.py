@@ -4,7 +4,7 @@ The computation must be deterministic: a piece is known by its number alone. The
 goes on has the inputs of the one that was killed.
 
     with journal(folder):
-        tensors, numbers = piece(compute)     # read from the folder if it is there, else computed and written
+        tensors, numbers = journaled(compute)     # read from the folder if it is there, else computed and written
 """
 
 import itertools
@@ -20,11 +20,11 @@ import torch
 from torch import Tensor
 
 from steady_ppl.errors import FilterError, RunError
+from steady_ppl.utils.cores import Output
 from steady_ppl.utils.schema import ANYTHING, TEXT, mismatch
 from steady_ppl.utils.tensor_files import read_tensors, write_tensors
 
-Piece = tuple[Mapping[str, Tensor], Mapping[str, Any]]
-RANDOM = "random state"  # of torch, after the piece
+RANDOM_STATE = "random state"  # of torch, after the piece
 ENTRY_FORM = ({"values": {str: ANYTHING}}, {"failed": TEXT})
 
 _files: ContextVar[Iterator[Path] | None] = ContextVar("the files of a journal's pieces, in order", default=None)
@@ -46,7 +46,7 @@ def journal(folder: Path) -> Iterator[None]:
     shutil.rmtree(folder)
 
 
-def piece(compute: Callable[[], Piece]) -> Piece:
+def journaled(compute: Callable[[], Output]) -> Output:
     """The next piece: tensors, and what JSON can hold. A `FilterError` is a result like any other. Outside of a journal
     nothing is kept."""
     files = _files.get()
@@ -56,7 +56,7 @@ def piece(compute: Callable[[], Piece]) -> Piece:
     if not file.is_file():
         _write(file, compute)
     tensors, said = _read(file)
-    torch.set_rng_state(tensors.pop(RANDOM))
+    torch.set_rng_state(tensors.pop(RANDOM_STATE))
     if "failed" in said:
         raise FilterError(said["failed"])
     return tensors, said["values"]
@@ -69,17 +69,17 @@ def _read(file: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         said = json.loads(text.get("said", "null"))
     except (ValueError, RecursionError):
         said = None
-    state, now = tensors.get(RANDOM), torch.get_rng_state()
+    state, now = tensors.get(RANDOM_STATE), torch.get_rng_state()
     if mismatch(said, ENTRY_FORM) is not None or state is None or (state.shape, state.dtype) != (now.shape, now.dtype):
         raise RunError(f"{file} is damaged: it is no piece of a search; --force begins the search anew")
     return tensors, said
 
 
-def _write(file: Path, compute: Callable[[], Piece]) -> None:
+def _write(file: Path, compute: Callable[[], Output]) -> None:
     tensors: Mapping[str, Tensor] = {}
     try:
         tensors, values = compute()
         said: dict[str, Any] = {"values": dict(values)}
     except FilterError as error:
         said = {"failed": str(error)}
-    write_tensors(file, {**tensors, RANDOM: torch.get_rng_state()}, {"said": json.dumps(said)})
+    write_tensors(file, {**tensors, RANDOM_STATE: torch.get_rng_state()}, {"said": json.dumps(said)})

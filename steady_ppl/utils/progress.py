@@ -14,7 +14,7 @@ Listener = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
-class _Place:
+class _Stage:
     """Where the computation is: what it does, which part of the whole that is, and whether it is in a stage."""
 
     listener: Listener
@@ -24,25 +24,25 @@ class _Place:
     inside: bool = False
 
 
-_place: ContextVar[_Place | None] = ContextVar("place", default=None)
+_stage: ContextVar[_Stage | None] = ContextVar("stage", default=None)
 
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
     """Tell `listener` what is begun and which share of the whole is done, whenever a stage begins; at the end of the
     outermost ones it hears no name and a share of 1."""
-    token = _place.set(_Place(listener))
+    token = _stage.set(_Stage(listener))
     try:
         yield
     finally:
-        _place.reset(token)
+        _stage.reset(token)
 
 
 @contextmanager
 def stages(*named: tuple[str, float]) -> Iterator[Callable[[], None]]:
     """Divide what is going on into stages, one after another: what each does, and how long it takes relative to the
     others. Yields what is to be called as each begins."""
-    outer = _place.get()
+    outer = _stage.get()
     total, done, remaining = sum(share for _, share in named), 0.0, iter(named)
 
     def begin() -> None:
@@ -54,13 +54,13 @@ def stages(*named: tuple[str, float]) -> Iterator[Callable[[], None]]:
         first, last = outer.first + done * width, outer.first + (done + share) * width
         done += share
         said = ": ".join(part for part in (outer.doing, doing) if part)
-        _place.set(replace(outer, doing=said, first=first, last=last, inside=True))
+        _stage.set(replace(outer, doing=said, first=first, last=last, inside=True))
         outer.listener(said, first)
 
     try:
         yield begin
     finally:
         if outer is not None:
-            _place.set(outer)
+            _stage.set(outer)
             if not outer.inside:
                 outer.listener("", 1.0)

@@ -1,6 +1,6 @@
 """The form of JSON that somebody gives, and where it departs from it.
 
-A form is `NUMBER`, `WHOLE`, `TEXT`, `TRUTH`, `ANYTHING` or None, which is null; `[form]` for a list, `[form, form]` for
+A form is `NUMBER`, `WHOLE`, `TEXT`, `BOOL`, `ANYTHING` or None, which is null; `[form]` for a list, `[form, form]` for
 one of two; `(form, form)` for one of several; `{"key": form, "other?": form}` for what has these keys, of which those
 with a `?` need not be there, and perhaps others; `{str: form}` for any keys; `Paired(form, keys)`.
 """
@@ -14,7 +14,7 @@ from steady_ppl.errors import RunError
 from steady_ppl.utils.files import read_json
 from steady_ppl.utils.text import shown
 
-NUMBER, WHOLE, TEXT, TRUTH = "a finite number", "a whole number from 0 to 2^63", "text", "true or false"
+NUMBER, WHOLE, TEXT, BOOL = "a finite number", "a whole number from 0 to 2^63", "text", "true or false"
 ANYTHING = "anything"
 LINES = [TEXT]
 
@@ -90,7 +90,7 @@ def _unpaired(content: Mapping[str, Any], keys: tuple[str, ...], place: str) -> 
 def _is(content: Any, form: str | None) -> bool:
     if form is None or form == ANYTHING:
         return form == ANYTHING or content is None
-    if form in (TEXT, TRUTH):
+    if form in (TEXT, BOOL):
         return isinstance(content, str if form == TEXT else bool)
     if isinstance(content, bool) or not isinstance(content, int | float):
         return False

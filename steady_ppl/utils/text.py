@@ -3,12 +3,14 @@
 import shlex
 import sys
 import unicodedata
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 
 # what moves the cursor, colours, renames the window, turns lines round, is not seen, or cannot be written at all
-UNSEEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # categories of Unicode: control, format, half of a pair, line separators
+INVISIBLE = ("Cc", "Cf", "Cs", "Zl", "Zp")  # categories of Unicode: control, format, half of a pair, line separators
+Say = Callable[[str], None]  # tells a person one line
+TEXT_WIDTH = 100  # characters of a line in the text of a result
 MAX_LINE_LENGTH = 1000  # characters of a line that is said; a file that somebody gives can put more into it
 
 _quiet: ContextVar[bool] = ContextVar("quiet", default=False)
@@ -25,7 +27,7 @@ def printable(text: str, kept: str = "\t\n") -> str:
     if text.isprintable():
         return text
     return "".join(
-        char.encode("unicode_escape").decode() if unicodedata.category(char) in UNSEEN and char not in kept else char
+        char.encode("unicode_escape").decode() if unicodedata.category(char) in INVISIBLE and char not in kept else char
         for char in text
     )
 

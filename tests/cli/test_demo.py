@@ -9,7 +9,7 @@ from small import steady
 
 from steady_ppl import Fit, RunError, load_program, read_table
 from steady_ppl.cli import demo
-from steady_ppl.cli.demo import RECORD, Size, demonstrate
+from steady_ppl.cli.demo import DEMO_RECORD, Size, demonstrate
 from steady_ppl.cli.main import app
 from steady_ppl.effects import attached
 from steady_ppl.errors import ComputationError
@@ -35,7 +35,7 @@ def test_it_goes_through_the_loop_and_keeps_everything(told: tuple[Path, list[st
     assert commands == ["simulate"] * 3 + ["fit", "check", "discover", "add", "fit", "fit", "prove", "report"]
     for file in (*FILES, "report.html", "train.csv", "valid.csv", "test.csv"):
         assert (out / file).stat().st_size > 0
-    record = json.loads((out / RECORD).read_text())
+    record = json.loads((out / DEMO_RECORD).read_text())
     assert record["status"] == "finished"
     assert all(step["result"] and step["commands"] for step in record["steps"])
 
@@ -77,7 +77,7 @@ def test_a_search_that_finds_nothing_to_add_is_its_end(tmp_path: Path, monkeypat
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(demo, "run", lambda command, arguments: "")
     with pytest.raises(ComputationError, match="nothing to add.*No effect is missing"):
-        demo.discover(demo.Tour(STEADY, [].append), QUICK)
+        demo.discover(demo.Demo(STEADY, [].append), QUICK)
 
 
 def test_it_goes_over_its_own_folder_only(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ def test_every_command_has_examples_that_parse(command, capsys: pytest.CaptureFi
     for example in "\n".join(command.examples).replace("\\\n", " ").splitlines():
         program, found, *words = shlex.split(example.partition(" | ")[0])
         assert (program, found) == ("steady", name)
-        words = [word for word in words[: (*words, ">").index(">")] if word not in command_line.EVERYWHERE]
+        words = [word for word in words[: (*words, ">").index(">")] if word not in command_line.GLOBAL_OPTIONS]
         parser.make_context(name, words)
 
 

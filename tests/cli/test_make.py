@@ -17,7 +17,7 @@ from small import HOVERCRAFT, TRUTH, commands, contents, simulated, steady, writ
 from truck_logs import command_log, pose_log, write as write_logs
 
 from steady_ppl import read_table
-from steady_ppl.cli.make import NEXT
+from steady_ppl.cli.make import NEXT_COMMANDS
 from steady_ppl.data.table import to_frame
 
 ROOT = MODELS.parent
@@ -29,7 +29,7 @@ def test_it_copies_the_rooms_and_simulates_drives(tmp_path: Path, capsys, refuse
     lab = tmp_path / "lab"
     assert steady("init", lab) == 0
     said = capsys.readouterr().out
-    assert "train.csv" in said and all(line in said for line in NEXT)
+    assert "train.csv" in said and all(line in said for line in NEXT_COMMANDS)
     for room in ("models", "inference", "notebooks", "studies"):
         ours = {name: text for name, text in contents(lab / room).items() if "__pycache__" not in name}
         kinds = (".py", ".ipynb", ".toml")

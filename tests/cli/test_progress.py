@@ -44,7 +44,7 @@ def two_seconds() -> None:
 def test_progress_is_drawn_on_a_terminal_only_and_cleared(monkeypatch, is_terminal: bool) -> None:
     screen = Terminal() if is_terminal else io.StringIO()
     monkeypatch.setattr("sys.stderr", screen)
-    monkeypatch.setattr(progress_line, "PATIENCE", 0.1)
+    monkeypatch.setattr(progress_line, "PATIENCE_SECONDS", 0.1)
     with progress_line.progress_line() as line, listening(line):
         two_seconds()
         shown = screen.getvalue()
@@ -53,7 +53,7 @@ def test_progress_is_drawn_on_a_terminal_only_and_cleared(monkeypatch, is_termin
         return
     assert "first … 0 s so far" in shown or "first … 1 s so far" in shown
     assert "second … about to end" in shown or "second … about 1 s left" in shown
-    assert shown.endswith(progress_line.CLEAR)
+    assert shown.endswith(progress_line.CLEAR_LINE)
 
 
 @pytest.mark.parametrize("width", [2, 30])
@@ -62,10 +62,10 @@ def test_progress_keeps_to_one_row_of_a_narrow_terminal(monkeypatch, width: int)
     screen.fileno = lambda: 2
     monkeypatch.setattr("sys.stderr", screen)
     monkeypatch.setattr("os.get_terminal_size", lambda _: os.terminal_size((width, 24)))
-    monkeypatch.setattr(progress_line, "PATIENCE", 0.1)
+    monkeypatch.setattr(progress_line, "PATIENCE_SECONDS", 0.1)
     with progress_line.progress_line() as line, listening(line), stages(("a stage whose name is long", 1)) as begin:
         begin()
         time.sleep(0.7)
-    drawn = screen.getvalue().split(progress_line.CLEAR)
+    drawn = screen.getvalue().split(progress_line.CLEAR_LINE)
     assert max(map(len, drawn)) == width - 1 and any(said.startswith("…") for said in drawn)
     assert width == 2 or any(said.endswith("s so far") for said in drawn)

@@ -14,7 +14,7 @@ from oracles import cart_parameters, kalman
 from small import FEW, HOVERCRAFT, TRUTH, contents, finite, only_start, simulated, steady, written
 
 import steady_ppl as st
-from steady_ppl.comparison.prove import far_off, prove
+from steady_ppl.comparison.prove import doubtful, prove
 from steady_ppl.comparison.scores import Key
 from steady_ppl.model.program import Program, for_program
 
@@ -110,14 +110,14 @@ def test_a_drive_that_the_linearised_program_misjudges_is_named(drag, dragged):
     left = torch.zeros(len(dragged))
     left[3], left[7] = -4.0, 2.5
     rows = {"after": replace(drag.rows["after"], neglected=left)}
-    assert far_off(rows, dragged) == [
+    assert doubtful(rows, dragged) == [
         "after: on drive 4 a particle filter's log p(y) is 4.0 nats below the linearised program's (1 other likewise): "
         "look at it before you trust the table"
     ]
     left[5] = torch.nan
-    assert "on drive 6 a particle filter's log p(y) is not comparable with the linearised" in far_off(rows, dragged)[0]
+    assert "on drive 6 a particle filter's log p(y) is not comparable with the linearised" in doubtful(rows, dragged)[0]
     rows = {"after": replace(drag.rows["after"], neglected="it broke down")}
-    assert far_off(rows, dragged)[0].endswith("can be trusted: it broke down")
+    assert doubtful(rows, dragged)[0].endswith("can be trusted: it broke down")
 
 
 @pytest.mark.parametrize("horizon", ["1 s", "3 s"])

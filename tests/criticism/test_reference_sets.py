@@ -93,7 +93,7 @@ def test_paths_are_those_of_more_linearisations(known_start):
     with seeded(1, "again"):
         again, truth = simulate_again(program, data, data.known_start.expand(4, -1, -1), 3)
     _, tracked = simulated._tracked(Problem(program, again, known_start), truth)
-    rested = smooth(Problem(program, again, known_start), truth, passes=simulated.LINEARISATIONS)
+    rested = smooth(Problem(program, again, known_start), truth, passes=simulated.MAX_LINEARISATIONS)
     means, noise = rested.means()
     inside = again.transitions[..., None]
     torch.testing.assert_close(tracked.noise * inside, noise * inside, rtol=0, atol=3 * simulated.REST_TOLERANCE)

@@ -9,7 +9,7 @@ import torch
 from examples import example
 
 import steady_ppl as st
-from steady_ppl.data.frozen_sensors import MIN_ROWS, frozen_stretches, masked
+from steady_ppl.data.frozen_sensors import MIN_STRETCH_ROWS, frozen_stretches, masked
 
 
 def table(rows: int = 61) -> st.Trajectories:
@@ -44,10 +44,10 @@ def test_a_gap_filled_by_interpolation_is_found_to_the_row() -> None:
 def test_a_sensor_that_hangs_is_found_and_a_short_rest_is_not() -> None:
     data = table()
     measurements = data.measurements.clone()
-    measurements[10 : 10 + MIN_ROWS, 0, 2] = measurements[10, 0, 2]
-    measurements[30 : 30 + MIN_ROWS - 2, 2, 1] = measurements[30, 2, 1]
+    measurements[10 : 10 + MIN_STRETCH_ROWS, 0, 2] = measurements[10, 0, 2]
+    measurements[30 : 30 + MIN_STRETCH_ROWS - 2, 2, 1] = measurements[30, 2, 1]
     (found,) = frozen_stretches(replace(data, measurements=measurements))
-    assert (found.drive, found.rows, found.columns) == (0, (10, 10 + MIN_ROWS - 1), ("y.bearing_2",))
+    assert (found.drive, found.rows, found.columns) == (0, (10, 10 + MIN_STRETCH_ROWS - 1), ("y.bearing_2",))
 
 
 def test_overlapping_stretches_of_a_drive_are_one_and_a_column_that_never_scatters_is_none() -> None:

@@ -11,7 +11,7 @@ import torch
 from small import HOVERCRAFT, simulated, steady, written
 
 import steady_ppl as st
-from steady_ppl.data.table import MAX_ROWS
+from steady_ppl.data.table import MAX_DRIVE_ROWS
 
 
 def test_pieces_are_the_rows_of_their_time_as_they_were():
@@ -58,7 +58,7 @@ def test_what_cannot_be_cut_says_why():
 
 
 def test_what_looks_at_drives_as_a_whole_refuses_long_ones(tmp_path, capsys):
-    rows = MAX_ROWS + 1
+    rows = MAX_DRIVE_ROWS + 1
     frame = st.to_frame(simulated(trajectories=6, rows=11))
     first = frame[frame["trajectory"] == "1"]
     first = pd.concat([first] * (rows // 11 + 1)).iloc[:rows].assign(time=np.arange(rows) / 10)

@@ -72,7 +72,7 @@ def assert_found(truth: Program, program: Program, text: str) -> None:
     train, valid = (Problem.of_table(program, table, known_start=True) for table in drives)
     found = findings(search(train, valid.data, Settings(program, sets=50, later_sets=50)))
     name, where, *_ = parsed(text)
-    assert found and ":".join(part for part in (name, where) if part) in found[0].alike, [
-        finding.alike for finding in found
+    assert found and ":".join(part for part in (name, where) if part) in found[0].aliases, [
+        finding.aliases for finding in found
     ]
     assert found[0].kind == found[0].variant.effect.verdict

@@ -17,7 +17,7 @@ from torch.distributions import constraints
 import steady_ppl as st
 from steady_ppl.discovery.candidates import variance_of_places
 from steady_ppl.discovery.curves import knots_of
-from steady_ppl.discovery.discover import NOT_CONVERGED, _of_one_drive
+from steady_ppl.discovery.discover import NOT_CONVERGED, _note_of_one_drive
 from steady_ppl.discovery.finding import _spread, next_run
 from steady_ppl.effects import Effect, chosen_variant, parsed
 from steady_ppl.effects.registry import _EFFECTS, register
@@ -66,7 +66,7 @@ def clean() -> st.Discovery:
 def test_a_missing_drag_is_found_with_its_coefficient(dragged):
     assert dragged.verdict == "dynamics" and dragged.p_value < 0.05
     (finding,) = dragged.findings
-    assert finding.alike[0] == "quadratic_drag" and finding.confidence > 0.8
+    assert finding.aliases[0] == "quadratic_drag" and finding.confidence > 0.8
     assert abs(finding.coefficient[0] - 0.05) < 4 * finding.sd[0]
     low, high = finding.interval[0]
     assert low < finding.coefficient[0] < high
@@ -101,15 +101,15 @@ def test_clean_drives_give_none_and_say_what_could_have_been_seen(clean):
 @pytest.mark.slow
 def test_a_fault_of_the_sensor_is_not_blamed_on_the_dynamics():
     found = discovered("landmark_bias:1=0.07")
-    assert found.verdict == "sensor" and found.findings[0].alike == ["landmark_bias:bearing_1"]
+    assert found.verdict == "sensor" and found.findings[0].aliases == ["landmark_bias:bearing_1"]
     assert abs(found.findings[0].coefficient[0] - 0.07) < 4 * found.findings[0].sd[0]
 
 
 @pytest.mark.slow
 def test_two_effects_are_both_found():
     found = discovered("linear_drag=0.12", "landmark_bias:2=0.08")
-    assert {finding.alike[0] for finding in found.findings} >= {"landmark_bias:bearing_2"}
-    assert any("linear_drag" in finding.alike for finding in found.findings)
+    assert {finding.aliases[0] for finding in found.findings} >= {"landmark_bias:bearing_2"}
+    assert any("linear_drag" in finding.aliases for finding in found.findings)
 
 
 @pytest.mark.slow
@@ -164,11 +164,11 @@ class FreeSight(type(owner())):
 
 def test_a_gain_of_one_drive_is_said_to_be(dragged):
     (found,) = dragged.search.found
-    assert _of_one_drive(found) == ""
+    assert _note_of_one_drive(found) == ""
     gain = torch.zeros(2 * DRIVES)
     gain[13] = 9.0
     alone = replace(found, candidate=replace(found.candidate, gain=gain))
-    assert _of_one_drive(alone).startswith("without drive 4 of the training drives nothing would be left")
+    assert _note_of_one_drive(alone).startswith("without drive 4 of the training drives nothing would be left")
 
 
 def test_what_was_found_comes_first_among_the_candidates(dragged):
@@ -217,8 +217,8 @@ def test_the_next_run_tells_what_these_drives_do_not():
 class Unclear:
     """A class of several effects."""
 
-    def __init__(self, alike):
-        self.alike = alike
+    def __init__(self, aliases):
+        self.aliases = aliases
 
 
 def test_a_sensor_that_failed_on_all_training_drives_is_no_obstacle():
@@ -263,8 +263,8 @@ def test_a_pendulum_lacks_friction_and_a_spring_and_says_so():
     program = example("pendulum", torch.float32)
     found = discovered("coulomb_friction=0.8", "cubic_stiffness=4", program=program)
     assert found.verdict == "dynamics"
-    assert {finding.alike[0] for finding in found.findings} == {"coulomb_friction", "cubic_stiffness"}
-    for finding, planted in ((one, 0.8 if one.alike[0] == "coulomb_friction" else 4) for one in found.findings):
+    assert {finding.aliases[0] for finding in found.findings} == {"coulomb_friction", "cubic_stiffness"}
+    for finding, planted in ((one, 0.8 if one.aliases[0] == "coulomb_friction" else 4) for one in found.findings):
         assert abs(finding.coefficient[0] - planted) < 4 * finding.sd[0]
 
 
@@ -272,7 +272,7 @@ def test_a_pendulum_lacks_friction_and_a_spring_and_says_so():
 def test_an_unknown_start_gaps_and_unequal_lengths_do_not_mislead():
     train, valid = tables(with_effects(owner(), "quadratic_drag=0.06"), rows=91)
     found = st.discover(owner(), gappy(train, 1), gappy(valid, 2), simulations=SETS)
-    assert found.verdict == "dynamics" and "quadratic_drag" in found.findings[0].alike
+    assert found.verdict == "dynamics" and "quadratic_drag" in found.findings[0].aliases
 
 
 def gappy(data, seed: int):

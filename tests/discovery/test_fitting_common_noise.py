@@ -22,7 +22,7 @@ from steady_ppl.discovery.refits import Threshold, first_refit, refit_with
 from steady_ppl.effects import chosen_variant
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path, smooth
-from steady_ppl.likelihood.maximize import Term, climb, maximise
+from steady_ppl.likelihood.maximize import Term, maximise, maximise_sum
 from steady_ppl.likelihood.parameters import elements, values_of
 from steady_ppl.model.problem import Problem
 
@@ -115,7 +115,7 @@ def test_programs_that_have_everything_in_common_are_one(priors):
         program.priors = priors
         parts = [elements(program)[index] for index in order]
         terms.append(Term(Problem(program, data, True), find_path(Problem(program, data, True)), parts, order))
-    first, second = climb(terms, precision=1e-4)
+    first, second = maximise_sum(terms, precision=1e-4)
     assert first.objective + second.objective == pytest.approx(whole.objective, abs=1e-3)
     for term in terms:
         assert values_of(elements(term.problem.program)).tolist() == pytest.approx(
@@ -187,10 +187,10 @@ def test_it_begins_elsewhere_where_the_parabola_leads_nowhere(carts, monkeypatch
         tried.append(terms)
         if len(tried) == 1:
             raise FilterError("beyond all measure")
-        return climb(terms, **options)
+        return maximise_sum(terms, **options)
 
     monkeypatch.setattr(fitting, "_starts", far)
-    monkeypatch.setattr(fitting, "climb", seen)
+    monkeypatch.setattr(fitting, "maximise_sum", seen)
     problems = [fold.fitting(program) for program, fold in zip(carts.programs, carts.folds, strict=True)]
     found = with_common_noise(problems, carts.maxima)
     assert len(tried) == 2

@@ -9,7 +9,7 @@ from examples import example
 from scipy import stats
 
 from steady_ppl.discovery.effect_scores import Column
-from steady_ppl.discovery.screening import ALPHA, _critical, _test, screen
+from steady_ppl.discovery.screening import FAMILY_LEVEL, _critical, _test, screen
 from steady_ppl.effects import chosen_variant
 
 DRIVES, PARAMETERS = 16, 3
@@ -75,7 +75,7 @@ def test_a_single_tests_level_and_the_familys_say_the_same(sets):
     critical = _critical(family)
     for observed in (*np.sort(family), critical, *np.nextafter(np.sort(family)[:12], 0.0)):
         whole = (1 + int((family <= observed).sum())) / (1 + sets)
-        assert (whole <= ALPHA) == (observed <= critical)
+        assert (whole <= FAMILY_LEVEL) == (observed <= critical)
 
 
 def test_a_statistic_that_rounding_made_negative_says_nothing():

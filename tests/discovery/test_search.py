@@ -16,4 +16,4 @@ def test_a_class_begins_with_what_was_chosen():
 
     more, chosen, near, far = Stub(10.5), Stub(10.0), Stub(8.5), Stub(7.0)
     found = Found(chosen, [more, chosen, near, far], None)
-    assert found.alike == [chosen, more, near]
+    assert found.aliases == [chosen, more, near]

@@ -39,7 +39,7 @@ def test_a_program_has_kernels_for_the_filter_and_for_its_jacobians(monkeypatch)
 
 
 def test_jacobians_that_cannot_be_compiled_come_from_torch_and_the_guide_says_why(monkeypatch):
-    monkeypatch.setattr(linearized, "WORTH_COMPILING", 1)
+    monkeypatch.setattr(linearized, "GUIDE_ROWS_WORTH_COMPILING", 1)
     data = drives(example("hovercraft", torch.float32), 2, 12)
     guide = GaussianGuide(Switching(), draws=3, known_start=True)
     with seeded("plain"):

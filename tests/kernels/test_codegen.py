@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from steady_ppl.kernels.codegen import LANES, source
+from steady_ppl.kernels.codegen import SIMD_LANES, source
 from steady_ppl.kernels.graph import PARTICLE, NotCompilable, ScalarGraph
 from steady_ppl.kernels.jit import Kernel, Method
 
@@ -219,7 +219,7 @@ def test_residual_layers_and_two_heads_of_one_hidden_layer_are_those_of_torch():
     torch.testing.assert_close(mine[:, 0].t(), theirs, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("particles", [LANES, LANES + 1, 3 * LANES - 1, 5 * LANES])
+@pytest.mark.parametrize("particles", [SIMD_LANES, SIMD_LANES + 1, 3 * SIMD_LANES - 1, 5 * SIMD_LANES])
 def test_any_number_of_particles_is_worked_through(particles):
     x, u = torch.arange(3.0 * particles).view(3, particles), torch.tensor([1.0, 2.0, 3.0])
     assert torch.equal(kernel_of(lambda x, u: 2 * x + u, x, uniform=u)[0], 2 * x + u[:, None])

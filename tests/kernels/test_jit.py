@@ -202,7 +202,7 @@ def test_a_kernel_is_compared_when_a_program_first_runs_with_it() -> None:
     which.strength = 2.0
     assert_own(copy.deepcopy(which), lines)
     which.gain.data += 1.0
-    assert found(which, lines) == jit.DIFFERENT
+    assert found(which, lines) == jit.RESULTS_DIFFER
 
 
 def test_a_class_goes_when_nobody_has_it() -> None:

@@ -13,7 +13,7 @@ from torch import nn
 from steady_ppl import seeded
 from steady_ppl.gaussian.linearize import ReferencePath, linearize
 from steady_ppl.kernels import jit, rows as rows_by_kernels
-from steady_ppl.kernels.rows import Slopes, in_plain_torch, on_all_rows, slopes_on_all_rows, without_kernels
+from steady_ppl.kernels.rows import Slopes, fallback_notes, kernel_failures, on_all_rows, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import elements, on_both_sides
 from steady_ppl.model.handlers import Standardised, running
 from steady_ppl.model.problem import Problem
@@ -103,7 +103,7 @@ def test_a_program_that_differs_in_what_nothing_tells_is_not_run_by_the_others_k
     path = ReferencePath(torch.randn(9, 2, 6), torch.randn(8, 2, 3))
     assert linearize(Problem(program, data), path).in_plain_torch is None
     found, expected = linearize(Problem(other, data), path), linearize(Problem(other, data), path, kernels=False)
-    assert found.in_plain_torch == jit.DIFFERENT and torch.equal(found.state, expected.state)
+    assert found.in_plain_torch == jit.RESULTS_DIFFER and torch.equal(found.state, expected.state)
 
 
 class InPlace(type(example("hovercraft"))):
@@ -145,12 +145,12 @@ def test_why_there_is_no_kernel_is_noted_once_a_function():
         pass
 
     program, given = Sorting(), {"state": torch.randn(4, 5, 3)}
-    with without_kernels() as why:
+    with kernel_failures() as why:
         for _ in range(2):
             assert isinstance(on_all_rows(program, "sorted", lambda state: state.sort(-1).values, given), str)
-        with without_kernels() as inner:
+        with kernel_failures() as inner:
             on_all_rows(program, "sorted twice", lambda state: state.sort(-1).values, given)
     assert list(why) == ["sorted"] and list(inner) == ["sorted twice"]
-    (note,) = in_plain_torch({"one": "a", "two": "b", "three": "a"})
+    (note,) = fallback_notes({"one": "a", "two": "b", "three": "a"})
     assert note == "computed in plain torch, without compiled kernels: one, three: a; two: b"
-    assert in_plain_torch({}) == []
+    assert fallback_notes({}) == []

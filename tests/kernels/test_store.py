@@ -178,7 +178,7 @@ def of_another_kernel(file: Path, other: bytes) -> None:
 
 
 def without_header(file: Path, other: bytes) -> None:
-    file.write_bytes(file.read_bytes()[len(store.MAGIC) + store.DIGEST :])
+    file.write_bytes(file.read_bytes()[len(store.MAGIC) + store.DIGEST_BYTES :])
 
 
 def of_another_format(file: Path, other: bytes) -> None:
@@ -370,7 +370,7 @@ def test_the_bound_holds_and_what_was_used_last_stays(folder, monkeypatch):
 
 def test_one_kernel_in_sixteen_looks_through_the_folder(folder, monkeypatch):
     looked = []
-    monkeypatch.setattr(store, "_forget", looked.append)
+    monkeypatch.setattr(store, "_evict", looked.append)
     names = [store._name(str(number)) for number in range(48)]
     assert all(compiled(str(number), number) for number in range(48))
     assert len(looked) == sum(name.startswith("0") for name in names)
@@ -402,7 +402,7 @@ def test_the_users_cache_folder(folder, monkeypatch, tmp_path):
     for useless in ("", "relative"):
         monkeypatch.setenv("XDG_CACHE_HOME", useless)
         monkeypatch.setenv("HOME", str(tmp_path / "home"))
-        assert store._place() == tmp_path / "home" / ".cache" / "steady-ppl" / "kernels"
+        assert store._folder_path() == tmp_path / "home" / ".cache" / "steady-ppl" / "kernels"
 
 
 def test_off_and_paths_that_depend_on_where_one_works(folder, monkeypatch, tmp_path):

@@ -13,7 +13,7 @@ import typer
 from small import blocks, commands, simulated
 
 import steady_ppl as st
-from steady_ppl.cli.main import COMMANDS, EVERYWHERE, app, main
+from steady_ppl.cli.main import COMMANDS, GLOBAL_OPTIONS, app, main
 from steady_ppl.effects import catalogue
 
 ROOT = Path(__file__).parents[2]
@@ -30,7 +30,7 @@ RUN = (
 def test_every_command_parses(page: Path) -> None:
     group = typer.main.get_command(app)
     for words in commands(page):
-        name, *rest = [word for word in words if word not in EVERYWHERE]
+        name, *rest = [word for word in words if word not in GLOBAL_OPTIONS]
         command = group.commands[name]
         while hasattr(command, "commands"):
             name, *rest = rest

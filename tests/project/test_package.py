@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import steady_ppl
-from steady_ppl.utils import late
+from steady_ppl.utils import hooks
 
 STUB = Path(steady_ppl.__file__).with_suffix(".pyi")
 
@@ -37,4 +37,4 @@ def test_importing_the_package_loads_no_torch() -> None:
 
 
 def test_the_root_says_what_lower_packages_call_of_higher_ones() -> None:
-    assert late._absent not in (late.html, late.attach_listed, late.with_effect)
+    assert hooks._absent not in (hooks.html, hooks.attach_listed, hooks.with_effect)

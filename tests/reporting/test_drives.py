@@ -9,7 +9,7 @@ from report_pages import two_run_report, two_runs, unpacked
 from small import simulated
 
 import steady_ppl as st
-from steady_ppl.reporting.drives import chosen, packed, where_to_look
+from steady_ppl.reporting.drives import chosen_drives, packed, where_to_look
 
 
 def test_numbers_come_back_as_finely_as_sixteen_bits_are():
@@ -48,11 +48,11 @@ def test_a_place_to_look_at_is_where_the_misfit_is():
 
 def test_there_is_room_for_the_strongest_drives():
     checks = list(two_run_report().checks.values())
-    assert chosen(checks).note is None
-    few = chosen(checks, numbers=3 * 101 * 80)
+    assert chosen_drives(checks).note is None
+    few = chosen_drives(checks, numbers=3 * 101 * 80)
     assert 1 <= len(few.drives) < 6 and few.every == 1 and "strongest misfits" in few.note
     assert f"{len(few.drives)} of 6 drives" in few.note
-    tiny = chosen(checks, numbers=500)
+    tiny = chosen_drives(checks, numbers=500)
     assert len(tiny.drives) == 1 and tiny.every > 1 and "th row" in tiny.note
 
 
@@ -60,8 +60,8 @@ def test_what_is_shown_row_by_row_has_an_upper_bound():
     """A page of three hundred drives is hardly larger than one of thirty."""
     checks = [st.check(one, simulated(trajectories=6, rows=101), simulations=20) for one in two_runs().values()]
     for numbers in (3_000, 30_000):
-        shown = chosen(checks, numbers)
+        shown = chosen_drives(checks, numbers)
         rows = -(-101 // shown.every)
         assert 0.5 * numbers < len(shown.drives) * rows * 100 < 1.5 * numbers
         assert shown.note and "of 6 drives" in shown.note
-    assert chosen(checks).note is None
+    assert chosen_drives(checks).note is None

@@ -13,7 +13,7 @@ from small_studies import STUDY, written
 from steady_ppl.errors import ComputationError
 from steady_ppl.runs.fit import packages
 from steady_ppl.studies import executors
-from steady_ppl.studies.executors import TRIES, Attempts, Local
+from steady_ppl.studies.executors import MAX_TRIES, Attempts, Local
 from steady_ppl.studies.plan import read_plan
 from steady_ppl.studies.runner import run_study
 from steady_ppl.studies.table import TABLE, read_results
@@ -58,7 +58,7 @@ def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(t
         and found.loc[13, "reason"] == "its worker died each time that it was tried"
     )
     begun = {seed: (tmp_path / "marks" / str(seed)).stat().st_size for seed in (1, 7, 13)}
-    assert begun == {1: 2, 7: 2, 13: TRIES}
+    assert begun == {1: 2, 7: 2, 13: MAX_TRIES}
     assert sorted(file.name for file in out.iterdir()) == [TABLE, "study.json"]
     assert run_study(plan, out, Local(workers)) == 3  # what has failed is left
     assert (tmp_path / "marks" / "7").stat().st_size == begun[7]
@@ -83,8 +83,8 @@ def test_a_deadly_job_takes_nothing_with_it_and_is_tried_after_the_others(tmp_pa
     assert [(row["seed"], row["outcome"]) for row in found[4:]] == [(13, "failed")]
     assert {(row["seed"], row["outcome"]) for row in found[:4]} == {(seed, "done") for seed in (1, 2, 3, 5)}
     begun = {int(mark.name): mark.stat().st_size for mark in (tmp_path / "marks").iterdir()}
-    assert begun == {1: 1, 2: 1, 3: 1, 5: 1, 13: TRIES}
-    assert said == [f"a worker died of {jobs[0].label}"] * TRIES
+    assert begun == {1: 1, 2: 1, 3: 1, 5: 1, 13: MAX_TRIES}
+    assert said == [f"a worker died of {jobs[0].label}"] * MAX_TRIES
 
 
 def test_workers_that_die_before_they_begin_end_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -165,7 +165,7 @@ def test_a_cluster_gives_up_every_job_that_kills_and_none_that_only_waited():
     for key in [*deadly, "waits"]:
         attempts.sent(key)
     for key in 4 * deadly:
-        attempts.hear(key)
+        attempts.note_begun(key)
     assert all(attempts.killed(key) for key in deadly)  # all at once
     assert not attempts.killed("waits")
     assert not any(attempts.killed("waits") for _ in range(9))
@@ -177,5 +177,5 @@ def test_jobs_that_a_machine_takes_along_once_are_tried_again():
     attempts = Attempts()
     for key in map(str, range(40)):  # of a scheduler that tries once
         attempts.sent(key)
-        attempts.hear(key)
+        attempts.note_begun(key)
     assert not any(attempts.killed(str(place)) for place in range(40))

@@ -158,7 +158,7 @@ def test_what_has_come_is_let_go_of(tmp_path: Path, dask: Dask):
 
 
 def test_a_cluster_without_a_worker_is_said_and_waited_for(tmp_path: Path, dask: Dask, monkeypatch):
-    monkeypatch.setattr(clusters, "WORKER_WAIT", 2)
+    monkeypatch.setattr(clusters, "WORKER_WAIT_SECONDS", 2)
     said, out = list[str](), tmp_path / "out"
 
     def hear(line: str) -> None:

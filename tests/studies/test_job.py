@@ -9,7 +9,7 @@ import pytest
 from small import MODELS
 from small_studies import CART, STUDY, search_study, written
 
-from steady_ppl.studies.job import CHANGED, in_limits, planted, run, told_settings
+from steady_ppl.studies.job import OUTDATED, in_limits, planted_effect, run, settings_with_noise
 from steady_ppl.studies.plan import read_plan
 
 
@@ -34,7 +34,7 @@ def test_a_job_is_known_by_what_it_depends_on_and_not_by_where_it_is(tmp_path: P
 )
 def test_what_is_planted_is_told_from_where_it_is_absent(tmp_path: Path, effect: str, name: str, value: list):
     text = search_study().replace('["", "linear_drag=0.5"]', f'"{effect}"')
-    variant, found = planted(read_plan(written(tmp_path, text)).jobs[0])
+    variant, found = planted_effect(read_plan(written(tmp_path, text)).jobs[0])
     assert (variant.name if variant else "") == name and found == pytest.approx(value)
 
 
@@ -91,7 +91,7 @@ def test_every_program_of_a_job_knows_the_noise_of_the_bearings(tmp_path: Path):
     text += f'[[method]]\nname = "by hand"\nprogram = "{hovercraft}"\nrecipe = "fit-hand"\n'
     text += f'settings = {{hand = "{hovercraft}", lineages = 2}}\n'
     (tmp_path / "study.toml").write_text(text)
-    settings = told_settings(read_plan(tmp_path / "study.toml").jobs[0])
+    settings = settings_with_noise(read_plan(tmp_path / "study.toml").jobs[0])
     assert settings["hand"].bearing_sd == pytest.approx(math.radians(20)) and settings["lineages"] == 2
 
 
@@ -104,9 +104,9 @@ def test_what_was_changed_while_a_study_went_on_is_no_result(tmp_path: Path):
     assert run(job)["outcome"] == "done"
     with (folder / "mine.py").open("a") as file:
         file.write("# changed\n")
-    assert run(job)["reason"] == CHANGED
+    assert run(job)["reason"] == OUTDATED
     (folder / "mine.py").unlink()
-    assert run(job)["reason"] == CHANGED
+    assert run(job)["reason"] == OUTDATED
 
 
 @pytest.mark.parametrize(

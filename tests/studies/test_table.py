@@ -15,8 +15,8 @@ from small_studies import row, written
 
 from steady_ppl.errors import RunError
 from steady_ppl.studies.executors import Local
-from steady_ppl.studies.job import CHANGED
-from steady_ppl.studies.plan import RECORD, read_plan, record_plan, recorded_plan
+from steady_ppl.studies.job import OUTDATED
+from steady_ppl.studies.plan import STUDY_RECORD, read_plan, record_plan, recorded_plan
 from steady_ppl.studies.runner import run_study
 from steady_ppl.studies.table import ARRIVED, EARLIER, TABLE, StudyTable, read_results, study_table
 
@@ -133,12 +133,12 @@ def test_a_link_is_not_followed_and_what_is_not_the_studys_stays(tmp_path: Path)
 
 def test_a_damaged_record_and_one_of_a_newer_version_are_said(tmp_path: Path):
     record_plan(read_plan(written(tmp_path)), tmp_path)
-    record = json.loads((tmp_path / RECORD).read_text())
+    record = json.loads((tmp_path / STUDY_RECORD).read_text())
     assert recorded_plan(tmp_path) == read_plan(tmp_path / "study.toml")
-    (tmp_path / RECORD).write_text(json.dumps(record | {"picture": record["picture"] | {"y": []}}))
+    (tmp_path / STUDY_RECORD).write_text(json.dumps(record | {"picture": record["picture"] | {"y": []}}))
     with pytest.raises(RunError, match="damaged: picture.y has 0 columns"):
         recorded_plan(tmp_path)
-    (tmp_path / RECORD).write_text(json.dumps(record | {"format": 99}))
+    (tmp_path / STUDY_RECORD).write_text(json.dumps(record | {"format": 99}))
     with pytest.raises(RunError, match="written by a newer steady-ppl: its form is number 99"):
         recorded_plan(tmp_path)
 
@@ -184,7 +184,7 @@ def test_files_that_had_changed_are_tried_again_by_the_same_command(tmp_path: Pa
     plan, out = read_plan(written(tmp_path)), tmp_path / "out"
     plan = replace(plan, jobs=plan.jobs[:2])
     with study_table(out) as table:
-        table.add(row(plan.jobs[0].key, "failed", reason=CHANGED, seconds=0.0))
+        table.add(row(plan.jobs[0].key, "failed", reason=OUTDATED, seconds=0.0))
         table.add(row(plan.jobs[1].key, "failed", reason="no"))
     assert run_study(plan, out, Local(1)) == 1
     assert read_results(out)["outcome"].tolist() == ["failed", "done"]

@@ -6,30 +6,30 @@ from examples import HeavyTailed, example
 from small import simulated
 
 from steady_ppl import Validation, for_program, log_likelihood, seeded, simulate
-from steady_ppl.training.loop import as_good
+from steady_ppl.training.loop import within_one_standard_error
 
 
 def test_better_is_as_good() -> None:
-    assert as_good([2.0, 3.0, 4.0], [1.0, 2.0, 3.0])
+    assert within_one_standard_error([2.0, 3.0, 4.0], [1.0, 2.0, 3.0])
 
 
 def test_within_one_standard_error_of_the_paired_difference_is_as_good() -> None:
     best = [10.0, 20.0, 30.0, 40.0]
     loss = [1.0, -0.5, 0.5, 0.0]  # mean .25, standard error .323
-    assert as_good([b - difference for b, difference in zip(best, loss, strict=True)], best)
+    assert within_one_standard_error([b - difference for b, difference in zip(best, loss, strict=True)], best)
 
 
 def test_a_consistent_loss_is_worse_however_small() -> None:
-    assert not as_good([9.99, 19.98, 29.99, 39.98], [10.0, 20.0, 30.0, 40.0])
+    assert not within_one_standard_error([9.99, 19.98, 29.99, 39.98], [10.0, 20.0, 30.0, 40.0])
 
 
 def test_a_single_held_out_drive_is_compared_directly() -> None:
-    assert as_good([1.0], [1.0])
-    assert not as_good([0.9], [1.0])
+    assert within_one_standard_error([1.0], [1.0])
+    assert not within_one_standard_error([0.9], [1.0])
 
 
 def test_without_held_out_drives_the_last_is_kept() -> None:
-    assert as_good([], [])
+    assert within_one_standard_error([], [])
 
 
 def test_validation_repeats_its_random_numbers_and_averages_at_the_stated_rate() -> None:

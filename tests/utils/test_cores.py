@@ -13,7 +13,7 @@ import torch
 
 from steady_ppl.errors import FilterError
 from steady_ppl.utils import cores
-from steady_ppl.utils.cores import one_core, side_by_side
+from steady_ppl.utils.cores import one_core, run_in_parallel
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +32,7 @@ def jobs_of(count, run=lambda index: None):
 
 
 def test_results_come_in_the_order_of_jobs_from_several_processes():
-    found = side_by_side(jobs_of(7))
+    found = run_in_parallel(jobs_of(7))
     assert [values["at"] for _, values in found] == [[index, "é"] for index in range(7)]
     for index, (tensors, _) in enumerate(found):
         torch.testing.assert_close(tensors["squares"], torch.arange(index + 1.0).square(), rtol=0, atol=0)
@@ -41,16 +41,16 @@ def test_results_come_in_the_order_of_jobs_from_several_processes():
 
 def test_one_core_and_one_job_take_no_other_process():
     with one_core():
-        assert {values["pid"] for _, values in side_by_side(jobs_of(4))} == {os.getpid()}
-    assert side_by_side(jobs_of(1))[0][1]["pid"] == os.getpid()
-    assert side_by_side([]) == []
+        assert {values["pid"] for _, values in run_in_parallel(jobs_of(4))} == {os.getpid()}
+    assert run_in_parallel(jobs_of(1))[0][1]["pid"] == os.getpid()
+    assert run_in_parallel([]) == []
 
 
 def test_jobs_within_jobs_stay_in_their_process():
     def outer():
-        return {}, {"pids": sorted({values["pid"] for _, values in side_by_side(jobs_of(4))})}
+        return {}, {"pids": sorted({values["pid"] for _, values in run_in_parallel(jobs_of(4))})}
 
-    inner = [values["pids"] for _, values in side_by_side([outer, outer, outer])]
+    inner = [values["pids"] for _, values in run_in_parallel([outer, outer, outer])]
     assert [len(pids) for pids in inner[1:]] == [1, 1]
 
 
@@ -60,7 +60,7 @@ def test_what_a_job_raises_elsewhere_is_raised_here():
             raise FilterError("trajectory 3 blew up")
 
     with pytest.raises(FilterError, match="trajectory 3 blew up"):
-        side_by_side(jobs_of(4, fail))
+        run_in_parallel(jobs_of(4, fail))
 
 
 def test_jobs_of_a_process_that_is_killed_are_run_here():
@@ -70,7 +70,7 @@ def test_jobs_of_a_process_that_is_killed_are_run_here():
         if index == 1 and os.getpid() != mine:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    found = side_by_side(jobs_of(6, die))
+    found = run_in_parallel(jobs_of(6, die))
     assert [values["at"][0] for _, values in found] == list(range(6))
     assert found[1][1]["pid"] == mine and found[4][1]["pid"] == mine and found[2][1]["pid"] != mine
 
@@ -87,7 +87,7 @@ def test_an_error_here_ends_the_other_processes(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        side_by_side(jobs_of(3, wait))
+        run_in_parallel(jobs_of(3, wait))
     for file in tmp_path.iterdir():
         with pytest.raises(ProcessLookupError):
             os.kill(int(file.name), 0)
@@ -95,7 +95,7 @@ def test_an_error_here_ends_the_other_processes(tmp_path):
 
 def test_a_process_that_hangs_is_not_waited_for(monkeypatch):
     mine, held = os.getpid(), threading.Lock()
-    monkeypatch.setattr(cores, "MIN_PATIENCE", 0.2)
+    monkeypatch.setattr(cores, "MIN_PATIENCE_SECONDS", 0.2)
 
     def wait(index):
         if os.getpid() != mine:
@@ -103,7 +103,7 @@ def test_a_process_that_hangs_is_not_waited_for(monkeypatch):
                 time.sleep(60)
 
     with held:
-        found = side_by_side(jobs_of(4, wait))
+        found = run_in_parallel(jobs_of(4, wait))
     assert {values["pid"] for _, values in found} == {mine}
 
 
@@ -114,13 +114,13 @@ def test_where_no_process_or_memory_is_to_be_had_jobs_run_here(monkeypatch):
     for call in ("fork", "memfd_create", "pidfd_open"):
         with monkeypatch.context() as patched:
             patched.setattr(os, call, refuse)
-            assert {values["pid"] for _, values in side_by_side(jobs_of(5))} == {os.getpid()}
+            assert {values["pid"] for _, values in run_in_parallel(jobs_of(5))} == {os.getpid()}
 
 
 def test_processes_that_someone_else_has_waited_for_are_as_good(monkeypatch):
     before = signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     try:
-        found = side_by_side(jobs_of(6))
+        found = run_in_parallel(jobs_of(6))
     finally:
         signal.signal(signal.SIGCHLD, before)
     assert len({values["pid"] for _, values in found}) == 3

@@ -13,12 +13,12 @@ from steady_ppl.errors import UsageError, labelled
 from steady_ppl.utils.files import require_file
 from steady_ppl.utils.schema import NUMBER, TEXT, mismatch
 
-CHOICES = {
+ALLOWED_VALUES = {
     "between": (None, "hold", "interpolate"),
     "reading": (None, "yaw", "angle"),
     "clock": ("bag", "header", "aligned"),
 }
-FORM = {"topic": TEXT, "field": TEXT, "longest": (NUMBER, None), "late": NUMBER, "scale": NUMBER, "offset": NUMBER}
+KEY_FORMS = {"topic": TEXT, "field": TEXT, "longest": (NUMBER, None), "late": NUMBER, "scale": NUMBER, "offset": NUMBER}
 MAX_LATE = 1e9  # s; times are whole nanoseconds in 64 bits
 SPELLING = re.compile(r"[A-Za-z_]\w*(\[\d+\])*(\.[A-Za-z_]\w*(\[\d+\])*)*", re.ASCII)  # twist.linear.x, ranges[0]
 Steps = tuple[str | int, ...]  # the names and indices that lead to a field
@@ -60,10 +60,10 @@ class BagColumn:
     def _check(self) -> None:
         if self.name[:2] not in ("u.", "y.", "x.") or len(self.name) < 3:
             raise UsageError("expected u.NAME (a control), y.NAME (a measurement) or x.NAME (a known state)")
-        problem = mismatch(vars(self), FORM)
+        problem = mismatch(vars(self), KEY_FORMS)
         if problem or not self.topic:
             raise UsageError(problem or "topic is '', expected text")
-        for key, choices in CHOICES.items():
+        for key, choices in ALLOWED_VALUES.items():
             value = getattr(self, key)
             if value not in choices:
                 known = " or ".join(f'"{choice}"' for choice in choices if choice)

@@ -24,13 +24,13 @@ import numpy as np
 import pandas as pd
 
 from steady_ppl.data.rosbag.mapping import BagColumn, BagMapping
-from steady_ppl.data.rosbag.reader import Bag, Say, bag_name, check_field, has_stamp, open_bag, stamp_of, value_at
-from steady_ppl.data.rosbag.resample import EvenRows, Series, align, held_pauses, in_rows
+from steady_ppl.data.rosbag.reader import Bag, bag_name, check_field, has_stamp, open_bag, stamp_of, value_at
+from steady_ppl.data.rosbag.resample import EvenRows, Series, align, in_rows, long_holds
 from steady_ppl.data.table import from_frame
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.utils.progress import stages
-from steady_ppl.utils.text import say as say_aside
+from steady_ppl.utils.text import Say, say as say_aside
 
 
 def read_bags(paths: Sequence[str | Path], mapping: BagMapping, say: Say = say_aside) -> Trajectories:
@@ -151,7 +151,7 @@ def _series(where: str, column: BagColumn, time: np.ndarray, values: np.ndarray)
 def _pieces(series: list[Series], mapping: BagMapping, label: str, say: Say) -> dict[str, EvenRows]:
     """The trajectories of a bag by name, without those that say nothing; what is left out is said."""
     found = in_rows(series, mapping.step, label)
-    for held in held_pauses(series, mapping.step):
+    for held in long_holds(series, mapping.step):
         say(f"{label}: {held}")
     first = min((int(one.times[0]) for one in series if len(one.times)), default=0)
     kept = {}

@@ -10,7 +10,7 @@ import math
 import os
 import re
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,9 +26,8 @@ from steady_ppl.errors import DataError, SteadyError, UsageError
 from steady_ppl.utils.files import require_file
 from steady_ppl.utils.text import one_line
 
-Say = Callable[[str], None]
-MAX_WIDTH = 110  # characters of a list of fields
-TEXT = ("string", "wstring", "wchar")
+FIELD_LIST_COLUMNS = 110  # characters of a list of fields
+TEXT_TYPES = ("string", "wstring", "wchar")
 
 
 @dataclass(frozen=True)
@@ -184,7 +183,7 @@ def check_field(store: Any, type_name: str, steps: Steps, where: str, *, quatern
         if kind[0] != Nodetype.NAME or not set("xyzw") <= dict(store.get_msgdef(kind[1]).fields).keys():
             wanted = "as yaw needs a quaternion with x, y, z and w"
             raise DataError(f"{where}: {wanted}, {so_far} is {_describe(store, kind)}")
-    elif kind[0] != Nodetype.BASE or kind[1][0] in TEXT:
+    elif kind[0] != Nodetype.BASE or kind[1][0] in TEXT_TYPES:
         raise DataError(f"{where}: expected a number, {so_far} is {_describe(store, kind)}")
 
 
@@ -240,7 +239,7 @@ def numeric_fields(store: Any, type_name: str, message: Any = None) -> Iterator[
 
     def walk(kind: Any, spelt: str, value: Any) -> Iterator[str]:
         if kind[0] == Nodetype.BASE:
-            if kind[1][0] not in TEXT:
+            if kind[1][0] not in TEXT_TYPES:
                 yield spelt
         elif kind[0] == Nodetype.NAME:
             fields = dict(store.get_msgdef(kind[1]).fields)
@@ -264,7 +263,7 @@ def numeric_fields(store: Any, type_name: str, message: Any = None) -> Iterator[
 def _describe(store: Any, kind: Any) -> str:
     """What a field holds, in words."""
     if kind[0] == Nodetype.BASE:
-        return "text" if kind[1][0] in TEXT else f"a number ({kind[1][0]})"
+        return "text" if kind[1][0] in TEXT_TYPES else f"a number ({kind[1][0]})"
     if kind[0] == Nodetype.NAME:
         return f"a {kind[1]} with the fields {', '.join(name for name, _ in store.get_msgdef(kind[1]).fields)}"
     length = f" of {kind[1][1]} elements" if kind[0] == Nodetype.ARRAY else ""
@@ -311,7 +310,7 @@ def _of_bag(bag: Bag, sections: dict[tuple[str, str], list[str]]) -> list[str]:
         elif len(types) == 1:
             fields = list(numeric_fields(bag.store, types[0], first.get(topic)))
             text = ", ".join(field.replace(" ", "\0") for field in fields) or "no number"
-            wrapped = textwrap.wrap(text, MAX_WIDTH, break_long_words=False, break_on_hyphens=False)
+            wrapped = textwrap.wrap(text, FIELD_LIST_COLUMNS, break_long_words=False, break_on_hyphens=False)
             lines += [f"#     {line}".replace("\0", " ") for line in wrapped]
             sections |= _section(topic, fields, has_stamp(bag.store, types[0]))
     return lines

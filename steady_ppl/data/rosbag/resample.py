@@ -12,7 +12,7 @@ import numpy as np
 from steady_ppl.data.rosbag.mapping import BagColumn
 from steady_ppl.errors import DataError
 
-MAX_ROWS = 10_000_000
+MAX_BAG_ROWS = 10_000_000  # of a piece of a bag
 MAX_PAUSE_RATIO = 20  # times the usual time between commands or the step, the longer, from which a pause is reported
 
 
@@ -43,7 +43,7 @@ class EvenRows:
 def in_rows(series: Sequence[Series], step: float, name: str = "bag") -> list[EvenRows]:
     """The pieces between pauses, each with rows from where all controls are known to its last measurement.
 
-    No series of a control may be empty. More rows than `MAX_ROWS` are a DataError that names the bag.
+    No series of a control may be empty. More rows than `MAX_BAG_ROWS` are a DataError that names the bag.
     """
     measured = [one.times for one in series if one.column.kind == "y" and len(one.times)]
     if not measured:
@@ -67,7 +67,7 @@ def _stretches(control: Series, last: int) -> list[tuple[int, int]]:
     return list(zip(first.tolist(), end.tolist(), strict=True))
 
 
-def held_pauses(series: Sequence[Series], step: float) -> Iterator[str]:
+def long_holds(series: Sequence[Series], step: float) -> Iterator[str]:
     """What is to be said of controls that are held, or interpolated, for far longer than commands usually last."""
     measured = [one.times[-1] for one in series if one.column.kind == "y" and len(one.times)]
     for control in series:
@@ -101,8 +101,8 @@ def _intersection(a: list[tuple[int, int]], b: list[tuple[int, int]]) -> list[tu
 def _piece(series: Sequence[Series], start: int, end: int, step: float, name: str) -> EvenRows:
     spacing = step * 1e9
     last = int(np.floor((end - start) / spacing + 0.5))
-    if last >= MAX_ROWS:
-        what = f"{(end - start) / 1e9:.6g} s in steps of {step} s are {last + 1} rows, more than {MAX_ROWS}"
+    if last >= MAX_BAG_ROWS:
+        what = f"{(end - start) / 1e9:.6g} s in steps of {step} s are {last + 1} rows, more than {MAX_BAG_ROWS}"
         raise DataError(f"{name}: {what}; take a larger step, or the same clock for controls and measurements")
     nearest = {one.column.name: _nearest(one, start, spacing, last) for one in series if one.column.kind == "y"}
     rows = 1 + max((int(at[-1]) for at, _, _ in nearest.values() if len(at)), default=-1)

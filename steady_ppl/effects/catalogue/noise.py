@@ -8,7 +8,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.catalogue.forces import PLANAR
 from steady_ppl.effects.catalogue.sensors import BEARINGS
-from steady_ppl.effects.catalogue.wheels import COMMANDED
+from steady_ppl.effects.catalogue.wheels import SPEED_AND_TURN
 from steady_ppl.effects.declaration import Choices, Effect, Names, Need, Pushes, declare, needs
 from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.model.program import Program
@@ -75,7 +75,7 @@ def process_noise(self: Any, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
     return dict.fromkeys(channels, c)
 
 
-@_noise("spread", "s/m", typical=1.0, limit=5.0, sign=1, lacks=needs(COMMANDED, PLANAR))
+@_noise("spread", "s/m", typical=1.0, limit=5.0, sign=1, lacks=needs(SPEED_AND_TURN, PLANAR))
 def command_noise(self: Any, state: Tensor, control: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""σ → σ (1 + c |command - state|)
 

@@ -16,7 +16,7 @@ BEARINGS: Need = (
     lambda program: program.sees_bearings,
     "it acts on bearings to landmarks, and the program measures something else",
 )
-LANDMARKS: Need = (lambda program: len(program.measurements) != 1, "there is one landmark: its bias is that of all")
+TWO_LANDMARKS: Need = (lambda program: len(program.measurements) != 1, "there is one landmark: its bias is that of all")
 OTHER_SENSORS: Need = (
     lambda program: not (isinstance(program, PlanarVehicle) and program.sees_bearings),
     "of bearings to landmarks it is bearing_bias or landmark_bias",
@@ -55,7 +55,7 @@ def bearing_bias(self: Any, state: Tensor, measured: Tensor, c: Tensor) -> Tenso
     return measured + c
 
 
-@_on_readings("rad", typical=0.06, limit=0.5, choices=_each, lacks=needs(PLANAR, LANDMARKS, BEARINGS))
+@_on_readings("rad", typical=0.06, limit=0.5, choices=_each, lacks=needs(PLANAR, TWO_LANDMARKS, BEARINGS))
 def landmark_bias(self: Any, state: Tensor, measured: Tensor, c: Tensor, component: Any) -> Tensor:
     r"""y_i → y_i + c, one landmark
 

@@ -12,7 +12,7 @@ from steady_ppl.effects.catalogue.forces import PLANAR
 from steady_ppl.effects.declaration import Choices, Effect, Means, Names, Need, Pushes, declare, needs
 from steady_ppl.model.program import Program
 
-COMMANDED: Need = (
+SPEED_AND_TURN: Need = (
     lambda program: {"speed", "turn"} <= set(program.control_names),
     "the controls are not a speed and a turn rate, which the state could be compared with",
 )
@@ -24,9 +24,9 @@ def _each_channel(program: Program, data: Trajectories | None) -> Choices:
 
 
 WHEELS: list[Effect] = []
-_on_command = partial(declare, WHEELS, "command", lacks=needs(COMMANDED, PLANAR))
+_on_command = partial(declare, WHEELS, "command", lacks=needs(SPEED_AND_TURN, PLANAR))
 _on_lateral_velocity = partial(declare, WHEELS, "push", lacks=needs(PLANAR, GRIP))
-_on_wheels = partial(declare, WHEELS, "push", lacks=needs(COMMANDED, PLANAR, GRIP))
+_on_wheels = partial(declare, WHEELS, "push", lacks=needs(SPEED_AND_TURN, PLANAR, GRIP))
 
 
 @_on_wheels(
