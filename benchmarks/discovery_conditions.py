@@ -120,6 +120,21 @@ def table(records: list[dict[str, Any]]) -> str:
     return "\n".join([*lines, ""])
 
 
+def page(records: list[dict[str, Any]], seeds: int, clean_sets: int) -> str:
+    """The table, the false alarms, the seeds and what failed."""
+    done = [record for record in records if "failed" not in record]
+    clean = [r for r in done if r["condition"] == "unknown start" and not r["planted"]]
+    lines = [
+        table(done),
+        f"Clean, unknown start: false alarms {share(clean, lambda r: r['verdict'] != 'none')}; p-values' distance from",
+        f"uniform (Kolmogorov–Smirnov), its p: {uniformity(clean)}.",
+        f"Seeds 60000–{60_000 + seeds - 1}, of clean sets with an unknown start also "
+        f"61000–{61_000 + clean_sets - 1}; tables 10 s + 1 and 2. Digest of the engine's source: {made_by(done)}.",
+        *(f"failed: {record['set']}: {record['failed']}" for record in records if "failed" in record),
+    ]
+    return "\n".join([*lines, ""])
+
+
 def main() -> None:
     """Run what is left and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -136,17 +151,7 @@ def main() -> None:
     ]
     cases += [(Case("unknown start", "", 61_000 + seed),) for seed in range(options.clean)]
     records = run_sets(judged, cases, options.results, options.workers)
-    done = [record for record in records if "failed" not in record]
-    clean = [r for r in done if r["condition"] == "unknown start" and not r["planted"]]
-    lines = [
-        table(done),
-        f"Clean, unknown start: false alarms {share(clean, lambda r: r['verdict'] != 'none')}; p-values' distance from",
-        f"uniform (Kolmogorov–Smirnov), its p: {uniformity(clean)}.",
-        f"Seeds 60000–{60_000 + options.seeds - 1}, of clean sets with an unknown start also "
-        f"61000–{61_000 + options.clean - 1}; tables 10 s + 1 and 2. Digest of the engine's source: {made_by(done)}.",
-        *(f"failed: {record['set']}: {record['failed']}" for record in records if "failed" in record),
-    ]
-    text = "\n".join([*lines, ""])
+    text = page(records, options.seeds, options.clean)
     options.results.with_suffix(".md").write_text(text)
     print(text)
 
