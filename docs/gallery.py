@@ -21,7 +21,7 @@ from steady_ppl.model.program import for_program, names, unit_of, units
 
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
-RECORDS = ROOT / "benchmarks" / "results" / "discovery.jsonl"
+RECORDS = ROOT / "benchmarks" / "results" / "discovery-continuous.jsonl"
 PROGRAMS = ("hovercraft", "truck", "pendulum")  # the first that can have an effect shows it
 QUIET = 0.1  # of the channels' noise, so that the effect is seen; but for effects on that noise
 SEEDS = {"hovercraft": 4, "truck": 3, "pendulum": 4}  # of drives on which much happens
@@ -30,7 +30,7 @@ HEAD = """# Effect gallery
 
 What could be missing, what it looks like and what it is taken for. Pictures: the same drive, the same commands and \
 the same noise (a tenth of the program's, but for effects on that noise), blue without the effect and orange with it, \
-at its typical size. Confusions are those of the [discovery benchmark](../benchmarks/results/discovery.md): hovercraft \
+at its typical size. Confusions are those of the [discovery benchmark](../benchmarks/results/discovery-continuous.md): hovercraft \
 drives on which one effect was planted alone, most of them small; an effect is *in the class* when the search named it \
 or said that the drives cannot tell it from what it named. A confusion that more drives would not mend is mended by \
 other controls: `steady discover` proposes them.
