@@ -8,20 +8,20 @@ tests physical effects by name.
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
-from steady_ppl.gaussian.predict import mean_step, mean_steps, on_a_circle, row_errors
+from steady_ppl.gaussian.predict import mean_steps, on_a_circle, row_errors
 from steady_ppl.kernels.rows import Slopes, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import Element, elements, on_both_sides
 from steady_ppl.likelihood.scores import measured, of_actuators
 from steady_ppl.model.actuation import lagged
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, row_controls
+from steady_ppl.model.substeps import RowInputs, acting_controls, mean_step, row_controls, row_inputs
 from steady_ppl.utils.angles import wrap, wrap_angles
 
 LAG_SECONDS = 0.3
@@ -85,8 +85,8 @@ class _Scores:
     def _pushed_by(self, parts: Sequence[Element]) -> Tensor:
         """Scores of what numbers change of the mean steps, `(B, P)`."""
         program, data = self.program, self.data
-        given = {"state": self.states, "control": self.controls[:-1], "time": data.elapsed[:-1], "step": data.steps}
-        slopes = slopes_on_all_rows(program, "mean step", mean_step(program), given, parts)
+        given = {"state": self.states} | row_inputs(program, data)._asdict()
+        slopes = slopes_on_all_rows(program, "mean step", partial(mean_step, program), given, parts)
         scores, left = torch.zeros(len(data), len(parts)).double(), list(range(len(parts)))
         if isinstance(slopes, Slopes):
             arrival = torch.where(data.transitions[..., None], self.arrival, 0.0)
@@ -221,4 +221,5 @@ class _Scores:
 
     def _moved(self, controls: Tensor) -> Tensor:
         """The program's mean step from every row, `(T, B, D)`."""
-        return mean_steps(self.program, self.states, controls[:-1], self.data.elapsed[:-1], self.data.steps).double()
+        inputs = RowInputs(controls[:-1], self.data.elapsed[:-1], self.data.steps)
+        return mean_steps(self.program, self.states, inputs).double()
