@@ -84,9 +84,9 @@ from .reporting.html import Report as Report
 from .reporting.report import report as report
 from .runs.export import Dynamics as Dynamics
 from .runs.fit import Fit as Fit
-from .smc.filter import particle_filter as particle_filter, roll_out as roll_out
+from .smc.filter import particle_filter as particle_filter
 from .smc.genealogy import Filtered as Filtered, Paths as Paths
-from .smc.simulate import simulate as simulate
+from .smc.simulate import roll_out as roll_out, simulate as simulate
 from .training.loop import Optimization as Optimization, Trained as Trained, Validation as Validation, train as train
 from .utils.angles import wrap as wrap
 from .utils.random import seeded as seeded

@@ -16,14 +16,15 @@ from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, labelled
 from steady_ppl.likelihood.evidence import choose_filter, evidence, in_parts, run_filter
-from steady_ppl.model.handlers import AtMean, Recording, as_vector, residual, running
+from steady_ppl.model.handlers import AtMean, Recording, residual, running
 from steady_ppl.model.planar_vehicle import PlanarVehicle, UnknownMap
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, error_groups, for_program, names
-from steady_ppl.model.substeps import acting_controls
+from steady_ppl.model.substeps import acting_controls, joined, parted
 from steady_ppl.runs.fit import Fit
-from steady_ppl.smc.filter import particle_filter, roll_out
+from steady_ppl.smc.filter import particle_filter
 from steady_ppl.smc.resampling import systematic, take
+from steady_ppl.smc.simulate import roll_out
 from steady_ppl.utils.angles import wrap_angles
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
@@ -342,15 +343,12 @@ def _totals(problem: Problem, particles: int, horizons: dict[str, int]) -> dict[
 
 def _residuals(program: Program, states: Tensor, measurements: Tensor) -> tuple[Tensor, Tensor]:
     """Measured minus predicted, and one draw of the measurement noise, both `(..., K)`."""
-    recording = Recording()
-    with running(*states.shape[:-1]), recording:
+    left, seen = states.shape[:-1], Recording()
+    with running(*left), seen:
         program.observe(states)
-    errors, noises, column = [], [], 0
-    for site, fn in recording.distributions.items():
-        drawn = recording.values[site]
-        width = fn.event_shape.numel()
-        measured = measurements[..., column : column + width]
-        column += width
-        errors.append(as_vector(residual(fn, measured if fn.event_dim else measured[..., 0]), fn.event_dim))
-        noises.append(as_vector(residual(fn, drawn), fn.event_dim))
-    return torch.cat(errors, -1), torch.cat(noises, -1)
+    kinds = seen.distributions
+
+    def apart(values: Mapping[str, Tensor]) -> Tensor:
+        return joined({site: residual(fn, values[site]) for site, fn in kinds.items()}, kinds, left)
+
+    return apart(parted(measurements, kinds)), apart(seen.values)

@@ -12,10 +12,10 @@ from torch import Tensor
 from steady_ppl.gaussian.kalman import Tracked, track
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, on_a_circle, predict
-from steady_ppl.model.handlers import AtMean, ByColumn, Recording, Standardised, as_event, normal_moments, running
+from steady_ppl.model.handlers import ByColumn, Recording, Standardised, as_event, normal_moments, running
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, advance, joined, sample_channels
+from steady_ppl.model.substeps import joined, mean_step, row_inputs, sample_channels
 from steady_ppl.utils.angles import wrap
 
 NOISE_MULTIPLES = (0.5, 1.0, 2.0, 4.0, 8.0)  # of the channels' root mean squares, that are scanned
@@ -82,7 +82,7 @@ def constant_velocity(problem: Problem, tracked: Tracked, horizons: Sequence[int
     """
     program, data = problem.program, problem.data
     path = tracked.path(data)
-    inputs = acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps
+    inputs = row_inputs(program, data)
     left, seen = path.noise.shape[:-1], Recording()
     with running(*left), seen, Standardised(path.noise):
         sample_channels(program, path.states[:-1], *inputs)
@@ -92,9 +92,8 @@ def constant_velocity(problem: Problem, tracked: Tracked, horizons: Sequence[int
     sizes = (values.double().square() + spread.double().square())[data.transitions].mean(0).sqrt()
     if not bool((sizes > 0).all() and torch.isfinite(sizes).all()):
         return "a channel of the program never moves"
-    with running(*left), AtMean():
-        moved = advance(program, path.states[:-1], *inputs)
-        coasted = advance(ConstantVelocity(program, sizes.tolist()), path.states[:-1], *inputs)
+    moved = mean_step(program, path.states[:-1], *inputs)
+    coasted = mean_step(ConstantVelocity(program, sizes.tolist()), path.states[:-1], *inputs)
     if torch.allclose(moved, coasted, rtol=1e-6, atol=1e-7):
         return "the program's channels have no mean that could be taken away"
     best: tuple[float, ConstantVelocity, Tracked] | None = None

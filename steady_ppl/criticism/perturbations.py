@@ -8,20 +8,20 @@ tests physical effects by name.
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
-from steady_ppl.gaussian.predict import mean_step, mean_steps, on_a_circle, row_errors
+from steady_ppl.gaussian.predict import mean_steps, on_a_circle, row_errors
 from steady_ppl.kernels.rows import Slopes, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import Element, elements, on_both_sides
 from steady_ppl.likelihood.scores import measured, of_actuators
 from steady_ppl.model.actuation import lagged
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, row_controls
+from steady_ppl.model.substeps import RowInputs, acting_controls, mean_step, row_controls
 from steady_ppl.utils.angles import wrap, wrap_angles
 
 LAG_SECONDS = 0.3
@@ -63,6 +63,7 @@ class _Scores:
         self.linear, self.states, self.steps = tracked.linearization, self.path.states[:-1], data.steps.double()
         self.arrival, self.noise, self.reading = tracked.arrival[1:], tracked.noise, tracked.reading
         self.controls = acting_controls(program, data)
+        self.inputs = RowInputs(self.controls[:-1], data.elapsed[:-1], data.steps)
         self.commands = row_controls(program, self.controls).double()
         count = self.noise.shape[-1]
         self.channels = program.channel_names if len(program.channels) == count else [f"{i + 1}" for i in range(count)]
@@ -85,8 +86,8 @@ class _Scores:
     def _pushed_by(self, parts: Sequence[Element]) -> Tensor:
         """Scores of what numbers change of the mean steps, `(B, P)`."""
         program, data = self.program, self.data
-        given = {"state": self.states, "control": self.controls[:-1], "time": data.elapsed[:-1], "step": data.steps}
-        slopes = slopes_on_all_rows(program, "mean step", mean_step(program), given, parts)
+        given = {"state": self.states} | self.inputs._asdict()
+        slopes = slopes_on_all_rows(program, "mean step", partial(mean_step, program), given, parts)
         scores, left = torch.zeros(len(data), len(parts)).double(), list(range(len(parts)))
         if isinstance(slopes, Slopes):
             arrival = torch.where(data.transitions[..., None], self.arrival, 0.0)
@@ -221,4 +222,4 @@ class _Scores:
 
     def _moved(self, controls: Tensor) -> Tensor:
         """The program's mean step from every row, `(T, B, D)`."""
-        return mean_steps(self.program, self.states, controls[:-1], self.data.elapsed[:-1], self.data.steps).double()
+        return mean_steps(self.program, self.states, self.inputs._replace(control=controls[:-1])).double()

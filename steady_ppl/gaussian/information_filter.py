@@ -129,7 +129,7 @@ class Lookahead:
         deviation of zero lead to."""
         linear = self.linearization
         begin = linear.start_offset + times(linear.start_noise, start) - turns
-        return roll_out(self.given, self.steering.gain, in_lanes(begin.unsqueeze(-1)), noise), noise
+        return roll_deviations(self.given, self.steering.gain, in_lanes(begin.unsqueeze(-1)), noise), noise
 
     def _tensor(self, blocks: Array) -> Tensor:
         linear = self.linearization
@@ -305,7 +305,7 @@ def backward(given: LinearArrays, log_scale: Array, first: Potential, futures: P
 
 
 @njit(cache=True, error_model="numpy")
-def roll_out(given: LinearArrays, gain: Array, begin: Array, noise: Array) -> Array:
+def roll_deviations(given: LinearArrays, gain: Array, begin: Array, noise: Array) -> Array:
     """δ' = F δ + offset + G ε row by row, from the first, `(M, blocks, D, 1, LANES)`.
 
     `noise` is ε at δ = 0, `(M, T, blocks, C, 1, LANES)`; from it, gain δ is taken off.

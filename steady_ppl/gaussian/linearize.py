@@ -9,7 +9,6 @@ residual r(x) for every measurement. Around a path of states x̄ and noise ε̄,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -20,20 +19,11 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError
 from steady_ppl.gaussian.lanes import Array, array
-from steady_ppl.kernels.rows import on_all_rows
-from steady_ppl.model.handlers import (
-    AtMean,
-    Observing,
-    Recording,
-    Standardised,
-    broadcast_event,
-    residual,
-    running,
-    tangent_normal,
-)
+from steady_ppl.kernels.rows import derivatives, on_all_rows
+from steady_ppl.model.handlers import Observing, Recording, Standardised, draw_starts, residual, running, tangent_normal
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, advance, joined
+from steady_ppl.model.substeps import joined, mean_step, noisy_step, row_inputs
 from steady_ppl.model.validate import start_size, step_size
 from steady_ppl.utils.angles import wrap
 
@@ -121,17 +111,13 @@ def linearize(
     Raises:
         ProgramError: a site has another distribution, or an operation has no derivative.
     """
-
-    def step(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-        with running(*state.shape[:-1]), Standardised(noise):
-            return advance(program, state, control, time, step)
-
     program, data, states, noise = problem.program, problem.data, path.states, path.noise
     if angles is None:
         angles = angles_on_a_circle(program, data, states[0, :1])
-    along = {"state": states[:-1], "noise": noise}
-    given = {"control": acting_controls(program, data)[:-1], "time": data.elapsed[:-1], "step": data.steps}
-    moved, (by_state, by_noise), in_plain_torch = _jacobians(program, "step", step, along, given, kernels)
+    given = {"state": states[:-1], "noise": noise} | row_inputs(program, data)._asdict()
+    moved, (by_state, by_noise), in_plain_torch = on_all_rows(
+        program, "step", partial(noisy_step, program), given, ("state", "noise"), kernels
+    )
     offset = (moved - (by_noise @ noise.unsqueeze(-1)).squeeze(-1) - states[1:]).double()
     offset[..., angles] = wrap(offset[..., angles])  # a program may keep its angles on the circle, and so may a path
     start_offset, start_noise = (part.double() for part in _start(problem, states[0]))
@@ -162,11 +148,11 @@ def linearize_sensors(
     kernels: bool | None = None,
 ) -> Sensors:
     """The part of `linearize` that is about what is measured, around states `(T + 1, B, D)`."""
-    along, given = {"state": states}, {"measurement": data.measurements, "observed": data.observed}
+    given = {"state": states, "measurement": data.measurements, "observed": data.observed}
     measure, count = partial(_residuals, program), data.measurements.shape[-1]
-    measured, by, in_plain_torch = _jacobians(program, "measure", measure, along, given, kernels, outputs=count)
+    measured, (by,), in_plain_torch = on_all_rows(program, "measure", measure, given, ("state",), kernels, count)
     residuals, log_sd, log_density = measured.chunk(3, -1)
-    by_measured = -by[0][..., :count, :]
+    by_measured = -by[..., :count, :]
     observed = data.observed & torch.isfinite(by_measured.sum(-1))  # a bearing to where one stands has no derivative
     return Sensors(
         residual=torch.where(observed, residuals, 0.0).double(),
@@ -179,13 +165,13 @@ def linearize_sensors(
 
 @torch.no_grad()
 def why_not_linear(program: Program, data: Trajectories, *, known_start: bool = False) -> str | None:
-    """What keeps a program from being linearised, None if nothing does; tried on the first two rows of a trajectory."""
+    """What keeps a program from being linearised, None if nothing does; tried on the first two rows of the first
+    trajectory of `data`, as returned by `for_program`, where its first state is certain if `known_start`."""
     rows, first = min(2, data.time.shape[0]), data.subset([0])
     by_row = {name: getattr(first, name) for name in ("time", "controls", "measurements", "observed", "states")}
     head = {name: values[:rows] for name, values in by_row.items() if values is not None}
     data = replace(first, **head, lengths=first.lengths.clamp(max=rows))
-    with running(rows - 1, 1):
-        state = broadcast_event(program.initial(), torch.Size((rows - 1, 1)), 1)
+    state = draw_starts(program, rows - 1, 1)
     path = ReferencePath(state[:1].expand(rows, -1, -1), state.new_zeros((rows - 1, 1, step_size(program))))
     try:
         linearize(Problem(program, data, known_start), path)
@@ -212,11 +198,11 @@ def _start(problem: Problem, first: Tensor) -> tuple[Tensor, Tensor]:
     def start(noise: Tensor) -> Tensor:
         left = noise.shape[:-1]
         with running(*left), Standardised(noise):
-            return broadcast_event(problem.program.initial(), left, 1)
+            return problem.program.initial().expand(*left, -1)
 
     if problem.known_start:
         return problem.data.known_start - first, first.new_zeros((*first.shape, 1))
-    began, (start_noise,) = _derivatives(start, first.new_zeros((first.shape[0], start_size(problem.program))))
+    began, (start_noise,) = derivatives(start, first.new_zeros((first.shape[0], start_size(problem.program))))
     return began - first, start_noise
 
 
@@ -235,52 +221,8 @@ def angles_on_a_circle(program: Program, data: Trajectories, state: Tensor) -> t
     same = ((squares - squares[first]).abs() <= 0.01 * (1 + squares)).flatten(1).all(1)
     if len(data.steps):
         given = (part[first, first] for part in (data.controls, data.elapsed, data.steps))
-        with running(len(turns), 1), AtMean():
-            moved = advance(program, states, *given)
-        change = moved - states
+        change = mean_step(program, states, *given) - states
         apart = change - change[first]
         apart[..., angles] = wrap(apart[..., angles])
         same &= (apart.abs() <= 0.01 * change.abs() + 1e-5 * (1 + states.abs())).flatten(1).all(1)
     return tuple(angle for angle, periodic in zip(angles, same[1:].tolist(), strict=True) if periodic)
-
-
-def _jacobians(
-    program: Program,
-    name: str,
-    function: Callable[..., Tensor],
-    along: dict[str, Tensor],
-    given: dict[str, Tensor],
-    kernels: bool | None,
-    outputs: int | None = None,
-) -> tuple[Tensor, list[Tensor], str | None]:
-    """A function's value `(..., V)`, its Jacobians `(..., V, ·)`, and why they had to come from plain torch, if so,
-    which differentiates the first `outputs` components only."""
-    found = on_all_rows(program, name, function, along | given, tuple(along), kernels)
-    if isinstance(found, tuple):
-        return (*found, None)
-    value, by = _derivatives(lambda *inputs: function(*inputs, *given.values()), *along.values(), outputs=outputs)
-    return value, by, found
-
-
-def _derivatives(
-    function: Callable[..., Tensor], *inputs: Tensor, outputs: int | None = None
-) -> tuple[Tensor, list[Tensor]]:
-    """A function's value `(..., V)` and the Jacobians `(..., V, ·)` of its first `outputs` components in each input
-    `(..., ·)`; rows and trajectories on the left do not mix, so that a sum's gradient has them all."""
-    leaves = [value.detach().clone().requires_grad_() for value in inputs]
-    with torch.enable_grad():
-        value = function(*leaves)
-        rows = [_gradients(component, leaves) for component in value.unbind(-1)[:outputs]]
-    return value.detach(), [torch.stack(column, -2) for column in zip(*rows, strict=True)]
-
-
-def _gradients(component: Tensor, leaves: list[Tensor]) -> Sequence[Tensor]:
-    if not component.requires_grad:
-        return [torch.zeros_like(leaf) for leaf in leaves]
-    try:
-        return torch.autograd.grad(component.sum(), leaves, retain_graph=True, materialize_grads=True)
-    except (NotImplementedError, RuntimeError) as error:
-        why = str(error).splitlines()[0]
-        raise ProgramError(
-            f"the program cannot be linearised: {why} (--recipe steady --guide bootstrap takes any)"
-        ) from error

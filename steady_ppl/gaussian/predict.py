@@ -1,8 +1,9 @@
 """Measurements predicted from the rows before them, some rows ahead, and drives simulated to compare with."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -11,9 +12,9 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.kernels.rows import on_all_rows
-from steady_ppl.model.handlers import AtMean, Observing, Recording, residual, running
+from steady_ppl.model.handlers import Observing, Recording, residual, running
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, advance, joined
+from steady_ppl.model.substeps import RowInputs, joined, mean_step, row_inputs
 from steady_ppl.smc.backends import Stepping
 from steady_ppl.smc.simulate import measure
 
@@ -61,29 +62,16 @@ def predict(
 def states_ahead(program: Program, data: Trajectories, tracked: Tracked, most: int) -> Iterator[tuple[int, Tensor]]:
     """From every row on, without noise: how many rows ahead, and the states there, `(T + 1 − ahead, B, D)`."""
     state = tracked.states.to(data.controls.dtype)
-    controls, elapsed, steps = acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps
-    for ahead in range(1, min(most, len(steps)) + 1):
-        since = slice(ahead - 1, None)
-        state = mean_steps(program, state[:-1], controls[since], elapsed[since], steps[since])
+    inputs = row_inputs(program, data)
+    for ahead in range(1, min(most, len(data.steps)) + 1):
+        state = mean_steps(program, state[:-1], RowInputs(*(values[ahead - 1 :] for values in inputs)))
         yield ahead, state
 
 
-def mean_steps(program: Program, states: Tensor, controls: Tensor, elapsed: Tensor, steps: Tensor) -> Tensor:
-    """Where rows end without noise, `(rows, B, D)`; the controls are the acting ones."""
-    given = {"state": states, "control": controls, "time": elapsed, "step": steps}
-    step = mean_step(program)
-    found = on_all_rows(program, "mean step", step, given)
-    return found[0] if isinstance(found, tuple) else step(**given)
-
-
-def mean_step(program: Program) -> Callable[..., Tensor]:
-    """A program's step without noise, of state, acting control, time and step."""
-
-    def moved(state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-        with running(*state.shape[:-1]), AtMean():
-            return advance(program, state, control, time, step)
-
-    return moved
+def mean_steps(program: Program, states: Tensor, inputs: RowInputs) -> Tensor:
+    """Where rows end without noise, `(rows, B, D)`, by a kernel where there is one."""
+    given = {"state": states} | inputs._asdict()
+    return on_all_rows(program, "mean step", partial(mean_step, program), given).values
 
 
 def errors(program: Program, states: Tensor, measurements: Tensor, observed: Tensor) -> Tensor:
@@ -97,8 +85,7 @@ def errors(program: Program, states: Tensor, measurements: Tensor, observed: Ten
 def row_errors(program: Program, states: Tensor, measurements: Tensor, observed: Tensor) -> Tensor:
     """`errors` of states `(rows, B, D)`, by a kernel where there is one."""
     given = {"state": states, "measurement": measurements, "observed": observed}
-    found = on_all_rows(program, "errors", lambda *values: errors(program, *values), given)
-    return found[0] if isinstance(found, tuple) else errors(program, *given.values())
+    return on_all_rows(program, "errors", partial(errors, program), given).values
 
 
 @torch.no_grad()

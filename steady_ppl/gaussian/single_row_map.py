@@ -12,7 +12,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError
 from steady_ppl.gaussian.linearize import linearize_sensors
 from steady_ppl.gaussian.predict import simulate_again
-from steady_ppl.model.handlers import broadcast_event, running
+from steady_ppl.model.handlers import draw_starts
 from steady_ppl.model.program import Program
 from steady_ppl.model.validate import step_size
 from steady_ppl.utils.cores import one_thread
@@ -40,11 +40,8 @@ def fixes(program: Program, data: Trajectories, *, places: int = 32, passes: int
         DataError: nothing is measured, or fewer than two rows of a drive have enough measurements.
     """
     data = data.without_truth()
-    left = torch.Size((places, len(data)))
-    with running(*left):
-        starts = broadcast_event(program.initial(), left, 1)
-    _, made_up = simulate_again(program, data, starts, step_size(program))
-    guesses = made_up.states.unflatten(1, left)  # (T + 1, S, B, D)
+    _, made_up = simulate_again(program, data, draw_starts(program, places, len(data)), step_size(program))
+    guesses = made_up.states.unflatten(1, (places, len(data)))  # (T + 1, S, B, D)
     told = (linearize_sensors(program, data, guesses[:, 0]).measurement != 0).flatten(0, 2).any(0)
     enough = (data.observed.sum(-1) >= told.sum()) & data.rows
     _require_enough(program, data, told, enough)

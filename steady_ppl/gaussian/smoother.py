@@ -17,11 +17,11 @@ from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
 from steady_ppl.gaussian.linearize import ReferencePath, angles_on_a_circle, linearize
 from steady_ppl.kernels.jit import unchanged
 from steady_ppl.kernels.rows import on_all_rows
-from steady_ppl.model.handlers import KnownStart, Recording, Standardised, broadcast_event, normal_moments, running
+from steady_ppl.model.handlers import KnownStart, Recording, Standardised, normal_moments, running
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import divergence
-from steady_ppl.model.substeps import acting_controls, joined, parted, sample_channels
+from steady_ppl.model.substeps import all_rows, joined, parted, sample_channels
 from steady_ppl.smc.filter import particle_filter
 from steady_ppl.smc.genealogy import Paths, event_dims
 from steady_ppl.utils.angles import wrap_angles
@@ -56,12 +56,12 @@ def smooth(
     """
 
     def look(path: ReferencePath) -> Lookahead:
-        return look_ahead(linearize(problem, path, **given))
+        weight = observation_weight
+        return look_ahead(linearize(problem, path, observation_weight=weight, kernels=kernels, angles=angles))
 
     data = problem.data
-    given: dict[str, Any] = {"observation_weight": observation_weight, "kernels": kernels}
     with unchanged(problem.program):
-        given["angles"] = angles_on_a_circle(problem.program, data, path.states[0, :1])
+        angles = angles_on_a_circle(problem.program, data, path.states[0, :1])
         if passes == 1:
             return look(path)
         accepted = path = ReferencePath(path.states, torch.where(data.transitions[..., None], path.noise, 0.0))
@@ -205,10 +205,9 @@ def find_path(
 @torch.no_grad()
 def standard_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor:
     """The channel noise of paths in its standard deviations, `(M, T, B, C)`."""
-    channels, scaled = paths.channels(program, data), {}
-    for site, fn in channels.items():
-        mean, sd = normal_moments(fn, site)
-        scaled[site] = (paths.noise[site] - mean) / sd
+    channels = paths.channels(program, data)
+    moments = {site: normal_moments(fn, site) for site, fn in channels.items()}
+    scaled = {site: (paths.noise[site] - mean) / sd for site, (mean, sd) in moments.items()}
     return joined(scaled, channels, paths.states[:, 1:].shape[:-1])
 
 
@@ -229,24 +228,18 @@ def smoother_paths(problem: Problem, ahead: Lookahead, draws: int, *, kernels: b
     with running(1, 1, trajectories), Recording() as moving, Standardised(noise[few, few]):
         sample_channels(program, states[few, few], data.controls[few], data.elapsed[few], data.steps[few])
     dims = event_dims(start, moving)
-    first = torch.Size((draws, 1, trajectories))
 
     def drawn(state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
         with running(*state.shape[:-1]), Recording() as seen, Standardised(noise):
             sample_channels(program, state, control, time, step)
         return joined(seen.values, seen.distributions, state.shape[:-1])
 
-    given = {"control": acting_controls(program, data)[:-1], "time": data.elapsed[:-1], "step": data.steps}
-    arguments = {"state": states[:, :-1], "noise": noise} | {
-        name: value.expand(draws, *value.shape) for name, value in given.items()
-    }
-    by_row = {name: value.flatten(0, 1) for name, value in arguments.items()}
+    by_row = all_rows(program, data, state=states[:, :-1], noise=noise)
     found = on_all_rows(program, "drawn", drawn, by_row, kernels=kernels)
-    values = found[0].unflatten(0, (draws, -1)) if isinstance(found, tuple) else drawn(*arguments.values())
     return Paths(
         states=states,
-        start={site: broadcast_event(value, first, dims[site]) for site, value in start.values.items()},
-        noise=parted(values, moving.distributions),
+        start=start.expanded((draws, 1, trajectories)),
+        noise=parted(found.values.unflatten(0, (draws, -1)), moving.distributions),
         event_dims=dims | {"states": 1},
-        in_plain_torch=found if isinstance(found, str) else None,
+        in_plain_torch=found.in_plain_torch,
     )

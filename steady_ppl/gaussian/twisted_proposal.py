@@ -156,10 +156,10 @@ def steer_in_parallel(
     shift, gain, factor, whitening = steering
     mean = shift - _times(gain, _deviation(state, path, angles))
     noise = torch.where(stays.unsqueeze(-1), own.double(), mean + _times(factor, own.double()))
-    return noise.to(own.dtype), -mixture(log_ratio(noise, mean, whitening), untwisted)
+    return noise.to(own.dtype), -mixture(log_steered(noise, mean, whitening), untwisted)
 
 
-def log_ratio(noise: Tensor, mean: Tensor, whitening: Tensor) -> Tensor:
+def log_steered(noise: Tensor, mean: Tensor, whitening: Tensor) -> Tensor:
     """log N(noise; mean, factor factorᵀ) − log N(noise; 0, I), `(N, B)`."""
     white = _times(whitening, noise - mean)
     log_determinant = whitening.diagonal(dim1=-2, dim2=-1).log().sum(-1)
@@ -221,27 +221,30 @@ class Twist(Proposal):
         self.steering = (steps.shift, steps.gain, steps.factor, inverse(steps.factor))
 
     def log_future(self, row: int, state: Tensor) -> Tensor:
+        """log p(y_{row+1}, …, y_T | state) of the linearised program, see `Proposal`."""
         ahead = self.lookahead
         future = log_future if state.device.type == "cpu" else log_future_in_parallel
         parts = (self.path[row], self.angles, ahead.precision[row], ahead.information[row], ahead.log_scale[row])
         return future(state, *parts)
 
     def start(self, particles: int) -> tuple[Tensor | None, Tensor | float]:
+        """Steer the start's noise, of the mixture of all `windings`, see `Proposal`."""
         ahead, starts = self.lookahead, self.lookahead.starts
         _, twisted, own = ahead.draw_starts(particles)
         stays = torch.rand(own.shape[:-1], dtype=torch.float64, device=own.device) < self.untwisted
         noise = torch.where(stays.unsqueeze(-1), own, twisted)
         whitening = inverse(starts.factor)
         ratios = [
-            ahead.winding_masses[k] + log_ratio(noise, starts.shift[k], whitening[k])
+            ahead.winding_masses[k] + log_steered(noise, starts.shift[k], whitening[k])
             for k in range(len(ahead.windings))
         ]
         return noise.to(self.dtype), -mixture(torch.stack(ratios).logsumexp(0), self.untwisted)
 
     def step(self, row: int, state: Tensor) -> tuple[Tensor | None, Tensor | float]:
+        """Steer an interval's noise from the states before it, see `Proposal`."""
         particles, trajectories = state.shape[:2]
         kind: Any = {"device": state.device, "dtype": self.dtype}
-        own = torch.randn(self.steering[0].shape[-1], trajectories, particles, **kind).permute(2, 1, 0)
+        own = torch.randn(self.lookahead.steps.shift.shape[-1], trajectories, particles, **kind).permute(2, 1, 0)
         stays = torch.zeros(trajectories, particles, dtype=torch.bool, device=state.device).t()
         if self.untwisted:
             stays = torch.rand(trajectories, particles, **kind).t() < self.untwisted

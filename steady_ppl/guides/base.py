@@ -4,7 +4,6 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import pyro
 import pyro.distributions as dist
@@ -13,9 +12,9 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, FilterError, ProgramError, require
-from steady_ppl.model.handlers import ByColumn, Recording, masked, running
+from steady_ppl.model.handlers import Recording, Substituting, masked, running
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, sample_row
+from steady_ppl.model.substeps import row_inputs, sample_row
 from steady_ppl.model.validate import step_size
 from steady_ppl.smc.filter import STEPS_WORTH_COMPILING, Proposal, particle_filter
 from steady_ppl.smc.genealogy import Paths, event_dims
@@ -187,11 +186,11 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
     states = torch.where(data.rows[..., None], states, states[:1])
     exact, within = copy.deepcopy(program).double(), data.to(torch.float64)
     before, after = states[:-1].double(), states[1:].double()
-    over_time = (acting_controls(exact, within)[:-1], within.elapsed[:-1], within.steps)
+    inputs = row_inputs(exact, within)
 
     def run(noise: Tensor) -> tuple[Tensor, Recording]:
         with running(*before.shape[:-1]), Recording() as recording, Substituting(noise):
-            return sample_row(exact, before, *over_time), recording
+            return sample_row(exact, before, *inputs), recording
 
     channels = torch.eye(step_size(program)).to(before)
     noise = before.new_zeros(*before.shape[:-1], len(channels))
@@ -222,18 +221,6 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
         noise={s: value[None].to(states.dtype) for s, value in moving.values.items()},
         event_dims=event_dims(start, moving) | {"states": 1},
     )
-
-
-class Substituting(ByColumn):
-    """Give latent sites the columns of some values, `(..., C)`, in the order in which the sites are met."""
-
-    def __init__(self, values: Tensor) -> None:
-        super().__init__()
-        self.values = values
-
-    def _pyro_sample(self, message: Any) -> None:
-        taken = self.values[..., self.take(message["fn"])]
-        message["value"] = taken if message["fn"].event_dim else taken[..., 0]
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,12 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, require
 from steady_ppl.gaussian.predict import on_a_circle
 from steady_ppl.gaussian.smoother import find_and_smooth, means_as_path
-from steady_ppl.guides.base import Constant, Substituting, Tempering, sample_known
+from steady_ppl.guides.base import Constant, Tempering, sample_known
 from steady_ppl.likelihood.scores import channel_moments
-from steady_ppl.model.handlers import KnownStart, Recording, Replaying, Standardised, broadcast_event, running
+from steady_ppl.model.handlers import KnownStart, Recording, Replaying, Standardised, Substituting, running
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, sample_row
+from steady_ppl.model.substeps import row_inputs, sample_row
 from steady_ppl.model.validate import start_size, step_size
 from steady_ppl.smc.genealogy import Paths, event_dims
 
@@ -110,10 +110,10 @@ class VariationalGuide(nn.Module):
             at_start, certain = apart.sum(1), Standardised(noise.unsqueeze(1))
         with running(*left):
             with Recording() as started, certain:
-                state = broadcast_event(self.program.initial(), left, 1).squeeze(1)
+                state = self.program.initial().expand(*left, -1).squeeze(1)
             states, values = [state], dict[str, list[Tensor]]()
-            over_time = (acting_controls(self.program, data)[:-1], data.elapsed[:-1], data.steps)
-            for row, given in enumerate(zip(*(values.split(1) for values in over_time), strict=True)):
+            by_row = zip(*(values.split(1) for values in row_inputs(self.program, data)), strict=True)
+            for row, given in enumerate(by_row):
                 noise, density = self.step(row, state)
                 inside = data.transitions[row]
                 later = later + torch.where(inside, density, 0.0).sum(-1)
@@ -126,7 +126,7 @@ class VariationalGuide(nn.Module):
         dims = event_dims(started, moving)
         paths = Paths(
             states=torch.stack(states, 1),
-            start={site: broadcast_event(value, left, dims[site]) for site, value in started.values.items()},
+            start=started.expanded(left),
             noise={site: torch.cat(parts, 1) for site, parts in values.items()},
             event_dims=dims | {"states": 1},
         )
@@ -185,6 +185,7 @@ class AutoRollout(VariationalGuide):
             self.auto(data)  # makes its parameters
 
     def begin(self, data: Trajectories) -> Tensor:
+        """Draw all noise at once; log q(ε) − log N(ε; 0, 1) of it, `(M,)`."""
         if data.labels != self.labels:
             raise UsageError(
                 "an automatic guide has parameters for each of its drives: it takes no others and no batch"
@@ -277,6 +278,7 @@ class InferenceNetwork(VariationalGuide):
         self.to(data.controls)
 
     def begin(self, data: Trajectories) -> Tensor:
+        """Read the drives backward; centred, log q(z) of all intervals' noise, `(M,)`, which no state changes."""
         inputs = self._inputs(data)
         backward = (data.lengths - 1 - torch.arange(len(inputs), device=inputs.device)[:, None]) % len(inputs)
         turned = self.encoder(inputs).tanh().take_along_dim(backward[..., None], 0)

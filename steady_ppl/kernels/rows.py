@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from steady_ppl.errors import ProgramError
 from steady_ppl.kernels.codegen import SIMD_LANES
 from steady_ppl.kernels.jit import Method, Number, close, compiled, discard
 
@@ -39,6 +40,14 @@ def fallback_notes(why: Mapping[str, str]) -> list[str]:
     return [f"computed in plain torch, without compiled kernels: {'; '.join(parts)}"] if parts else []
 
 
+class Computed(NamedTuple):
+    """A function on all rows."""
+
+    values: Tensor  # (rows, B, V)
+    jacobians: list[Tensor]  # in each argument that was asked for, (rows, B, V, ·)
+    in_plain_torch: str | None  # why no kernel served; None where one did or was not worth it
+
+
 def on_all_rows(
     program: nn.Module,
     name: str,
@@ -46,9 +55,9 @@ def on_all_rows(
     arguments: dict[str, Tensor],
     along: Sequence[str] = (),
     kernels: bool | None = None,
-) -> tuple[Tensor, list[Tensor]] | str | None:
-    """A function's value `(rows, B, V)` and its Jacobians `(rows, B, V, ·)`; why there is no kernel; or None where it
-    is not worth one.
+    outputs: int | None = None,
+) -> Computed:
+    """A function's value and Jacobians, by a kernel where one can serve, and else in plain torch.
 
     Args:
         program: what the function belongs to.
@@ -57,13 +66,45 @@ def on_all_rows(
         arguments: its arguments in order, each `(rows, B)` or `(rows, B, ·)`.
         along: those in which to differentiate, the first ones.
         kernels: whether a kernel is worth compiling; None: if there are `ROWS_WORTH_COMPILING`.
+        outputs: how many of the first components have to be differentiated; None: all.
+
+    Raises:
+        ProgramError: an operation has no derivative.
     """
     found = _computed(program, name, function, arguments, kernels, along=along)
-    if not isinstance(found, tuple):
-        return found
-    method, values, rest = found
-    widths = [arguments[at].shape[-1] for at in along]
-    return values, list(rest.unflatten(-1, (method.values, sum(widths))).split(widths, -1)) if along else []
+    if isinstance(found, tuple):
+        method, values, rest = found
+        widths = [arguments[at].shape[-1] for at in along]
+        by = list(rest.unflatten(-1, (method.values, sum(widths))).split(widths, -1)) if along else []
+        return Computed(values, by, None)
+    if not along:
+        return Computed(function(*arguments.values()), [], found)
+    inputs, given = list(arguments.values())[: len(along)], list(arguments.values())[len(along) :]
+    return Computed(*derivatives(lambda *inputs: function(*inputs, *given), *inputs, outputs=outputs), found)
+
+
+def derivatives(
+    function: Callable[..., Tensor], *inputs: Tensor, outputs: int | None = None
+) -> tuple[Tensor, list[Tensor]]:
+    """A function's value `(..., V)` and the Jacobians `(..., V, ·)` of its first `outputs` components in each input
+    `(..., ·)`, in plain torch; rows and trajectories on the left do not mix, so that a sum's gradient has them all."""
+    leaves = [value.detach().clone().requires_grad_() for value in inputs]
+    with torch.enable_grad():
+        value = function(*leaves)
+        rows = [_gradients(component, leaves) for component in value.unbind(-1)[:outputs]]
+    return value.detach(), [torch.stack(column, -2) for column in zip(*rows, strict=True)]
+
+
+def _gradients(component: Tensor, leaves: list[Tensor]) -> Sequence[Tensor]:
+    if not component.requires_grad:
+        return [torch.zeros_like(leaf) for leaf in leaves]
+    try:
+        return torch.autograd.grad(component.sum(), leaves, retain_graph=True, materialize_grads=True)
+    except (NotImplementedError, RuntimeError) as error:
+        why = str(error).splitlines()[0]
+        raise ProgramError(
+            f"the program cannot be linearised: {why} (--recipe steady --guide bootstrap takes any)"
+        ) from error
 
 
 class Slopes(NamedTuple):
@@ -88,7 +129,8 @@ def slopes_on_all_rows(
     numbers: Sequence[Number],
     kernels: bool | None = None,
 ) -> Slopes | str | None:
-    """A function's slopes in a program's learnable numbers; otherwise as `on_all_rows`."""
+    """A function's slopes in a program's learnable numbers, if by a kernel; why there is none; or None where it is not
+    worth one. The arguments are those of `on_all_rows`."""
     found = _computed(program, name, function, arguments, kernels, by_parameters=True)
     if not isinstance(found, tuple):
         return found

@@ -59,7 +59,8 @@ def choose_filter(
     particles: int | None = None,
     look_ahead: bool | None = None,
 ) -> FilterChoice:
-    """Settle what is None: the filter by the program's noise, its particles (200 looking ahead, else 5000)."""
+    """Settle what is None: the filter by the program's noise, its particles (200 looking ahead, else 5000).
+    The arguments are those of `evidence`; fewer than one particle are a UsageError."""
     reason = why_not_linear(program, data, known_start=known_start) if look_ahead is None else "as asked"
     ahead = reason is None if look_ahead is None else look_ahead
     name = "lookahead" if ahead else f"bootstrap ({reason})"

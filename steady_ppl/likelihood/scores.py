@@ -32,18 +32,9 @@ from steady_ppl.gaussian.posterior_moments import posterior_moments
 from steady_ppl.kernels.graph import NotCompilable
 from steady_ppl.kernels.rows import Slopes, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import Element, moved, on_both_sides
-from steady_ppl.model.handlers import (
-    AtMean,
-    Recording,
-    Standardised,
-    as_vector,
-    normal_moments,
-    residual,
-    running,
-    unwrapped,
-)
+from steady_ppl.model.handlers import AtMean, Recording, as_vector, normal_moments, residual, running, unwrapped
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, advance, channel_scales, sample_channels
+from steady_ppl.model.substeps import acting_controls, all_rows, channel_scales, noisy_step, row_inputs, sample_channels
 from steady_ppl.utils.angles import wrap_angles
 
 
@@ -135,8 +126,7 @@ class Arrivals:
 
     def ends(self, program: Program, data: Trajectories) -> Tensor:
         """Where rows end from these states with this noise, `(1 + 2 D, T, B, D)`."""
-        given = (acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
-        return _row_ends(program, self.states, self.noise, *given).double()
+        return noisy_step(program, self.states, self.noise, *row_inputs(program, data)).double()
 
     def score(self, change: Tensor) -> Tensor:
         """Of a change of where rows end, `(1 + 2 D, T, B, D)`; `(B,)`."""
@@ -200,7 +190,7 @@ def smoothed(ahead: Lookahead, data: Trajectories) -> Smoothed:
 
 
 def component_major(values: Tensor) -> Tensor:
-    """The same, laid out component by component, as the programs take them apart."""
+    """The same values `(..., C)`, laid out component by component, as the programs take them apart."""
     return values.movedim(-1, 0).contiguous().movedim(0, -1)
 
 
@@ -333,7 +323,7 @@ def _of_channels(program: Program, data: Trajectories, at: Smoothed, parts: list
         mean, sd = _moments_of_channels(program, state, control, time, step)
         return torch.cat([mean, sd.log()], -1)
 
-    slopes = slopes_on_all_rows(program, "moments", moments, _by_row(program, data, state=points), parts)
+    slopes = slopes_on_all_rows(program, "moments", moments, all_rows(program, data, state=points), parts)
     scores, left = at.states.new_zeros((len(data), len(parts))).double(), list(range(len(parts)))
     if isinstance(slopes, Slopes):
         rows, count = at.channels.mean.shape[0], at.channels.mean.shape[-1]
@@ -352,8 +342,8 @@ def _of_channels(program: Program, data: Trajectories, at: Smoothed, parts: list
 def _of_ends(program: Program, data: Trajectories, at: Smoothed, parts: list[Element]) -> Tensor:
     """The parameters' part in where rows end, `(B, P)`."""
     arriving = arrivals(at.ahead, data)
-    given = _by_row(program, data, state=arriving.states, noise=arriving.noise)
-    slopes = slopes_on_all_rows(program, "ends", partial(_row_ends, program), given, parts)
+    given = all_rows(program, data, state=arriving.states, noise=arriving.noise)
+    slopes = slopes_on_all_rows(program, "ends", partial(noisy_step, program), given, parts)
     scores, left = at.states.new_zeros((len(data), len(parts))).double(), list(range(len(parts)))
     if isinstance(slopes, Slopes):
         scores, left = arriving.of_slopes(slopes), of_actuators(program, data, parts)
@@ -395,19 +385,6 @@ def _of_measurements(program: Program, at: Smoothed, parts: list[Element]) -> Te
         of_spread = found.of_spread((up.spread[0] / down.spread[0]).log() / width)
         scores[:, index] = of_mean + of_spread + (_of_tails(here, up, at) - _of_tails(here, down, at)) / width
     return scores
-
-
-def _by_row(program: Program, data: Trajectories, **along: Tensor) -> dict[str, Tensor]:
-    """Points `(P, T, B, ·)` and what the program is given there, with all rows of all points in front."""
-    given = {"control": acting_controls(program, data)[:-1], "time": data.elapsed[:-1], "step": data.steps}
-    count = len(next(iter(along.values())))
-    given = {name: value.expand(count, *value.shape) for name, value in given.items()}
-    return {name: value.flatten(0, 1) for name, value in (along | given).items()}
-
-
-def _row_ends(program: Program, states: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-    with running(*states.shape[:-1]), Standardised(noise):
-        return advance(program, states, control, time, step)
 
 
 def _of_tails(here: Measured, other: Measured, at: Smoothed) -> Tensor:

@@ -18,6 +18,7 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.errors import ProgramError
+from steady_ppl.model.program import Program
 
 
 class ByColumn(Messenger):
@@ -172,6 +173,16 @@ class Standardised(ByColumn):
 
 
 @dataclass(eq=False)
+class Substituting(ByColumn):
+    """Give latent sites the columns of some values, `(..., C)`, in the order in which the sites are met."""
+
+    values: Tensor
+
+    def _pyro_sample(self, message: Any) -> None:
+        message["value"] = as_event(self.values[..., self.take(message["fn"])], message["fn"].event_dim)
+
+
+@dataclass(eq=False)
 class Recording(Messenger):
     """Keep the values of latent sites, every site's distribution, and the observed sites' tempered log-densities."""
 
@@ -183,6 +194,11 @@ class Recording(Messenger):
     def total(self) -> Tensor:
         """The sum of the observed sites' log-densities, `(...)`."""
         return reduce(operator.add, self.log_likelihood)
+
+    def expanded(self, left: Sequence[int]) -> dict[str, Tensor]:
+        """Values of latent sites, by site, of batch shape `left`."""
+        kinds = self.distributions
+        return {site: broadcast_event(value, left, kinds[site].event_dim) for site, value in self.values.items()}
 
     def _pyro_post_sample(self, message: Any) -> None:
         name = message["name"]
@@ -207,7 +223,8 @@ def unwrapped(fn: Any) -> Any:
 
 
 def residual(fn: Any, value: Tensor) -> Tensor:
-    """`value − mean` of a measurement site, on the circle where the site's distribution lives there."""
+    """`value − mean` of a measurement site, in its unit and as `value`, on the circle where its distribution lives
+    there."""
     base = unwrapped(fn)
     if hasattr(base, "residual"):
         return base.residual(value)
@@ -246,7 +263,7 @@ def tangent_normal(fn: Any, residual: Tensor, site: str) -> tuple[Tensor, Tensor
 
 
 def as_vector(value: Tensor, event_dim: int) -> Tensor:
-    """A site's value with its event as the last dimension, scalars as vectors of one."""
+    """A site's value `(..., *event)` as columns, `(..., C)`: a scalar, of event dimension 0, as a vector of one."""
     return value.unsqueeze(-1) if event_dim == 0 else value
 
 
@@ -263,9 +280,15 @@ def with_moments(fn: Any, loc: Tensor | None = None, scale: Tensor | None = None
     return type(base)(*freedom, *moments).to_event(fn.event_dim)
 
 
-def broadcast_event(value: Tensor, left: torch.Size, event_dim: int) -> Tensor:
-    """Expand a site's value to the batch shape `left`."""
+def broadcast_event(value: Tensor, left: Sequence[int], event_dim: int) -> Tensor:
+    """Expand a site's value `(..., *event)` to the batch shape `left`; `event_dim` is the event's dimensions."""
     return value.expand(*left, *value.shape[value.dim() - event_dim :])
+
+
+def draw_starts(program: Program, *left: int) -> Tensor:
+    """Draw states from a program's `initial`, `(*left, D)`."""
+    with running(*left):
+        return broadcast_event(program.initial(), left, 1)
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:

@@ -9,7 +9,7 @@ from pyro.distributions import constraints
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.handlers import KnownStart, Observing, masked
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, sample_channels
+from steady_ppl.model.substeps import row_inputs, sample_channels
 
 
 class Joint:
@@ -36,7 +36,6 @@ class Joint:
             with pyro.plate("first_row", 1, dim=-2), certain:
                 self.program.initial()
             with pyro.plate("interval", rows - 1, dim=-2), masked(data.transitions):
-                controls = acting_controls(self.program, data)[:-1]
-                sample_channels(self.program, states[..., :-1, :, :], controls, data.elapsed[:-1], data.steps)
+                sample_channels(self.program, states[..., :-1, :, :], *row_inputs(self.program, data))
             with pyro.plate("observed_row", rows, dim=-2), Observing(data.measurements, data.observed):
                 self.program.observe(states)

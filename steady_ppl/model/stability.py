@@ -8,7 +8,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError
-from steady_ppl.model.handlers import broadcast_event, running
+from steady_ppl.model.handlers import draw_starts, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import MAX_SUBSTEPS, Held, advance, with_substeps, within_row
 from steady_ppl.utils.random import seeded
@@ -193,9 +193,8 @@ def _given(data: Trajectories, drive: int, rows: Tensor | slice) -> _Given:
 
 def _starts(program: Program, rows: int) -> Tensor:
     """States from a program's start, `(PROBED_STATES, rows, 1, D)`."""
-    left = torch.Size((PROBED_STATES, rows, 1))
-    with seeded("starts"), running(*left):
-        return broadcast_event(program.initial(), left, 1)
+    with seeded("starts"):
+        return draw_starts(program, PROBED_STATES, rows, 1)
 
 
 def _after(program: Program, state: Tensor, given: _Given, noise: float) -> Tensor:

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Any
+from typing import Any, NamedTuple
 
 import pyro
 import pyro.distributions as dist
@@ -28,7 +28,16 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError, UsageError
 from steady_ppl.model.actuation import row_spans
-from steady_ppl.model.handlers import Recording, as_event, as_vector, unwrapped, with_moments
+from steady_ppl.model.handlers import (
+    AtMean,
+    Recording,
+    Standardised,
+    as_event,
+    as_vector,
+    running,
+    unwrapped,
+    with_moments,
+)
 from steady_ppl.model.program import Program
 
 MAX_SUBSTEPS = 1000  # of a row
@@ -81,6 +90,18 @@ def advance(program: Program, state: Tensor, control: Tensor, time: Tensor, step
     return state
 
 
+def mean_step(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
+    """Return where a row ends without noise; arguments and result are those of `advance`."""
+    with running(*state.shape[:-1]), AtMean():
+        return advance(program, state, control, time, step)
+
+
+def noisy_step(program: Program, state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
+    """Return where a row ends under noise `(..., C)` in standard deviations; the rest is as in `advance`."""
+    with running(*state.shape[:-1]), Standardised(noise):
+        return advance(program, state, control, time, step)
+
+
 def sample_channels(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> None:
     """Sample a row's channels at their sites, and move nowhere; arguments are those of `advance`."""
     if program.substeps == 1:
@@ -99,6 +120,7 @@ def sample_row(program: Program, state: Tensor, control: Tensor, time: Tensor, s
     return state
 
 
+@torch.no_grad()
 def channel_values(
     program: Program, data: Trajectories, states: Tensor, noise: Mapping[str, Tensor]
 ) -> dict[str, Tensor]:
@@ -106,8 +128,10 @@ def channel_values(
 
     `noise` is site → `(M, T, B, ...)`, in standard deviations.
     """
-    given = (states[..., :-1, :, :], acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
-    moments = {site: location_and_scale(fn, site) for site, fn in _on_average(program, *given).items()}
+    before = states[..., :-1, :, :]
+    with running(*before.shape[:-1]):
+        channels = _on_average(program, before, *row_inputs(program, data))
+    moments = {site: location_and_scale(fn, site) for site, fn in channels.items()}
     return {site: loc + scale * noise[site] for site, (loc, scale) in moments.items()}
 
 
@@ -121,6 +145,26 @@ def channel_scales(program: Program, state: Tensor, control: Tensor, time: Tenso
         scales = {site: location_and_scale(fn, site)[1] for site, fn in seen.distributions.items()}
         found.append(joined(scales, seen.distributions, state.shape[:-1]))
     return _mean(found)
+
+
+class RowInputs(NamedTuple):
+    """What a program is given beside its state in each row, in the order of `advance`."""
+
+    control: Tensor  # (T, B, U), or (T, B, K U) as `acting` gives them
+    time: Tensor  # (T, B) s since the trajectory's first row
+    step: Tensor  # (T, B) s
+
+
+def row_inputs(program: Program, data: Trajectories) -> RowInputs:
+    """Return what drives give the program in every row that it moves on from."""
+    return RowInputs(acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
+
+
+def all_rows(program: Program, data: Trajectories, **along: Tensor) -> dict[str, Tensor]:
+    """Return points `(P, T, B, ·)` by name and `row_inputs` there, all rows of all points in front: `(P T, B, ·)`."""
+    count = len(next(iter(along.values())))
+    given = {name: value.expand(count, *value.shape) for name, value in row_inputs(program, data)._asdict().items()}
+    return {name: value.flatten(0, 1) for name, value in (along | given).items()}
 
 
 def acting_controls(program: Program, data: Trajectories) -> Tensor:

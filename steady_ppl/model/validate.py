@@ -11,7 +11,7 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.errors import ProgramError, SteadyError
-from steady_ppl.model.handlers import Broadcasting, Observing, Recording, Replaying, broadcast_event, running
+from steady_ppl.model.handlers import Broadcasting, Observing, Recording, Replaying, draw_starts, running
 from steady_ppl.model.program import Program, names
 from steady_ppl.model.stability import require_convergence
 from steady_ppl.model.substeps import MAX_SUBSTEPS, is_count
@@ -193,9 +193,8 @@ def start_size(program: Program) -> int:
 def step_size(program: Program) -> int:
     """How many numbers each `transition` draws."""
     seen = Recording()
-    with running(1, 1):
-        state = broadcast_event(program.initial(), torch.Size((1, 1)), 1)
-        control, one = state.new_zeros(1, 1, len(program.controls)), state.new_ones(1, 1)
-        with seen:
-            program.transition(state, control, 0.0 * one, one)
+    state = draw_starts(program, 1, 1)
+    control, one = state.new_zeros(1, 1, len(program.controls)), state.new_ones(1, 1)
+    with running(1, 1), seen:
+        program.transition(state, control, 0.0 * one, one)
     return sum(fn.event_shape.numel() for fn in seen.distributions.values())

@@ -1,4 +1,4 @@
-"""How a filter runs a program's methods on its particles: as they are written, here, or compiled (`compiled`)."""
+"""How a filter runs a program's methods on its particles: as they are written, here, or as kernels."""
 
 import math
 from contextlib import nullcontext

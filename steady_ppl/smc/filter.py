@@ -6,21 +6,21 @@ Densities live in the channels: a particle is a start and its channel noise, its
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from typing import NamedTuple
 
 import torch
-from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, ProgramError
-from steady_ppl.model.handlers import KnownStart, Recording, Standardised, broadcast_event, running
+from steady_ppl.model.handlers import KnownStart, Recording, Standardised, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import divergence
-from steady_ppl.model.substeps import advance, channel_values
+from steady_ppl.model.substeps import channel_values
 from steady_ppl.smc.backends import Stepping, stepping_for
 from steady_ppl.smc.genealogy import Filtered, event_dims
 from steady_ppl.smc.resampling import Resampler, effective_sample_size, normalise, systematic, take
@@ -81,34 +81,31 @@ class _Weighed(NamedTuple):
     blown_up: Tensor
 
 
+@dataclass(eq=False)
 class ParticleFilter:
     """A particle filter that goes through a table row by row: `init`, then a `step` a row, under `torch.no_grad()`.
 
     Its arguments are those of `particle_filter`.
     """
 
-    start: Recording  # the sites of `initial`, known after `init`
-    stepping: Stepping  # how the program's methods run, known after `init`
-    in_plain_torch: str | None = None  # why no kernels serve; None where they do or were not asked for
+    program: Program
+    data: Trajectories
+    _: KW_ONLY
+    particles: int
+    observation_weight: float | Tensor = 1.0
+    known_start: bool = False
+    resample_below: float = 0.5
+    proposal: Proposal = field(default_factory=Proposal)
+    resampler: Resampler = systematic
+    kernels: bool | None = None
+    on_frame: OnFrame | None = None
+    start: Recording = field(init=False)  # the sites of `initial`, known after `init`
+    stepping: Stepping = field(init=False)  # how the program's methods run, known after `init`
+    in_plain_torch: str | None = field(init=False, default=None)  # why no kernels serve, as in `Filtered`
 
-    def __init__(
-        self,
-        program: Program,
-        data: Trajectories,
-        *,
-        particles: int,
-        observation_weight: float | Tensor = 1.0,
-        known_start: bool = False,
-        resample_below: float = 0.5,
-        proposal: Proposal | None = None,
-        resampler: Resampler = systematic,
-        kernels: bool | None = None,
-        on_frame: OnFrame | None = None,
-    ) -> None:
-        self.program, self.data, self.particles = program, data, particles
-        self.observation_weight, self.known_start, self.resample_below = observation_weight, known_start, resample_below
-        self.proposal, self.resampler, self.on_frame = proposal or Proposal(), resampler, on_frame
-        if self.proposal.looks_ahead and on_frame is not None:
+    def __post_init__(self) -> None:
+        particles, data, kernels = self.particles, self.data, self.kernels
+        if self.proposal.looks_ahead and self.on_frame is not None:
             raise ValueError(
                 "on_frame sees what is predicted: a filter that looks ahead has seen the later measurements"
             )
@@ -119,17 +116,18 @@ class ParticleFilter:
         self.observed = data.observed.any(-1).any(-1).tolist()
 
     def init(self) -> FilterState:
-        """Draw the particles' starts.
+        """Draw the particles' starts; the state has come to the first row.
 
         Raises:
             ProgramError: a known start, and `initial` returns another state than the one that it samples.
         """
         program, data = self.program, self.data
         noise, log_ratio = (None, 0.0) if self.known_start else self.proposal.start(self.particles)
-        drawing = KnownStart(data.known_start) if self.known_start else _given(noise)
+        given = nullcontext() if noise is None else Standardised(noise.unsqueeze(1))
+        drawing = KnownStart(data.known_start) if self.known_start else given
         with running(*self.left), Recording() as self.start, drawing:
             states = program.initial()
-        states = broadcast_event(states, self.left, 1).squeeze(1)
+        states = states.expand(*self.left, -1).squeeze(1)
         if self.known_start and not bool((states == data.known_start).all()):
             raise ProgramError(
                 "a known start needs initial() to return the sampled state as it is; it returns another", site="initial"
@@ -144,7 +142,8 @@ class ParticleFilter:
         return FilterState(states=states, log_weights=even + log_ratio, roots=self._unmoved)
 
     def step(self, state: FilterState, row: int) -> tuple[FilterState, Step]:
-        """Weigh the particles at a row 0 … T, resample those trajectories that need it, and move on to the next row."""
+        """Weigh the particles that have come to a row 0 … T, resample those trajectories that need it, and move on;
+        returned are the particles at the next row, after the last one at itself, and what was done."""
         weighed = self._weigh(state, row)
         states, log_weights, roots = state.states, weighed.log_weights, state.roots
         ancestors, noise = None, dict[str, Tensor]()
@@ -244,7 +243,7 @@ def particle_filter(
         observation_weight=observation_weight,
         known_start=known_start,
         resample_below=resample_below,
-        proposal=proposal,
+        proposal=proposal or Proposal(),
         resampler=resampler,
         kernels=kernels,
         on_frame=on_frame,
@@ -258,7 +257,6 @@ def particle_filter(
         steps.append(step if keep_history else step._replace(ancestors=None, noise={}))
     evidence, sizes, blown_up = (torch.stack(values) for values in zip(*(step[:3] for step in steps), strict=True))
     _raise_if_broken(program, evidence, blown_up, data)
-    start, left, dims = along.start, along.left, event_dims(along.start)
     return Filtered(
         log_likelihood=evidence.sum(0),
         log_weights=state.log_weights,
@@ -266,23 +264,13 @@ def particle_filter(
         roots=torch.zeros_like(state.log_weights).scatter_(0, state.roots, 1.0).sum(0),
         blown_up=blown_up.sum(0),
         states=history,
-        start={site: broadcast_event(value, left, dims[site]).squeeze(1) for site, value in start.values.items()},
+        start={site: value.squeeze(1) for site, value in along.start.expanded(along.left).items()},
         noise={site: [step.noise[site] for step in steps[:-1]] for site in steps[0].noise},
         ancestors=[step.ancestors for step in steps] if keep_history else [],
-        event_dims={"states": 1} | dims | along.stepping.event_dims,
+        event_dims={"states": 1} | event_dims(along.start) | along.stepping.event_dims,
         in_plain_torch=along.in_plain_torch,
-        channels=None if program.substeps == 1 else partial(_channels, program, data),
+        channels=None if program.substeps == 1 else partial(channel_values, program, data),
     )
-
-
-@torch.no_grad()
-def _channels(program: Program, data: Trajectories, states: Tensor, noise: dict[str, Tensor]) -> dict[str, Tensor]:
-    with running(*noise[next(iter(noise))].shape[:3]):
-        return channel_values(program, data, states, noise)
-
-
-def _given(noise: Tensor | None) -> Standardised | nullcontext[None]:
-    return nullcontext() if noise is None else Standardised(noise.unsqueeze(1))
 
 
 def _raise_if_broken(program: Program, log_likelihood: Tensor, blown_up: Tensor, data: Trajectories) -> None:
@@ -299,27 +287,3 @@ def _raise_if_broken(program: Program, log_likelihood: Tensor, blown_up: Tensor,
         else "no particle is left that is a number: the program's parameters or states have blown up"
     )
     raise FilterError(f"trajectory {label} at {time:.3g} s: {what}", trajectory=label, time=time)
-
-
-@torch.no_grad()
-def roll_out(
-    program: Program,
-    state: Tensor,
-    controls: Tensor,
-    elapsed: Tensor,
-    steps: Tensor,
-    *,
-    handler: Messenger | None = None,
-) -> Iterator[Tensor]:
-    """Run the program forward from given states; yields the state after each step.
-
-    Args:
-        state: `(draws, 1 or R, B, D)`; rows R are starts of a roll-out of their own.
-        controls: `(H, 1 or R, B, U)`.
-        elapsed, steps: `(H, 1 or R, B)` s.
-        handler: acts on the channel noise, for example `AtMean()` for a roll-out without noise.
-    """
-    for control, time, step in zip(controls, elapsed, steps, strict=True):
-        with running(*state.shape[:-1]), handler or nullcontext():
-            state = advance(program, state, control, time, step)
-        yield state

@@ -12,7 +12,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.handlers import Recording, Replaying, running
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, sample_channels
+from steady_ppl.model.substeps import row_inputs, sample_channels
 from steady_ppl.smc.resampling import systematic, take
 
 MIN_EFFECTIVE_SIZE = 10  # particles in effect: with fewer, what a filter says hangs on a handful of draws
@@ -45,7 +45,7 @@ class Paths:
         """Each channel's distribution along the paths of `data`, given the noise of those before it."""
         states = self.states[:, :-1]
         with running(*states.shape[:-1]), Recording() as seen, Replaying(self.noise):
-            sample_channels(program, states, acting_controls(program, data)[:-1], data.elapsed[:-1], data.steps)
+            sample_channels(program, states, *row_inputs(program, data))
         return seen.distributions
 
     def within(self, data: Trajectories) -> Paths:

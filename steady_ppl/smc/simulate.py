@@ -1,18 +1,20 @@
 """Run a program forward in time without measurements."""
 
 import math
+from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 
 import torch
+from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError, SteadyError
-from steady_ppl.model.handlers import Recording, as_vector, broadcast_event, running
+from steady_ppl.model.handlers import Recording, as_vector, draw_starts, running
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.model.stability import counts_rows, is_step
-from steady_ppl.model.substeps import MAX_SUBSTEPS, acting_controls, with_substeps
-from steady_ppl.smc.filter import roll_out
+from steady_ppl.model.substeps import MAX_SUBSTEPS, advance, row_inputs, with_substeps
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
@@ -62,11 +64,10 @@ def simulate(
         run = for_program(program, like)
         program = with_substeps(program, simulated_substeps(program, run) if substeps is None else substeps)
         rows, drives = run.time.shape
-        with running(1, drives):
-            start = broadcast_event(program.initial(), torch.Size((1, drives)), 1)
-        states, over_time = [start], (acting_controls(program, run)[:-1], run.elapsed[:-1], run.steps)
+        states = [draw_starts(program, 1, drives)]
+        inputs = (values.unsqueeze(1) for values in row_inputs(program, run))
         with stages(*[("", 1)] * (rows - 1)) as begin:
-            for state in roll_out(program, start, *(values.unsqueeze(1) for values in over_time)):
+            for state in roll_out(program, states[0], *inputs):
                 begin()
                 states.append(state)
         path = torch.cat(states)
@@ -80,6 +81,30 @@ def simulate(
         states=torch.where(run.rows[..., None], path, torch.nan).double(),
         state_names=program.state_names,
     )
+
+
+@torch.no_grad()
+def roll_out(
+    program: Program,
+    state: Tensor,
+    controls: Tensor,
+    elapsed: Tensor,
+    steps: Tensor,
+    *,
+    handler: Messenger | None = None,
+) -> Iterator[Tensor]:
+    """Run the program forward from given states; yields the state after each step.
+
+    Args:
+        state: `(draws, 1 or R, B, D)`; rows R are starts of a roll-out of their own.
+        controls: `(H, 1 or R, B, U)`.
+        elapsed, steps: `(H, 1 or R, B)` s.
+        handler: acts on the channel noise, for example `AtMean()` for a roll-out without noise.
+    """
+    for control, time, step in zip(controls, elapsed, steps, strict=True):
+        with running(*state.shape[:-1]), handler or nullcontext():
+            state = advance(program, state, control, time, step)
+        yield state
 
 
 def simulated_substeps(program: Program, data: Trajectories) -> int:

@@ -1,4 +1,4 @@
-"""Checkpoints: tensors and a little text in one safetensors file, written beside and renamed. Never pickle."""
+"""Checkpoints of a training run, from which it goes on as if nothing had happened."""
 
 import json
 from collections.abc import Mapping

@@ -56,10 +56,10 @@ def program() -> Any:
     return Program()
 
 
-def found(which: nn.Module, lines: Lines) -> Tensor | str | None:
-    """What it comes to, by a kernel where there is one."""
+def found(which: nn.Module, lines: Lines) -> Tensor | str:
+    """What it comes to by a kernel, or why there is none."""
     result = on_all_rows(which, "lines", lambda state: lines(which, state), {"state": STATES})
-    return result if isinstance(result, str | None) else result[0]
+    return result.in_plain_torch or result.values
 
 
 def assert_own(which: nn.Module, lines: Lines) -> None:
@@ -176,7 +176,7 @@ def test_a_tape_keeps_no_tensor_of_the_program_that_was_traced() -> None:
 
 def test_fewer_rows_than_a_kernel_takes_are_left_to_torch() -> None:
     few = {"state": STATES[:1]}
-    assert "fewer than" in str(on_all_rows(program(), "lines", lambda state: state, few, kernels=True))
+    assert "fewer than" in str(on_all_rows(program(), "lines", lambda state: state, few, kernels=True).in_plain_torch)
 
 
 def test_slopes_that_are_no_numbers_are_left_to_torch() -> None:

@@ -16,7 +16,7 @@ from steady_ppl import for_program, seeded, simulate, with_substeps
 from steady_ppl.effects import catalogue, chosen_variant
 from steady_ppl.model.handlers import AtMean
 from steady_ppl.model.substeps import acting_controls
-from steady_ppl.smc.filter import roll_out
+from steady_ppl.smc.simulate import roll_out
 
 PROGRAMS = (
     "hovercraft",

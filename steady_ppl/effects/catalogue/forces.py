@@ -12,7 +12,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.declaration import Choices, Effect, Means, Names, Need, Pushes, declare, needs
-from steady_ppl.model.handlers import broadcast_event, running
+from steady_ppl.model.handlers import draw_starts
 from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.model.program import Program
 from steady_ppl.utils.random import seeded
@@ -77,8 +77,8 @@ def _places(program: Program, data: Trajectories | None) -> Choices:
 @torch.no_grad()
 def _starts(program: Program) -> Tensor:
     """Drawn from where drives begin, `(1, STARTS, D)`."""
-    with seeded("starts"), running(1, STARTS):
-        return broadcast_event(program.initial(), torch.Size((1, STARTS)), 1)
+    with seeded("starts"):
+        return draw_starts(program, 1, STARTS)
 
 
 FORCES: list[Effect] = []
