@@ -13,10 +13,10 @@ from torch import Tensor
 from steady_ppl.comparison.evaluate import has_truth, squared_errors
 from steady_ppl.criticism.baselines import ConstantVelocity, constant_velocity
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.errors import FilterError, UsageError
+from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.kalman import Tracked, track
-from steady_ppl.gaussian.linearize import ReferencePath, why_not_linear
+from steady_ppl.gaussian.linearize import ReferencePath, require_linear
 from steady_ppl.gaussian.predict import Prediction, named_horizons, predict, simulate_again, states_ahead
 from steady_ppl.gaussian.smoother import find_and_smooth, smooth
 from steady_ppl.likelihood.evidence import neglected
@@ -130,9 +130,7 @@ def judge_program(
     """Find the paths from the measurements alone, unless one is given; predict, and compare; errors as of `prove`."""
     problem = Problem(program, for_program(program, data), known_start)
     unseen = problem.without_truth()
-    if (why := why_not_linear(program, unseen.data, known_start=known_start)) is not None:
-        said = f"{name}: prove needs programs that can be linearised: {why.split(': looking')[0]}"
-        raise UsageError(f"{said} (`steady evaluate` takes any)")
+    require_linear(unseen, f"{name}: prove needs programs that can be linearised", " (`steady evaluate` takes any)")
     try:
         with seeded(seed, "prove"):
             ahead = find_and_smooth(unseen, path=path)
@@ -172,7 +170,6 @@ def judge_constant_velocity(before: Judged) -> Judged | str:
     if isinstance(found, str):
         return found
     coasting = ConstantVelocity(unseen.program, found.scales)
-    coasting.error_groups = unseen.program.error_groups  # type: ignore[misc]
     path = before.tracked.path(unseen.data)
     still = ReferencePath(path.states, torch.zeros_like(path.noise))
     ahead = smooth(replace(unseen, program=coasting), still, kernels=False)

@@ -24,7 +24,7 @@ from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.kalman import track
-from steady_ppl.gaussian.linearize import why_not_linear
+from steady_ppl.gaussian.linearize import require_linear
 from steady_ppl.gaussian.predict import named_horizons, predict
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
@@ -69,8 +69,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     if run.time.shape[0] < 2 or not bool(run.observed[1:].any()):
         raise DataError("nothing to compare: no trajectory has a measurement after its first row")
     refuse_long(run)
-    if (why := why_not_linear(problem.program, problem.data, known_start=problem.known_start)) is not None:
-        raise UsageError(f"check needs a program that can be linearised: {why.split(': looking')[0]}")
+    require_linear(problem, "check needs a program that can be linearised")
     horizons = named_horizons(run, CHECK_HORIZONS_SECONDS)
     parts = (("finding paths", 1), ("comparing time steps", 1), ("simulating drives", 2), ("judging", 2))
     with stages(*parts) as begin:

@@ -18,10 +18,11 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.errors import ProgramError
+from steady_ppl.errors import ProgramError, UsageError
 from steady_ppl.gaussian.lanes import Array, array
 from steady_ppl.kernels.rows import on_all_rows
 from steady_ppl.model.handlers import (
+    NEEDS_NORMAL,
     AtMean,
     Observing,
     Recording,
@@ -192,6 +193,12 @@ def why_not_linear(program: Program, data: Trajectories, *, known_start: bool = 
     except ProgramError as error:
         return str(error)
     return None
+
+
+def require_linear(problem: Problem, what: str, advice: str = "") -> None:
+    """Raise the UsageError that `what` needs a program that can be linearised, why this one cannot, and the advice."""
+    if why := why_not_linear(problem.program, problem.data, known_start=problem.known_start):
+        raise UsageError(f"{what}: {why.removesuffix(NEEDS_NORMAL)}{advice}")
 
 
 def _residuals(program: Program, state: Tensor, measurement: Tensor, observed: Tensor) -> Tensor:
