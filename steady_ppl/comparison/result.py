@@ -72,6 +72,14 @@ class Proof(Displayed):
             "notes": self.notes,
         }
 
+    def open_loop(self, name: str) -> dict[tuple[str, str], list[tuple[float, float]]]:
+        """A row's open-loop errors by what they are of, as in `Key`: pairs of seconds ahead and root mean square."""
+        curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
+        for key, sums in sorted(self.rows[name].sums.items(), key=lambda pair: pair[0].horizon):
+            if key.kind in ("measurement", "state") and sums.value:
+                curves.setdefault((key.kind, key.of), []).append((key.horizon * self.step, sums.value))
+        return curves
+
     def __str__(self) -> str:
         content = self.figures
         rows, horizons = content["rows"], list(content["horizons"])

@@ -29,7 +29,8 @@ def open_loop_picture(found: Proof, *, of: str | None = None, axes: Axes | None 
     """
     states = units_of_states(found)
     of = found.rows[found.reference].program.measurement_units[0] if of is None else of
-    curves = {name: _curve(found, name, of) for name in found.rows}
+    every = {name: found.open_loop(name) for name in found.rows}
+    curves = {name: one.get(("state", of)) or one.get(("measurement", of), []) for name, one in every.items()}
     if not curves[found.reference]:
         have = {key.of for key in found.rows[found.reference].sums if key.kind in ("measurement", "state")}
         raise UsageError(f"there is no open-loop error of {of!r}; there are {', '.join(sorted(have))}")
@@ -66,10 +67,3 @@ def proof_picture(found: Proof) -> Figure:
     figure = plt.Figure(figsize=(6, 4), layout="constrained")
     open_loop_picture(found, axes=figure.subplots())
     return figure
-
-
-def _curve(found: Proof, name: str, of: str) -> list[tuple[float, float]]:
-    """Seconds ahead and error, where there is one."""
-    kinds, sums = ("measurement", "state"), found.rows[name].sums.items()
-    at = {key.horizon: one.value for key, one in sums if key.kind in kinds and key.of == of}
-    return [(rows * found.step, value) for rows, value in sorted(at.items()) if value]

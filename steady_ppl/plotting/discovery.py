@@ -8,19 +8,17 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import torch
 
 from steady_ppl.discovery.candidates import Candidate
-from steady_ppl.discovery.curves import variables
+from steady_ppl.discovery.curves import variables_along
 from steady_ppl.discovery.finding import Finding, gain_interval
 from steady_ppl.discovery.refits import Fold, Refit
 from steady_ppl.discovery.result import Discovery, limit_of, sentence
 from steady_ppl.discovery.screening import Tested
 from steady_ppl.effects import Variant
 from steady_ppl.errors import UsageError
-from steady_ppl.model.interventions import channel_means
+from steady_ppl.gaussian.predict import HALF_WIDTH
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, row_controls
 from steady_ppl.plotting.comparison import open_loop_picture
 
 if TYPE_CHECKING:
@@ -196,7 +194,7 @@ def _of_finding(found: Discovery, finding: Finding) -> list[GainRow]:
 
 
 def _of_test(tested: Tested) -> list[GainRow]:
-    half = 1.645 * tested.sd
+    half = HALF_WIDTH * tested.sd
     ends = np.stack([tested.coefficient - half, tested.coefficient + half], -1)
     return _in_limits(tested.variant, tested.coefficient, ends, tested.detection_limit, OTHER_COLOR)
 
@@ -273,15 +271,12 @@ def titled(axes: Axes, title: str, about: str) -> Axes:
     return axes
 
 
-@torch.no_grad()
 def _visited(program: Program, variant: Variant, fold: Fold) -> np.ndarray:
     """Values of what a curve depends on, on the drives of a fold."""
     data = fold.drives
     if "chosen" in variant.options:
         index = [program.measurement_names.index(name) for name in variant.options["chosen"]]
         return data.measurements[..., index][data.observed[..., index]].double().numpy(force=True)
-    states = fold.path.states[..., : len(program.states)]
-    given = (states[:-1], row_controls(program, acting_controls(program, data))[:-1], data.elapsed[:-1])
-    mean = channel_means(program, program.transition, *given, data.steps / program.substeps)
-    values = variables(program, *given, mean)[variant.options["variable"]]
-    return values.expand(data.transitions.shape)[data.transitions].double().numpy(force=True)
+    along, _ = variables_along(program, data, fold.path.states[..., : len(program.states)])
+    values = along[variant.options["variable"]].expand(data.transitions.shape)
+    return values[data.transitions].double().numpy(force=True)

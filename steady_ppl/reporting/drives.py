@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from steady_ppl.comparison.evaluate import has_truth
 from steady_ppl.criticism.residual_maps import Cell
-from steady_ppl.criticism.result import Check, place, subject
+from steady_ppl.criticism.result import Check, band, measured_values, place, strips, subject
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.program import Program, names, units
-from steady_ppl.plotting.check import band, measured_values, strips
 from steady_ppl.runs.fit import Fit
 from steady_ppl.runs.posterior import drawn_states
 from steady_ppl.utils.angles import nearest_turn
@@ -207,10 +207,10 @@ def _components(declared: Any) -> list[dict[str, str]]:
 
 def _truth(program: Program, table: Trajectories, middle: np.ndarray) -> np.ndarray | None:
     """The true states `(rows, B, D)`, angles on the turn of the posterior's median; None where there are but starts."""
-    truth = table.select(program.control_names, program.measurement_names, program.state_names).states
-    if truth is None or not bool(torch.isfinite(truth[1:]).any()):
+    data = table.select(program.control_names, program.measurement_names, program.state_names)
+    if data.states is None or not has_truth(data):
         return None
-    found = truth.double().numpy(force=True).copy()
+    found = data.states.double().numpy(force=True).copy()
     for index in program.angle_indices:
         found[..., index] = nearest_turn(found[..., index], middle[..., index])
     return found

@@ -18,7 +18,7 @@ from plotly.offline import get_plotlyjs
 from steady_ppl.comparison.result import Proof
 from steady_ppl.criticism.result import Check, strongest
 from steady_ppl.effects import Effect, attached, written_class
-from steady_ppl.plotting.notebook import parameter_rows
+from steady_ppl.model.program import parameter_rows
 from steady_ppl.reporting.drives import Shown, where_to_look
 from steady_ppl.runs.fit import Fit, versions
 from steady_ppl.utils.files import finite_json, whole_file
@@ -114,14 +114,12 @@ def _linked(findings: list[dict[str, Any]], found: Report, label: str) -> list[d
     return rows
 
 
-def _curves(proof: Any) -> dict[str, Any]:
+def _curves(proof: Proof) -> dict[str, Any]:
     """Root mean square error against the seconds ahead: of → row → pairs."""
-    curves: dict[str, dict[str, list[list[float]]]] = {}
-    for name, row in proof.rows.items():
-        for key, sums in sorted(row.sums.items(), key=lambda pair: pair[0].horizon):
-            if key.kind in ("measurement", "state") and sums.value:
-                of = f"measured [{key.of}]" if key.kind == "measurement" else key.of
-                curves.setdefault(of, {}).setdefault(name, []).append([key.horizon * proof.step, sums.value])
+    curves: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for name in proof.rows:
+        for (kind, of), curve in proof.open_loop(name).items():
+            curves.setdefault(f"measured [{of}]" if kind == "measurement" else of, {})[name] = curve
     return curves
 
 
