@@ -136,7 +136,7 @@ def judge_program(
             ahead = find_and_smooth(unseen, path=path)
     except FilterError as error:
         raise FilterError(f"{name}: {error}", trajectory=error.trajectory, time=error.time) from error
-    judged = judge(problem, ahead)
+    judged = compare_predictions(problem, ahead)
     try:
         with seeded(seed, "prove by particles"):
             return replace(judged, neglected=neglected(program, unseen.data, known_start=known_start, ahead=ahead))
@@ -144,7 +144,7 @@ def judge_program(
         return replace(judged, neglected=str(error))
 
 
-def judge(problem: Problem, ahead: Lookahead, kernels: bool | None = None) -> Judged:
+def compare_predictions(problem: Problem, ahead: Lookahead, kernels: bool | None = None) -> Judged:
     """Track along a path that was found and compare what is predicted from every row with measurements and truth."""
     program, data, unseen = problem.program, problem.data, problem.without_truth()
     tracked = track(unseen, ahead.linearization.path, kernels=kernels)
@@ -175,7 +175,7 @@ def judge_constant_velocity(before: Judged) -> Judged | str:
     ahead = smooth(replace(unseen, program=coasting), still, kernels=False)
     if not bool(torch.isfinite(ahead.log_likelihood).all()):
         return "it blows up on these drives"
-    return judge(replace(before.problem, program=coasting), ahead, kernels=False)
+    return compare_predictions(replace(before.problem, program=coasting), ahead, kernels=False)
 
 
 def noise_floor(true: Judged, seed: int) -> Judged | str:
@@ -193,7 +193,7 @@ def noise_floor(true: Judged, seed: int) -> Judged | str:
         return "the true program does not explain drives of its own"
     if true.states:
         own = replace(own, data=replace(again, states=torch.where(again.rows.unsqueeze(-1), path.states, torch.nan)))
-    return judge(own, ahead)
+    return compare_predictions(own, ahead)
 
 
 def as_row(judged: Judged, counted: Mapping[int, Tensor]) -> ProgramScores:

@@ -16,7 +16,7 @@ from steady_ppl.criticism.attribution import SCATTER, attribute, scored
 from steady_ppl.criticism.baselines import constant_velocity, last_measurement
 from steady_ppl.criticism.perturbations import directions
 from steady_ppl.criticism.reference_sets import MIN_BAND_SETS, residuals, simulate_sets
-from steady_ppl.criticism.residual_maps import Residuals, judge
+from steady_ppl.criticism.residual_maps import Residuals, misfit_of
 from steady_ppl.criticism.result import Check
 from steady_ppl.criticism.step_size import check_step
 from steady_ppl.data.frozen_sensors import frozen_stretches
@@ -93,8 +93,8 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         time, dispersion = run.elapsed[:-1].numpy(force=True), scores.dispersion.mean(-1)
         acting = run.controls[:-1]
         controls = {name: acting[..., i].double().numpy(force=True) for i, name in enumerate(program.control_names)}
-        both = Residuals.joined([ours, theirs])
-        misfit = judge(both, time, controls, _pairs(program, ours), dispersion)
+        both = Residuals.concatenated([ours, theirs])
+        misfit = misfit_of(both, time, controls, _pairs(program, ours), dispersion)
     notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
     notes += fallback_notes(uncompiled)
     notes += run.uneven_steps + diagnose_units(program, run)

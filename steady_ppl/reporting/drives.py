@@ -33,7 +33,7 @@ def _strips(found: Check) -> dict[str, Any] | None:
     return {
         "edges": [start for start, _ in times] + [times[-1][1]],
         "drives": list(found.data.labels),
-        "z": packed(z),
+        "z": in_sixteen_bits(z),
         "significant": [[one.residual, one.where["drive"], times.index(one.where["time"])] for one in significant],
     }
 
@@ -97,7 +97,7 @@ def _longest(there: np.ndarray, found: Check, drive: int) -> tuple[float, float]
     return float(elapsed[starts[longest]]), float(elapsed[min(ends[longest], len(elapsed) - 1)])
 
 
-def packed(values: Any) -> dict[str, Any]:
+def in_sixteen_bits(values: Any) -> dict[str, Any]:
     """An array of any shape as base64 of little-endian 16-bit integers, `low + step (code + 32767)`.
 
     A number that is not finite is missing; it has a code of its own.
@@ -131,7 +131,7 @@ class Shown:
 
     def of(self, values: Any) -> dict[str, Any]:
         """`(rows, B, ·)` as `(drives, ·, rows)`, packed."""
-        return packed(np.asarray(values)[:: self.every, self.drives].transpose(1, 2, 0))
+        return in_sixteen_bits(np.asarray(values)[:: self.every, self.drives].transpose(1, 2, 0))
 
 
 def chosen_drives(checks: list[Check], numbers: int = MAX_PACKED_NUMBERS) -> Shown:

@@ -61,7 +61,7 @@ class Report:
             trim_blocks=True,
             lstrip_blocks=True,
         )
-        templates.filters |= {"number": number, "signed": signed, "interval": interval, "spread": spread, "said": said}
+        templates.filters |= {"number": rounded, "signed": signed, "interval": interval, "spread": spread, "said": said}
         figures = {label: one.figures for label, one in self.checks.items()}
         curves = {} if isinstance(self.proof, str) else _curves(self.proof)
         drawn = ("candidates", "effects", "shape")  # the rest of a discovery is in the text
@@ -133,10 +133,10 @@ def _data(content: Mapping[str, Any]) -> Markup:
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
 
 
-def number(value: Any, digits: int = 3) -> str:
+def rounded(value: Any, digits: int = 3) -> str:
     """A figure with so many digits, a list of them, or a dash."""
     if isinstance(value, list | tuple):
-        return ", ".join(number(one, digits) for one in value)
+        return ", ".join(rounded(one, digits) for one in value)
     return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}g}".replace("-", "−")
 
 
@@ -149,7 +149,7 @@ def spread(candidate: Mapping[str, Any]) -> str:
     """Coefficients with their standard deviations, component by component."""
     values, sds = (one if isinstance(one, list) else [one] for one in (candidate["coefficient"], candidate["sd"]))
     pairs = zip(values, sds if len(sds) == len(values) else [None] * len(values), strict=True)
-    return ", ".join(number(value) + (f" ± {number(sd, 2)}" if sd is not None else "") for value, sd in pairs)
+    return ", ".join(rounded(value) + (f" ± {rounded(sd, 2)}" if sd is not None else "") for value, sd in pairs)
 
 
 def said(sentence: str) -> Markup:
@@ -161,7 +161,7 @@ def said(sentence: str) -> Markup:
 
 def interval(pair: Any, digits: int = 3) -> str:
     """Both ends, or nothing."""
-    return "" if pair is None else f"[{number(pair[0], digits)}, {number(pair[1], digits)}]"
+    return "" if pair is None else f"[{rounded(pair[0], digits)}, {rounded(pair[1], digits)}]"
 
 
 def _program(label: str, fit: Fit) -> dict[str, Any]:
