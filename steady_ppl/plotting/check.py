@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from steady_ppl.criticism.baselines import Reference
 from steady_ppl.criticism.result import Check, band, measured_values, over_floor, strips, subject, verdict
 from steady_ppl.errors import UsageError
 from steady_ppl.model.program import unit_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from steady_ppl.utils.text import with_unit
 
 DATA_COLOR, NEAR_COLOR, FAR_COLOR, BASELINE_COLOR, FLOOR_COLOR = "black", "#0072b2", "#d55e00", "#cc79a7", "#009e73"
 MAX_COMPONENTS_SHOWN = 4  # panels
@@ -25,8 +25,6 @@ CHECK_TITLE_COLUMNS = 165  # letters of its line over the whole width
 
 def check_picture(found: Check) -> Figure:
     """One figure of everything; made without pyplot's list of figures, so that nothing needs to be closed."""
-    import matplotlib.pyplot as plt
-
     with plt.rc_context({"axes.titlesize": 9, "axes.labelsize": 8}):
         shown = min(MAX_COMPONENTS_SHOWN, len(found.program.measurement_names))
         figure = plt.Figure(figsize=(13, 2.2 * max(shown, 3) + 1.3), layout="constrained")
@@ -66,8 +64,8 @@ def predictions(found: Check, drive: int, component: int, axes: Axes) -> None:
         axes.fill_between(at, middle - half, middle + half, color=color, alpha=0.18, lw=0)
         axes.plot(at, middle, color=color, lw=1, label=f"{name} ahead, 90 % band")
     axes.plot(time, measured_values(found)[:, drive, component], ".", color=DATA_COLOR, ms=3, label="measured")
-    name, unit = found.program.measurement_names[component], found.program.measurement_units[component]
-    axes.set_ylabel(f"{name} [{unit}]" if unit else name)
+    program = found.program
+    axes.set_ylabel(with_unit(program.measurement_names[component], program.measurement_units[component]))
 
 
 def _with_breaks(time: np.ndarray, middle: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -116,8 +114,7 @@ def regime_panel(found: Check, axes: Axes) -> None:
         if cell in stand_out:
             axes.plot(sum(cell.where[variable]) / 2, z, "k*", ms=6)
     axes.axhline(0, color="black", lw=0.6)
-    unit = unit_of(found.program, variable)
-    axes.set(xlabel=f"{variable} [{unit}]" if unit else variable, ylabel="simulated sd")
+    axes.set(xlabel=with_unit(variable, unit_of(found.program, variable)), ylabel="simulated sd")
     what = "in which regime" if stand_out else "strongest regime, not significant"
     axes.set_title(f"{what}: mean residual of {subject(found, strongest.residual)} (grey: ±2)")
 
@@ -158,8 +155,6 @@ def innovations(found: Check, trajectory: str, *, axes: Axes | None = None) -> A
     """
     if trajectory not in found.data.labels:
         raise UsageError(f"no trajectory {trajectory!r}; there are {', '.join(found.data.labels)}")
-    import matplotlib.pyplot as plt
-
     axes = axes if axes is not None else plt.subplots(figsize=(7, 3), layout="constrained")[1]
     drive, prediction = found.data.labels.index(trajectory), found.predictions[1]
     time = found.data.elapsed[1:, drive].numpy(force=True)

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.curves import variables_along
@@ -20,10 +23,7 @@ from steady_ppl.errors import UsageError
 from steady_ppl.gaussian.predict import HALF_WIDTH
 from steady_ppl.model.program import Program
 from steady_ppl.plotting.comparison import open_loop_picture
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from steady_ppl.utils.text import with_unit
 
 CHOSEN_COLOR, ALIAS_COLOR, OTHER_COLOR, LIMIT_COLOR = "#d55e00", "#e69f00", "#0072b2", "#009e73"  # Okabe and Ito
 MAX_CANDIDATES = 9  # candidates of a group
@@ -56,8 +56,6 @@ def discovery_picture(found: Discovery) -> Figure:
     """One figure of everything; made without pyplot's list of figures, so that nothing needs to be closed."""
     rows = sum(2 + len(group.candidates) for group in _groups(found))
     height = max(7.5, 4.5 + 0.24 * rows) if rows else 2.2 + 0.19 * len(_remaining(found))
-    import matplotlib.pyplot as plt
-
     figure = plt.Figure(figsize=(12, height), layout="constrained")
     if rows:
         left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1, 1.05), squeeze=False))
@@ -235,8 +233,6 @@ def unknown_effect(found: Discovery, *, axes: Axes | None = None) -> Axes:
     if shape is None:
         raise UsageError(f"there is no curve to draw: the verdict is {found.verdict}")
     assert chosen is not None and isinstance(chosen.refit, Refit)
-    import matplotlib.pyplot as plt
-
     axes = axes if axes is not None else plt.subplots(figsize=(6, 4), layout="constrained")[1]
     points, heights, band = (np.array(values) for values in (shape.points, shape.curve, shape.band))
     program = found.before.program
@@ -258,7 +254,7 @@ def unknown_effect(found: Discovery, *, axes: Axes | None = None) -> Axes:
     times = f", times {shape.times}" if shape.times else ""
     axes.set_ylabel(f"missing from {shape.channel}{times}{f' [{shape.unit}]' if shape.unit not in ('', '1') else ''}")
     axes.legend(fontsize=7, loc="upper right" if heights[0] > heights[-1] else "upper left")
-    variable = f"{shape.variable} [{shape.variable_unit}]" if shape.variable_unit else shape.variable
+    variable = with_unit(shape.variable, shape.variable_unit)
     return titled(axes, "the curve that is missing, in no catalogue", f"{variable}; ticks: where the drives were")
 
 

@@ -6,9 +6,10 @@ import base64
 import io
 from collections.abc import Callable, Sequence
 from functools import partial, singledispatch
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from markupsafe import Markup
+from matplotlib.figure import Figure
 
 from steady_ppl.comparison.result import Proof, verdict as comparison_verdict
 from steady_ppl.criticism.result import Check, verdict as criticism_verdict
@@ -20,9 +21,6 @@ from steady_ppl.plotting.check import check_picture
 from steady_ppl.plotting.comparison import proof_picture
 from steady_ppl.plotting.discovery import discovery_picture
 from steady_ppl.runs.fit import Fit
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 DOTS_PER_INCH = 90  # an inch, of pictures
 SENTENCE, PARAGRAPH = Markup("<p><strong>{}</strong></p>"), Markup("<p>{}</p>")

@@ -111,9 +111,9 @@ class Trained:
 
     @property
     def rise(self) -> tuple[float, float] | None:
-        """Held-out log p(y) of a drive at first and at the step that was kept; None where nothing was held out."""
+        """Held-out log p(y) of a drive at first and at the step that was kept; None where it was not judged there."""
         judged = {entry["step"]: entry["log_likelihood"] for entry in self.history if "log_likelihood" in entry}
-        return (next(iter(judged.values())), judged[self.kept]) if judged else None
+        return (next(iter(judged.values())), judged[self.kept]) if self.kept in judged else None
 
     @property
     def still_rising(self) -> float | None:
