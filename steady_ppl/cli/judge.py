@@ -183,7 +183,7 @@ def report(
 
     What `steady discover … --out RUN` found is shown if one of the runs is such a RUN. The page needs no network.
     """
-    from steady_ppl.runs.folder import read_discovery
+    from steady_ppl.discovery.result import read_discovery
     from steady_ppl.runs.recipes import fingerprint
 
     runs, table = runs_and_table("report", arguments)

@@ -72,9 +72,8 @@ def fit(
     say(*result.notes)
     tell(f"{out}: {result.program}")
     if result.trained is not None:
-        judged = {e["step"]: e["log_likelihood"] for e in result.trained.history if "log_likelihood" in e}
-        if judged:
-            first, kept = next(iter(judged.values())), judged[result.trained.kept]
+        if result.trained.rise:
+            first, kept = result.trained.rise
             rise = f"{first:.2f} → {kept:.2f} at step {result.trained.kept}"
             tell(f"held-out log p(y) of a drive {rise}, whose parameters were kept")
         if result.trained.interrupted:

@@ -71,7 +71,7 @@ def evaluate(
         UsageError: the map is none, or another vehicle's.
         FilterError: the filter broke down.
     """
-    problem = _checked(fit, table, surveyed)
+    problem, of_map = _checked(fit, table, surveyed)
     program, data, known_start = problem.program, problem.data, problem.known_start
     choice = choose_filter(program, data, known_start=known_start, particles=particles, look_ahead=look_ahead)
     settings: dict[str, Any] = {"look_ahead": choice.look_ahead, "known_start": known_start}
@@ -96,9 +96,7 @@ def evaluate(
         begin()
         with seeded(seed, "measurement"):
             result["measurement"] = measurement_errors(program, data, particles=2000, known_start=known_start)
-    if surveyed is not None:
-        result["map"] = _judged_map(program, surveyed)
-    return result
+    return result | ({} if of_map is None else {"map": of_map})
 
 
 def evaluate_all(
@@ -121,17 +119,15 @@ def evaluate_all(
     return results
 
 
-def _checked(fit: Fit, table: Trajectories, surveyed: Program | None) -> Problem:
-    """The fit's program and the columns that it reads, if table and map suit it."""
+def _checked(fit: Fit, table: Trajectories, surveyed: Program | None) -> tuple[Problem, dict[str, Any] | None]:
+    """The fit's program and the columns that it reads, and errors of its map, if table and map suit it."""
     data = for_program(fit.program, table)
     refuse_long(data)
-    problem = Problem(fit.program, data, fit.known_start)
-    if surveyed is not None:
-        _judged_map(fit.program, surveyed)
-    return problem
+    of_map = None if surveyed is None else _errors_of_map(fit.program, surveyed)
+    return Problem(fit.program, data, fit.known_start), of_map
 
 
-def _judged_map(program: Program, surveyed: Program) -> dict[str, Any]:
+def _errors_of_map(program: Program, surveyed: Program) -> dict[str, Any]:
     for one in (program, surveyed):
         if not len(getattr(one, "landmarks", ())):
             raise UsageError(f"program {type(one).__name__} has no landmarks: judge it without a map")

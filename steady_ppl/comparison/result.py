@@ -12,7 +12,7 @@ from steady_ppl.comparison.scores import BANDED_HORIZONS, COVERAGE, RESAMPLES, C
 from steady_ppl.effects import attached
 from steady_ppl.model.program import error_groups
 from steady_ppl.utils.hooks import Displayed
-from steady_ppl.utils.text import TEXT_WIDTH, aligned, number
+from steady_ppl.utils.text import TEXT_WIDTH, aligned, number, with_unit
 
 NAME_COLUMNS = 20  # characters of a row's name
 NOISE_FLOOR, CONSTANT_VELOCITY = "noise floor", "constant velocity"  # rows that `prove` adds
@@ -72,6 +72,14 @@ class Proof(Displayed):
             "notes": self.notes,
         }
 
+    def open_loop(self, name: str) -> dict[tuple[str, str], list[tuple[float, float]]]:
+        """A row's open-loop errors by what they are of, as in `Key`: pairs of seconds ahead and root mean square."""
+        curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
+        for key, sums in sorted(self.rows[name].sums.items(), key=lambda pair: pair[0].horizon):
+            if key.kind in ("measurement", "state") and sums.value:
+                curves.setdefault((key.kind, key.of), []).append((key.horizon * self.step, sums.value))
+        return curves
+
     def __str__(self) -> str:
         content = self.figures
         rows, horizons = content["rows"], list(content["horizons"])
@@ -88,7 +96,7 @@ class Proof(Displayed):
         units_of |= {("state", of): unit for of, unit in content["units"].items()}
         for (kind, of), unit in units_of.items():
             title = of if kind == "state" else "measured"
-            header = [f"{title} [{unit}]" if unit else title, *far, *(f"{name}, differs" for name in far)]
+            header = [with_unit(title, unit), *far, *(f"{name}, differs" for name in far)]
             cells = [[row["row"], *_errors(row, kind, of, far)] for row in rows if of in row[kind]]
             lines += [*_table([header, *cells]), ""] if cells else []
         lines += _scales([row for row in rows if row["row"] != NOISE_FLOOR])

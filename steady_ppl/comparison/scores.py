@@ -13,10 +13,10 @@ from torch import Tensor
 from steady_ppl.comparison.evaluate import has_truth, squared_errors
 from steady_ppl.criticism.baselines import ConstantVelocity, constant_velocity
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.errors import FilterError, UsageError
+from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.kalman import Tracked, track
-from steady_ppl.gaussian.linearize import ReferencePath, why_not_linear
+from steady_ppl.gaussian.linearize import ReferencePath, require_linear
 from steady_ppl.gaussian.predict import Prediction, named_horizons, predict, simulate_again, states_ahead
 from steady_ppl.gaussian.smoother import find_and_smooth, smooth
 from steady_ppl.likelihood.evidence import neglected
@@ -130,15 +130,13 @@ def judge_program(
     """Find the paths from the measurements alone, unless one is given; predict, and compare; errors as of `prove`."""
     problem = Problem(program, for_program(program, data), known_start)
     unseen = problem.without_truth()
-    if (why := why_not_linear(program, unseen.data, known_start=known_start)) is not None:
-        said = f"{name}: prove needs programs that can be linearised: {why.split(': looking')[0]}"
-        raise UsageError(f"{said} (`steady evaluate` takes any)")
+    require_linear(unseen, f"{name}: prove needs programs that can be linearised", " (`steady evaluate` takes any)")
     try:
         with seeded(seed, "prove"):
             ahead = find_and_smooth(unseen, path=path)
     except FilterError as error:
         raise FilterError(f"{name}: {error}", trajectory=error.trajectory, time=error.time) from error
-    judged = judge(problem, ahead)
+    judged = compare_predictions(problem, ahead)
     try:
         with seeded(seed, "prove by particles"):
             return replace(judged, neglected=neglected(program, unseen.data, known_start=known_start, ahead=ahead))
@@ -146,7 +144,7 @@ def judge_program(
         return replace(judged, neglected=str(error))
 
 
-def judge(problem: Problem, ahead: Lookahead, kernels: bool | None = None) -> Judged:
+def compare_predictions(problem: Problem, ahead: Lookahead, kernels: bool | None = None) -> Judged:
     """Track along a path that was found and compare what is predicted from every row with measurements and truth."""
     program, data, unseen = problem.program, problem.data, problem.without_truth()
     tracked = track(unseen, ahead.linearization.path, kernels=kernels)
@@ -172,13 +170,12 @@ def judge_constant_velocity(before: Judged) -> Judged | str:
     if isinstance(found, str):
         return found
     coasting = ConstantVelocity(unseen.program, found.scales)
-    coasting.error_groups = unseen.program.error_groups  # type: ignore[misc]
     path = before.tracked.path(unseen.data)
     still = ReferencePath(path.states, torch.zeros_like(path.noise))
     ahead = smooth(replace(unseen, program=coasting), still, kernels=False)
     if not bool(torch.isfinite(ahead.log_likelihood).all()):
         return "it blows up on these drives"
-    return judge(replace(before.problem, program=coasting), ahead, kernels=False)
+    return compare_predictions(replace(before.problem, program=coasting), ahead, kernels=False)
 
 
 def noise_floor(true: Judged, seed: int) -> Judged | str:
@@ -196,7 +193,7 @@ def noise_floor(true: Judged, seed: int) -> Judged | str:
         return "the true program does not explain drives of its own"
     if true.states:
         own = replace(own, data=replace(again, states=torch.where(again.rows.unsqueeze(-1), path.states, torch.nan)))
-    return judge(own, ahead)
+    return compare_predictions(own, ahead)
 
 
 def as_row(judged: Judged, counted: Mapping[int, Tensor]) -> ProgramScores:

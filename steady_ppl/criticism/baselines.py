@@ -47,7 +47,7 @@ class ConstantVelocity(Program):
     def __init__(self, program: Program, scales: Sequence[float]) -> None:
         super().__init__()
         self.scales = tuple(scales)
-        for name in ("states", "controls", "channels", "measurements", "substeps", "angles"):
+        for name in ("states", "controls", "channels", "measurements", "substeps", "angles", "error_groups"):
             setattr(self, name, getattr(program, name))
         object.__setattr__(self, "of", program)  # not a part of this one: Pyro would rename it
 

@@ -16,7 +16,7 @@ from steady_ppl.criticism.attribution import SCATTER, attribute, scored
 from steady_ppl.criticism.baselines import constant_velocity, last_measurement
 from steady_ppl.criticism.perturbations import directions
 from steady_ppl.criticism.reference_sets import MIN_BAND_SETS, residuals, simulate_sets
-from steady_ppl.criticism.residual_maps import Residuals, judge
+from steady_ppl.criticism.residual_maps import Residuals, misfit_of
 from steady_ppl.criticism.result import Check
 from steady_ppl.criticism.step_size import check_step
 from steady_ppl.data.frozen_sensors import frozen_stretches
@@ -24,7 +24,7 @@ from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.kalman import track
-from steady_ppl.gaussian.linearize import why_not_linear
+from steady_ppl.gaussian.linearize import require_linear
 from steady_ppl.gaussian.predict import named_horizons, predict
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
@@ -69,8 +69,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     if run.time.shape[0] < 2 or not bool(run.observed[1:].any()):
         raise DataError("nothing to compare: no trajectory has a measurement after its first row")
     refuse_long(run)
-    if (why := why_not_linear(problem.program, problem.data, known_start=problem.known_start)) is not None:
-        raise UsageError(f"check needs a program that can be linearised: {why.split(': looking')[0]}")
+    require_linear(problem, "check needs a program that can be linearised")
     horizons = named_horizons(run, CHECK_HORIZONS_SECONDS)
     parts = (("finding paths", 1), ("comparing time steps", 1), ("simulating drives", 2), ("judging", 2))
     with stages(*parts) as begin:
@@ -94,8 +93,8 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         time, dispersion = run.elapsed[:-1].numpy(force=True), scores.dispersion.mean(-1)
         acting = run.controls[:-1]
         controls = {name: acting[..., i].double().numpy(force=True) for i, name in enumerate(program.control_names)}
-        both = Residuals.joined([ours, theirs])
-        misfit = judge(both, time, controls, _pairs(program, ours), dispersion)
+        both = Residuals.concatenated([ours, theirs])
+        misfit = misfit_of(both, time, controls, _pairs(program, ours), dispersion)
     notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
     notes += fallback_notes(uncompiled)
     notes += run.uneven_steps + diagnose_units(program, run)

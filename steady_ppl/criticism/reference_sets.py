@@ -68,17 +68,17 @@ def simulate_sets(problem: Problem, starts: Tensor, channels: int, horizons: Seq
         what = f"{len(starts) - sets} of {len(starts)} simulated sets blew up"
         raise FilterError(f"{what}: the fitted program does not even explain drives of its own")
 
-    def joined(name: str) -> Tensor:
+    def of_blocks(name: str) -> Tensor:
         return torch.cat([tensors[name] for tensors, _ in blocks])
 
     _, said = blocks[0]
-    variables = {name: joined(f"variable {name}").numpy() for name in said["variables"]}
+    variables = {name: of_blocks(f"variable {name}").numpy() for name in said["variables"]}
     in_all = [one for one in said["directions"] if all(f"scores {one[1]}" in tensors for tensors, _ in blocks)]
     return SimulatedSets(
         sets,
-        {horizon: joined(f"floor {horizon}").numpy() for horizon in said["horizons"]},
-        Residuals(said["names"], joined("values").numpy(), joined("there").numpy(), variables),
-        [Direction(kind, name, joined(f"scores {name}")) for kind, name in in_all],
+        {horizon: of_blocks(f"floor {horizon}").numpy() for horizon in said["horizons"]},
+        Residuals(said["names"], of_blocks("values").numpy(), of_blocks("there").numpy(), variables),
+        [Direction(kind, name, of_blocks(f"scores {name}")) for kind, name in in_all],
     )
 
 

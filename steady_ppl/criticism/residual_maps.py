@@ -57,7 +57,7 @@ class Residuals:
         return (self.values**2).sum((1, 2)) / np.maximum(self.there.sum((1, 2)), 1)
 
     @staticmethod
-    def joined(parts: Sequence[Residuals]) -> Residuals:
+    def concatenated(parts: Sequence[Residuals]) -> Residuals:
         """The sets of all parts, one part after another."""
         return replace(
             parts[0],
@@ -106,7 +106,7 @@ class Misfit:
         return [(cell, float(z)) for cell, z in zip(self.cells, self.z, strict=True) if cell.map == name]
 
 
-def judge(both: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence, unexplained: Array) -> Misfit:
+def misfit_of(both: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence, unexplained: Array) -> Misfit:
     """Compare every cell of one real set with those of many simulated ones.
 
     Args:

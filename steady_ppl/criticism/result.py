@@ -15,10 +15,10 @@ from steady_ppl.criticism.step_size import StepCheck
 from steady_ppl.data.frozen_sensors import Stretch
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.gaussian.predict import Prediction
+from steady_ppl.gaussian.predict import HALF_WIDTH, Prediction
 from steady_ppl.model.program import Program, unit_of
 from steady_ppl.utils.hooks import Displayed
-from steady_ppl.utils.text import aligned, number
+from steady_ppl.utils.text import aligned, number, with_unit
 
 MAX_FINDINGS_SHOWN = 8  # findings in the table
 VERDICTS = {  # the verdict; and what stands out as well, which is no verdict while the parameters are wrong
@@ -116,8 +116,7 @@ class Check(Displayed):
             for horizon, row in component["horizons"].items():
                 keys = ("rmse", "noise_floor", "constant_velocity", "last_measurement")
                 cells = [number(row[key], ".4g") for key in keys]
-                label = f"{name} [{component['unit']}]" if component["unit"] else name
-                table.append([label, horizon, *cells, f"{row['coverage_90']:.1%}"])
+                table.append([with_unit(name, component["unit"]), horizon, *cells, f"{row['coverage_90']:.1%}"])
         lines = [content["verdict"], "", *aligned(table, left=(0, 1))]
         ratios = ", ".join(f"{name} {value:.2f}" for name, value in content["evidence"]["scatter"].items())
         lines += ["", f"mean squares over those of simulated drives (nearly blind to a missing effect): {ratios}"]
@@ -158,6 +157,45 @@ def _component(found: Check, index: int) -> dict[str, Any]:
 
 def _rms(error: Tensor, there: Tensor) -> float | None:
     return float(error[there].double().square().mean().sqrt()) if bool(there.any()) else None
+
+
+def over_floor(error: Tensor, there: Tensor, floor: np.ndarray) -> float:
+    """Errors `(·, B, K)` over the noise floor's, `(M, K)`: root mean square over the components; NaN without any."""
+    typical, count = floor.mean(0), there.numpy(force=True).sum((0, 1))
+    square = torch.where(there, error, 0.0).numpy(force=True) ** 2
+    means, known = square.sum((0, 1)) / np.maximum(count, 1), (count > 0) & (typical > 0)
+    return float(np.sqrt((means[known] / typical[known] ** 2).mean())) if known.any() else np.nan
+
+
+def measured_values(found: Check) -> np.ndarray:
+    """What was measured, `(T + 1, B, K)`, NaN where it was not."""
+    data = found.data
+    return np.where(data.observed.numpy(force=True), data.measurements.double().numpy(force=True), np.nan)
+
+
+def band(found: Check, horizon: str) -> tuple[np.ndarray, np.ndarray]:
+    """The middle of the predictions so far ahead and half the width of their 90 % bands, `(T + 1, B, K)` each.
+
+    NaN where nothing was measured, and where a line would cross the whole circle because an angle comes round.
+    """
+    rows = found.horizons[horizon]
+    prediction = found.predictions[rows]
+    there = prediction.observed.numpy(force=True)
+    middle, half = np.full((2, *found.data.measurements.shape), np.nan)
+    middle[rows:] = np.where(there, measured_values(found)[rows:] - prediction.error.numpy(force=True), np.nan)
+    half[rows:] = HALF_WIDTH * np.sqrt(np.where(there, prediction.variance.numpy(force=True), np.nan))
+    jumps = np.abs(np.diff(middle, axis=0, prepend=middle[:1])) > np.maximum(np.pi, 3 * np.nan_to_num(half))
+    return np.where(jumps, np.nan, middle), half
+
+
+def strips(found: Check) -> tuple[list[tuple[float, float]], np.ndarray]:
+    """The strips of time, s, and z of each residual, drive and strip; NaN where there are too few residuals."""
+    cells = found.misfit.of_map("drive and time")
+    times = sorted({cell.where["time"] for cell, _ in cells})
+    grid = np.full((len(found.residuals), len(found.data), len(times)), np.nan)
+    for cell, z in cells:
+        grid[cell.residual, cell.where["drive"], times.index(cell.where["time"])] = z
+    return times, grid
 
 
 def lost_horizons(found: Check) -> list[str]:

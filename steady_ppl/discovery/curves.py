@@ -41,11 +41,8 @@ def curves(program: Program, data: Trajectories, spread: Tensor, sharpness: Tens
     `sharpness`, `(K,)`, of the measurements.
     """
     assert data.states is not None
-    controls = row_controls(program, acting_controls(program, data))
-    given = (data.states[:-1], controls[:-1], data.elapsed[:-1], data.steps / program.substeps)
-    mean = channel_means(program, program.transition, *given)
-    found = []
-    for variable, values in variables(program, *given[:3], mean).items():
+    (along, mean), found = variables_along(program, data, data.states), list[Variant]()
+    for variable, values in along.items():
         seen = values.expand(data.transitions.shape)[data.transitions]
         knots = knots_of(seen, variable in program.angles)
         if knots is None:
@@ -82,6 +79,16 @@ def variables(
     found |= {name: control[..., i] for i, name in enumerate(program.control_names)}
     found |= {f"commanded {channel}": value for channel, value in mean.items()}
     return found | {"time": time}
+
+
+@torch.no_grad()
+def variables_along(
+    program: Program, data: Trajectories, states: Tensor
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """`variables` along states `(T + 1, B, D)`, and what is commanded of each channel; all expand to `(T, B)`."""
+    given = (states[:-1], row_controls(program, acting_controls(program, data))[:-1], data.elapsed[:-1])
+    mean = channel_means(program, program.transition, *given, data.steps / program.substeps)
+    return variables(program, *given, mean), mean
 
 
 def knots_of(values: Tensor, circular: bool) -> tuple[float, ...] | None:

@@ -21,7 +21,7 @@ from steady_ppl.discovery.result import Discovery
 from steady_ppl.discovery.search import MAX_EFFECTS, Found, Search, Settings, search
 from steady_ppl.effects import of_name, record, restore, written_class
 from steady_ppl.errors import DataError, UsageError
-from steady_ppl.gaussian.linearize import why_not_linear
+from steady_ppl.gaussian.linearize import require_linear
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
@@ -224,8 +224,7 @@ def require_searchable(problem: Problem, valid: Trajectories, simulations: int) 
             f"{len(both)} of the validation drives are training drives as well ({some}): nothing could be judged "
             "by them"
         )
-    if (why := why_not_linear(problem.program, problem.data, known_start=problem.known_start)) is not None:
-        raise UsageError(f"discover needs a program that can be linearised: {why.split(': looking')[0]}")
+    require_linear(problem, "discover needs a program that can be linearised")
     constant = unexcited(program, train)
     if constant and len(constant) == len(program.control_names):
         raise DataError(

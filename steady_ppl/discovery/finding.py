@@ -16,14 +16,13 @@ from steady_ppl.discovery.refits import Refit, with_states_of
 from steady_ppl.discovery.screening import Tested
 from steady_ppl.discovery.search import MIN_GAIN_OF_CURVE, Found, Search
 from steady_ppl.effects import Variant, attached
-from steady_ppl.gaussian.predict import simulate_again
+from steady_ppl.gaussian.predict import HALF_WIDTH, simulate_again
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, unit_of
 from steady_ppl.utils.random import seeded
 
-INTERVAL_COVERAGE = 0.9  # of the intervals of coefficients, and of the band of a curve
-HALF_WIDTH = float(-special.ndtri((1 - INTERVAL_COVERAGE) / 2))  # of such an interval, in standard deviations
+BAND_COVERAGE = 0.9  # of the whole band of a curve
 MAX_SIMULATED_DRIVES = 24  # of each proposed excitation
 EXCITATIONS_OF_KIND = 3  # that are held, pushed, stepped and swung
 
@@ -125,7 +124,7 @@ def shape_of(search: Search, program: Program) -> Shape | None:
         return None
     variant = curve.variant
     heights = curve.refit.coefficient(variant)
-    width = float(-special.ndtri((1 - INTERVAL_COVERAGE) / 2 / len(heights))) * math.sqrt(curve.refit.first_share)
+    width = float(-special.ndtri((1 - BAND_COVERAGE) / 2 / len(heights))) * math.sqrt(curve.refit.first_share)
     channel = variant.at.partition("~")[0]
     variable = variant.options.get("variable", "reading")
     about = program.measurement_names[0] if channel == "all" else channel

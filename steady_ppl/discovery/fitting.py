@@ -159,12 +159,9 @@ def with_common_noise(problems: Sequence[Problem], maxima: Sequence[Maximum]) ->
     copies = [replace(problem, program=copy.deepcopy(problem.program)) for problem in problems]
     parts = [elements(problem.program) for problem in copies]
     own = [index for index in range(len(parts[0])) if index not in common]
-    place = {index: place for place, index in enumerate([*common, *own])}  # of the numbers of the first program
-    shift = [0 if index in common else len(own) for index in range(len(parts[0]))]  # from program to program
-    terms = [
-        Term(problem, maximum.path, parts[order], [place[index] + order * by for index, by in enumerate(shift)])
-        for order, (problem, maximum) in enumerate(zip(copies, maxima, strict=True))
-    ]
+    first = [[*common, *own].index(index) for index in range(len(parts[0]))]  # columns: those in common, then its own
+    columns = [[at if at < len(common) else at + order * len(own) for at in first] for order in range(len(copies))]
+    terms = [Term(one, m.path, part, at) for one, m, part, at in zip(copies, maxima, parts, columns, strict=True)]
     information, starts = _starts(terms, maxima)
     for last, start in enumerate(starts, 1):
         for term in terms:

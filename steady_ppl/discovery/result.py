@@ -1,9 +1,10 @@
-"""What `discover` found as a plain dict and as text."""
+"""What `discover` found as a plain dict, in its file and as text."""
 
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,12 @@ from steady_ppl.discovery.finding import Finding, NextRun, Shape, gain_interval
 from steady_ppl.discovery.screening import FAMILY_LEVEL, Tested
 from steady_ppl.discovery.search import Search
 from steady_ppl.effects import Variant
+from steady_ppl.errors import RunError
 from steady_ppl.runs.fit import Fit
+from steady_ppl.runs.folder import DISCOVERY
+from steady_ppl.utils.files import read_json
 from steady_ppl.utils.hooks import Displayed
+from steady_ppl.utils.schema import BOOL, LINES, NUMBER, TEXT, Paired, count, mismatch
 from steady_ppl.utils.text import TEXT_WIDTH, aligned, number
 
 CANDIDATES_SHOWN = 12  # candidates in the table
@@ -26,6 +31,33 @@ VERDICT_PHRASES = {
     "sensor": "The sensor has",
     "noise": "The noise is not as declared:",
     "other": "Something is missing that is in no catalogue",
+}
+PAIR_FORM, NUMBERS_FORM = [NUMBER, NUMBER], (NUMBER, [(NUMBER, None)], None)
+CANDIDATE_FORM = {
+    **dict.fromkeys(("effect", "kind", "unit"), TEXT),
+    **dict.fromkeys(("p_value", "absent", "heldout_gain"), (NUMBER, None)),
+    **dict.fromkeys(("coefficient", "sd", "detection_limit"), NUMBERS_FORM),
+    "heldout_gain_ci": (PAIR_FORM, None),
+    "note": (TEXT, None),
+}
+EFFECT_FORM = {
+    **dict.fromkeys(("effect", "text", "unit"), TEXT),
+    **dict.fromkeys(("confidence", "heldout_gain"), (NUMBER, None)),
+    "class": LINES,
+    "coefficient": [NUMBER],
+    "interval_90": [PAIR_FORM],
+}
+SHAPE_FORM = {"channel": TEXT, "variable": TEXT, "points": [NUMBER], "curve": [NUMBER], "band": [NUMBER]}
+DISCOVERY_FORM = {
+    "source?": TEXT,
+    "sentence": TEXT,
+    "complete?": BOOL,
+    "candidates": [Paired(CANDIDATE_FORM, ("coefficient", "sd"))],
+    "effects": [Paired(EFFECT_FORM, ("coefficient", "interval_90"))],
+    "shape": (Paired(SHAPE_FORM, ("points", "curve", "band")), None),
+    "doubts": LINES,
+    "notes": LINES,
+    "next_run": ({"between": LINES, "way": TEXT, "separation": NUMBER, "usual": NUMBER}, None),
 }
 
 
@@ -120,6 +152,28 @@ class Discovery(Displayed):
 
     def __repr__(self) -> str:
         return f"Discovery({sentence(self)!r})"
+
+
+def read_discovery(source: Path) -> dict[str, Any] | None:
+    """What `discover` said when it made this run, or in this file; None where there is nothing. RunError: the file is
+    damaged."""
+    file = source / DISCOVERY if source.is_dir() else source
+    if not file.is_file():
+        return None
+    found = read_json(file, RunError)
+    if problem := mismatch(found, DISCOVERY_FORM) or _inconsistency(found):
+        raise RunError(f"{file} is not what `steady discover` writes: {problem}")
+    return found
+
+
+def _inconsistency(found: Mapping[str, Any]) -> str | None:
+    """A candidate that was chosen and has another number of coefficients alone than together with the others."""
+    chosen = {one["effect"]: len(one["coefficient"]) for one in found["effects"]}
+    for i, one in enumerate(found["candidates"]):
+        known = chosen.get(one["effect"])
+        if known is not None and one["sd"] is not None and count(one["coefficient"]) != known:
+            return f"candidates[{i}].coefficient has length {count(one['coefficient'])}, expected {known} as in effects"
+    return None
 
 
 def ranked(found: Discovery) -> list[Tested]:

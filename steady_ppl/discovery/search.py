@@ -105,7 +105,7 @@ class Found:
 
 @dataclass
 class Search:
-    """What a search came to."""
+    """The state of a search: what it has come to so far."""
 
     base: Refit  # the program as it stands, fitted
     final: Refit  # the program with all effects that were found, fitted

@@ -17,10 +17,19 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.errors import ProgramError
+from steady_ppl.errors import ProgramError, UsageError
 from steady_ppl.gaussian.lanes import Array, array
 from steady_ppl.kernels.rows import derivatives, on_all_rows
-from steady_ppl.model.handlers import Observing, Recording, Standardised, draw_starts, residual, running, tangent_normal
+from steady_ppl.model.handlers import (
+    NEEDS_NORMAL,
+    Observing,
+    Recording,
+    Standardised,
+    draw_starts,
+    residual,
+    running,
+    tangent_normal,
+)
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import joined, mean_step, noisy_step, row_inputs
@@ -178,6 +187,12 @@ def why_not_linear(program: Program, data: Trajectories, *, known_start: bool = 
     except ProgramError as error:
         return str(error)
     return None
+
+
+def require_linear(problem: Problem, what: str, advice: str = "") -> None:
+    """Raise the UsageError that `what` needs a program that can be linearised, why this one cannot, and the advice."""
+    if why := why_not_linear(problem.program, problem.data, known_start=problem.known_start):
+        raise UsageError(f"{what}: {why.removesuffix(NEEDS_NORMAL)}{advice}")
 
 
 def _residuals(program: Program, state: Tensor, measurement: Tensor, observed: Tensor) -> Tensor:

@@ -18,6 +18,8 @@ from steady_ppl.model.substeps import RowInputs, joined, mean_step, row_inputs
 from steady_ppl.smc.backends import Stepping
 from steady_ppl.smc.simulate import measure
 
+HALF_WIDTH = 1.6448536269514729  # of a normal's 90 % interval, in standard deviations
+
 
 @dataclass(frozen=True)
 class Prediction:
@@ -35,7 +37,7 @@ class Prediction:
 
     def covered(self) -> Tensor:
         """Whether the 90 % band holds the measurement."""
-        return (self.standardised.abs() < 1.6448536269514722) & self.observed
+        return (self.standardised.abs() < HALF_WIDTH) & self.observed
 
 
 @torch.no_grad()

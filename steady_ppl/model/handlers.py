@@ -20,6 +20,11 @@ from torch import Tensor
 from steady_ppl.errors import ProgramError
 from steady_ppl.model.program import Program
 
+NEEDS_NORMAL = (  # ends the message of `normal_moments`
+    ": looking ahead needs normal noise with independent components (a scalar or a vector); --recipe steady --guide "
+    "bootstrap takes any"
+)
+
 
 class ByColumn(Messenger):
     """A handler whose sites take columns in the order in which they are met, from the first whenever it is entered."""
@@ -237,9 +242,7 @@ def normal_moments(fn: Any, site: str) -> tuple[Tensor, Tensor]:
     base = unwrapped(fn)
     if not isinstance(base, dist.Normal) or fn.event_dim > 1:
         raise ProgramError(
-            f"site {site!r} is {type(base).__name__} with event shape {tuple(fn.event_shape)}: looking ahead needs "
-            "normal noise with independent components (a scalar or a vector); --recipe steady --guide bootstrap takes "
-            "any",
+            f"site {site!r} is {type(base).__name__} with event shape {tuple(fn.event_shape)}{NEEDS_NORMAL}",
             site=site,
         )
     return base.loc, base.scale

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, wraps
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 import pyro
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from steady_ppl.data.trajectories import Trajectories
 
 MIN_STEP, MAX_STEP = 1e-10, 1e9  # s between two rows; beyond these the time has another unit
+MAX_NUMBERS_SHOWN = 12  # numbers of a parameter that are shown one by one
 
 
 def _with_listed_effects(init: Callable[..., None]) -> Callable[..., None]:
@@ -277,6 +279,20 @@ def error_groups(program: Program) -> dict[str, tuple[int, ...]]:
     order = program.state_names
     groups = program.error_groups or {name: (name,) for name in order}
     return {group: tuple(order.index(name) for name in members) for group, members in groups.items()}
+
+
+@torch.no_grad()
+def parameter_rows(program: Program) -> list[tuple[str, str]]:
+    """Name and value of each learnable parameter; of many numbers how many, and their range."""
+    rows = []
+    for name in dict.fromkeys(name.removesuffix("_unconstrained") for name, _ in program.named_parameters()):
+        value = attrgetter(name)(program)
+        numbers = value.flatten().tolist()
+        said = ", ".join(f"{number:.4g}" for number in numbers)
+        if len(numbers) > MAX_NUMBERS_SHOWN:
+            said = f"{' × '.join(map(str, value.shape))} numbers from {min(numbers):.4g} to {max(numbers):.4g}"
+        rows.append((name, said))
+    return rows
 
 
 def unit_of(program: Program, variable: str) -> str:

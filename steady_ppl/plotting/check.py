@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from steady_ppl.criticism.baselines import Reference
-from steady_ppl.criticism.result import Check, subject, verdict
+from steady_ppl.criticism.result import Check, band, measured_values, over_floor, strips, subject, verdict
 from steady_ppl.errors import UsageError
 from steady_ppl.model.program import unit_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from steady_ppl.utils.text import with_unit
 
 DATA_COLOR, NEAR_COLOR, FAR_COLOR, BASELINE_COLOR, FLOOR_COLOR = "black", "#0072b2", "#d55e00", "#cc79a7", "#009e73"
 MAX_COMPONENTS_SHOWN = 4  # panels
@@ -25,8 +25,6 @@ CHECK_TITLE_COLUMNS = 165  # letters of its line over the whole width
 
 def check_picture(found: Check) -> Figure:
     """One figure of everything; made without pyplot's list of figures, so that nothing needs to be closed."""
-    import matplotlib.pyplot as plt
-
     with plt.rc_context({"axes.titlesize": 9, "axes.labelsize": 8}):
         shown = min(MAX_COMPONENTS_SHOWN, len(found.program.measurement_names))
         figure = plt.Figure(figsize=(13, 2.2 * max(shown, 3) + 1.3), layout="constrained")
@@ -62,52 +60,21 @@ def predictions(found: Check, drive: int, component: int, axes: Axes) -> None:
     time = data.elapsed[:, drive].numpy(force=True)
     last = list(found.horizons)[-1]
     for name, color in zip(dict.fromkeys(("one step", last)), (NEAR_COLOR, FAR_COLOR), strict=False):
-        at, middle, half = _joined(time, *(values[:, drive, component] for values in band(found, name)))
+        at, middle, half = _with_breaks(time, *(values[:, drive, component] for values in band(found, name)))
         axes.fill_between(at, middle - half, middle + half, color=color, alpha=0.18, lw=0)
         axes.plot(at, middle, color=color, lw=1, label=f"{name} ahead, 90 % band")
     axes.plot(time, measured_values(found)[:, drive, component], ".", color=DATA_COLOR, ms=3, label="measured")
-    name, unit = found.program.measurement_names[component], found.program.measurement_units[component]
-    axes.set_ylabel(f"{name} [{unit}]" if unit else name)
+    program = found.program
+    axes.set_ylabel(with_unit(program.measurement_names[component], program.measurement_units[component]))
 
 
-def _joined(time: np.ndarray, middle: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _with_breaks(time: np.ndarray, middle: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The rows that were measured, with a break wherever three of them, as they usually come, are missing."""
     seen = np.isfinite(half)
     time, middle, half = time[seen], middle[seen], half[seen]
     apart = np.diff(time)
     breaks = np.flatnonzero(apart > 3.5 * np.median(apart)) + 1 if len(apart) else np.zeros(0, int)
     return np.insert(time, breaks, np.nan), np.insert(middle, breaks, np.nan), np.insert(half, breaks, np.nan)
-
-
-def measured_values(found: Check) -> np.ndarray:
-    """What was measured, `(T + 1, B, K)`, NaN where it was not."""
-    data = found.data
-    return np.where(data.observed.numpy(force=True), data.measurements.double().numpy(force=True), np.nan)
-
-
-def band(found: Check, horizon: str) -> tuple[np.ndarray, np.ndarray]:
-    """The middle of the predictions so far ahead and half the width of their 90 % bands, `(T + 1, B, K)` each.
-
-    NaN where nothing was measured, and where a line would cross the whole circle because an angle comes round.
-    """
-    rows = found.horizons[horizon]
-    prediction = found.predictions[rows]
-    there = prediction.observed.numpy(force=True)
-    middle, half = np.full((2, *found.data.measurements.shape), np.nan)
-    middle[rows:] = np.where(there, measured_values(found)[rows:] - prediction.error.numpy(force=True), np.nan)
-    half[rows:] = 1.645 * np.sqrt(np.where(there, prediction.variance.numpy(force=True), np.nan))
-    jumps = np.abs(np.diff(middle, axis=0, prepend=middle[:1])) > np.maximum(np.pi, 3 * np.nan_to_num(half))
-    return np.where(jumps, np.nan, middle), half
-
-
-def strips(found: Check) -> tuple[list[tuple[float, float]], np.ndarray]:
-    """The strips of time, s, and z of each residual, drive and strip; NaN where there are too few residuals."""
-    cells = found.misfit.of_map("drive and time")
-    times = sorted({cell.where["time"] for cell, _ in cells})
-    grid = np.full((len(found.residuals), len(found.data), len(times)), np.nan)
-    for cell, z in cells:
-        grid[cell.residual, cell.where["drive"], times.index(cell.where["time"])] = z
-    return times, grid
 
 
 def where_and_when(found: Check, axes: Axes) -> None:
@@ -147,8 +114,7 @@ def regime_panel(found: Check, axes: Axes) -> None:
         if cell in stand_out:
             axes.plot(sum(cell.where[variable]) / 2, z, "k*", ms=6)
     axes.axhline(0, color="black", lw=0.6)
-    unit = unit_of(found.program, variable)
-    axes.set(xlabel=f"{variable} [{unit}]" if unit else variable, ylabel="simulated sd")
+    axes.set(xlabel=with_unit(variable, unit_of(found.program, variable)), ylabel="simulated sd")
     what = "in which regime" if stand_out else "strongest regime, not significant"
     axes.set_title(f"{what}: mean residual of {subject(found, strongest.residual)} (grey: ±2)")
 
@@ -160,7 +126,7 @@ def against_references(found: Check, axes: Axes) -> None:
     axes.axhline(1, color=FLOOR_COLOR, lw=1.5, label="noise alone")
 
     def line(errors: Mapping[int, tuple[Any, Any]], style: str, color: str, label: str) -> None:
-        relative = [_relative(*errors[horizon], found.floor[horizon].mean(0)) for horizon in horizons]
+        relative = [over_floor(*errors[horizon], found.floor[horizon]) for horizon in horizons]
         axes.plot(seconds, relative, style, color=color, label=label, ms=4)
 
     line({ahead: (one.error, one.observed) for ahead, one in found.predictions.items()}, "o-", NEAR_COLOR, "program")
@@ -176,14 +142,6 @@ def against_references(found: Check, axes: Axes) -> None:
     axes.legend(fontsize=7)
 
 
-def _relative(error: Any, there: Any, floor: np.ndarray) -> float:
-    error, there = error.numpy(force=True), there.numpy(force=True)
-    square = np.where(there, error, 0.0) ** 2
-    means = square.sum((0, 1)) / np.maximum(there.sum((0, 1)), 1)
-    known = (there.sum((0, 1)) > 0) & (floor > 0)
-    return float(np.sqrt((means[known] / floor[known] ** 2).mean())) if known.any() else np.nan
-
-
 def innovations(found: Check, trajectory: str, *, axes: Axes | None = None) -> Axes:
     """Measured less predicted one step ahead, in standard deviations of the prediction; 95 % belong into the grey.
 
@@ -197,8 +155,6 @@ def innovations(found: Check, trajectory: str, *, axes: Axes | None = None) -> A
     """
     if trajectory not in found.data.labels:
         raise UsageError(f"no trajectory {trajectory!r}; there are {', '.join(found.data.labels)}")
-    import matplotlib.pyplot as plt
-
     axes = axes if axes is not None else plt.subplots(figsize=(7, 3), layout="constrained")[1]
     drive, prediction = found.data.labels.index(trajectory), found.predictions[1]
     time = found.data.elapsed[1:, drive].numpy(force=True)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from steady_ppl.comparison.result import NOISE_FLOOR, Proof, units_of_states
 from steady_ppl.errors import UsageError
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "black")  # Okabe and Ito
 MARKERS = "os^Dvx+"
@@ -29,12 +27,11 @@ def open_loop_picture(found: Proof, *, of: str | None = None, axes: Axes | None 
     """
     states = units_of_states(found)
     of = found.rows[found.reference].program.measurement_units[0] if of is None else of
-    curves = {name: _curve(found, name, of) for name in found.rows}
+    every = {name: found.open_loop(name) for name in found.rows}
+    curves = {name: one.get(("state", of)) or one.get(("measurement", of), []) for name, one in every.items()}
     if not curves[found.reference]:
         have = {key.of for key in found.rows[found.reference].sums if key.kind in ("measurement", "state")}
         raise UsageError(f"there is no open-loop error of {of!r}; there are {', '.join(sorted(have))}")
-    import matplotlib.pyplot as plt
-
     axes = axes if axes is not None else plt.subplots(figsize=(6, 4), layout="constrained")[1]
     floor = curves.pop(NOISE_FLOOR, [])
     curves = {name: curve for name, curve in curves.items() if curve}
@@ -61,15 +58,6 @@ def open_loop_picture(found: Proof, *, of: str | None = None, axes: Axes | None 
 
 def proof_picture(found: Proof) -> Figure:
     """The same as a figure of its own; made without pyplot's list of figures, so that nothing needs to be closed."""
-    import matplotlib.pyplot as plt
-
     figure = plt.Figure(figsize=(6, 4), layout="constrained")
     open_loop_picture(found, axes=figure.subplots())
     return figure
-
-
-def _curve(found: Proof, name: str, of: str) -> list[tuple[float, float]]:
-    """Seconds ahead and error, where there is one."""
-    kinds, sums = ("measurement", "state"), found.rows[name].sums.items()
-    at = {key.horizon: one.value for key, one in sums if key.kind in kinds and key.of == of}
-    return [(rows * found.step, value) for rows, value in sorted(at.items()) if value]

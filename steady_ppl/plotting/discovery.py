@@ -5,27 +5,25 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+import matplotlib.pyplot as plt
 import numpy as np
-import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from steady_ppl.discovery.candidates import Candidate
-from steady_ppl.discovery.curves import variables
+from steady_ppl.discovery.curves import variables_along
 from steady_ppl.discovery.finding import Finding, gain_interval
 from steady_ppl.discovery.refits import Fold, Refit
 from steady_ppl.discovery.result import Discovery, limit_of, sentence
 from steady_ppl.discovery.screening import Tested
 from steady_ppl.effects import Variant
 from steady_ppl.errors import UsageError
-from steady_ppl.model.interventions import channel_means
+from steady_ppl.gaussian.predict import HALF_WIDTH
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, row_controls
 from steady_ppl.plotting.comparison import open_loop_picture
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from steady_ppl.utils.text import with_unit
 
 CHOSEN_COLOR, ALIAS_COLOR, OTHER_COLOR, LIMIT_COLOR = "#d55e00", "#e69f00", "#0072b2", "#009e73"  # Okabe and Ito
 MAX_CANDIDATES = 9  # candidates of a group
@@ -58,8 +56,6 @@ def discovery_picture(found: Discovery) -> Figure:
     """One figure of everything; made without pyplot's list of figures, so that nothing needs to be closed."""
     rows = sum(2 + len(group.candidates) for group in _groups(found))
     height = max(7.5, 4.5 + 0.24 * rows) if rows else 2.2 + 0.19 * len(_remaining(found))
-    import matplotlib.pyplot as plt
-
     figure = plt.Figure(figsize=(12, height), layout="constrained")
     if rows:
         left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1, 1.05), squeeze=False))
@@ -196,7 +192,7 @@ def _of_finding(found: Discovery, finding: Finding) -> list[GainRow]:
 
 
 def _of_test(tested: Tested) -> list[GainRow]:
-    half = 1.645 * tested.sd
+    half = HALF_WIDTH * tested.sd
     ends = np.stack([tested.coefficient - half, tested.coefficient + half], -1)
     return _in_limits(tested.variant, tested.coefficient, ends, tested.detection_limit, OTHER_COLOR)
 
@@ -237,8 +233,6 @@ def unknown_effect(found: Discovery, *, axes: Axes | None = None) -> Axes:
     if shape is None:
         raise UsageError(f"there is no curve to draw: the verdict is {found.verdict}")
     assert chosen is not None and isinstance(chosen.refit, Refit)
-    import matplotlib.pyplot as plt
-
     axes = axes if axes is not None else plt.subplots(figsize=(6, 4), layout="constrained")[1]
     points, heights, band = (np.array(values) for values in (shape.points, shape.curve, shape.band))
     program = found.before.program
@@ -260,7 +254,7 @@ def unknown_effect(found: Discovery, *, axes: Axes | None = None) -> Axes:
     times = f", times {shape.times}" if shape.times else ""
     axes.set_ylabel(f"missing from {shape.channel}{times}{f' [{shape.unit}]' if shape.unit not in ('', '1') else ''}")
     axes.legend(fontsize=7, loc="upper right" if heights[0] > heights[-1] else "upper left")
-    variable = f"{shape.variable} [{shape.variable_unit}]" if shape.variable_unit else shape.variable
+    variable = with_unit(shape.variable, shape.variable_unit)
     return titled(axes, "the curve that is missing, in no catalogue", f"{variable}; ticks: where the drives were")
 
 
@@ -273,15 +267,12 @@ def titled(axes: Axes, title: str, about: str) -> Axes:
     return axes
 
 
-@torch.no_grad()
 def _visited(program: Program, variant: Variant, fold: Fold) -> np.ndarray:
     """Values of what a curve depends on, on the drives of a fold."""
     data = fold.drives
     if "chosen" in variant.options:
         index = [program.measurement_names.index(name) for name in variant.options["chosen"]]
         return data.measurements[..., index][data.observed[..., index]].double().numpy(force=True)
-    states = fold.path.states[..., : len(program.states)]
-    given = (states[:-1], row_controls(program, acting_controls(program, data))[:-1], data.elapsed[:-1])
-    mean = channel_means(program, program.transition, *given, data.steps / program.substeps)
-    values = variables(program, *given, mean)[variant.options["variable"]]
-    return values.expand(data.transitions.shape)[data.transitions].double().numpy(force=True)
+    along, _ = variables_along(program, data, fold.path.states[..., : len(program.states)])
+    values = along[variant.options["variable"]].expand(data.transitions.shape)
+    return values[data.transitions].double().numpy(force=True)

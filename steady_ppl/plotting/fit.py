@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 from steady_ppl.errors import UsageError
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.angles import nearest_turn
+from steady_ppl.utils.text import with_unit
 
 if TYPE_CHECKING:
     import arviz
@@ -56,8 +57,9 @@ def posterior_trajectories(
     if len(landmarks):
         xs, ys = torch.as_tensor(landmarks).detach().cpu().unbind(-1)
         axes.plot(xs, ys, "^", color=ORANGE, ms=8, label="landmark", clip_on=True)
-    axes.set(xlabel=with_unit(plane[0], draws[0]), ylabel=with_unit(plane[1], draws[1]))
-    if draws[0].attrs.get("units") == draws[1].attrs.get("units"):
+    units = [one.attrs.get("units") for one in draws]
+    axes.set(xlabel=with_unit(plane[0], units[0]), ylabel=with_unit(plane[1], units[1]))
+    if units[0] == units[1]:
         axes.set_aspect("equal", "box")
     axes.set_title(f"trajectory {trajectory}", parse_math=False)
     for line in axes.get_lines():
@@ -81,7 +83,7 @@ def posterior_states(
         UsageError: there is no such trajectory, or the program has no such states.
     """
     time, draws, true = _drawn(posterior, trajectory, components)
-    called = [with_unit(name, one) for name, one in zip(components, draws, strict=True)]
+    called = [with_unit(name, one.attrs.get("units")) for name, one in zip(components, draws, strict=True)]
     return _bands(axes, time, called, draws, true, color, label)
 
 
@@ -99,7 +101,7 @@ def posterior_velocities(
         UsageError: there is no such trajectory, or the program has not the states heading, vx and vy.
     """
     time, draws, true = _drawn(posterior, trajectory, ("heading", "vx", "vy"))
-    called = [with_unit(name, draws[1]) for name in ("longitudinal", "lateral")]
+    called = [with_unit(name, draws[1].attrs.get("units")) for name in ("longitudinal", "lateral")]
     bodily = None if true is None else _in_body_frame(*true)
     return _bands(axes, time, called, _in_body_frame(*draws), bodily, color, label)
 
@@ -149,7 +151,7 @@ def forecast_band(
     elif f"true_{of}" in found["constant_data"]:
         truth = found["constant_data"][f"true_{of}"].sel(trajectory=trajectory)
         axes.plot(time, truth, "--", color=BLACK, label="truth")
-    axes.set(xlabel="time [s]", ylabel=with_unit(of, variables[name]))
+    axes.set(xlabel="time [s]", ylabel=with_unit(of, variables[name].attrs.get("units")))
     axes.legend(fontsize=8)
     return axes
 
@@ -164,9 +166,8 @@ def held_out_curve(fit: Fit, *, axes: Axes | None = None, label: str = "held-out
     axes = _over_steps(axes, "held-out log p(y) [nats a drive]")
     (line,) = axes.plot(steps, values, "o-", ms=3, label=label)
     assert fit.trained is not None
-    kept = dict(zip(steps, values, strict=True)).get(fit.trained.kept)
-    if kept is not None:
-        axes.plot(fit.trained.kept, kept, "*", ms=11, color=line.get_color(), mec="black", label="kept")
+    if fit.trained.rise:
+        axes.plot(fit.trained.kept, fit.trained.rise[1], "*", ms=11, color=line.get_color(), mec="black", label="kept")
     return axes
 
 
@@ -207,12 +208,6 @@ def particle_curve(fit: Fit, *, axes: Axes | None = None) -> Axes:
     axes.set_yscale("log")
     axes.legend(fontsize=8)
     return axes
-
-
-def with_unit(name: str, values: Any) -> str:
-    """As it is written at an axis."""
-    unit = values.attrs.get("units")
-    return f"{name} [{unit}]" if unit else name
 
 
 def _time(found: arviz.InferenceData, trajectory: str) -> Any:

@@ -6,27 +6,22 @@ import base64
 import io
 from collections.abc import Callable, Sequence
 from functools import partial, singledispatch
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import torch
 from markupsafe import Markup
+from matplotlib.figure import Figure
 
 from steady_ppl.comparison.result import Proof, verdict as comparison_verdict
 from steady_ppl.criticism.result import Check, verdict as criticism_verdict
 from steady_ppl.data.table import to_frame
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.result import Discovery, sentence
-from steady_ppl.model.program import Program
+from steady_ppl.model.program import parameter_rows
 from steady_ppl.plotting.check import check_picture
 from steady_ppl.plotting.comparison import proof_picture
 from steady_ppl.plotting.discovery import discovery_picture
 from steady_ppl.runs.fit import Fit
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-MAX_NUMBERS_SHOWN = 12  # numbers of a parameter that are shown one by one
 DOTS_PER_INCH = 90  # an inch, of pictures
 SENTENCE, PARAGRAPH = Markup("<p><strong>{}</strong></p>"), Markup("<p>{}</p>")
 
@@ -60,10 +55,8 @@ def _(fit: Fit) -> str:
     said = SENTENCE.format(
         f"{name}, fitted by {fit.recipe}" if trained else f"{name}, recipe {fit.recipe}, nothing learned"
     )
-    judged = [entry for entry in trained.history if "log_likelihood" in entry] if trained else []
-    if trained and judged:
-        kept = {entry["step"]: entry["log_likelihood"] for entry in judged}[trained.kept]
-        first = judged[0]["log_likelihood"]
+    if trained and trained.rise:
+        first, kept = trained.rise
         said += PARAGRAPH.format(
             f"held-out log p(y) {first:.2f} → {kept:.2f} nats a drive, kept at step {trained.kept}"
         )
@@ -88,20 +81,6 @@ def _of_result(verdict: Callable[[Any], str], picture: Callable[[Any], Figure], 
 html.register(Check, partial(_of_result, criticism_verdict, check_picture))
 html.register(Proof, partial(_of_result, comparison_verdict, proof_picture))
 html.register(Discovery, partial(_of_result, sentence, discovery_picture))
-
-
-@torch.no_grad()
-def parameter_rows(program: Program) -> list[tuple[str, str]]:
-    """Name and value of each learnable parameter; of many numbers how many, and their range."""
-    rows = []
-    for name in dict.fromkeys(name.removesuffix("_unconstrained") for name, _ in program.named_parameters()):
-        value = attrgetter(name)(program)
-        numbers = value.flatten().tolist()
-        said = ", ".join(f"{number:.4g}" for number in numbers)
-        if len(numbers) > MAX_NUMBERS_SHOWN:
-            said = f"{' × '.join(map(str, value.shape))} numbers from {min(numbers):.4g} to {max(numbers):.4g}"
-        rows.append((name, said))
-    return rows
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Markup:

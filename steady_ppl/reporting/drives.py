@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from steady_ppl.comparison.evaluate import has_truth
 from steady_ppl.criticism.residual_maps import Cell
-from steady_ppl.criticism.result import Check, place, subject
+from steady_ppl.criticism.result import Check, band, measured_values, place, strips, subject
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.program import Program, names, units
-from steady_ppl.plotting.check import band, measured_values, strips
 from steady_ppl.runs.fit import Fit
 from steady_ppl.runs.posterior import drawn_states
 from steady_ppl.utils.angles import nearest_turn
@@ -33,7 +33,7 @@ def _strips(found: Check) -> dict[str, Any] | None:
     return {
         "edges": [start for start, _ in times] + [times[-1][1]],
         "drives": list(found.data.labels),
-        "z": packed(z),
+        "z": in_sixteen_bits(z),
         "significant": [[one.residual, one.where["drive"], times.index(one.where["time"])] for one in significant],
     }
 
@@ -97,7 +97,7 @@ def _longest(there: np.ndarray, found: Check, drive: int) -> tuple[float, float]
     return float(elapsed[starts[longest]]), float(elapsed[min(ends[longest], len(elapsed) - 1)])
 
 
-def packed(values: Any) -> dict[str, Any]:
+def in_sixteen_bits(values: Any) -> dict[str, Any]:
     """An array of any shape as base64 of little-endian 16-bit integers, `low + step (code + 32767)`.
 
     A number that is not finite is missing; it has a code of its own.
@@ -131,7 +131,7 @@ class Shown:
 
     def of(self, values: Any) -> dict[str, Any]:
         """`(rows, B, ·)` as `(drives, ·, rows)`, packed."""
-        return packed(np.asarray(values)[:: self.every, self.drives].transpose(1, 2, 0))
+        return in_sixteen_bits(np.asarray(values)[:: self.every, self.drives].transpose(1, 2, 0))
 
 
 def chosen_drives(checks: list[Check], numbers: int = MAX_PACKED_NUMBERS) -> Shown:
@@ -207,10 +207,10 @@ def _components(declared: Any) -> list[dict[str, str]]:
 
 def _truth(program: Program, table: Trajectories, middle: np.ndarray) -> np.ndarray | None:
     """The true states `(rows, B, D)`, angles on the turn of the posterior's median; None where there are but starts."""
-    truth = table.select(program.control_names, program.measurement_names, program.state_names).states
-    if truth is None or not bool(torch.isfinite(truth[1:]).any()):
+    data = table.select(program.control_names, program.measurement_names, program.state_names)
+    if data.states is None or not has_truth(data):
         return None
-    found = truth.double().numpy(force=True).copy()
+    found = data.states.double().numpy(force=True).copy()
     for index in program.angle_indices:
         found[..., index] = nearest_turn(found[..., index], middle[..., index])
     return found

@@ -18,7 +18,7 @@ from plotly.offline import get_plotlyjs
 from steady_ppl.comparison.result import Proof
 from steady_ppl.criticism.result import Check, strongest
 from steady_ppl.effects import Effect, attached, written_class
-from steady_ppl.plotting.notebook import parameter_rows
+from steady_ppl.model.program import parameter_rows
 from steady_ppl.reporting.drives import Shown, where_to_look
 from steady_ppl.runs.fit import Fit, versions
 from steady_ppl.utils.files import finite_json, whole_file
@@ -61,7 +61,7 @@ class Report:
             trim_blocks=True,
             lstrip_blocks=True,
         )
-        templates.filters |= {"number": number, "signed": signed, "interval": interval, "spread": spread, "said": said}
+        templates.filters |= {"number": rounded, "signed": signed, "interval": interval, "spread": spread, "said": said}
         figures = {label: one.figures for label, one in self.checks.items()}
         curves = {} if isinstance(self.proof, str) else _curves(self.proof)
         drawn = ("candidates", "effects", "shape")  # the rest of a discovery is in the text
@@ -114,14 +114,12 @@ def _linked(findings: list[dict[str, Any]], found: Report, label: str) -> list[d
     return rows
 
 
-def _curves(proof: Any) -> dict[str, Any]:
+def _curves(proof: Proof) -> dict[str, Any]:
     """Root mean square error against the seconds ahead: of → row → pairs."""
-    curves: dict[str, dict[str, list[list[float]]]] = {}
-    for name, row in proof.rows.items():
-        for key, sums in sorted(row.sums.items(), key=lambda pair: pair[0].horizon):
-            if key.kind in ("measurement", "state") and sums.value:
-                of = f"measured [{key.of}]" if key.kind == "measurement" else key.of
-                curves.setdefault(of, {}).setdefault(name, []).append([key.horizon * proof.step, sums.value])
+    curves: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for name in proof.rows:
+        for (kind, of), curve in proof.open_loop(name).items():
+            curves.setdefault(f"measured [{of}]" if kind == "measurement" else of, {})[name] = curve
     return curves
 
 
@@ -135,10 +133,10 @@ def _data(content: Mapping[str, Any]) -> Markup:
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
 
 
-def number(value: Any, digits: int = 3) -> str:
+def rounded(value: Any, digits: int = 3) -> str:
     """A figure with so many digits, a list of them, or a dash."""
     if isinstance(value, list | tuple):
-        return ", ".join(number(one, digits) for one in value)
+        return ", ".join(rounded(one, digits) for one in value)
     return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}g}".replace("-", "−")
 
 
@@ -151,7 +149,7 @@ def spread(candidate: Mapping[str, Any]) -> str:
     """Coefficients with their standard deviations, component by component."""
     values, sds = (one if isinstance(one, list) else [one] for one in (candidate["coefficient"], candidate["sd"]))
     pairs = zip(values, sds if len(sds) == len(values) else [None] * len(values), strict=True)
-    return ", ".join(number(value) + (f" ± {number(sd, 2)}" if sd is not None else "") for value, sd in pairs)
+    return ", ".join(rounded(value) + (f" ± {rounded(sd, 2)}" if sd is not None else "") for value, sd in pairs)
 
 
 def said(sentence: str) -> Markup:
@@ -163,7 +161,7 @@ def said(sentence: str) -> Markup:
 
 def interval(pair: Any, digits: int = 3) -> str:
     """Both ends, or nothing."""
-    return "" if pair is None else f"[{number(pair[0], digits)}, {number(pair[1], digits)}]"
+    return "" if pair is None else f"[{rounded(pair[0], digits)}, {rounded(pair[1], digits)}]"
 
 
 def _program(label: str, fit: Fit) -> dict[str, Any]:

@@ -12,8 +12,8 @@ from filelock import FileLock, Timeout
 
 from steady_ppl.errors import RunError
 from steady_ppl.utils import schema
-from steady_ppl.utils.files import read_json, require_file, whole_file
-from steady_ppl.utils.schema import ANYTHING, BOOL, LINES, NUMBER, TEXT, WHOLE, Paired, count, mismatch
+from steady_ppl.utils.files import require_file, whole_file
+from steady_ppl.utils.schema import ANYTHING, BOOL, LINES, TEXT, WHOLE, mismatch
 from steady_ppl.utils.tensor_files import read_tensors
 from steady_ppl.utils.text import command_line
 
@@ -40,33 +40,6 @@ FINISHED_RECORD_FORM = {
     "kept_step": (WHOLE, None),
     "history": [{str: ANYTHING}],
     "notes": LINES,
-}
-PAIR_FORM, NUMBERS_FORM = [NUMBER, NUMBER], (NUMBER, [(NUMBER, None)], None)
-CANDIDATE_FORM = {
-    **dict.fromkeys(("effect", "kind", "unit"), TEXT),
-    **dict.fromkeys(("p_value", "absent", "heldout_gain"), (NUMBER, None)),
-    **dict.fromkeys(("coefficient", "sd", "detection_limit"), NUMBERS_FORM),
-    "heldout_gain_ci": (PAIR_FORM, None),
-    "note": (TEXT, None),
-}
-EFFECT_FORM = {
-    **dict.fromkeys(("effect", "text", "unit"), TEXT),
-    **dict.fromkeys(("confidence", "heldout_gain"), (NUMBER, None)),
-    "class": LINES,
-    "coefficient": [NUMBER],
-    "interval_90": [PAIR_FORM],
-}
-SHAPE_FORM = {"channel": TEXT, "variable": TEXT, "points": [NUMBER], "curve": [NUMBER], "band": [NUMBER]}
-DISCOVERY_FORM = {
-    "source?": TEXT,
-    "sentence": TEXT,
-    "complete?": BOOL,
-    "candidates": [Paired(CANDIDATE_FORM, ("coefficient", "sd"))],
-    "effects": [Paired(EFFECT_FORM, ("coefficient", "interval_90"))],
-    "shape": (Paired(SHAPE_FORM, ("points", "curve", "band")), None),
-    "doubts": LINES,
-    "notes": LINES,
-    "next_run": ({"between": LINES, "way": TEXT, "separation": NUMBER, "usual": NUMBER}, None),
 }
 
 
@@ -199,25 +172,3 @@ def read_record(folder: Path) -> dict[str, Any]:
     if record["status"] in FINISHED and (problem := mismatch(record, FINISHED_RECORD_FORM)):
         raise RunError(f"{folder / RUN_RECORD} is damaged: {problem}")
     return record
-
-
-def read_discovery(source: Path) -> dict[str, Any] | None:
-    """What `discover` said when it made this run, or in this file; None where there is nothing. RunError: the file is
-    damaged."""
-    file = source / DISCOVERY if source.is_dir() else source
-    if not file.is_file():
-        return None
-    found = read_json(file, RunError)
-    if problem := mismatch(found, DISCOVERY_FORM) or _inconsistency(found):
-        raise RunError(f"{file} is not what `steady discover` writes: {problem}")
-    return found
-
-
-def _inconsistency(found: Mapping[str, Any]) -> str | None:
-    """A candidate that was chosen and has another number of coefficients alone than together with the others."""
-    chosen = {one["effect"]: len(one["coefficient"]) for one in found["effects"]}
-    for i, one in enumerate(found["candidates"]):
-        known = chosen.get(one["effect"])
-        if known is not None and one["sd"] is not None and count(one["coefficient"]) != known:
-            return f"candidates[{i}].coefficient has length {count(one['coefficient'])}, expected {known} as in effects"
-    return None

@@ -11,7 +11,7 @@ import torch
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, require
-from steady_ppl.gaussian.linearize import why_not_linear
+from steady_ppl.gaussian.linearize import require_linear
 from steady_ppl.likelihood.parameters import MAX_LEARNABLE_NUMBERS
 from steady_ppl.model.loading import program_file, run_file
 from steady_ppl.model.problem import Problem
@@ -97,9 +97,10 @@ def suited_recipe(
     if not 0 < count <= MAX_LEARNABLE_NUMBERS:
         return "steady", f"{count} learnable numbers, where likelihood takes 1 to {MAX_LEARNABLE_NUMBERS}"
     problem = Problem.of_table(program, table, known_start)
-    why = why_not_linear(program, problem.data, known_start=known_start)
-    if why is not None:
-        return "steady", f"likelihood needs a program that can be linearised: {why.split(': looking')[0]}"
+    try:
+        require_linear(problem, "likelihood needs a program that can be linearised")
+    except UsageError as error:
+        return "steady", str(error)
     return "likelihood", f"{count} learnable numbers and noise that can be linearised; --recipe steady takes any"
 
 

@@ -110,6 +110,12 @@ class Trained:
     interrupted: bool = False
 
     @property
+    def rise(self) -> tuple[float, float] | None:
+        """Held-out log p(y) of a drive at first and at the step that was kept; None where it was not judged there."""
+        judged = {entry["step"]: entry["log_likelihood"] for entry in self.history if "log_likelihood" in entry}
+        return (next(iter(judged.values())), judged[self.kept]) if self.kept in judged else None
+
+    @property
     def still_rising(self) -> float | None:
         """By how many nats a drive held-out log p(y) rose over the last quarter, if more than `MAX_FINAL_GAIN` and its
         end was kept; None where it had settled, or where fewer than three validations cannot tell."""

@@ -95,6 +95,11 @@ def number(value: float | None, form: str) -> str:
     return "–" if value is None else f"{value:{form}}"
 
 
+def with_unit(name: str, unit: str | None) -> str:
+    """A name as it is written at an axis or over a column."""
+    return f"{name} [{unit}]" if unit else name
+
+
 def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list[str]:
     """Rows of cells as lines of equal columns, which are flush right but for those that are `left`.
 

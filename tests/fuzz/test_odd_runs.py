@@ -19,8 +19,8 @@ from report_pages import FOUND, two_run_report
 from small import FEW, steady
 
 import steady_ppl as st
+from steady_ppl.discovery.result import read_discovery
 from steady_ppl.errors import RunError
-from steady_ppl.runs.folder import read_discovery
 from steady_ppl.utils.tensor_files import read_tensors, write_tensors
 
 CART = MODELS / "linear_gaussian.py"

@@ -9,18 +9,18 @@ from report_pages import two_run_report, two_runs, unpacked
 from small import simulated
 
 import steady_ppl as st
-from steady_ppl.reporting.drives import chosen_drives, packed, where_to_look
+from steady_ppl.reporting.drives import chosen_drives, in_sixteen_bits, where_to_look
 
 
 def test_numbers_come_back_as_finely_as_sixteen_bits_are():
     values = np.random.default_rng(0).normal(size=(3, 4, 5)) * 100
     values[1, 2, 3] = np.nan
-    back = unpacked(packed(values))
+    back = unpacked(in_sixteen_bits(values))
     np.testing.assert_array_equal(np.isnan(back), np.isnan(values))
     np.testing.assert_allclose(back, values, atol=np.nanmax(values) - np.nanmin(values), rtol=0)
     assert np.nanmax(abs(back - values)) <= 0.5001 * (np.nanmax(values) - np.nanmin(values)) / 65534
-    assert unpacked(packed(np.full((2, 2), np.nan))).shape == (2, 2)
-    np.testing.assert_array_equal(unpacked(packed(np.full(3, 7.0))), 7.0)
+    assert unpacked(in_sixteen_bits(np.full((2, 2), np.nan))).shape == (2, 2)
+    np.testing.assert_array_equal(unpacked(in_sixteen_bits(np.full(3, 7.0))), 7.0)
 
 
 def test_a_place_to_look_at_is_where_the_misfit_is():

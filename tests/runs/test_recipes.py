@@ -309,7 +309,7 @@ def test_it_goes_by_program_and_settings(tmp_path: Path, program: str, options, 
 
 def test_noise_that_cannot_be_linearised_is_steadys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     table = read_table(written(tmp_path / "t.csv"))
-    monkeypatch.setattr("steady_ppl.runs.recipes.why_not_linear", lambda *_, **__: "its noise is Laplace")
+    monkeypatch.setattr("steady_ppl.gaussian.linearize.why_not_linear", lambda *_, **__: "its noise is Laplace")
     assert suited_recipe(example("hovercraft"), table, {}) == (
         "steady",
         "likelihood needs a program that can be linearised: its noise is Laplace",
