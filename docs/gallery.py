@@ -30,8 +30,9 @@ HEAD = """# Effect gallery
 
 What could be missing, what it looks like and what it is taken for. Pictures: the same drive, the same commands and \
 the same noise (a tenth of the program's, but for effects on that noise), blue without the effect and orange with it, \
-at its typical size. Confusions are those of the [discovery benchmark](../benchmarks/results/discovery-continuous.md): hovercraft \
-drives on which one effect was planted alone, most of them small; an effect is *in the class* when the search named it \
+at its typical size. Confusions are those of the [discovery \
+benchmark](../benchmarks/results/discovery-continuous.md): hovercraft drives on which one effect was planted \
+alone, most of them small; an effect is *in the class* when the search named it \
 or said that the drives cannot tell it from what it named. A confusion that more drives would not mend is mended by \
 other controls: `steady discover` proposes them.
 
