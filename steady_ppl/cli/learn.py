@@ -172,18 +172,18 @@ def add(
     Its parameters start at the run's values, a coefficient at the value that is given, else at the run's, else at the
     effect's typical one.
     """
-    from steady_ppl.effects import added, write_program
-    from steady_ppl.effects.attach import with_effects
+    from steady_ppl.effects import attached, with_effects, write_program
 
     given, is_run = fit_or_program(source, program), Path(source).is_dir()
-    grown = with_effects(given.program if is_run else given, effects or [], say)
-    if not added(grown):
+    grown, values = with_effects(given.program if is_run else given, effects or [])
+    say(*values)
+    if not attached(grown):
         raise UsageError(f"{source} has no effect that its file does not have: name one, `steady effects` lists them")
     notes = write_program(grown, out, force=force)
     if is_run:
         say(*notes)
     tell(f"{out}: {grown}")
-    for variant in added(grown):
+    for variant in attached(grown):
         tell(f"{variant.label}: {variant.effect.text}")
         tell(f"{variant.label}: ${variant.effect.equation}$")
 

@@ -153,13 +153,14 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate drives of a program, with measurements and true states."""
-    from steady_ppl.effects.attach import with_effects
+    from steady_ppl.effects import with_effects
     from steady_ppl.model.validate import probe
     from steady_ppl.smc.simulate import simulated_in
 
     if controls and trajectories:
         raise UsageError("--controls has as many drives as its table: leave --trajectories out")
-    program = with_effects(program_from(model, seed), effect or [], say)
+    program, values = with_effects(program_from(model, seed), effect or [])
+    say(*values)
     if substeps is not None:
         probe(st.with_substeps(program, substeps))
     like = st.read_table(controls) if controls else None

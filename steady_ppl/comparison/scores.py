@@ -172,7 +172,7 @@ def judge_constant_velocity(before: Judged) -> Judged | str:
     if isinstance(found, str):
         return found
     coasting = ConstantVelocity(unseen.program, found.scales)
-    coasting.error_groups = unseen.program.error_groups  # type: ignore[misc]
+    coasting.error_groups = unseen.program.error_groups
     path = before.tracked.path(unseen.data)
     still = ReferencePath(path.states, torch.zeros_like(path.noise))
     ahead = smooth(replace(unseen, program=coasting), still, kernels=False)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, wraps
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import pyro
 import torch
@@ -119,7 +119,6 @@ class Program(PyroModule):
         error_groups: what an error is reported for: name → components whose Euclidean norm it is.
         resting: state components that start at zero in every drive; a table need not have them.
         effects: effects that the program has besides what it writes out: `("linear_drag=0.1", "slope=0.05,-0.03")`.
-        attached: coefficient's name → the effect that has it.
         substeps: in how many steps of `transition` the program takes a row; see `steady_ppl.model.substeps`.
 
     Hints for a fit, by the names of parameters or their beginnings:
@@ -137,18 +136,17 @@ class Program(PyroModule):
     controls: Sequence[str] = ()
     measurements: Sequence[str] = ()
     channels: Sequence[str] = ()
-    angles: ClassVar[Sequence[str]] = ()
-    motion: ClassVar[Mapping[str, tuple[str, str]]] = {}
-    error_groups: ClassVar[Mapping[str, Sequence[str]]] = {}
+    angles: Sequence[str] = ()
+    motion: Mapping[str, tuple[str, str]] = {}
+    error_groups: Mapping[str, Sequence[str]] = {}
     resting: Sequence[str] = ()
-    effects: ClassVar[Sequence[str]] = ()
-    attached: ClassVar[Mapping[str, Any]] = {}
+    effects: Sequence[str] = ()
     substeps: int = 1
 
-    priors: ClassVar[Mapping[str, Any]] = {}
-    guesses: ClassVar[Sequence[str]] = ()
-    rates: ClassVar[Mapping[str, float]] = {}
-    decays: ClassVar[Mapping[str, float]] = {}
+    priors: Mapping[str, Any] = {}
+    guesses: Sequence[str] = ()
+    rates: Mapping[str, float] = {}
+    decays: Mapping[str, float] = {}
 
     duration: float = 10.0
     step: float = 0.1
@@ -263,8 +261,13 @@ class Program(PyroModule):
 
     def extra_repr(self) -> str:
         """The values of the program's own parameters."""
-        own = [name.removesuffix("_unconstrained") for name, _ in self.named_parameters(recurse=False)]
+        own = [parameter_name(name) for name, _ in self.named_parameters(recurse=False)]
         return ", ".join(f"{name}={_rounded(getattr(self, name))}" for name in own)
+
+
+def parameter_name(name: str) -> str:
+    """The name under which a program declares what `named_parameters` and `state_dict` call `name`."""
+    return name.removesuffix("_unconstrained")
 
 
 def _rounded(value: Tensor) -> Any:

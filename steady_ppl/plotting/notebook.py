@@ -17,7 +17,7 @@ from steady_ppl.criticism.result import Check, verdict as criticism_verdict
 from steady_ppl.data.table import to_frame
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.result import Discovery, sentence
-from steady_ppl.model.program import Program
+from steady_ppl.model.program import Program, parameter_name
 from steady_ppl.plotting.check import check_picture
 from steady_ppl.plotting.comparison import proof_picture
 from steady_ppl.plotting.discovery import discovery_picture
@@ -94,7 +94,7 @@ html.register(Discovery, partial(_of_result, sentence, discovery_picture))
 def parameter_rows(program: Program) -> list[tuple[str, str]]:
     """Name and value of each learnable parameter; of many numbers how many, and their range."""
     rows = []
-    for name in dict.fromkeys(name.removesuffix("_unconstrained") for name, _ in program.named_parameters()):
+    for name in dict.fromkeys(parameter_name(name) for name, _ in program.named_parameters()):
         value = attrgetter(name)(program)
         numbers = value.flatten().tolist()
         said = ", ".join(f"{number:.4g}" for number in numbers)
