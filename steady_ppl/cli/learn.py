@@ -174,13 +174,13 @@ def add(
     """
     from steady_ppl.effects import attached, with_effects, write_program
 
-    given, is_run = fit_or_program(source, program), Path(source).is_dir()
-    grown, values = with_effects(given.program if is_run else given, effects or [])
+    given = fit_or_program(source, program)
+    grown, values = with_effects(given.program if isinstance(given, st.Fit) else given, effects or [])
     say(*values)
     if not attached(grown):
         raise UsageError(f"{source} has no effect that its file does not have: name one, `steady effects` lists them")
     notes = write_program(grown, out, force=force)
-    if is_run:
+    if isinstance(given, st.Fit):
         say(*notes)
     tell(f"{out}: {grown}")
     for variant in attached(grown):

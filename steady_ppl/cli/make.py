@@ -69,11 +69,11 @@ def import_bag(
     tell(f"{out}: {many} trajector{'y' if many == 1 else 'ies'}, {rows} rows, {seen}")
 
 
-def _mapping(file: Path | None, maps: list[str], step: float | None) -> Any:
+def _mapping(file: Path | None, maps: list[str], step: float | None) -> st.BagMapping:
     """What a file, `--map` and `--step` say together."""
-    from steady_ppl.data.rosbag.mapping import BagMapping, parse_map, read_toml
+    from steady_ppl.data.rosbag.mapping import parse_map, read_mapping
 
-    content: dict[str, Any] = read_toml(file) if file else {}
+    content: dict[str, Any] = read_mapping(file) if file else {}
     if step is not None:
         content["step"] = step
     columns, added = content.get("columns", {}), dict[str, Any]()
@@ -84,7 +84,7 @@ def _mapping(file: Path | None, maps: list[str], step: float | None) -> Any:
         added[name] = said
     if added and isinstance(columns, dict):
         content["columns"] = columns | added
-    return BagMapping.parse(content, file.name if file else "--map")
+    return st.BagMapping.parse(content, file.name if file else "--map")
 
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)

@@ -19,7 +19,7 @@ from steady_ppl.likelihood.evidence import choose_filter, evidence, in_parts, ru
 from steady_ppl.model.handlers import AtMean, Recording, as_vector, residual, running
 from steady_ppl.model.planar_vehicle import PlanarVehicle, UnknownMap
 from steady_ppl.model.problem import Problem
-from steady_ppl.model.program import Program, error_groups, for_program, names
+from steady_ppl.model.program import Program, error_indices, for_program
 from steady_ppl.model.substeps import acting_controls
 from steady_ppl.runs.fit import Fit
 from steady_ppl.smc.filter import particle_filter, roll_out
@@ -137,7 +137,7 @@ def _judged_map(program: Program, surveyed: Program) -> dict[str, Any]:
     errors = map_errors(program, surveyed)
 
     def form(one: Program) -> tuple[tuple[str, ...], ...]:
-        states = tuple(name for name in one.state_names if name not in names(one.resting))  # but those of added effects
+        states = tuple(name for name in one.state_names if name not in one.resting_names)  # but those of added effects
         return states, one.control_names, one.measurement_names
 
     for what, own, other in zip(("states", "controls", "measurements"), form(program), form(surveyed), strict=True):
@@ -194,8 +194,8 @@ def has_truth(data: Trajectories) -> bool:
 
 def squared_errors(program: Program, states: Tensor, truth: Tensor) -> dict[str, Tensor]:
     """Squared errors `(...)` of each of the program's error groups, angles on the circle; NaN where unknown."""
-    difference = wrap_angles(states - truth, [program.state_names.index(name) for name in program.angles])
-    return {group: difference[..., list(members)].square().sum(-1) for group, members in error_groups(program).items()}
+    difference = wrap_angles(states - truth, program.angle_indices)
+    return {group: difference[..., list(members)].square().sum(-1) for group, members in error_indices(program).items()}
 
 
 @torch.no_grad()
@@ -248,7 +248,7 @@ def forward(
         draws = min(at_once, rollouts - first)
         end = _ends_of_roll_outs(program, data, origin.expand(draws, *origin.shape), horizon, handler)
         for group, squared in squared_errors(program, end, data.states[horizon:]).items():
-            members = list(error_groups(program)[group])
+            members = list(error_indices(program)[group])
             known = counted & torch.isfinite(data.states[horizon:, :, members]).all(-1)
             sums[group] += float(squared[:, known].double().sum())
             counts[group] += draws * int(known.sum())

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from steady_ppl.comparison.scores import BANDED_HORIZONS, COVERAGE, RESAMPLES, Change, Key, ProgramScores, paired
 from steady_ppl.effects import attached
-from steady_ppl.model.program import error_groups
+from steady_ppl.model.program import error_indices
 from steady_ppl.utils.hooks import Displayed
 from steady_ppl.utils.text import TEXT_WIDTH, aligned, number
 
@@ -103,7 +103,7 @@ class Proof(Displayed):
 def units_of_states(found: Proof) -> dict[str, str]:
     """Error group of states → unit, empty where its components have several."""
     program = found.rows[found.reference].program
-    of = {group: {program.state_units[i] for i in members} for group, members in error_groups(program).items()}
+    of = {group: {program.state_units[i] for i in members} for group, members in error_indices(program).items()}
     return {group: kinds.pop() if len(kinds) == 1 else "" for group, kinds in of.items()}
 
 

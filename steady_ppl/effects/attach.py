@@ -1,7 +1,7 @@
 """A program with an effect: the same three methods, around which the effect acts."""
 
 import copy
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -64,7 +64,8 @@ def _class_with(base: type[Program], variant: Variant, name: str | None) -> type
     """A program's class with an effect; the same one for the same effect and name, so that kernels are shared."""
     name = name or f"{base.__name__}With{''.join(part.capitalize() for part in variant.parameter.split('_'))}"
     known = _CLASSES.setdefault(base, WeakValueDictionary())
-    key = (name, variant.effect, variant.at, _frozen(variant.options), variant.called, variant.scale, variant.unit)
+    options = variant.options.items()
+    key = _frozen((name, variant.effect, variant.at, *options, variant.called, variant.scale, variant.unit))
     grown = known.get(key)
     if grown is None:
         about = {"__module__": base.__module__, "__doc__": base.__doc__, "_attached": variant}
@@ -75,8 +76,6 @@ def _class_with(base: type[Program], variant: Variant, name: str | None) -> type
 
 def _frozen(value: object) -> Hashable:
     """A value that can be a key; of arrays and other objects it is the object itself."""
-    if isinstance(value, Mapping):
-        return tuple((name, _frozen(part)) for name, part in value.items())
     if isinstance(value, tuple | list):
         return tuple(map(_frozen, value))
     return value if isinstance(value, Hashable) else id(value)

@@ -166,11 +166,8 @@ class Program(PyroModule):
     def __setattr__(self, name: str, value: Any) -> None:
         hidden = isinstance(value, PyroParam | PyroSample | torch.nn.Parameter) and hasattr(type(self), name)
         if hidden and not callable(getattr(type(self), name)):
-            raise ProgramError(
-                f"program {type(self).__name__}: {name} is a constant of its class, behind which a parameter of that "
-                "name would never be seen: take another name",
-                site="__init__",
-            )
+            about = f"{name} is a constant of its class, which would hide the parameter: take another name"
+            raise ProgramError(f"program {type(self).__name__}: {about}", site="__init__")
         super().__setattr__(name, value)
 
     def initial(self) -> Tensor:
@@ -203,11 +200,12 @@ class Program(PyroModule):
     control_names, control_units = _components("controls")
     measurement_names, measurement_units = _components("measurements")
     channel_names, channel_units = _components("channels")
+    resting_names, _ = _components("resting")
 
     @property
     def angle_indices(self) -> tuple[int, ...]:
         """Which state components live on a circle."""
-        return tuple(self.state_names.index(name) for name in names(self.angles))
+        return tuple(self.state_names.index(name) for name in self.angles)
 
     @property
     def derivatives(self) -> Mapping[str, str]:
@@ -248,7 +246,9 @@ class Program(PyroModule):
         """One for the controls that are named and zero for the others, `(U,)`."""
         return like.new_tensor([float(name in chosen) for name in self.control_names])
 
-    def with_effect(self, effect: Any, value: Any = None, **where: Any) -> Program:
+    def with_effect(
+        self, effect: object, value: float | Sequence[float] | Tensor | None = None, **where: object
+    ) -> Program:
         """A copy with a physical effect added, its coefficient a learnable parameter; see `effects.attach`."""
         return hooks.with_effect(self, effect, value, **where)
 
@@ -275,7 +275,7 @@ def _rounded(value: Tensor) -> Any:
     return values[0] if value.dim() == 0 else values
 
 
-def error_groups(program: Program) -> dict[str, tuple[int, ...]]:
+def error_indices(program: Program) -> dict[str, tuple[int, ...]]:
     """What errors are reported for: name → indices of the state components; each component alone by default."""
     order = program.state_names
     groups = program.error_groups or {name: (name,) for name in order}
@@ -300,7 +300,7 @@ def for_program(program: Program, data: Trajectories) -> Trajectories:
     """The columns that the program reads, in its order, its precision and on its device."""
     chosen = data.select(program.control_names, program.measurement_names, program.state_names)
     if chosen.states is not None and program.resting:
-        resting = [program.state_names.index(name) for name in names(program.resting)]
+        resting = [program.state_names.index(name) for name in program.resting_names]
         chosen.states[0][..., resting] = 0.0
     parameter = next(program.parameters(), torch.empty(0, device=data.time.device))
     return _within(chosen.to(parameter.dtype, parameter.device))

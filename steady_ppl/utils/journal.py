@@ -71,7 +71,7 @@ def _read(file: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         said = None
     state, now = tensors.get(RANDOM_STATE), torch.get_rng_state()
     if mismatch(said, ENTRY_FORM) is not None or state is None or (state.shape, state.dtype) != (now.shape, now.dtype):
-        raise RunError(f"{file} is damaged: it is no piece of a search; --force begins the search anew")
+        raise RunError(f"{file} is corrupt: use --force to restart the search")
     return tensors, said
 
 
