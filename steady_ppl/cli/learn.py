@@ -10,8 +10,9 @@ import steady_ppl as st
 from steady_ppl.cli import options
 from steady_ppl.cli.common import fit_or_program, present, program_from, write_json
 from steady_ppl.errors import RunError, UsageError
+from steady_ppl.utils.context import is_quiet
 from steady_ppl.utils.files import require_picture, require_place, write_picture
-from steady_ppl.utils.text import is_quiet, say, shown, tell
+from steady_ppl.utils.text import say, shown, tell
 
 LITERALS = {"true": True, "false": False, "none": None}
 RECIPES = ("steady", "likelihood", "steady-minus", "svi", "hand", "fit-hand", "fit-tv", "fit-truth")

@@ -69,7 +69,7 @@ def import_bag(
     tell(f"{out}: {many} trajector{'y' if many == 1 else 'ies'}, {rows} rows, {seen}")
 
 
-def _mapping(file: Path | None, maps: list[str], step: float | None) -> st.BagMapping:
+def _mapping(file: Path | None, maps: list[str], step: float | None) -> "st.BagMapping":
     """What a file, `--map` and `--step` say together."""
     from steady_ppl.data.rosbag.mapping import parse_map, read_mapping
 

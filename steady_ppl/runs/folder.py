@@ -11,10 +11,10 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from steady_ppl.errors import RunError
+from steady_ppl.utils.context import command_line
 from steady_ppl.utils.files import read_json, require_file, whole_file
 from steady_ppl.utils.schema import ANYTHING, BOOL, LINES, NUMBER, TEXT, WHOLE, Paired, count, mismatch
 from steady_ppl.utils.tensor_files import read_tensors
-from steady_ppl.utils.text import command_line
 
 PARAMETERS, RUN_RECORD, POSTERIOR = "parameters.safetensors", "run.json", "posterior.nc"
 CHECKPOINT, DISCOVERY = "checkpoint.safetensors", "discovery.json"

@@ -16,7 +16,7 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.errors import FilterError, ProgramError
+from steady_ppl.errors import FilterError, ProgramError, UsageError
 from steady_ppl.model.handlers import KnownStart, Recording, Standardised, broadcast_event, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import divergence
@@ -109,7 +109,7 @@ class ParticleFilter:
         self.observation_weight, self.known_start, self.resample_below = observation_weight, known_start, resample_below
         self.proposal, self.resampler, self.on_frame = proposal or Proposal(), resampler, on_frame
         if self.proposal.looks_ahead and on_frame is not None:
-            raise ValueError(
+            raise UsageError(
                 "on_frame sees what is predicted: a filter that looks ahead has seen the later measurements"
             )
         self.bootstrap = type(self.proposal) is Proposal
@@ -236,6 +236,7 @@ def particle_filter(
 
     Raises:
         FilterError: every weight is zero; names trajectory and time.
+        UsageError: `on_frame` is given with a proposal that looks ahead.
     """
     along = ParticleFilter(
         program,
