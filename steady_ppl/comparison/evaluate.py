@@ -28,7 +28,7 @@ from steady_ppl.utils.angles import wrap_angles
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
-from steady_ppl.utils.text import aligned, number
+from steady_ppl.utils.text import aligned, figure
 
 Errors = dict[str, float]
 OPEN_LOOP = {"open_loop_1s": 1.0, "open_loop_3s": 3.0}  # s ahead
@@ -180,7 +180,7 @@ def table_of(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> str
     lines = [["", "start", "log p(y)", *columns]]
     for label, result in zip(labels, results, strict=True):
         start = "known" if result["known_start"] else "prior"
-        errors = [number(result[of].get(name), ".4f") for of, name in columns.values()]
+        errors = [figure(result[of].get(name), ".4f") for of, name in columns.values()]
         lines.append([label, start, f"{result['log_likelihood']:.2f}", *errors])
     if len({result["known_start"] for result in results}) == 1:
         lines = [[label, *figures] for label, _, *figures in lines]

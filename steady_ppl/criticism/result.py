@@ -18,7 +18,7 @@ from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction
 from steady_ppl.model.program import Program, unit_of
 from steady_ppl.utils.hooks import Displayed
-from steady_ppl.utils.text import aligned, number
+from steady_ppl.utils.text import aligned, figure
 
 MAX_FINDINGS_SHOWN = 8  # findings in the table
 VERDICTS = {  # the verdict; and what stands out as well, which is no verdict while the parameters are wrong
@@ -115,7 +115,7 @@ class Check(Displayed):
         for name, component in content["measurements"].items():
             for horizon, row in component["horizons"].items():
                 keys = ("rmse", "noise_floor", "constant_velocity", "last_measurement")
-                cells = [number(row[key], ".4g") for key in keys]
+                cells = [figure(row[key], ".4g") for key in keys]
                 label = f"{name} [{component['unit']}]" if component["unit"] else name
                 table.append([label, horizon, *cells, f"{row['coverage_90']:.1%}"])
         lines = [content["verdict"], "", *aligned(table, left=(0, 1))]

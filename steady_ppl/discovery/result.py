@@ -16,7 +16,7 @@ from steady_ppl.discovery.search import Search
 from steady_ppl.effects import Variant
 from steady_ppl.runs.fit import Fit
 from steady_ppl.utils.hooks import Displayed
-from steady_ppl.utils.text import TEXT_WIDTH, aligned, number
+from steady_ppl.utils.text import TEXT_WIDTH, aligned, figure
 
 CANDIDATES_SHOWN = 12  # candidates in the table
 VERDICT_PHRASES = {
@@ -280,7 +280,7 @@ def _line(found: Discovery, tested: Tested) -> list[str]:
 
 
 def _short(value: float | list[float] | None) -> str:
-    return ", ".join(f"{v:.2g}" for v in value) if isinstance(value, list) else number(value, ".3g")
+    return ", ".join(f"{v:.2g}" for v in value) if isinstance(value, list) else figure(value, ".3g")
 
 
 def _numbers(values: np.ndarray) -> float | list[float] | None:

@@ -56,7 +56,7 @@ def say(*remarks: str, always: bool = False) -> None:
         tell("\n".join([f"steady: {part}" for part in lines[:1]] + lines[1:]), aside=True)
 
 
-def number(value: float | None, form: str) -> str:
+def figure(value: float | None, form: str) -> str:
     """A figure as text, a dash where there is none."""
     return "–" if value is None else f"{value:{form}}"
 
