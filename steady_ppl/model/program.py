@@ -200,7 +200,7 @@ class Program(PyroModule):
     control_names, control_units = _components("controls")
     measurement_names, measurement_units = _components("measurements")
     channel_names, channel_units = _components("channels")
-    resting_names, _ = _components("resting")
+    resting_names = _components("resting")[0]
 
     @property
     def angle_indices(self) -> tuple[int, ...]:
