@@ -12,7 +12,7 @@ from experiments import truck
 from models.truck import Truck
 from steady_ppl import Fit, Trajectories, discover
 from steady_ppl.comparison.evaluate import evaluate
-from steady_ppl.data.trajectories import joined
+from steady_ppl.data.trajectories import concatenated
 from steady_ppl.effects import record
 from steady_ppl.utils.random import seeded
 
@@ -32,7 +32,7 @@ def path(logs: Path, draw: int, *, judged: bool = True) -> dict[str, Any]:
     """
     torch.set_num_threads(1)
     train, valid, test = truck(logs, draw, centred=True)
-    drives = joined(train=train, valid=valid).without_truth(keep_start=True)
+    drives = concatenated(train=train, valid=valid).without_truth(keep_start=True)
     with seeded(0, "program"):
         now: Any = Truck()
     judges = test if judged else None

@@ -20,7 +20,7 @@ from truck_programs import MECHANISTIC, SPACINGS
 from inference import steady
 from models.discovered_truck import DiscoveredTruck
 from steady_ppl import Program, Trajectories, bearings_to, discover, for_program, wrap
-from steady_ppl.data.trajectories import joined
+from steady_ppl.data.trajectories import concatenated
 
 CALIBRATION = (101, 102, 103, 104)  # draws of the bearings
 KEPT_FREE = ("noise", "erratic")  # the rest is known as calibrated: a fault in a gain would be fitted away
@@ -149,7 +149,7 @@ def calibrated(logs: Path) -> Program:
         train, valid, _ = truck(logs, draw, centred=True)
         parts |= {f"train{draw}": train, f"valid{draw}": valid}
     program = DiscoveredTruck().with_effect("response_time:yaw", 0.0)
-    drives = joined(**parts).without_truth(keep_start=True)
+    drives = concatenated(**parts).without_truth(keep_start=True)
     settings = MECHANISTIC | {"first_weight": 1.0}
     steady.fit(program, drives, known_start=True, seed=0, progress=False, **settings)
     move_to_likeliest(program, for_program(program, drives), SPACINGS, known_start=True)
@@ -175,7 +175,7 @@ def planted(logs: Path, fault: str, share: float, draw: int) -> dict[str, Any]:
     torch.set_num_threads(1)
     program = calibrated(logs)
     train, valid, _ = (FAULTS[fault].plant(part, share) for part in truck(logs, draw, centred=True))
-    drives = joined(train=train, valid=valid).without_truth(keep_start=True)
+    drives = concatenated(train=train, valid=valid).without_truth(keep_start=True)
     began = time.perf_counter()
     figures = discover(frozen(program), drives, known_start=True, seed=draw).figures
     return {

@@ -14,7 +14,9 @@ NO_SPACE = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory", "Storage size calculation overflowed")
 
 
-def fit_or_program(source: str, program: str | None, seed: int = 0, substeps: int | None = None) -> Any:
+def fit_or_program(
+    source: str, program: str | None, seed: int = 0, substeps: int | None = None
+) -> "st.Fit | st.Program":
     """The fit in a run folder, or else the program of a file; UsageError: `program` is given for what is no run."""
     from steady_ppl.model.validate import probe
 
@@ -29,7 +31,7 @@ def fit_or_program(source: str, program: str | None, seed: int = 0, substeps: in
     return fit
 
 
-def program_from(model: str, seed: int, substeps: int | None = None) -> Any:
+def program_from(model: str, seed: int, substeps: int | None = None) -> "st.Program":
     """Load a program, its random initial weights keyed by the seed, and try it once on a probe; with as many substeps a
     row as its class says when None."""
     from steady_ppl.model.validate import probe
@@ -80,7 +82,7 @@ def run_labels(runs: Sequence[Path], taken: Collection[str] = ()) -> dict[str, P
     return labels
 
 
-def load_runs(labels: Mapping[str, Path], programs: Sequence[str] | None) -> dict[str, Any]:
+def load_runs(labels: Mapping[str, Path], programs: Sequence[str] | None) -> "dict[str, st.Fit]":
     """The fits of runs by label, with the programs that `--program` names, one for each, or their own."""
     if programs and len(programs) != len(labels):
         raise UsageError(
@@ -101,7 +103,7 @@ def used_before(runs: Mapping[str, Path], table: str) -> list[str]:
             continue  # was given it, and learned nothing
         for key, how in (("table_sha256", "fitted to"), ("valid_sha256", "chosen by")):
             if record.get(key) == table:
-                notes.append(f"{label} was {how} this very table: take drives that were not used, this proves nothing")
+                notes.append(f"{label} was {how} this very table: the comparison needs drives that were not used")
     return notes
 
 

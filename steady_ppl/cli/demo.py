@@ -22,7 +22,7 @@ import steady_ppl as st
 from steady_ppl.errors import ComputationError, RunError
 from steady_ppl.runs.workbench import TRUE_PROGRAM, cleared_on_failure, workbench
 from steady_ppl.utils.files import read_json
-from steady_ppl.utils.text import TEXT_WIDTH, aligned, number, tell
+from steady_ppl.utils.text import TEXT_WIDTH, aligned, figure, tell
 
 
 @dataclass
@@ -206,7 +206,7 @@ def _summary(figures: Mapping[str, Any]) -> list[str]:
     for row in rows:
         errors = [row["measurement"][unit].get(name) for name in ahead]
         values = [*errors, row["state"][group].get(far), row["scales"]["channels"].get(channel)]
-        lines.append([row["row"], f"{row['log_likelihood']:.1f}", *(number(value, ".3g") for value in values)])
+        lines.append([row["row"], f"{row['log_likelihood']:.1f}", *(figure(value, ".3g") for value in values)])
     return aligned(lines)
 
 

@@ -32,7 +32,7 @@ def check(
     seed: options.Seed = 0,
 ) -> None:
     """Compare a run with measurements: where, when and in which regime it fails, and who is at fault."""
-    from steady_ppl.data.frozen_sensors import masked
+    from steady_ppl.data.frozen_sensors import without_stretches
     from steady_ppl.data.table import require_table_file
 
     require_picture(picture)
@@ -50,7 +50,7 @@ def check(
         write_picture(check_picture(found), picture)
     present(str(found), {"run": str(run), **found.figures}, json_file)
     if mask is not None:
-        st.write_table(masked(drives, found.stuck), mask)
+        st.write_table(without_stretches(drives, found.stuck), mask)
         count = len(found.stuck)
         say(f"{mask}: {table.name} without {count} stretch{'' if count == 1 else 'es'} that nobody measured")
 
@@ -71,7 +71,7 @@ def prove(
     require_picture(picture)
     require_place(json_file)
     labels = run_labels(runs, taken={"oracle", "truth"}) | ({"oracle": oracle} if oracle else {})
-    rows: dict[str, Any] = load_runs(labels, program)
+    rows: dict[str, st.Fit | st.Program] = {**load_runs(labels, program)}
     if truth is not None:
         rows["truth"] = program_from(truth, seed)
     drives = st.read_table(table)

@@ -10,8 +10,9 @@ import steady_ppl as st
 from steady_ppl.cli import options
 from steady_ppl.cli.common import fit_or_program, present, program_from, write_json
 from steady_ppl.errors import RunError, UsageError
+from steady_ppl.utils.context import is_quiet
 from steady_ppl.utils.files import require_picture, require_place, write_picture
-from steady_ppl.utils.text import is_quiet, say, shown, tell
+from steady_ppl.utils.text import say, shown, tell
 
 LITERALS = {"true": True, "false": False, "none": None}
 RECIPES = ("steady", "likelihood", "steady-minus", "svi", "hand", "fit-hand", "fit-tv", "fit-truth")
@@ -171,18 +172,18 @@ def add(
     Its parameters start at the run's values, a coefficient at the value that is given, else at the run's, else at the
     effect's typical one.
     """
-    from steady_ppl.effects import added, write_program
-    from steady_ppl.effects.attach import with_effects
+    from steady_ppl.effects import attached, with_effects, write_program
 
-    given, is_run = fit_or_program(source, program), Path(source).is_dir()
-    grown = with_effects(given.program if is_run else given, effects or [], say)
-    if not added(grown):
+    given = fit_or_program(source, program)
+    grown, values = with_effects(given.program if isinstance(given, st.Fit) else given, effects or [])
+    say(*values)
+    if not attached(grown):
         raise UsageError(f"{source} has no effect that its file does not have: name one, `steady effects` lists them")
     notes = write_program(grown, out, force=force)
-    if is_run:
+    if isinstance(given, st.Fit):
         say(*notes)
     tell(f"{out}: {grown}")
-    for variant in added(grown):
+    for variant in attached(grown):
         tell(f"{variant.label}: {variant.effect.text}")
         tell(f"{variant.label}: ${variant.effect.equation}$")
 

@@ -16,9 +16,10 @@ from steady_ppl.cli import demo, judge, learn, make
 from steady_ppl.cli.common import as_refusal
 from steady_ppl.cli.progress import progress_line
 from steady_ppl.errors import SteadyError
+from steady_ppl.utils.context import commanded, quietly
 from steady_ppl.utils.cores import ONE_THREAD
 from steady_ppl.utils.progress import listening
-from steady_ppl.utils.text import commanded, one_line, quietly, say, tell
+from steady_ppl.utils.text import one_line, say, tell
 
 INTERRUPTED_CODE = 130  # what typer returns for Ctrl-C
 # left out of the help, which then fits one screen; as --debug, which the line of an unexpected error names

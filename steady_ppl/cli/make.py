@@ -69,11 +69,11 @@ def import_bag(
     tell(f"{out}: {many} trajector{'y' if many == 1 else 'ies'}, {rows} rows, {seen}")
 
 
-def _mapping(file: Path | None, maps: list[str], step: float | None) -> Any:
+def _mapping(file: Path | None, maps: list[str], step: float | None) -> "st.BagMapping":
     """What a file, `--map` and `--step` say together."""
-    from steady_ppl.data.rosbag.mapping import BagMapping, parse_map, read_toml
+    from steady_ppl.data.rosbag.mapping import parse_map, read_mapping
 
-    content: dict[str, Any] = read_toml(file) if file else {}
+    content: dict[str, Any] = read_mapping(file) if file else {}
     if step is not None:
         content["step"] = step
     columns, added = content.get("columns", {}), dict[str, Any]()
@@ -84,7 +84,7 @@ def _mapping(file: Path | None, maps: list[str], step: float | None) -> Any:
         added[name] = said
     if added and isinstance(columns, dict):
         content["columns"] = columns | added
-    return BagMapping.parse(content, file.name if file else "--map")
+    return st.BagMapping.parse(content, file.name if file else "--map")
 
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
@@ -153,13 +153,14 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate drives of a program, with measurements and true states."""
-    from steady_ppl.effects.attach import with_effects
+    from steady_ppl.effects import with_effects
     from steady_ppl.model.validate import probe
     from steady_ppl.smc.simulate import simulated_in
 
     if controls and trajectories:
         raise UsageError("--controls has as many drives as its table: leave --trajectories out")
-    program = with_effects(program_from(model, seed), effect or [], say)
+    program, values = with_effects(program_from(model, seed), effect or [])
+    say(*values)
     if substeps is not None:
         probe(st.with_substeps(program, substeps))
     like = st.read_table(controls) if controls else None

@@ -7,7 +7,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from steady_ppl.utils.text import is_quiet, printable
+from steady_ppl.utils.context import is_quiet
+from steady_ppl.utils.text import printable
 
 PATIENCE_SECONDS = 2.0  # before anything is said
 CLEAR_LINE = "\r\x1b[K"

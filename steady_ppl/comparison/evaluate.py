@@ -19,7 +19,7 @@ from steady_ppl.likelihood.evidence import choose_filter, evidence, in_parts, ru
 from steady_ppl.model.handlers import AtMean, Recording, residual, running
 from steady_ppl.model.planar_vehicle import PlanarVehicle, UnknownMap
 from steady_ppl.model.problem import Problem
-from steady_ppl.model.program import Program, error_groups, for_program, names
+from steady_ppl.model.program import Program, error_indices, for_program
 from steady_ppl.model.substeps import acting_controls, joined, parted
 from steady_ppl.runs.fit import Fit
 from steady_ppl.smc.filter import particle_filter
@@ -29,7 +29,7 @@ from steady_ppl.utils.angles import wrap_angles
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
-from steady_ppl.utils.text import aligned, number
+from steady_ppl.utils.text import aligned, figure
 
 Errors = dict[str, float]
 OPEN_LOOP = {"open_loop_1s": 1.0, "open_loop_3s": 3.0}  # s ahead
@@ -134,7 +134,7 @@ def _errors_of_map(program: Program, surveyed: Program) -> dict[str, Any]:
     errors = map_errors(program, surveyed)
 
     def form(one: Program) -> tuple[tuple[str, ...], ...]:
-        states = tuple(name for name in one.state_names if name not in names(one.resting))  # but those of added effects
+        states = tuple(name for name in one.state_names if name not in one.resting_names)  # but those of added effects
         return states, one.control_names, one.measurement_names
 
     for what, own, other in zip(("states", "controls", "measurements"), form(program), form(surveyed), strict=True):
@@ -177,7 +177,7 @@ def table_of(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> str
     lines = [["", "start", "log p(y)", *columns]]
     for label, result in zip(labels, results, strict=True):
         start = "known" if result["known_start"] else "prior"
-        errors = [number(result[of].get(name), ".4f") for of, name in columns.values()]
+        errors = [figure(result[of].get(name), ".4f") for of, name in columns.values()]
         lines.append([label, start, f"{result['log_likelihood']:.2f}", *errors])
     if len({result["known_start"] for result in results}) == 1:
         lines = [[label, *figures] for label, _, *figures in lines]
@@ -191,8 +191,8 @@ def has_truth(data: Trajectories) -> bool:
 
 def squared_errors(program: Program, states: Tensor, truth: Tensor) -> dict[str, Tensor]:
     """Squared errors `(...)` of each of the program's error groups, angles on the circle; NaN where unknown."""
-    difference = wrap_angles(states - truth, [program.state_names.index(name) for name in program.angles])
-    return {group: difference[..., list(members)].square().sum(-1) for group, members in error_groups(program).items()}
+    difference = wrap_angles(states - truth, program.angle_indices)
+    return {group: difference[..., list(members)].square().sum(-1) for group, members in error_indices(program).items()}
 
 
 @torch.no_grad()
@@ -245,7 +245,7 @@ def forward(
         draws = min(at_once, rollouts - first)
         end = _ends_of_roll_outs(program, data, origin.expand(draws, *origin.shape), horizon, handler)
         for group, squared in squared_errors(program, end, data.states[horizon:]).items():
-            members = list(error_groups(program)[group])
+            members = list(error_indices(program)[group])
             known = counted & torch.isfinite(data.states[horizon:, :, members]).all(-1)
             sums[group] += float(squared[:, known].double().sum())
             counts[group] += draws * int(known.sum())

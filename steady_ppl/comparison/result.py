@@ -10,9 +10,9 @@ from torch import Tensor
 
 from steady_ppl.comparison.scores import BANDED_HORIZONS, COVERAGE, RESAMPLES, Change, Key, ProgramScores, paired
 from steady_ppl.effects import attached
-from steady_ppl.model.program import error_groups
+from steady_ppl.model.program import error_indices
 from steady_ppl.utils.hooks import Displayed
-from steady_ppl.utils.text import TEXT_WIDTH, aligned, number, with_unit
+from steady_ppl.utils.text import TEXT_WIDTH, aligned, figure, with_unit
 
 NAME_COLUMNS = 20  # characters of a row's name
 NOISE_FLOOR, CONSTANT_VELOCITY = "noise floor", "constant velocity"  # rows that `prove` adds
@@ -111,7 +111,7 @@ class Proof(Displayed):
 def units_of_states(found: Proof) -> dict[str, str]:
     """Error group of states → unit, empty where its components have several."""
     program = found.rows[found.reference].program
-    of = {group: {program.state_units[i] for i in members} for group, members in error_groups(program).items()}
+    of = {group: {program.state_units[i] for i in members} for group, members in error_indices(program).items()}
     return {group: kinds.pop() if len(kinds) == 1 else "" for group, kinds in of.items()}
 
 
@@ -183,14 +183,14 @@ def with_interval(value: float, interval: Sequence[float], digits: int, unit: st
 def _likelihood_cells(row: Mapping[str, Any], bands: Sequence[str]) -> list[str]:
     change = (row["against_reference"] or {}).get("log_likelihood")
     said = with_interval(change["difference"], change["interval"], 1) if change else ""
-    cells = [number(row["log_likelihood"], ".1f"), said, number(row["neglected"], "+.2f")]
-    cells += [number(row["coverage_90"].get(name), ".1%") for name in bands]
+    cells = [figure(row["log_likelihood"], ".1f"), said, figure(row["neglected"], "+.2f")]
+    cells += [figure(row["coverage_90"].get(name), ".1%") for name in bands]
     return [cell.replace("-", "−") for cell in cells]
 
 
 def _errors(row: Mapping[str, Any], kind: str, of: str, horizons: Sequence[str]) -> list[str]:
     errors, against = row[kind][of], (row["against_reference"] or {}).get(kind, {}).get(of, {})
-    return [number(errors.get(name), ".3g") for name in horizons] + [_differs(against.get(name)) for name in horizons]
+    return [figure(errors.get(name), ".3g") for name in horizons] + [_differs(against.get(name)) for name in horizons]
 
 
 def _differs(change: Mapping[str, Any] | None) -> str:
@@ -205,7 +205,7 @@ def _scales(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     for kind in ("channels", "measurements"):
         before: list[str] | None = None
         for label in rows[0]["scales"][kind]:
-            column = [number(row["scales"][kind].get(label), ".4g") for row in rows]
+            column = [figure(row["scales"][kind].get(label), ".4g") for row in rows]
             if column == before:
                 last = list(columns)[-1]
                 columns[last if "…" in last else last.replace(" ", " … ", 1)] = columns.pop(last)

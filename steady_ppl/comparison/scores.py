@@ -22,7 +22,7 @@ from steady_ppl.gaussian.smoother import find_and_smooth, smooth
 from steady_ppl.likelihood.evidence import neglected
 from steady_ppl.likelihood.scores import measured, substep_spreads
 from steady_ppl.model.problem import Problem
-from steady_ppl.model.program import Program, error_groups, for_program
+from steady_ppl.model.program import Program, error_indices, for_program
 from steady_ppl.utils.random import seeded
 
 PROOF_HORIZONS_SECONDS = (1.0, 3.0, 10.0)  # ahead, besides one step
@@ -158,7 +158,7 @@ def compare_predictions(problem: Problem, ahead: Lookahead, kernels: bool | None
             if horizon in horizons:
                 truth = data.states[horizon:]
                 for group, squares in squared_errors(program, state, truth).items():
-                    known = torch.isfinite(truth[..., list(error_groups(program)[group])]).all(-1)
+                    known = torch.isfinite(truth[..., list(error_indices(program)[group])]).all(-1)
                     states[group, horizon] = squares, known
     return Judged(problem, ahead, tracked, predictions, states)
 

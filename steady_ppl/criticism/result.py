@@ -18,7 +18,7 @@ from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import HALF_WIDTH, Prediction
 from steady_ppl.model.program import Program, unit_of
 from steady_ppl.utils.hooks import Displayed
-from steady_ppl.utils.text import aligned, number, with_unit
+from steady_ppl.utils.text import aligned, figure, with_unit
 
 MAX_FINDINGS_SHOWN = 8  # findings in the table
 VERDICTS = {  # the verdict; and what stands out as well, which is no verdict while the parameters are wrong
@@ -115,7 +115,7 @@ class Check(Displayed):
         for name, component in content["measurements"].items():
             for horizon, row in component["horizons"].items():
                 keys = ("rmse", "noise_floor", "constant_velocity", "last_measurement")
-                cells = [number(row[key], ".4g") for key in keys]
+                cells = [figure(row[key], ".4g") for key in keys]
                 table.append([with_unit(name, component["unit"]), horizon, *cells, f"{row['coverage_90']:.1%}"])
         lines = [content["verdict"], "", *aligned(table, left=(0, 1))]
         ratios = ", ".join(f"{name} {value:.2f}" for name, value in content["evidence"]["scatter"].items())

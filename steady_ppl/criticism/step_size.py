@@ -187,7 +187,7 @@ def check_step(
         watched = ()
     elif parts is not None and watched is None:
         wider = widens(program, parts, data)
-        watched = [part.name.split("[")[0] for part, noise in zip(parts, wider, strict=True) if not noise]
+        watched = [part.owner for part, noise in zip(parts, wider, strict=True) if not noise]
     names = watched or ()
 
     def trial(substeps: int, like: Program, path: ReferencePath, steps: int) -> StepTrial:
@@ -275,7 +275,7 @@ def _uncompared(found: StepCheck, failure: str | None) -> str | None:
 def _trial(program: Program, maximum: Maximum, watched: Sequence[str]) -> StepTrial:
     likely, decrement = float(maximum.log_likelihood.sum()), maximum.decrement or 0.0
     found = StepTrial(program.substeps, likely, decrement, program, maximum.path)
-    chosen = {i: part for i, part in enumerate(elements(program)) if part.name.split("[")[0] in watched}
+    chosen = {i: part for i, part in enumerate(elements(program)) if part.owner in watched}
     if not chosen:
         return found
     at, parts = list(chosen), list(chosen.values())

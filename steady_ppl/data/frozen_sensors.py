@@ -62,7 +62,7 @@ def _beside(run: RowRange, moving: set[RowRange]) -> bool:
     return any(m[0] == drive and m[1] <= last and first <= m[2] and m[3].startswith("x.") for m in moving)
 
 
-def masked(data: Trajectories, stretches: list[Stretch]) -> Trajectories:
+def without_stretches(data: Trajectories, stretches: list[Stretch]) -> Trajectories:
     """The drives without what nobody measured: a measurement that hung and, where known states are made up, everything
     that was logged with them but a first row's states."""
     observed = data.observed.clone()

@@ -106,6 +106,12 @@ class Trajectories(Displayed):
     @property
     def known_start(self) -> Tensor:
         """`(B, D)` the true first states; DataError where they are not all known."""
+        self.require_known_start()
+        assert self.states is not None
+        return self.states[0]
+
+    def require_known_start(self) -> None:
+        """Raise DataError where the true first states are not all known."""
         if self.states is None:
             wanted = "the true states of every trajectory's first row"
             raise DataError(f"a known start needs {wanted}: the table has no x. columns")
@@ -113,7 +119,6 @@ class Trajectories(Displayed):
             column, label = f"x.{self.state_names[component]}", self.labels[trajectory]
             problem = f"a known start needs every trajectory's first state: {column} of trajectory {label} is empty"
             raise DataError(problem, column=column, trajectory=label, row=1)
-        return self.states[0]
 
     def subset(self, index: Sequence[int] | Tensor) -> Trajectories:
         """The trajectories at `index`, still padded to the same number of rows."""
@@ -152,7 +157,7 @@ class Trajectories(Displayed):
                 f"(rows, {len(self)}, {self.controls.shape[-1]}), for {', '.join(self.control_names) or 'no control'}"
             )
         if not 0 < step < math.inf:
-            raise DataError(f"a step of {step} s leads nowhere")
+            raise DataError(f"step must be positive, got {step} s")
         later = step * torch.arange(1, len(plan) + 1, dtype=self.time.dtype, device=self.time.device)
         ends = self.lengths.tolist()
 
@@ -182,7 +187,7 @@ class Trajectories(Displayed):
         states[0] = self.states[0]
         return replace(self, states=states)
 
-    def to(self, like: torch.dtype | None = None, device: Any = None) -> Trajectories:
+    def to(self, like: torch.dtype | None = None, device: torch.device | str | None = None) -> Trajectories:
         """Cast to a floating dtype and move to a device; `time`, from zero, stays in double precision."""
 
         def cast(tensor: Tensor) -> Tensor:
@@ -235,7 +240,7 @@ def pad_time(times: Sequence[Tensor]) -> Tensor:
     return out
 
 
-def joined(**tables: Trajectories) -> Trajectories:
+def concatenated(**tables: Trajectories) -> Trajectories:
     """The trajectories of several tables by name, one after another; DataError where their columns differ.
 
     Where two trajectories have the same label, every label gets the name of its table before it.

@@ -70,7 +70,7 @@ def variables(
 ) -> dict[str, Tensor]:
     """Everything that a curve may depend on, by name, each `(...)`: state components, velocities in the channels' own
     frame and their products, controls, what the program makes of them, and time."""
-    found = {name: state[..., i] for i, name in enumerate(program.state_names) if name not in program.resting}
+    found = {name: state[..., i] for i, name in enumerate(program.state_names) if name not in program.resting_names}
     moving = {f"{channel} velocity": value for channel, value in program.velocities(state).items()}
     named = {f"{channel} velocity": velocity for channel, (_, velocity) in program.motion.items()}
     found |= {name: value for name, value in moving.items() if name not in named and name != "yaw velocity"}

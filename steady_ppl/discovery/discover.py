@@ -12,7 +12,7 @@ import torch
 from steady_ppl.comparison.prove import doubtful, prove
 from steady_ppl.comparison.scores import MIN_DRIVES
 from steady_ppl.data.table import refuse_long
-from steady_ppl.data.trajectories import Trajectories, joined
+from steady_ppl.data.trajectories import Trajectories, concatenated
 from steady_ppl.discovery.candidates import TIE_NATS
 from steady_ppl.discovery.finding import findings, next_run, shape_of
 from steady_ppl.discovery.fitting import ByDraws
@@ -98,7 +98,7 @@ def discover(
     if mix:
         if valid is None:
             raise UsageError("mix puts two tables together: name the second one (--valid)")
-        train, valid = joined(train=train, valid=valid), None
+        train, valid = concatenated(train=train, valid=valid), None
     if valid is None:
         if len(train) < 2 * MIN_DRIVES:
             raise DataError(

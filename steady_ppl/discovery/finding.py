@@ -95,7 +95,7 @@ def _spread(search: Search, variant: Variant, count: int) -> np.ndarray:
     information = screening.information[""]
     ridge = 1e-10 * float(information.diagonal().max()) * torch.eye(len(information)).double()
     covariance = torch.linalg.inv(information + ridge)  # what the drives do not tell has a huge variance
-    learned = [part.name.split("[")[0] for part in screening.parameters]
+    learned = [part.owner for part in screening.parameters]
     (there,) = [known for known in attached(search.final.program) if known.name == variant.name]
     index = [i for i, name in enumerate(learned) if name == there.parameter]
     assert len(index) == count

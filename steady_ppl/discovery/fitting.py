@@ -143,7 +143,7 @@ class Judges:
 
     programs: list[Program]
     maxima: list[Maximum]  # where each ended
-    common: tuple[str, ...] = ()  # names of the learnable numbers that are the same in all
+    common: tuple[str, ...] = ()  # parameters of the learnable numbers that are the same in all
 
 
 def with_common_noise(problems: Sequence[Problem], maxima: Sequence[Maximum]) -> Judges:
@@ -172,7 +172,7 @@ def with_common_noise(problems: Sequence[Problem], maxima: Sequence[Maximum]) ->
         except FilterError:
             if last == len(starts):
                 raise
-    return Judges([problem.program for problem in copies], ended, tuple(parts[0][index].name for index in common))
+    return Judges([problem.program for problem in copies], ended, tuple(parts[0][index].owner for index in common))
 
 
 @torch.no_grad()
@@ -185,9 +185,8 @@ def noise_numbers(program: Program, data: Trajectories, path: ReferencePath) -> 
     mean, spread = _moments(program, data, path)
 
     def is_noise(part: Element) -> bool:
-        name = part.name.split("[")[0]
-        if name in forms:
-            return forms[name] in NOISE_FORMS
+        if part.owner in forms:
+            return forms[part.owner] in NOISE_FORMS
         with moved(part, PROBE_MOVE):
             mean_there, spread_there = _moments(program, data, path)
         change = (spread_there / spread).log().nan_to_num(0.0, 0.0, 0.0)

@@ -22,7 +22,7 @@ from steady_ppl.likelihood.maximize import Maximum, fit_by_likelihood, maximise,
 from steady_ppl.likelihood.parameters import Element, elements, values_of
 from steady_ppl.likelihood.scores import widens
 from steady_ppl.model.problem import Problem
-from steady_ppl.model.program import Program
+from steady_ppl.model.program import Program, parameter_name
 from steady_ppl.utils.random import seeded
 
 MAX_LOG_NOISE_RATIO = math.log(20.0)  # of noise after a fit and before, beyond which a program explains nothing
@@ -135,7 +135,7 @@ class Refit(Fits):
     def in_common(self, variant: Variant) -> int:
         """How many numbers of an effect's coefficient all drives told, those that judge it as well."""
         name = _as_attached(self.program, variant).parameter
-        return sum(common.split("[")[0] == name for common in self.judges.common)
+        return self.judges.common.count(name)
 
 
 def first_refit(problem: Problem, valid: Trajectories, *, seed: int, nearer: Program | None = None) -> Refit:
@@ -268,7 +268,7 @@ def as_declared(declared: Program, fitted: Program) -> Program:
     program, values = copy.deepcopy(fitted), dict(declared.named_parameters())
     coefficients = {known.parameter for known in attached(fitted)}
     for name, parameter in program.named_parameters():
-        if name in values and name.removesuffix("_unconstrained") not in coefficients:
+        if name in values and parameter_name(name) not in coefficients:
             parameter.data.copy_(values[name].data)
     return program
 

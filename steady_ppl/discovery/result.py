@@ -21,7 +21,7 @@ from steady_ppl.runs.folder import DISCOVERY
 from steady_ppl.utils.files import read_json
 from steady_ppl.utils.hooks import Displayed
 from steady_ppl.utils.schema import BOOL, LINES, NUMBER, TEXT, Paired, count, mismatch
-from steady_ppl.utils.text import TEXT_WIDTH, aligned, number
+from steady_ppl.utils.text import TEXT_WIDTH, aligned, figure
 
 CANDIDATES_SHOWN = 12  # candidates in the table
 VERDICT_PHRASES = {
@@ -334,7 +334,7 @@ def _line(found: Discovery, tested: Tested) -> list[str]:
 
 
 def _short(value: float | list[float] | None) -> str:
-    return ", ".join(f"{v:.2g}" for v in value) if isinstance(value, list) else number(value, ".3g")
+    return ", ".join(f"{v:.2g}" for v in value) if isinstance(value, list) else figure(value, ".3g")
 
 
 def _numbers(values: np.ndarray) -> float | list[float] | None:

@@ -264,7 +264,7 @@ def departures(declared: Program, now: Refit, parts: Sequence[Element]) -> list[
         return []
     program, fold = now.program, now.folds[0]
     effects = {known.parameter for known in attached(program)}
-    own = torch.tensor([part.name.split("[")[0] not in effects for part in parts])
+    own = torch.tensor([part.owner not in effects for part in parts])
     guessed = torch.tensor([any(part.name.startswith(guess) for guess in program.guesses) for part in parts])
     found = []
     for name, log_spread in LOG_SPREADS.items():

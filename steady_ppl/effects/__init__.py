@@ -4,7 +4,6 @@ Nothing here knows of data beyond what an effect's choices need, or of how an ef
 """
 
 from steady_ppl.effects.attach import (
-    added,
     attach,
     attached,
     coefficient,
@@ -12,12 +11,13 @@ from steady_ppl.effects.attach import (
     restore,
     set_coefficient,
     with_effect,
+    with_effects,
     written_class,
 )
 from steady_ppl.effects.codegen import write_program
 from steady_ppl.effects.declaration import Effect, Variant
 from steady_ppl.effects.registry import catalogue, chosen_variant, find, not_applicable, of_name, parsed, register
 
-__all__ = ["Effect", "Variant", "added", "attach", "attached", "catalogue", "chosen_variant", "coefficient", "find"]
+__all__ = ["Effect", "Variant", "attach", "attached", "catalogue", "chosen_variant", "coefficient", "find"]
 __all__ += ["not_applicable", "of_name", "parsed", "record", "register", "restore", "set_coefficient", "with_effect"]
-__all__ += ["write_program", "written_class"]
+__all__ += ["with_effects", "write_program", "written_class"]

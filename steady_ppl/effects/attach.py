@@ -1,7 +1,7 @@
 """A program with an effect: the same three methods, around which the effect acts."""
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,13 +15,13 @@ from pyro.nn import PyroParam
 from torch import Tensor
 
 from steady_ppl.effects.declaration import Effect, Value, Variant
-from steady_ppl.effects.registry import chosen_variant, is_known, parsed
+from steady_ppl.effects.registry import chosen_variant, parsed
 from steady_ppl.errors import UsageError
 from steady_ppl.model import interventions
 from steady_ppl.model.program import Program, names
 
 Methods = dict[str, Any]
-_CLASSES: WeakKeyDictionary[type[Program], WeakValueDictionary[Variant, type[Program]]] = WeakKeyDictionary()
+_CLASSES: WeakKeyDictionary[type[Program], WeakValueDictionary[Hashable, type[Program]]] = WeakKeyDictionary()
 
 
 def with_effect(
@@ -42,42 +42,50 @@ def with_effect(
     return attach(copy.deepcopy(program), variant, value)
 
 
-def attach(program: Program, variant: Variant, value: Value | None = None) -> Program:
-    """Add an effect to this very program."""
+def attach(program: Program, variant: Variant, value: Value | None = None, *, class_name: str | None = None) -> Program:
+    """Add an effect to this very program, whose class is named after it and the effect without a `class_name`."""
     if variant.name in [known.name for known in attached(program)]:
         raise UsageError(f"program {type(program).__name__} has the effect {variant.name} already")
     if hasattr(program, variant.parameter):  # a parameter of its own that has nothing to do with it
         variant = replace(variant, called=f"{variant.parameter}_effect")
     name, effect = variant.parameter, variant.effect
     start = _start(variant, value, next(program.parameters(), torch.zeros(())))
-    program.__class__ = _class_with(type(program), variant)
+    program.__class__ = _class_with(type(program), variant, class_name)
     with pyro.settings.context(module_local_params=True):
         setattr(program, name, PyroParam(start, _constraint(effect)))
     wide = dist.Cauchy(1.0 if effect.null == 1 else 0.0, effect.limit)  # as wide as is physical
-    program.priors = {**program.priors, name: wide if effect.prior is None else effect.prior}  # type: ignore[misc]
+    program.priors = {**program.priors, name: wide if effect.prior is None else effect.prior}
     rate = float(variant.typical.abs().max()) if effect.null == 0 else 1.0  # Adam's steps are of this size in any unit
-    program.rates = {name: rate, **program.rates}  # type: ignore[misc]
+    program.rates = {name: rate, **program.rates}
     return program
 
 
-def _class_with(base: type[Program], variant: Variant) -> type[Program]:
-    """A program's class with an effect; the same one for the same effect, so that kernels are shared."""
+def _class_with(base: type[Program], variant: Variant, name: str | None) -> type[Program]:
+    """A program's class with an effect; the same one for the same effect and name, so that kernels are shared."""
+    name = name or f"{base.__name__}With{''.join(part.capitalize() for part in variant.parameter.split('_'))}"
     known = _CLASSES.setdefault(base, WeakValueDictionary())
-    grown = known.get(variant)
+    options = variant.options.items()
+    key = _frozen((name, variant.effect, variant.at, *options, variant.called, variant.scale, variant.unit))
+    grown = known.get(key)
     if grown is None:
-        title = "".join(part.capitalize() for part in variant.parameter.split("_"))
-        about = {"__module__": base.__module__, "__doc__": base.__doc__, "attached": {variant.parameter: variant}}
+        about = {"__module__": base.__module__, "__doc__": base.__doc__, "_attached": variant}
         methods = _METHODS_OF_FORM[variant.effect.form](base, variant)
-        known[variant] = grown = type(f"{base.__name__}With{title}", (base,), {**about, **methods})
+        known[key] = grown = type(name, (base,), {**about, **methods})
     return grown
+
+
+def _frozen(value: object) -> Hashable:
+    """A value that can be a key; of arrays and other objects it is the object itself."""
+    if isinstance(value, tuple | list):
+        return tuple(map(_frozen, value))
+    return value if isinstance(value, Hashable) else id(value)
 
 
 def attach_listed(program: Program) -> Program:
     """Give this very program the effects that its class lists."""
     for text in program.effects:
         name, at, options, value = parsed(text)
-        attach(program, chosen_variant(program, name, at, **options), value)
-    type(program).__name__ = written_class(program).__name__
+        attach(program, chosen_variant(program, name, at, **options), value, class_name=type(program).__name__)
     return program
 
 
@@ -100,41 +108,24 @@ def _start(variant: Variant, value: Value | None, like: Tensor) -> Tensor:
     return start
 
 
-def added(program: Program) -> tuple[Variant, ...]:
-    """The effects that were added to a program and are not in its file, in their order."""
-    return tuple(which for _, which in _effects(program) if isinstance(which, Variant))
-
-
 def attached(program: Program) -> tuple[Variant, ...]:
-    """The effects that were added to a program or written out in its file and are known here, in their order."""
-    return tuple(
-        which if isinstance(which, Variant) else replace(chosen_variant(program, which), called=parameter)
-        for parameter, which in _effects(program)
-        if isinstance(which, Variant) or is_known(which)
-    )
-
-
-def _effects(program: Program) -> list[tuple[str, str | Variant]]:
-    return [item for one in reversed(type(program).__mro__) for item in vars(one).get("attached", {}).items()]
+    """The effects that a program's class lists or that were added to it, in their order."""
+    return tuple(vars(one)["_attached"] for one in reversed(type(program).__mro__) if "_attached" in vars(one))
 
 
 def written_class(program: Program) -> type[Program]:
-    """The class of a program as its file has it, without the effects that were added."""
-    return next(
-        one
-        for one in type(program).__mro__
-        if not any(isinstance(which, Variant) for which in vars(one).get("attached", {}).values())
-    )
+    """The class of a program as its file has it, without the effects that `attach` gave it."""
+    return next(one for one in type(program).__mro__ if "_attached" not in vars(one))
 
 
 def record(program: Program) -> list[str]:
-    """The effects that were added to a program, as `restore` reads them."""
-    return [variant.written for variant in added(program)]
+    """The effects that a program's class lists or that were added to it, as `restore` reads them."""
+    return [variant.written for variant in attached(program)]
 
 
 def restore(program: Program, effects: Sequence[str]) -> Program:
     """Add the effects of a record that the program does not have yet to this very program."""
-    have = [variant.written for variant in attached(program)]
+    have = record(program)
     for text in effects:
         if text not in have:
             attach(program, chosen_variant(program, text))
@@ -237,24 +228,24 @@ _METHODS_OF_FORM: dict[str, Callable[[Any, Variant], Methods]] = {
 }
 
 
-def with_effects(program: Any, effects: list[str], say: Any) -> Any:
-    """A program with effects as users write them; says which values they have."""
-    named: list[str] = []
+def with_effects(program: Program, effects: Sequence[str]) -> tuple[Program, list[str]]:
+    """A program with effects as users write them, and a line for each that says its value; UsageError: one is wrong."""
+    named, lines = list[str](), list[str]()
     for text in effects:
         name, at, options, value = parsed(text)
         variant = chosen_variant(program, name, at, **options)
         if variant.name in named:
             raise UsageError(f"effect {variant.name} is given twice")
         named.append(variant.name)
-        there = [known for known in added(program) if known.name == variant.name]
+        there = [known for known in attached(program) if known.name == variant.name]
         if there and (not options or dict(there[0].options) == dict(variant.options)):
             variant, origin = there[0], "as given" if value else "of the run"
             if value is not None:
                 program = set_coefficient(program, variant, value)
         else:
-            program, origin = program.with_effect(variant, value), "as given" if value else "typical"
-            variant = added(program)[-1]
-        numbers = getattr(program, variant.parameter).detach().flatten().tolist()
+            program, origin = with_effect(program, variant, value), "as given" if value else "typical"
+            variant = attached(program)[-1]
+        numbers = coefficient(program, variant).detach().flatten().tolist()
         unit = "" if variant.unit == "1" else f" {variant.unit}"
-        say(f"{variant.label} = {', '.join(f'{number:.4g}' for number in numbers)}{unit} ({origin})")
-    return program
+        lines.append(f"{variant.label} = {', '.join(f'{number:.4g}' for number in numbers)}{unit} ({origin})")
+    return program, lines

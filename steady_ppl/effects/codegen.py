@@ -14,12 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from steady_ppl.effects.attach import added, coefficient, written_class
+from steady_ppl.effects.attach import attached, coefficient, written_class
 from steady_ppl.effects.declaration import Variant
 from steady_ppl.effects.registry import chosen_variant
 from steady_ppl.errors import UsageError
 from steady_ppl.model.loading import load_program
-from steady_ppl.model.program import Program
+from steady_ppl.model.program import Program, parameter_name
 from steady_ppl.model.validate import probe
 from steady_ppl.utils.files import whole_file
 
@@ -41,7 +41,7 @@ def write_program(program: Program, path: str | Path, *, force: bool = False) ->
     path = Path(path)
     base, base_file = _base_of(program)
     class_name = _class_name(path, program, base, base_file, force)
-    if not added(program):
+    if not attached(program):
         raise UsageError(f"program {type(program).__name__} has no effect that its file does not have")
     values, notes = _carried_over(program, base)
     text = _program_text(program, class_name, base, base_file.stem, values)
@@ -52,14 +52,14 @@ def write_program(program: Program, path: str | Path, *, force: bool = False) ->
 
 
 def _program_text(program: Program, class_name: str, base: type[Program], module: str, values: Sequence[str]) -> str:
-    *most, last = (variant.name for variant in added(program))
+    *most, last = (variant.name for variant in attached(program))
     listed = f"{', '.join(most)} and {last}" if most else last
     title = f'"""{base.__name__} with {listed}, as `steady add` wrote it."""'
     lines = [title if len(title) <= CODE_COLUMNS else title.replace(listed, "effects"), ""]
     lines += ["from torch import tensor", ""] if any("tensor(" in line for line in values) else []
     lines += [f"from .{module} import {base.__name__}", "", "", f"class {class_name}({base.__name__}):"]
     lines += [f"    {line}" if line else "" for line in _docstring(program, base, listed)]
-    quoted = [f'"{_named(program, variant)}"' for variant in added(program)]
+    quoted = [f'"{_named(program, variant)}"' for variant in attached(program)]
     line = f"    effects = ({', '.join(quoted)}{',' if len(quoted) == 1 else ''})"
     long = ["    effects = (", *(f"        {one}," for one in quoted), "    )"]
     lines += ["", *([line] if len(line) <= CODE_COLUMNS else long)]
@@ -74,7 +74,7 @@ def _program_text(program: Program, class_name: str, base: type[Program], module
 
 def _docstring(program: Program, base: type[Program], listed: str) -> list[str]:
     lines = []
-    for variant in added(program):
+    for variant in attached(program):
         effect, told = variant.effect, ", ".join(f"{k} {v:.6g}" for k, v in variant.profiled.items())
         lines.append(f"{variant.parameter}: {effect.text}" + (f", {told}" if told else ""))
         lines.append(f"    c in {variant.unit}; {effect.feels}" if variant.unit != "1" else f"    {effect.feels}")
@@ -113,7 +113,7 @@ def _carried_over(program: Program, base: type[Program]) -> tuple[list[str], lis
     """Lines that set the parameters that are not as the file has them, and what is too much for a file."""
     with torch.random.fork_rng():
         fresh = base()
-    coefficients, lines, notes = {variant.parameter for variant in added(program)}, [], []
+    coefficients, lines, notes = {variant.parameter for variant in attached(program)}, [], []
     for name in program._pyro_params:
         value = getattr(program, name).detach()
         if name in coefficients or (hasattr(fresh, name) and torch.equal(value, getattr(fresh, name).to(value))):
@@ -124,10 +124,11 @@ def _carried_over(program: Program, base: type[Program]) -> tuple[list[str], lis
     if lines:
         lines.insert(0, "# where its own parameters begin; they are learned as before")
     before = fresh.state_dict()
-    own = {f"{name}_unconstrained" for name in program._pyro_params}
     modules: dict[str, None] = {}
     for name, value in program.state_dict().items():
-        if name not in own and not (name in before and torch.equal(value, before[name].to(value))):
+        if parameter_name(name) not in program._pyro_params and not (
+            name in before and torch.equal(value, before[name].to(value))
+        ):
             modules[name.partition(".")[0]] = None
     if modules:
         notes.append(f"not carried over, being too much for a program file: {', '.join(modules)}; fit them again")

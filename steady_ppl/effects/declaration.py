@@ -110,7 +110,7 @@ class Effect:
             (self.form in VERDICT_OF_FORM, f"no form {self.form!r}; there are {', '.join(VERDICT_OF_FORM)}"),
             ("c" in inspect.signature(self.function).parameters, "its function takes no coefficient c"),
             (len(typical) == self.size, f"{len(typical)} typical numbers for {self.size} components"),
-            (felt, f"its typical coefficient is {self.typical}: none would feel it"),
+            (felt, f"its typical coefficient must be finite and not zero, got {self.typical}"),
             (not (self.components and self.sign), "a coefficient of several components has no sign"),
             (self.limit > 0, f"its limit is a magnitude above zero, got {self.limit}"),
         ):

@@ -41,11 +41,6 @@ def not_applicable(program: Program) -> dict[str, str]:
     return {effect.name: str(effect.lacks(program)) for effect in _EFFECTS if effect.name not in known}
 
 
-def is_known(text: str) -> bool:
-    """Whether there is an effect of the name that `NAME[:AT]…` begins with."""
-    return parsed(text)[0] in [effect.name for effect in _EFFECTS]
-
-
 def of_name(name: str) -> list[Effect]:
     """All effects of a name, which differ in what they apply to; UsageError, with the nearest name, without any."""
     named = [effect for effect in _EFFECTS if effect.name == name]

@@ -33,7 +33,7 @@ from steady_ppl.model.handlers import (
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import joined, mean_step, noisy_step, row_inputs
-from steady_ppl.model.validate import start_size, step_size
+from steady_ppl.model.validate import noise_size, start_size
 from steady_ppl.utils.angles import wrap
 
 
@@ -181,7 +181,7 @@ def why_not_linear(program: Program, data: Trajectories, *, known_start: bool = 
     head = {name: values[:rows] for name, values in by_row.items() if values is not None}
     data = replace(first, **head, lengths=first.lengths.clamp(max=rows))
     state = draw_starts(program, rows - 1, 1)
-    path = ReferencePath(state[:1].expand(rows, -1, -1), state.new_zeros((rows - 1, 1, step_size(program))))
+    path = ReferencePath(state[:1].expand(rows, -1, -1), state.new_zeros((rows - 1, 1, noise_size(program))))
     try:
         linearize(Problem(program, data, known_start), path)
     except ProgramError as error:

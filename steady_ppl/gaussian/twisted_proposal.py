@@ -15,6 +15,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from steady_ppl.errors import require
 from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
 from steady_ppl.gaussian.lanes import Array
 from steady_ppl.smc.filter import Proposal
@@ -201,15 +202,16 @@ class Twist(Proposal):
             share of .05 doubles the scatter of log p(y) that .01 has.
         tempered: weight of the later measurements as the twist sees them, relative to their own; less than 1 guards
             against a twist that is narrower than the posterior.
+
+    Raises:
+        UsageError: `untwisted` is not in [0, 1), or `tempered` not in (0, 1].
     """
 
     looks_ahead = True
 
     def __init__(self, lookahead: Lookahead, *, untwisted: float = 0.01, tempered: float = 1.0) -> None:
-        if not 0 <= untwisted < 1:
-            raise ValueError(f"the untwisted share is in [0, 1), got {untwisted}")
-        if not 0 < tempered <= 1:
-            raise ValueError(f"the weight of the tempered measurements is in (0, 1], got {tempered}")
+        require(0 <= untwisted < 1, "untwisted", untwisted, "in [0, 1)")
+        require(0 < tempered <= 1, "tempered", tempered, "in (0, 1]")
         if tempered < 1:
             seen = lookahead.linearization
             weighted = replace(seen, precision=tempered * seen.precision, log_scale=tempered * seen.log_scale)

@@ -15,7 +15,7 @@ from steady_ppl.errors import DataError, FilterError, ProgramError, require
 from steady_ppl.model.handlers import Recording, Substituting, masked, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import row_inputs, sample_row
-from steady_ppl.model.validate import step_size
+from steady_ppl.model.validate import noise_size
 from steady_ppl.smc.filter import STEPS_WORTH_COMPILING, Proposal, particle_filter
 from steady_ppl.smc.genealogy import Paths, event_dims
 from steady_ppl.utils.angles import wrap_angles
@@ -192,7 +192,7 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
         with running(*before.shape[:-1]), Recording() as recording, Substituting(noise):
             return sample_row(exact, before, *inputs), recording
 
-    channels = torch.eye(step_size(program)).to(before)
+    channels = torch.eye(noise_size(program)).to(before)
     noise = before.new_zeros(*before.shape[:-1], len(channels))
     for _ in range(MAX_GAUSS_NEWTON_STEPS):
         base, _ = run(noise)

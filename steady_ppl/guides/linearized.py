@@ -105,7 +105,7 @@ class LinearizedGuide(PathGuide):
     def _recall(self, kind: str, data: Trajectories) -> Tensor:
         known = [self.memory[f"{kind}/{label}"] for label in data.labels]
         if any(len(path) != len(data.time) - (kind == "noise") for path in known):
-            raise ValueError("this guide remembers other drives of the same labels: make a new one for these")
+            raise UsageError("this guide remembers other drives of the same labels: make a new one for these")
         return torch.stack(known, 1).to(data.controls)
 
     def remember(self, path: ReferencePath, data: Trajectories) -> None:

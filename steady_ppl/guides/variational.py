@@ -26,7 +26,7 @@ from steady_ppl.model.handlers import KnownStart, Recording, Replaying, Standard
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import row_inputs, sample_row
-from steady_ppl.model.validate import start_size, step_size
+from steady_ppl.model.validate import noise_size, start_size
 from steady_ppl.smc.genealogy import Paths, event_dims
 
 HIDDEN_UNITS, BOUND = 16, 3.0  # units of a network beside its affine mean, and how many times the usual size they reach
@@ -177,7 +177,7 @@ class AutoRollout(VariationalGuide):
         **more: Any,
     ) -> None:
         super().__init__(program, **more)
-        self.sizes, self.labels = (start_size(program), step_size(program)), data.labels
+        self.sizes, self.labels = (start_size(program), noise_size(program)), data.labels
         self.now: dict[str, Tensor] = {}
         zeros = {name: data.controls.new_zeros(shape) for name, shape in self._shapes(data).items()}
         with pyro.settings.context(module_local_params=True), poutine.block():
@@ -260,7 +260,7 @@ class InferenceNetwork(VariationalGuide):
         inside, features = data.rows[..., None], self._features(states)
         scales = {"control": _Standard(data.controls, inside), "state": _Standard(features, inside)}
         self.scales = nn.ModuleDict({"measurement": _Standard(data.measurements, data.observed), **scales})
-        first, later, size = start_size(program), step_size(program), features.shape[-1]
+        first, later, size = start_size(program), noise_size(program), features.shape[-1]
         acting = data.controls.shape[-1] + 1
         inputs = 3 * data.measurements.shape[-1] + acting
         self.step_scale = data.median_step

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from steady_ppl.errors import ProgramError
 from steady_ppl.kernels.codegen import SIMD_LANES
 from steady_ppl.kernels.jit import Method, Number, close, compiled, discard
+from steady_ppl.utils.context import bound
 
 COMPARED_EVERY = 16  # of a program's runs on all rows; the first two are compared as well
 ROWS_WORTH_COMPILING = 1000  # of all trajectories together
@@ -26,11 +27,8 @@ _WHY: ContextVar[dict[str, str] | None] = ContextVar("why functions had no kerne
 def kernel_failures() -> Iterator[dict[str, str]]:
     """Why functions of the block had no kernel where there were rows enough for one, by the functions' names."""
     found: dict[str, str] = {}
-    token = _WHY.set(found)
-    try:
+    with bound(_WHY, found):
         yield found
-    finally:
-        _WHY.reset(token)
 
 
 def fallback_notes(why: Mapping[str, str]) -> list[str]:

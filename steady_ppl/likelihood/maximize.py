@@ -278,7 +278,7 @@ def _tried(terms: Sequence[Term], passes: int, least: float) -> _LinearizedObjec
 def _valued(terms: Sequence[Term], passes: int) -> list[_LinearizedTerm]:
     found, owners = [], Counter(column for term in terms for column in term.columns)
     for term in terms:
-        names = [part.name.split("[")[0] for part in term.parts]
+        names = [part.owner for part in term.parts]
         shares = {name: 1 / owners[column] for name, column in zip(names, term.columns, strict=True)}
         ahead = smooth(term.problem, term.path, passes=passes, tolerance=TOLERANCE)
         objective = float(ahead.log_likelihood.sum()) + log_prior(term.problem.program, shares)
@@ -313,7 +313,7 @@ def _slope_of_prior(program: Program, parts: list[Element], shares: dict[str, fl
     """Of the log prior in the unconstrained space, without the Jacobian: for the parameter's own mode, `(P,)`."""
     slope = torch.zeros(len(parts), dtype=torch.float64)
     for index, part in enumerate(parts):
-        if part.name.split("[")[0] in program.priors:
+        if part.owner in program.priors:
             up, down = on_both_sides(part, lambda: log_prior(program, shares))
             slope[index] = (up - down) / (2 * part.step)
     return slope

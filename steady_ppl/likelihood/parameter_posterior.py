@@ -239,7 +239,7 @@ def resampled(program: Program, values: Tensor, log_weights: Tensor, draws: int)
 def own_values(program: Program) -> Tensor:
     """All learnable numbers, `(P,)`, in their own units."""
     parts = elements(program)
-    tensors = [attrgetter(part.name.split("[")[0])(program).detach() for part in parts]
+    tensors = [attrgetter(part.owner)(program).detach() for part in parts]
     return torch.stack([values.view(-1)[part.index].double() for values, part in zip(tensors, parts, strict=True)])
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from steady_ppl.effects import attached
 from steady_ppl.errors import UsageError
 from steady_ppl.kernels.jit import Number
-from steady_ppl.model.program import Program
+from steady_ppl.model.program import Program, parameter_name
 
 MAX_LEARNABLE_NUMBERS = 60  # parameters that are screened one by one; networks have more
 MIN_RELATIVE_MOVE = 1e-3  # of a number, by which differences move it at least: single precision has seven digits
@@ -22,7 +22,12 @@ Result = TypeVar("Result")
 class Element(Number):
     """One number among a program's parameters, in the unconstrained space in which it is learned."""
 
-    name: str  # of the parameter, with an index where it has several numbers
+    owner: str  # the parameter's name
+
+    @property
+    def name(self) -> str:
+        """The parameter's, with an index where it has several numbers."""
+        return f"{self.owner}[{self.index}]" if self.parameter.numel() > 1 else self.owner
 
     def move(self, by: float) -> None:
         """Change it."""
@@ -44,10 +49,9 @@ def elements(program: Program, *, frozen: bool = False) -> list[Element]:
     for name, parameter in program.named_parameters():
         if not (parameter.requires_grad or frozen):
             continue
-        name = name.removesuffix("_unconstrained")
+        owner = parameter_name(name)
         for index, value in enumerate(parameter.detach().flatten().tolist()):
-            label = f"{name}[{index}]" if parameter.numel() > 1 else name
-            found.append(Element(parameter, index, max(steps.get(name, 0.01), MIN_RELATIVE_MOVE * abs(value)), label))
+            found.append(Element(parameter, index, max(steps.get(owner, 0.01), MIN_RELATIVE_MOVE * abs(value)), owner))
     if len(found) > MAX_LEARNABLE_NUMBERS:
         raise UsageError(
             f"program {type(program).__name__} has {len(found)} learnable numbers: a network cannot be looked at "

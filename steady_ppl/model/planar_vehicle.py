@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import ClassVar
 
 import pyro.distributions as dist
 import torch
@@ -31,15 +30,15 @@ class PlanarVehicle(Program):
 
     states = ("x [m]", "y [m]", "heading [rad]", "vx [m/s]", "vy [m/s]", "yaw_rate [rad/s]")
     channels = ("forward [m/s²]", "lateral [m/s²]", "yaw [rad/s²]")
-    angles: ClassVar = ("heading",)
-    error_groups: ClassVar = {
+    angles = ("heading",)
+    error_groups = {
         "location": ("x", "y"),
         "angle": ("heading",),
         "velocity": ("vx", "vy"),
         "yaw_rate": ("yaw_rate",),
     }
-    derivatives: ClassVar = {"x": "vx", "y": "vy", "heading": "yaw_rate"}
-    axes: ClassVar = {"translation": ("forward", "lateral"), "yaw": ("yaw",)}
+    derivatives = {"x": "vx", "y": "vy", "heading": "yaw_rate"}
+    axes = {"translation": ("forward", "lateral"), "yaw": ("yaw",)}
     landmarks: Sequence[Sequence[float]] = ()
     bearing_sd: float
     settling: float | None = None

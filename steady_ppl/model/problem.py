@@ -25,7 +25,7 @@ class Problem:
 
     def __post_init__(self) -> None:
         if self.known_start:
-            _ = self.data.known_start
+            self.data.require_known_start()
 
     @classmethod
     def of_table(cls, program: Program, table: Trajectories, known_start: bool) -> Problem:

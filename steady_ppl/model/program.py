@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, wraps
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import pyro
 import torch
@@ -121,7 +121,6 @@ class Program(PyroModule):
         error_groups: what an error is reported for: name → components whose Euclidean norm it is.
         resting: state components that start at zero in every drive; a table need not have them.
         effects: effects that the program has besides what it writes out: `("linear_drag=0.1", "slope=0.05,-0.03")`.
-        attached: coefficient's name → the effect that has it.
         substeps: in how many steps of `transition` the program takes a row; see `steady_ppl.model.substeps`.
 
     Hints for a fit, by the names of parameters or their beginnings:
@@ -139,18 +138,17 @@ class Program(PyroModule):
     controls: Sequence[str] = ()
     measurements: Sequence[str] = ()
     channels: Sequence[str] = ()
-    angles: ClassVar[Sequence[str]] = ()
-    motion: ClassVar[Mapping[str, tuple[str, str]]] = {}
-    error_groups: ClassVar[Mapping[str, Sequence[str]]] = {}
+    angles: Sequence[str] = ()
+    motion: Mapping[str, tuple[str, str]] = {}
+    error_groups: Mapping[str, Sequence[str]] = {}
     resting: Sequence[str] = ()
-    effects: ClassVar[Sequence[str]] = ()
-    attached: ClassVar[Mapping[str, Any]] = {}
+    effects: Sequence[str] = ()
     substeps: int = 1
 
-    priors: ClassVar[Mapping[str, Any]] = {}
-    guesses: ClassVar[Sequence[str]] = ()
-    rates: ClassVar[Mapping[str, float]] = {}
-    decays: ClassVar[Mapping[str, float]] = {}
+    priors: Mapping[str, Any] = {}
+    guesses: Sequence[str] = ()
+    rates: Mapping[str, float] = {}
+    decays: Mapping[str, float] = {}
 
     duration: float = 10.0
     step: float = 0.1
@@ -170,11 +168,8 @@ class Program(PyroModule):
     def __setattr__(self, name: str, value: Any) -> None:
         hidden = isinstance(value, PyroParam | PyroSample | torch.nn.Parameter) and hasattr(type(self), name)
         if hidden and not callable(getattr(type(self), name)):
-            raise ProgramError(
-                f"program {type(self).__name__}: {name} is a constant of its class, behind which a parameter of that "
-                "name would never be seen: take another name",
-                site="__init__",
-            )
+            about = f"{name} is a constant of its class, which would hide the parameter: take another name"
+            raise ProgramError(f"program {type(self).__name__}: {about}", site="__init__")
         super().__setattr__(name, value)
 
     def initial(self) -> Tensor:
@@ -207,11 +202,12 @@ class Program(PyroModule):
     control_names, control_units = _components("controls")
     measurement_names, measurement_units = _components("measurements")
     channel_names, channel_units = _components("channels")
+    resting_names = _components("resting")[0]
 
     @property
     def angle_indices(self) -> tuple[int, ...]:
         """Which state components live on a circle."""
-        return tuple(self.state_names.index(name) for name in names(self.angles))
+        return tuple(self.state_names.index(name) for name in self.angles)
 
     @property
     def derivatives(self) -> Mapping[str, str]:
@@ -252,7 +248,9 @@ class Program(PyroModule):
         """One for the controls that are named and zero for the others, `(U,)`."""
         return like.new_tensor([float(name in chosen) for name in self.control_names])
 
-    def with_effect(self, effect: Any, value: Any = None, **where: Any) -> Program:
+    def with_effect(
+        self, effect: object, value: float | Sequence[float] | Tensor | None = None, **where: object
+    ) -> Program:
         """A copy with a physical effect added, its coefficient a learnable parameter; see `effects.attach`."""
         return hooks.with_effect(self, effect, value, **where)
 
@@ -265,8 +263,13 @@ class Program(PyroModule):
 
     def extra_repr(self) -> str:
         """The values of the program's own parameters."""
-        own = [name.removesuffix("_unconstrained") for name, _ in self.named_parameters(recurse=False)]
+        own = [parameter_name(name) for name, _ in self.named_parameters(recurse=False)]
         return ", ".join(f"{name}={_rounded(getattr(self, name))}" for name in own)
+
+
+def parameter_name(name: str) -> str:
+    """The name under which a program declares what `named_parameters` and `state_dict` call `name`."""
+    return name.removesuffix("_unconstrained")
 
 
 def _rounded(value: Tensor) -> Any:
@@ -274,7 +277,7 @@ def _rounded(value: Tensor) -> Any:
     return values[0] if value.dim() == 0 else values
 
 
-def error_groups(program: Program) -> dict[str, tuple[int, ...]]:
+def error_indices(program: Program) -> dict[str, tuple[int, ...]]:
     """What errors are reported for: name → indices of the state components; each component alone by default."""
     order = program.state_names
     groups = program.error_groups or {name: (name,) for name in order}
@@ -313,7 +316,7 @@ def for_program(program: Program, data: Trajectories) -> Trajectories:
     """The columns that the program reads, in its order, its precision and on its device."""
     chosen = data.select(program.control_names, program.measurement_names, program.state_names)
     if chosen.states is not None and program.resting:
-        resting = [program.state_names.index(name) for name in names(program.resting)]
+        resting = [program.state_names.index(name) for name in program.resting_names]
         chosen.states[0][..., resting] = 0.0
     parameter = next(program.parameters(), torch.empty(0, device=data.time.device))
     return _within(chosen.to(parameter.dtype, parameter.device))

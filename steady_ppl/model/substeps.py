@@ -12,7 +12,7 @@ row the noise came, and what it does to other channels.
 
 import copy
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from numbers import Integral
@@ -39,6 +39,7 @@ from steady_ppl.model.handlers import (
     with_moments,
 )
 from steady_ppl.model.program import Program
+from steady_ppl.utils.context import bound
 
 MAX_SUBSTEPS = 1000  # of a row
 MIN_SHARE_OF_SD = 0.1  # of a channel in a substep, that it has on average over a row at least
@@ -195,14 +196,9 @@ def row_controls(program: Program, control: Tensor) -> Tensor:
     return control.unflatten(-1, (program.substeps, controls)).mean(-2)
 
 
-@contextmanager
-def within_row(ends: bool = False) -> Iterator[None]:
+def within_row(ends: bool = False) -> AbstractContextManager[None]:
     """Run a `transition` as one that no row ends with, so that what counts rows stays as it is; unless it `ends`."""
-    token = _ROW_ENDS.set(ends)
-    try:
-        yield
-    finally:
-        _ROW_ENDS.reset(token)
+    return bound(_ROW_ENDS, ends)
 
 
 @dataclass(eq=False)

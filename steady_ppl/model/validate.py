@@ -89,7 +89,8 @@ def _misdeclared(program: Program) -> Iterator[str]:
         missing = "states" if not program.states else "measurements (for a planar vehicle: landmarks)"
         yield f" declares no {missing}; name another class of the file as FILE.py:NAME"
     known = program.state_names
-    for what, members in (("angles", program.angles), *(("error_groups", g) for g in program.error_groups.values())):
+    groups = [("error_groups", group) for group in program.error_groups.values()]
+    for what, members in (("angles", program.angles), ("resting", program.resting_names), *groups):
         for member in members:
             if member not in known:
                 yield f": {what} names {member!r}, no state component ({', '.join(known)})"
@@ -190,7 +191,7 @@ def start_size(program: Program) -> int:
     return sum(fn.event_shape.numel() for fn in seen.distributions.values())
 
 
-def step_size(program: Program) -> int:
+def noise_size(program: Program) -> int:
     """How many numbers each `transition` draws."""
     seen = Recording()
     state = draw_starts(program, 1, 1)

@@ -7,7 +7,7 @@ from pyro.distributions import constraints
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.model.program import Program
+from steady_ppl.model.program import Program, parameter_name
 from steady_ppl.runs.fit import Fit
 
 LOG_RATIO_TO_ZERO = math.log(20.0)  # log ratio by which a positive number falls to next to nothing
@@ -35,7 +35,7 @@ def diagnose_fit(fit: Fit, declared: Mapping[str, Tensor]) -> list[str]:
             f"Fit again with {more}, or a mechanistic program by --recipe likelihood, which takes seconds"
         )
     for name, before in declared.items():
-        short = name.removesuffix("_unconstrained")
+        short = parameter_name(name)
         if not _is_positive(fit.program, short):
             continue
         guessed = short.startswith(tuple(fit.program.guesses))

@@ -34,7 +34,7 @@ class Dynamics(nn.Module):
     def __init__(self, program: Program, step: float) -> None:
         super().__init__()
         if not step > 0:
-            raise UsageError(f"a step of {step} s leads nowhere")
+            raise UsageError(f"step must be positive, got {step} s")
         self.program, self.step = program, step
         self.state_names, self.control_names = program.state_names, program.control_names
         self.measurement_names = program.measurement_names

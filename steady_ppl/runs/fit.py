@@ -140,8 +140,8 @@ class Fit(Displayed):
             raise RunError(f"{folder}: its {command} has not finished: go on with it by `steady {command} … --resume`")
         if not isinstance(program, Program):
             program = _load_recorded(folder, record["program"], program)
-        effects.restore(program, record.get("effects", []))
-        substeps = record.get("substeps", 1)
+        effects.restore(program, record["effects"])
+        substeps = record["substeps"]
         if not is_count(substeps):
             raise RunError(f"{folder / RUN_RECORD} is damaged: {substeps} substeps a row")
         program.substeps = substeps

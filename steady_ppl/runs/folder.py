@@ -11,11 +11,10 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from steady_ppl.errors import RunError
-from steady_ppl.utils import schema
-from steady_ppl.utils.files import require_file, whole_file
+from steady_ppl.utils.context import command_line
+from steady_ppl.utils.files import read_json, require_file, whole_file
 from steady_ppl.utils.schema import ANYTHING, BOOL, LINES, TEXT, WHOLE, mismatch
 from steady_ppl.utils.tensor_files import read_tensors
-from steady_ppl.utils.text import command_line
 
 PARAMETERS, RUN_RECORD, POSTERIOR = "parameters.safetensors", "run.json", "posterior.nc"
 CHECKPOINT, DISCOVERY = "checkpoint.safetensors", "discovery.json"
@@ -25,15 +24,15 @@ BACKUP, LOCK, JOURNAL = "previous", ".lock", "journal"
 RUN_FORMAT = 1  # number of the record's format
 FINISHED = ("finished", "interrupted")  # what the record of a run that can be used says
 BEGUN_RECORD_FORM = {
-    "format?": WHOLE,
+    "format": WHOLE,
     "program": ({"class": TEXT, "file": TEXT, "sha256": TEXT}, None),
     "recipe": TEXT,
     "status": TEXT,
     "command?": (TEXT, None),
 }
 FINISHED_RECORD_FORM = {
-    "effects?": LINES,
-    "substeps?": WHOLE,
+    "effects": LINES,
+    "substeps": WHOLE,
     "known_start": BOOL,
     "seed": WHOLE,
     "settings": {str: ANYTHING},
@@ -156,19 +155,36 @@ def require_same(folder: Path, begun: Mapping[str, Any]) -> None:
     for key, what in inputs.items():
         if before.get(key) != begun[key]:
             raise RunError(f"{folder}: --resume goes on with the same {what}, but it is another or has changed since")
-    if before.get("option_files", {}) != begun["option_files"]:
+    if before.get("option_files") != begun["option_files"]:
         same = " and ".join(begun["option_files"])
         raise RunError(f"{folder}: --resume goes on with the same {same}; a file has changed")
     for key in ("recipe", "known_start", "seed", "options", "begun_substeps"):
-        then = before.get(key, 1 if key == "begun_substeps" else None)
-        if then != begun[key]:
-            name = key.removeprefix("begun_")
+        if before.get(key) != begun[key]:
+            name, then = key.removeprefix("begun_"), before.get(key)
             raise RunError(f"{folder}: --resume needs the same {name}: {then} then, {begun[key]} now")
+
+
+def read_versioned(file: Path, form: Any, known: int, what: str) -> Any:
+    """Read JSON of a form, whose `format` is a number up to the one that is known. RunError: it is damaged, a newer
+    steady-ppl wrote it, or there is none, so that its folder is not `what`."""
+    try:
+        record = read_json(file, RunError)
+    except (FileNotFoundError, NotADirectoryError):
+        raise RunError(f"{file.parent} is not {what}: it has no {file.name}") from None
+    number = record.get("format") if isinstance(record, dict) else None
+    if isinstance(number, int) and number > known:
+        raise RunError(
+            f"{file.parent} was written by a newer steady-ppl: its form is number {number}, this one reads up to "
+            f"{known}; install that version or a later one to read it"
+        )
+    if problem := mismatch(record, form):
+        raise RunError(f"{file} is damaged: {problem}")
+    return record
 
 
 def read_record(folder: Path) -> dict[str, Any]:
     """Read `run.json`; RunError where there is none, it is damaged, or a newer steady-ppl wrote it."""
-    record = schema.read_record(folder / RUN_RECORD, BEGUN_RECORD_FORM, RUN_FORMAT, "a run")
+    record = read_versioned(folder / RUN_RECORD, BEGUN_RECORD_FORM, RUN_FORMAT, "a run")
     if record["status"] in FINISHED and (problem := mismatch(record, FINISHED_RECORD_FORM)):
         raise RunError(f"{folder / RUN_RECORD} is damaged: {problem}")
     return record

@@ -148,7 +148,7 @@ def run_recipe(
             columns = for_program(program, part)
             doubts += [said for said in diagnose_units(program, columns) if said not in doubts]
             if known_start:
-                _ = columns.known_start
+                columns.require_known_start()
     declared = {key: value.clone() for key, value in program.state_dict().items()}
     begun = {
         "program": program_source(program, folder),

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.errors import FilterError, ProgramError
+from steady_ppl.errors import FilterError, ProgramError, UsageError
 from steady_ppl.model.handlers import KnownStart, Recording, Standardised, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import divergence
@@ -106,7 +106,7 @@ class ParticleFilter:
     def __post_init__(self) -> None:
         particles, data, kernels = self.particles, self.data, self.kernels
         if self.proposal.looks_ahead and self.on_frame is not None:
-            raise ValueError(
+            raise UsageError(
                 "on_frame sees what is predicted: a filter that looks ahead has seen the later measurements"
             )
         self.bootstrap = type(self.proposal) is Proposal
@@ -235,6 +235,7 @@ def particle_filter(
 
     Raises:
         FilterError: every weight is zero; names trajectory and time.
+        UsageError: `on_frame` is given with a proposal that looks ahead.
     """
     along = ParticleFilter(
         program,

@@ -10,7 +10,7 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.errors import ProgramError, SteadyError
+from steady_ppl.errors import ProgramError, SteadyError, require
 from steady_ppl.model.handlers import Recording, as_vector, draw_starts, running
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.model.stability import counts_rows, is_step
@@ -45,10 +45,12 @@ def simulate(
 
     Raises:
         ProgramError: a state is not finite.
+        UsageError: `trajectories` is below 1.
     """
+    require(trajectories is None or trajectories > 0, "trajectories", trajectories, "at least 1")
     with seeded(seed, "simulate"):
         if like is None:
-            rows, drives = round(program.duration / program.step) + 1, trajectories or 1
+            rows, drives = round(program.duration / program.step) + 1, 1 if trajectories is None else trajectories
             time = (torch.arange(rows, dtype=torch.float64) * program.step)[:, None].repeat(1, drives)
             measurements = time.new_zeros((rows, drives, len(program.measurements)))
             like = Trajectories(

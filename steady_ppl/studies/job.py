@@ -26,8 +26,7 @@ from steady_ppl.data.table import read_table
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.datasets.alpha_truck import read_alpha_truck
 from steady_ppl.discovery.discover import discover
-from steady_ppl.effects import Variant, chosen_variant, parsed
-from steady_ppl.effects.attach import with_effects
+from steady_ppl.effects import Variant, chosen_variant, parsed, with_effects
 from steady_ppl.errors import DataError, RunError, UsageError
 from steady_ppl.likelihood.evidence import choose_filter, log_likelihood
 from steady_ppl.model.loading import load_program, program_file
@@ -338,7 +337,7 @@ def base_simulator(job: Job) -> Program:
 def simulator(job: Job) -> Program:
     """What simulates the drives, with the effect that its owner's program lacks."""
     owner, effect = base_simulator(job), job.data["effect"]
-    return with_effects(owner, [effect], say=lambda line: None) if effect else owner
+    return with_effects(owner, [effect])[0] if effect else owner
 
 
 def planted_effect(job: Job) -> tuple[Variant | None, list[float]]:

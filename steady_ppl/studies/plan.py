@@ -9,16 +9,16 @@ import itertools
 import json
 import math
 import os
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from steady_ppl.errors import RunError, UsageError, labelled
+from steady_ppl.runs.folder import read_versioned
 from steady_ppl.studies.job import FIGURES, HELD_OUT, TASKS, Job, JobFiles, is_program, without_folder
-from steady_ppl.utils.files import require_file, whole_file
-from steady_ppl.utils.schema import ANYTHING, BOOL, LINES, NUMBER, TEXT, WHOLE, mismatch, read_record
+from steady_ppl.utils.files import read_toml, whole_file
+from steady_ppl.utils.schema import ANYTHING, BOOL, LINES, NUMBER, TEXT, WHOLE, mismatch, surplus
 from steady_ppl.utils.text import shown
 
 MAX_PANELS, MAX_PUBLISHED, MAX_LABEL_LENGTH = 12, 100, 1000  # of a picture; lines of a panel; characters
@@ -101,13 +101,7 @@ class Plan:
 def read_plan(path: Path, data: Path | None = None) -> Plan:
     """Read a study from a TOML file, `data` in place of the folder of logs or tables that it names. UsageError says
     what is wrong, and where."""
-    require_file(path, UsageError)
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UsageError(f"there is no study {path}") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise UsageError(f"{path} cannot be read as TOML: {error}") from error
+    content = read_toml(path)
     with labelled(str(path)):
         return _plan(content, path.parent, data)
 
@@ -147,14 +141,9 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
 
 def _unknown(content: Mapping[str, Any]) -> str | None:
     """A name that means nothing, so that one that is misspelt does not pass for a default."""
-    places = [("", content, PLAN_FORM), *(("method.", one, METHOD_FORM) for one in content["method"])]
-    places += [("picture.", content["picture"], PICTURE_FORM)] if "picture" in content else []
-    for place, given, form in places:
-        known = [key.rstrip("?") for key in form]
-        for name in given:
-            if name not in known:
-                return f"{place}{name} means nothing here; there are {', '.join(known)}"
-    return None
+    methods = [surplus(one, METHOD_FORM, "method.") for one in content["method"]]
+    problems = (surplus(content, PLAN_FORM), *methods, surplus(content.get("picture", {}), PICTURE_FORM, "picture."))
+    return next(filter(None, problems), None)
 
 
 def _jobs(content: Mapping[str, Any], task: str, source: Axes, methods: list[dict]) -> Iterator[Job]:
@@ -220,10 +209,8 @@ def _source_axes(folder: Path, given: Mapping[str, Any], instead: Path | None, t
         raise UsageError(f"data has {' and '.join(named) or 'no source'}, expected one of {', '.join(SOURCES)}")
     (kind,) = named
     sayable = {name: usual for name, usual in SOURCES[kind].items() if (task, name) != ("discover", "test")}
-    surplus = [name for name in given if name not in {kind, *sayable}]
-    if surplus:
-        known = ", ".join(sayable) or "nothing else"
-        raise UsageError(f"data.{surplus[0]} means nothing beside {kind}; there is {known}")
+    if problem := surplus(given, [kind, *sayable], "data."):
+        raise UsageError(problem)
     if not isinstance(given[kind], str):
         raise UsageError(f"data.{kind} is {given[kind]!r}, expected a path")
     if instead is not None and kind == "simulate":
@@ -250,7 +237,7 @@ def _method_axes(folder: Path, given: Mapping[str, Any], task: str) -> dict[str,
     if not given["name"].strip():
         raise UsageError(f"method.name is {given['name']!r}, expected a name")
     if task == "discover" and "recipe" in given:
-        raise UsageError(f"method {given['name']}: a recipe means nothing to a search")
+        raise UsageError(f"method {given['name']}: a search takes no recipe")
     recipe = given.get("recipe", "steady") if task == "fit" else ""
     axes = {name: _axis(name, value) for name, value in given.get("settings", {}).items()}
     return {
@@ -334,7 +321,7 @@ def record_plan(plan: Plan, folder: Path) -> None:
 def recorded_plan(folder: Path) -> Plan:
     """The plan that the results in a folder are of; RunError where there is none, it is damaged, or a newer steady-ppl
     wrote it."""
-    content = read_record(folder / STUDY_RECORD, PLAN_RECORD_FORM, STUDY_FORMAT, "a study")
+    content = read_versioned(folder / STUDY_RECORD, PLAN_RECORD_FORM, STUDY_FORMAT, "a study")
     picture = content["picture"]
     if problem := _undrawable(content["title"], picture):
         raise RunError(f"{folder / STUDY_RECORD} is damaged: {problem}")

@@ -12,7 +12,7 @@ from steady_ppl.comparison.evaluate import OPEN_LOOP
 from steady_ppl.discovery.discover import discover
 from steady_ppl.errors import ComputationError, RunError, UsageError, labelled
 from steady_ppl.model.loading import load_program
-from steady_ppl.model.program import Program, error_groups, for_program
+from steady_ppl.model.program import Program, error_indices, for_program
 from steady_ppl.runs.fit import packages_text
 from steady_ppl.runs.recipes import find_recipe, require_settings
 from steady_ppl.smc.simulate import simulate
@@ -122,14 +122,14 @@ def require_runnable(plan: Plan) -> None:
         with labelled(f"method {method}"):
             read = for_program(program, given)
             if first.known_start:
-                _ = read.known_start
+                read.require_known_start()
     if plan.task == "fit" and plan.picture is not None:
         _require_figures(plan.picture.columns, [program for _, program in programs])
 
 
 def _require_figures(columns: Sequence[str], programs: Sequence[Program]) -> None:
     """Each is of an error that one of the programs has."""
-    errors = {"total": None} | {name: None for program in programs for name in error_groups(program)}
+    errors = {"total": None} | {name: None for program in programs for name in error_indices(program)}
     known = dict.fromkeys(ERRORS, errors) | {"measurement": dict.fromkeys(("one_step", "coverage_90", *OPEN_LOOP))}
     for column in columns:
         group, _, name = column.partition(".")

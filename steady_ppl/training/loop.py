@@ -21,7 +21,7 @@ from steady_ppl.errors import RunError, TrainingError, require
 from steady_ppl.gaussian.linearize import why_not_linear
 from steady_ppl.likelihood.evidence import log_likelihood
 from steady_ppl.model.joint import Joint
-from steady_ppl.model.program import Program, for_program
+from steady_ppl.model.program import Program, for_program, parameter_name
 from steady_ppl.smc.filter import STEPS_WORTH_COMPILING
 from steady_ppl.training.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from steady_ppl.utils.cores import one_thread
@@ -232,7 +232,7 @@ def _in_words(figures: Mapping[str, float], steps: int = 0) -> str:
 def _require_finite_gradient(name: str, value: Tensor, step: int) -> None:
     if value.grad is not None and not bool(torch.isfinite(value.grad).all()):
         raise TrainingError(
-            f"the gradient of {name.removesuffix('_unconstrained')} is not finite at step {step + 1}: look for a "
+            f"the gradient of {parameter_name(name)} is not finite at step {step + 1}: look for a "
             "square root, a division or a norm at zero in the program, or for roll-outs that blow up"
         )
 

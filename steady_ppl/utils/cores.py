@@ -19,10 +19,12 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from multiprocessing.connection import wait
 from typing import IO, TYPE_CHECKING, Any
+
+from steady_ppl.utils.context import bound
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -68,14 +70,9 @@ def one_thread() -> Iterator[None]:
                 torch.set_num_threads(_given)
 
 
-@contextmanager
-def one_core() -> Iterator[None]:
+def one_core() -> AbstractContextManager[None]:
     """Run all computations of the block in this process, for example where many such processes run."""
-    token = _most.set(1)
-    try:
-        yield
-    finally:
-        _most.reset(token)
+    return bound(_most, 1)
 
 
 def run_in_parallel(computations: Sequence[Computation]) -> list[Output]:

@@ -1,7 +1,8 @@
-"""Files: written whole or not at all, refused early, read as JSON; pictures."""
+"""Files: written whole or not at all, refused early, read as JSON or TOML; pictures."""
 
 import json
 import os
+import tomllib
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -88,7 +89,20 @@ def finite_json(
     try:
         return json.dumps(content, indent=indent, separators=separators, allow_nan=False)
     except ValueError as error:
-        raise ComputationError(f"{place} is not written: a figure is not finite, the program has blown up") from error
+        raise ComputationError(f"{place} is not written: a figure is not finite, the program diverges") from error
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """What a TOML file says; UsageError where it cannot be read."""
+    require_file(path, UsageError)
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise UsageError(f"{path} is not TOML: {str(error).partition(chr(10))[0]}") from error
+    except RecursionError:
+        raise UsageError(f"{path} is not TOML that can be read: it is nested too deeply") from None
 
 
 def read_json(path: Path, refused: type[SteadyError]) -> Any:

@@ -1,20 +1,17 @@
-"""What lower packages call of higher ones. The root, which imports all, puts the functions here."""
+"""What lower packages call of higher ones. The root, which is imported before any of them, puts the functions here."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Concatenate, TypeVar
 
+Given = TypeVar("Given")
 
-def _absent(*arguments: Any, **options: Any) -> Any:
-    raise RuntimeError("the root of steady_ppl has not been imported")
-
-
-html: Callable[[Any], str] = _absent
+html: Callable[[object], str] = repr
 """The HTML that a notebook shows of a value: `plotting.notebook`."""
 
-attach_listed: Callable[[Any], Any] = _absent
+attach_listed: Callable[[object], object]
 """Give a program the effects that its class lists: `effects.attach`."""
 
-with_effect: Callable[..., Any] = _absent
+with_effect: Callable[Concatenate[Given, ...], Given]
 """A copy of a program with an effect: `effects.attach`."""
 
 

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.errors import FilterError, RunError
+from steady_ppl.utils.context import bound
 from steady_ppl.utils.cores import Output
 from steady_ppl.utils.schema import ANYTHING, TEXT, mismatch
 from steady_ppl.utils.tensor_files import read_tensors, write_tensors
@@ -38,11 +39,8 @@ def journal(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"{folder} cannot be written: {error.strerror}") from error
-    token = _files.set(folder / f"{number:06d}.safetensors" for number in itertools.count(1))
-    try:
+    with bound(_files, (folder / f"{number:06d}.safetensors" for number in itertools.count(1))):
         yield
-    finally:
-        _files.reset(token)
     shutil.rmtree(folder)
 
 
@@ -71,7 +69,7 @@ def _read(file: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         said = None
     state, now = tensors.get(RANDOM_STATE), torch.get_rng_state()
     if mismatch(said, ENTRY_FORM) is not None or state is None or (state.shape, state.dtype) != (now.shape, now.dtype):
-        raise RunError(f"{file} is damaged: it is no piece of a search; --force begins the search anew")
+        raise RunError(f"{file} is corrupt: use --force to restart the search")
     return tensors, said
 
 

@@ -6,9 +6,11 @@ with stages(("smoothing", 1), ("simulating", 3)) as begin:   # names and their s
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+
+from steady_ppl.utils.context import bound
 
 Listener = Callable[[str, float], None]
 
@@ -27,15 +29,10 @@ class _Stage:
 _stage: ContextVar[_Stage | None] = ContextVar("stage", default=None)
 
 
-@contextmanager
-def listening(listener: Listener) -> Iterator[None]:
+def listening(listener: Listener) -> AbstractContextManager[None]:
     """Tell `listener` what is begun and which share of the whole is done, whenever a stage begins; at the end of the
     outermost ones it hears no name and a share of 1."""
-    token = _stage.set(_Stage(listener))
-    try:
-        yield
-    finally:
-        _stage.reset(token)
+    return bound(_stage, _Stage(listener))
 
 
 @contextmanager

@@ -7,11 +7,8 @@ with a `?` need not be there, and perhaps others; `{str: form}` for any keys; `P
 
 import math
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
-from steady_ppl.errors import RunError
-from steady_ppl.utils.files import read_json
 from steady_ppl.utils.text import shown
 
 NUMBER, WHOLE, TEXT, BOOL = "a finite number", "a whole number from 0 to 2^63", "text", "true or false"
@@ -55,22 +52,10 @@ def mismatch(content: Any, form: Any, place: str = "") -> str | None:
     return None if _is(content, form) else _wrong(content, place, form)
 
 
-def read_record(file: Path, form: Any, known: int, what: str) -> Any:
-    """Read JSON of a form, whose `format` is a number up to the one that is known. RunError: it is damaged, a newer
-    steady-ppl wrote it, or there is none, so that its folder is not `what`."""
-    try:
-        record = read_json(file, RunError)
-    except (FileNotFoundError, NotADirectoryError):
-        raise RunError(f"{file.parent} is not {what}: it has no {file.name}") from None
-    number = record.get("format") if isinstance(record, dict) else None
-    if isinstance(number, int) and number > known:
-        raise RunError(
-            f"{file.parent} was written by a newer steady-ppl: its form is number {number}, this one reads up to "
-            f"{known}; install that version or a later one to read it"
-        )
-    if problem := mismatch(record, form):
-        raise RunError(f"{file} is damaged: {problem}")
-    return record
+def surplus(content: Iterable[str], known: Iterable[str], place: str = "") -> str | None:
+    """Return which key has no meaning, in words; None where all are `known`, which may be the keys of a form."""
+    keys = [key.rstrip("?") for key in known]
+    return _first(f"unknown key {place}{key}; there are {', '.join(keys)}" for key in content if key not in keys)
 
 
 def count(numbers: Any) -> int:

@@ -1,20 +1,16 @@
-"""Text for a terminal, which obeys what is written to it; and the command line, for a run's record."""
+"""Text for a terminal, which obeys what is written to it."""
 
-import shlex
 import sys
 import unicodedata
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Collection, Sequence
+
+from steady_ppl.utils.context import is_quiet
 
 # what moves the cursor, colours, renames the window, turns lines round, is not seen, or cannot be written at all
 INVISIBLE = ("Cc", "Cf", "Cs", "Zl", "Zp")  # categories of Unicode: control, format, half of a pair, line separators
 Say = Callable[[str], None]  # tells a person one line
 TEXT_WIDTH = 100  # characters of a line in the text of a result
 MAX_LINE_LENGTH = 1000  # characters of a line that is said; a file that somebody gives can put more into it
-
-_quiet: ContextVar[bool] = ContextVar("quiet", default=False)
-_command: ContextVar[str | None] = ContextVar("command", default=None)
 
 
 def printable(text: str, kept: str = "\t\n") -> str:
@@ -53,21 +49,6 @@ def one_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
-@contextmanager
-def quietly(quiet: bool) -> Iterator[None]:
-    """Say nothing but errors and results, if asked for."""
-    token = _quiet.set(quiet)
-    try:
-        yield
-    finally:
-        _quiet.reset(token)
-
-
-def is_quiet() -> bool:
-    """Whether only errors and results are wanted."""
-    return _quiet.get()
-
-
 def say(*remarks: str, always: bool = False) -> None:
     """Words to the person, beside what a script reads; errors are said `always`."""
     for remark in remarks if always or not is_quiet() else ():
@@ -75,22 +56,7 @@ def say(*remarks: str, always: bool = False) -> None:
         tell("\n".join([f"steady: {part}" for part in lines[:1]] + lines[1:]), aside=True)
 
 
-@contextmanager
-def commanded(words: Sequence[str]) -> Iterator[None]:
-    """Let the record of every run that the block makes say which command line made it."""
-    token = _command.set(shlex.join(words))
-    try:
-        yield
-    finally:
-        _command.reset(token)
-
-
-def command_line() -> str | None:
-    """The words of it as a shell takes them; None in Python."""
-    return _command.get()
-
-
-def number(value: float | None, form: str) -> str:
+def figure(value: float | None, form: str) -> str:
     """A figure as text, a dash where there is none."""
     return "–" if value is None else f"{value:{form}}"
 

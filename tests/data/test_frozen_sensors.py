@@ -9,7 +9,7 @@ import torch
 from examples import example
 
 import steady_ppl as st
-from steady_ppl.data.frozen_sensors import MIN_STRETCH_ROWS, frozen_stretches, masked
+from steady_ppl.data.frozen_sensors import MIN_STRETCH_ROWS, frozen_stretches, without_stretches
 
 
 def table(rows: int = 61) -> st.Trajectories:
@@ -65,7 +65,7 @@ def test_masking_takes_measurements_and_states_of_the_stretch_alone() -> None:
     states = data.states.clone()
     states[:, 1, 0] = interpolated(states[:, 1, 0], 0, 21)
     there = replace(data, states=states)
-    kept = masked(there, frozen_stretches(there))
+    kept = without_stretches(there, frozen_stretches(there))
     assert not kept.observed[:22, 1].any() and kept.observed[22:, 1].all() and kept.observed[:, [0, 2]].all()
     assert torch.isfinite(kept.states[0]).all()  # a known start stays
     assert kept.states[1:22, 1].isnan().all() and torch.equal(kept.states[22:, 1], there.states[22:, 1])
@@ -81,7 +81,7 @@ def test_a_vehicle_at_rest_is_left_alone_and_a_sensor_that_hangs_meanwhile_is_ma
     there = replace(data, states=states, measurements=measurements)
     (found,) = frozen_stretches(there)
     assert found.rows == (30, 44) and found.columns == ("y.bearing_2",)
-    kept = masked(there, [found])
+    kept = without_stretches(there, [found])
     assert not kept.observed[30:45, 0, 2].any() and int((~kept.observed).sum()) == 15
     assert torch.equal(kept.states, there.states)
 

@@ -66,6 +66,8 @@ def test_curves_may_depend_on_everything_that_a_program_declares():
     } <= found.keys()
     pendulum = example("pendulum")
     assert set(variables(pendulum, torch.ones(2), torch.ones(1), time, {})) == {"angle", "rate", "torque", "time"}
+    pendulum.resting = ("angle [rad]",)
+    assert set(variables(pendulum, torch.ones(2), torch.ones(1), time, {})) == {"rate", "torque", "time"}
 
 
 def test_a_variable_that_stands_still_has_no_knots():

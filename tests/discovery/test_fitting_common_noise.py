@@ -14,7 +14,7 @@ from pyro.nn import PyroParam
 
 from models.linear_gaussian import LinearGaussian
 from steady_ppl import stack
-from steady_ppl.data.trajectories import joined
+from steady_ppl.data.trajectories import concatenated
 from steady_ppl.discovery import fitting
 from steady_ppl.discovery.candidates import judged
 from steady_ppl.discovery.fitting import noise_numbers, with_common_noise
@@ -107,7 +107,7 @@ def test_programs_that_have_everything_in_common_are_one(priors):
     train, valid = halves(3, noise=0.4, counts=(4, 6))
     pooled = example("linear_gaussian")
     pooled.priors = priors
-    both = joined(train=train, valid=valid)
+    both = concatenated(train=train, valid=valid)
     whole = maximise(Problem(pooled, both, True), precision=1e-4)
     terms, orders = [], ([0, 1, 2, 3], [2, 0, 3, 1])
     for data, order in zip((train, valid), orders, strict=True):

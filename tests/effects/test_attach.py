@@ -189,6 +189,19 @@ def test_an_init_that_fails_is_heard() -> None:
 def test_programs_with_the_same_effect_are_of_one_class():
     program = example("hovercraft")
     one = program.with_effect("linear_drag", 0.1)
-    variant = type(one).attached["linear_drag"]
-    assert type(program.with_effect(variant, 0.3)) is type(program.with_effect(variant, 0.5)) is type(one)
+    (variant,) = attached(one)
+    assert type(program.with_effect(variant, 0.3)) is type(program.with_effect("linear_drag", 0.5)) is type(one)
     assert type(one.with_effect("wind")) is not type(one)
+    saturated = [type(program.with_effect("thrust_saturation", knee=knee)) for knee in (0.6, 0.5, 0.6)]
+    assert saturated[0] is saturated[2] is not saturated[1]
+
+
+def test_a_class_keeps_its_name_where_a_program_lists_the_same_effect() -> None:
+    class Listing(type(example("hovercraft"))):
+        def __init__(self, *effects: str) -> None:
+            super().__init__()
+            self.effects = effects
+
+    listed, added = Listing("linear_drag=0.1"), Listing().with_effect("linear_drag", 0.1)
+    assert type(listed).__name__ == "Listing" and type(added).__name__ == "ListingWithLinearDrag"
+    assert type(Listing("linear_drag=0.2")) is type(listed)

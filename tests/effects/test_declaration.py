@@ -42,7 +42,7 @@ def test_probes_go_with_the_size_of_the_commands() -> None:
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
-        ({"typical": 0.0}, "none would feel it"),
+        ({"typical": 0.0}, "must be finite and not zero, got 0.0"),
         ({"typical": (0.1, 0.1)}, "2 typical numbers for 1 components"),
         ({"typical": (0.1, 0.1), "components": ("east", "north"), "sign": 1}, "has no sign"),
         ({"limit": 0.0}, "a magnitude above zero"),

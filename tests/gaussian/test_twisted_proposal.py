@@ -14,7 +14,7 @@ from oracles import CartPosterior, assert_mean, cart_parameters, kalman
 from paths import anywhere, at_its_mode
 from torch import Tensor
 
-from steady_ppl import FilterError, particle_filter, seeded, stack
+from steady_ppl import FilterError, UsageError, particle_filter, seeded, stack
 from steady_ppl.gaussian import twisted_proposal
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import smooth, smoother_paths
@@ -158,14 +158,14 @@ def test_paths_of_a_filter_with_a_bad_twist_have_the_moments_of_the_exact_smooth
 @pytest.mark.parametrize("share", [-0.1, 1.0, 1.5, math.nan])
 def test_the_untwisted_share_is_below_one(cart, even, share):
     ahead = smooth(Problem(cart, even), anywhere(cart, even), passes=2)
-    with pytest.raises(ValueError, match=r"\[0, 1\)"):
+    with pytest.raises(UsageError, match=r"\[0, 1\)"):
         Twist(ahead, untwisted=share)
 
 
 @pytest.mark.parametrize("weight", [0.0, -0.5, 1.1, math.nan])
 def test_the_weight_of_a_tempered_twist_is_at_most_one(cart, even, weight):
     ahead = smooth(Problem(cart, even), anywhere(cart, even), passes=2)
-    with pytest.raises(ValueError, match=r"\(0, 1\]"):
+    with pytest.raises(UsageError, match=r"\(0, 1\]"):
         Twist(ahead, tempered=weight)
 
 
@@ -180,7 +180,7 @@ def test_a_tempered_twist_is_wider_and_the_estimate_stays_unbiased(cart, even):
 
 def test_a_filter_that_looks_ahead_shows_no_frames(cart, even):
     twist = Twist(smooth(Problem(cart, even), anywhere(cart, even), passes=2))
-    with pytest.raises(ValueError, match="on_frame"):
+    with pytest.raises(UsageError, match="on_frame"):
         particle_filter(cart, even, particles=5, proposal=twist, on_frame=lambda *_: None)
 
 

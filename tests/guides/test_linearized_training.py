@@ -16,6 +16,7 @@ from steady_ppl import (
     GaussianGuide,
     LookaheadGuide,
     Optimization,
+    UsageError,
     Validation,
     train,
 )
@@ -146,7 +147,7 @@ def test_a_guide_refuses_other_drives_of_the_same_labels():
     program = example("hovercraft:HovercraftTruth").requires_grad_(False)
     looking = GaussianGuide(program, draws=4, known_start=True, tempering=Constant())
     looking.refresh(drives(program, 3, 12), 0.0)
-    with pytest.raises(ValueError, match="remembers other drives of the same labels"):
+    with pytest.raises(UsageError, match="remembers other drives of the same labels"):
         looking.refresh(drives(program, 3, 11), 0.1)
 
 

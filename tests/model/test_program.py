@@ -13,7 +13,7 @@ from pyro.nn import PyroParam
 
 from steady_ppl import DataError, Program, ProgramError, load_program
 from steady_ppl.model import program as form
-from steady_ppl.model.program import error_groups, for_program, names, units
+from steady_ppl.model.program import error_indices, for_program, names, units
 
 # --- declarations -----------------------------------------------------------------------------------------------------
 
@@ -42,13 +42,13 @@ def test_an_earlier_state_lies_back_at_its_velocity_however_many_channels_move_i
 
 
 def test_errors_are_reported_for_the_programs_groups_or_for_each_component() -> None:
-    assert error_groups(example("hovercraft")) == {
+    assert error_indices(example("hovercraft")) == {
         "location": (0, 1),
         "angle": (2,),
         "velocity": (3, 4),
         "yaw_rate": (5,),
     }
-    assert error_groups(example("pendulum")) == {"angle": (0,), "rate": (1,)}
+    assert error_indices(example("pendulum")) == {"angle": (0,), "rate": (1,)}
 
 
 def test_a_program_prints_the_values_of_its_parameters() -> None:

@@ -102,6 +102,7 @@ WRONG = [
     changed(SEEN, "dist.Normal(state, 0.1).to_event(2)", "seen", "(13, 2)", "a scalar or a vector", id="event too big"),
     changed(OBSERVE, "pass", "observe", "sampled 0", "declares 2", id="nothing measured"),
     changed("    channels", "    error_groups = {'way': ('z',)}\n    channels", None, "error_groups", id="error group"),
+    changed("    channels", "    resting = ('z [m]',)\n    channels", None, "resting names 'z'", id="resting"),
     changed('    states = ("x [m]", "v [m/s]")', "", None, "declares no states", id="no states"),
     changed('    measurements = ("x [m]", "v [m/s]")', "", None, "declares no measurements", id="no measurements"),
 ]

@@ -104,7 +104,7 @@ def test_each_drive_has_its_own_plan_and_step() -> None:
         ({"after": -1.0}, "trajectory 1 begins after -1 s"),
         ({"controls": torch.zeros(3, 5)}, r"shape \(3, 5\): expected \(rows, 2\) or \(rows, 3, 2\), for left, right"),
         ({"controls": torch.zeros(0, 2)}, "planned controls of shape"),
-        ({"controls": torch.zeros(3, 2), "step": 0.0}, "a step of 0.0 s leads nowhere"),
+        ({"controls": torch.zeros(3, 2), "step": 0.0}, "step must be positive, got 0.0 s"),
     ],
 )
 def test_what_cannot_be_forecast_is_refused(ask: dict, said: str) -> None:

@@ -9,7 +9,7 @@ import torch
 from examples import drives, example
 from oracles import START_MEAN, START_SD, assert_mean
 
-from steady_ppl import ProgramError, simulate
+from steady_ppl import ProgramError, UsageError, simulate
 
 NAMES = (
     "linear_gaussian",
@@ -67,6 +67,11 @@ def test_drives_like_others_have_their_clock_controls_gaps_and_names():
     assert not data.observed.all() and (data.measurements[~data.observed] == 0).all()
     assert data.states[~data.rows].isnan().all() and data.states[data.rows].isfinite().all()
     assert not torch.equal(data.states[0], like.states[0])
+
+
+def test_no_trajectories_are_refused() -> None:
+    with pytest.raises(UsageError, match="trajectories is 0: it must be at least 1"):
+        simulate(example("hovercraft"), 0)
 
 
 def test_a_program_that_blows_up_is_said_to():

@@ -32,11 +32,11 @@ def test_every_list_is_an_axis_and_seeds_are_outermost(tmp_path: Path):
         ('title = "Small"', "", "has no title"),
         ("seeds = [1, 2]", "seeds = [-1]", r"seeds\[0\] is -1"),
         ("seeds = [1, 2]", "seeds = []", "at least one seed"),
-        ("known_start", "known_stat", "known_stat means nothing here"),
-        ("train = 2", "trian = 2", "data.trian means nothing beside simulate"),
+        ("known_start", "known_stat", "unknown key known_stat"),
+        ("train = 2", "trian = 2", "unknown key data.trian; there are simulate, train"),
         ("simulate", "simulation", "data has no source"),
         ('simulate = "{model}"', 'simulate = "{model}"\ntables = "."', "data has simulate and tables"),
-        ("settings =", "setting =", "method.setting means nothing here"),
+        ("settings =", "setting =", "unknown key method.setting"),
         ("[50, 60]", "[50, 50]", "learned with seed 1 is there twice: .* lists values that differ"),
         ("seeds = [1, 2]", "seeds = [1, 1]", "as declared with seed 1 is there twice: .* seeds"),
         ('"as declared"', '" "', "method.name is ' ', expected a name"),
@@ -46,7 +46,7 @@ def test_every_list_is_an_axis_and_seeds_are_outermost(tmp_path: Path):
         ("train = 2", "train = 1.5", r"data.train\[0\] is 1.5, expected a whole number"),
         ("train = 2", "effect = 3", r"data.effect\[0\] is 3, expected text"),
         ("x = ", "z = ", "picture has no x"),
-        ("title", "title title", "cannot be read as TOML"),
+        ("title", "title title", "is not TOML"),
         ('simulate = "{model}"', 'tables = "nowhere"', "there is no folder .*nowhere"),
         ('simulate = "{model}"', 'simulate = "a\\u0000.py"', "is no path"),
         ('program = "{model}"', 'program = "a\\u0000.py"', "is no path"),
@@ -87,13 +87,13 @@ def test_what_is_wrong_with_a_study_is_named(tmp_path: Path, old: str, new: str,
 
 
 def test_a_search_has_no_recipe(tmp_path: Path):
-    with pytest.raises(UsageError, match="method it: a recipe means nothing to a search"):
+    with pytest.raises(UsageError, match="method it: a search takes no recipe"):
         read_plan(written(tmp_path, search_study() + 'recipe = "hand"\n'))
 
 
 def test_a_search_has_no_test_drives(tmp_path: Path):
     assert "data.test" not in read_plan(written(tmp_path, search_study())).jobs[0].columns
-    with pytest.raises(UsageError, match="data.test means nothing beside simulate; there is train, valid, effect, sig"):
+    with pytest.raises(UsageError, match="unknown key data.test; there are simulate, train, valid, effect, sig"):
         read_plan(written(tmp_path, search_study().replace("valid = 2", "valid = 2\ntest = 2")))
 
 

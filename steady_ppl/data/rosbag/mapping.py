@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import re
-import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from steady_ppl.errors import UsageError, labelled
-from steady_ppl.utils.files import require_file
-from steady_ppl.utils.schema import NUMBER, TEXT, mismatch
+from steady_ppl.utils.files import read_toml
+from steady_ppl.utils.schema import NUMBER, TEXT, mismatch, surplus
 
 ALLOWED_VALUES = {
     "between": (None, "hold", "interpolate"),
@@ -72,9 +71,9 @@ class BagColumn:
             key = "between" if self.between is not None else "longest"
             raise UsageError(f"{key} is for controls (u.); measurements and states are not held: leave it out")
         if abs(self.late) > MAX_LATE:
-            raise UsageError(f"late is {self.late:g} s, expected at most {MAX_LATE:g} s, which are thirty years")
+            raise UsageError(f"late is {self.late:g} s, expected at most {MAX_LATE:g} s")
         if self.scale == 0:
-            raise UsageError("scale is 0, which leaves nothing of what was read")
+            raise UsageError("scale must not be 0")
         if not SPELLING.fullmatch(self.field):
             wanted = "expected names and indices such as linear.x or data[0]"
             raise UsageError(f"field {self.field!r} is not spelt as one: {wanted}")
@@ -126,13 +125,14 @@ class BagMapping:
     @classmethod
     def read(cls, path: str | Path) -> BagMapping:
         """Read a mapping from a TOML file; UsageError names the file and what is wrong in it."""
-        return cls.parse(read_toml(Path(path)), Path(path).name)
+        return cls.parse(read_mapping(Path(path)), Path(path).name)
 
     @classmethod
     def parse(cls, content: Mapping[str, Any], name: str) -> BagMapping:
         """The mapping that a TOML file spells; UsageError, in which the file is called `name`, where it is none."""
         with labelled(name):
-            _known(content, ("step", "columns", "messages"), "")
+            if problem := surplus(content, ("step", "columns", "messages")):
+                raise UsageError(problem)
             if "step" not in content:
                 raise UsageError("there is no step: say how many seconds lie between two rows, for example step = 0.1")
             columns, messages = content.get("columns", {}), content.get("messages", [])
@@ -144,17 +144,9 @@ class BagMapping:
             return cls(found, content["step"], tuple(Path(text) for text in messages))
 
 
-def read_toml(path: Path) -> dict[str, Any]:
+def read_mapping(path: Path) -> dict[str, Any]:
     """What a TOML file spells, `messages` counted from its folder; UsageError where it cannot be read."""
-    require_file(path, UsageError)
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"{path.name}: cannot be read: {error.strerror or error}") from error
-    except ValueError as error:
-        raise UsageError(f"{path.name}: is not TOML: {str(error).partition(chr(10))[0]}") from error
-    except RecursionError:
-        raise UsageError(f"{path.name}: is not TOML that can be read: it is nested too deeply") from None
+    content = read_toml(path)
     if isinstance(content.get("messages"), list):
         content["messages"] = [path.parent / text if isinstance(text, str) else text for text in content["messages"]]
     return content
@@ -184,14 +176,9 @@ def parse_map(text: str) -> tuple[str, dict[str, Any]]:
 
 def _column(name: str, said: Mapping[str, Any]) -> BagColumn:
     keys = ["as" if field.name == "reading" else field.name for field in fields(BagColumn) if field.name != "name"]
-    _known(said, keys, f"column {name}: ")
+    if problem := surplus(said, keys):
+        raise UsageError(f"column {name}: {problem}")
     for key in ("topic", "field"):
         if key not in said:
             raise UsageError(f"column {name}: there is no {key}")
     return BagColumn(name, **{"reading" if key == "as" else key: value for key, value in said.items()})
-
-
-def _known(said: Mapping[str, Any], keys: Sequence[str], where: str) -> None:
-    for key in said:
-        if key not in keys:
-            raise UsageError(f"{where}unknown key {key}; there are {', '.join(keys)}")

@@ -306,7 +306,9 @@ def _of_bag(bag: Bag, sections: dict[tuple[str, str], list[str]]) -> list[str]:
         lines += ["#", f"# {topic}  {' and '.join(types)}  {len(at)} message{'' if len(at) == 1 else 's'}{rate}"]
         missing = next(filter(None, (undefined_type(bag.store, one) for one in types)), None)
         if missing:
-            lines.append(f'#     nobody defines {missing}: messages = ["PACKAGE/msg/NAME.msg"] in the mapping does')
+            lines.append(
+                f'#     {missing} is not defined: name its file, messages = ["PACKAGE/msg/NAME.msg"], in the mapping'
+            )
         elif len(types) == 1:
             fields = list(numeric_fields(bag.store, types[0], first.get(topic)))
             text = ", ".join(field.replace(" ", "\0") for field in fields) or "no number"

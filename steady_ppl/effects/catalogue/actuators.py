@@ -68,7 +68,7 @@ _on_time = partial(_on_controls, limit=2.0, sign=1, between=(0.0, math.inf), cho
 
 
 @_on_commands("1", typical=0.05, limit=0.5, lacks=needs(THRUSTERS))
-def thrust_asymmetry(self: Any, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
+def thrust_asymmetry(self: Program, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     r"""right → (1 + c) right
 
     equation: u_\mathrm{right} \to (1 + c)\,u_\mathrm{right}
@@ -79,7 +79,7 @@ def thrust_asymmetry(self: Any, control: Tensor, time: Tensor, c: Tensor) -> Ten
 
 
 @_on_commands("1", typical=0.08, limit=1.0, choices=_each, lacks=needs(NO_TWO_THRUSTS, CONTROLS))
-def gain_error(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Names) -> Tensor:
+def gain_error(self: Program, control: Tensor, time: Tensor, c: Tensor, controls: Names) -> Tensor:
     r"""u → (1 + c) u of one control
 
     equation: u \to (1 + c)\,u
@@ -90,7 +90,7 @@ def gain_error(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Na
 
 
 @declare(ACTUATORS, "command", "s/m", typical=0.1, limit=1.0, lacks=needs(PLANAR))
-def speed_dependent_gain(self: Any, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
+def speed_dependent_gain(self: Program, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     r"""u → (1 - c |v|) u
 
     equation: u \to (1 - c\,|v|)\,u
@@ -103,7 +103,7 @@ def speed_dependent_gain(self: Any, state: Tensor, control: Tensor, time: Tensor
 
 
 @_on_controls("1", typical=0.45, limit=1.0, sign=1, profiled=("knee",), choices=_knees)
-def thrust_saturation(self: Any, control: Tensor, *_: Tensor, c: Tensor, controls: Names, knee: Any) -> Tensor:
+def thrust_saturation(self: Program, control: Tensor, *_: Tensor, c: Tensor, controls: Names, knee: Any) -> Tensor:
     r"""u → u - c sign(u) max(|u| - knee, 0)
 
     equation: u \to u - c\,\mathrm{sign}(u)\max(|u| - u_0, 0)
@@ -115,7 +115,7 @@ def thrust_saturation(self: Any, control: Tensor, *_: Tensor, c: Tensor, control
 
 
 @_on_controls("of the control", typical=0.2, limit=1.0, sign=1, probes=(0.05, 0.15, 0.3), choices=_per_unit)
-def dead_zone(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Names) -> Tensor:
+def dead_zone(self: Program, control: Tensor, time: Tensor, c: Tensor, controls: Names) -> Tensor:
     r"""u → sign(u) max(|u| - c, 0)
 
     equation: u \to \mathrm{sign}(u)\max(|u| - c, 0)
@@ -127,7 +127,7 @@ def dead_zone(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Nam
 
 
 @_on_time("s", typical=0.25, probes=(0.1, 0.3, 0.6))
-def actuator_lag(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Names) -> Tensor:
+def actuator_lag(self: Program, control: Tensor, time: Tensor, c: Tensor, controls: Names) -> Tensor:
     r"""du_acting/dt = (u - u_acting) / c
 
     equation: \dot u_\mathrm{acting} = (u - u_\mathrm{acting}) / c
@@ -138,7 +138,7 @@ def actuator_lag(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: 
 
 
 @_on_time("s", typical=0.2, probes=(0.1, 0.2, 0.4))
-def actuator_delay(self: Any, control: Tensor, time: Tensor, c: Tensor, controls: Names) -> Tensor:
+def actuator_delay(self: Program, control: Tensor, time: Tensor, c: Tensor, controls: Names) -> Tensor:
     r"""u_acting(t) = u(t - c)
 
     equation: u_\mathrm{acting}(t) = u(t - c)
@@ -149,7 +149,7 @@ def actuator_delay(self: Any, control: Tensor, time: Tensor, c: Tensor, controls
 
 
 @_on_controls("1", typical=0.25, limit=1.0, sign=1)
-def battery_sag(self: Any, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
+def battery_sag(self: Program, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     r"""u → (1 - c t/T) u, T the program's duration
 
     equation: u \to (1 - c\,t / T)\,u

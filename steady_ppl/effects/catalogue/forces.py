@@ -91,7 +91,7 @@ _on_any = partial(_force, lacks=needs(PLANAR))
 
 
 @_on_axes("1/s", typical=0.12, limit=1.0, sign=1)
-def linear_drag(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
+def linear_drag(self: Program, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""a = -c v
 
     equation: a = -c\,v
@@ -104,7 +104,7 @@ def linear_drag(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names
 
 
 @_on_axes("1/m", typical=0.06, limit=0.5, sign=1)
-def quadratic_drag(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
+def quadratic_drag(self: Program, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""a = -c v |v| per axis
 
     equation: a = -c\,v\,|v|
@@ -116,7 +116,7 @@ def quadratic_drag(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Na
 
 
 @_on_axes("m/s²", typical=0.1, limit=1.0, sign=1)
-def coulomb_friction(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
+def coulomb_friction(self: Program, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""a = -c v / sqrt(v² + 0.05²)
 
     equation: a = -c\,v / \sqrt{v^2 + 0.05^2}
@@ -128,7 +128,7 @@ def coulomb_friction(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: 
 
 
 @_on_yaw("1/s", typical=0.15, limit=2.0, sign=1)
-def yaw_linear_drag(self: Any, *given: Tensor, c: Tensor, channels: Names) -> Pushes:
+def yaw_linear_drag(self: Program, *given: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""a_yaw = -c ω
 
     equation: a_\mathrm{yaw} = -c\,\omega
@@ -139,7 +139,7 @@ def yaw_linear_drag(self: Any, *given: Tensor, c: Tensor, channels: Names) -> Pu
 
 
 @_on_yaw("1/rad", typical=0.25, limit=3.0, sign=1)
-def yaw_quadratic_drag(self: Any, *given: Tensor, c: Tensor, channels: Names) -> Pushes:
+def yaw_quadratic_drag(self: Program, *given: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""a_yaw = -c ω |ω|
 
     equation: a_\mathrm{yaw} = -c\,\omega\,|\omega|
@@ -150,7 +150,7 @@ def yaw_quadratic_drag(self: Any, *given: Tensor, c: Tensor, channels: Names) ->
 
 
 @_on_yaw("rad/s²", typical=0.04, limit=0.5)
-def yaw_bias(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
+def yaw_bias(self: Program, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""a_yaw = c
 
     equation: a_\mathrm{yaw} = c
@@ -161,7 +161,7 @@ def yaw_bias(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -
 
 
 @_force("m/s²", typical=0.05, limit=0.5, choices=_axes, lacks=needs(ONE_COMPONENT, AXES))
-def acceleration_bias(self: Any, *given: Tensor, c: Tensor, channels: Names) -> Pushes:
+def acceleration_bias(self: Program, *given: Tensor, c: Tensor, channels: Names) -> Pushes:
     """a = c in the body frame
 
     equation: a = c
@@ -179,7 +179,7 @@ def acceleration_bias(self: Any, *given: Tensor, c: Tensor, channels: Names) -> 
     components=("forward", "lateral"),
     lacks=needs(BODY),
 )
-def planar_acceleration_bias(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
+def planar_acceleration_bias(self: Program, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""(a_forward, a_lateral) = (c₁, c₂)
 
     equation: (a_\mathrm{forward}, a_\mathrm{lateral}) = (c_1, c_2)
@@ -191,7 +191,7 @@ def planar_acceleration_bias(self: Any, state: Tensor, *_: Tensor, c: Tensor) ->
 
 
 @_on_springs("1/s²", typical=2.0, limit=50.0)
-def stiffness(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
+def stiffness(self: Program, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""a = -c x
 
     equation: a = -c\,x
@@ -203,7 +203,7 @@ def stiffness(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names) 
 
 
 @_on_springs("1/(m² s²)", typical=3.0, limit=100.0)
-def cubic_stiffness(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
+def cubic_stiffness(self: Program, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""a = -c x³
 
     equation: a = -c\,x^3
@@ -215,7 +215,7 @@ def cubic_stiffness(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: N
 
 
 @_where_it_slips("m/s²", typical=(0.05, -0.03), limit=0.5, components=("x", "y"))
-def slope(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
+def slope(self: Program, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""world-frame acceleration (c₁, c₂)
 
     equation: \dot v_\mathrm{world} = (c_1, c_2)
@@ -228,7 +228,7 @@ def slope(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
 
 
 @_where_it_slips("m/s", typical=(1.0, 0.5), limit=10.0, components=("x", "y"), profiled=("drag",), choices=_drags)
-def wind(self: Any, state: Tensor, *_: Tensor, c: Tensor, drag: Any) -> Pushes:
+def wind(self: Program, state: Tensor, *_: Tensor, c: Tensor, drag: Any) -> Pushes:
     r"""a = -k (v-w)|v-w| + k v|v| per axis, w the world-frame wind (c₁, c₂) in the body frame
 
     equation: a = -k\,(v - w)\,|v - w| + k\,v\,|v|,\quad w = R^\top(c_1, c_2)
@@ -247,7 +247,7 @@ def wind(self: Any, state: Tensor, *_: Tensor, c: Tensor, drag: Any) -> Pushes:
 
 
 @_force("1/kg", typical=0.2, limit=1.0, lacks=needs(THRUSTS, PLANAR))
-def lateral_coupling(self: Any, state: Tensor, control: Tensor, *_: Tensor, c: Tensor) -> Pushes:
+def lateral_coupling(self: Program, state: Tensor, control: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""a_lateral = c (left - right)
 
     equation: a_\mathrm{lateral} = c\,(u_\mathrm{left} - u_\mathrm{right})
@@ -259,7 +259,7 @@ def lateral_coupling(self: Any, state: Tensor, control: Tensor, *_: Tensor, c: T
 
 
 @_where_it_slips("rad/m²", typical=0.1, limit=1.0)
-def weathervane(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
+def weathervane(self: Program, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""a_yaw = -c v_x v_y
 
     equation: a_\mathrm{yaw} = -c\,v_x v_y
@@ -271,7 +271,7 @@ def weathervane(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
 
 
 @_on_any("1", typical=0.15, limit=2.0)
-def magnus(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
+def magnus(self: Program, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""a_lateral = -c v_x ω
 
     equation: a_\mathrm{lateral} = -c\,v_x\,\omega
@@ -283,7 +283,7 @@ def magnus(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
 
 
 @_where_it_slips("m", typical=0.15, limit=1.0)
-def lever_arm(self: Any, state: Tensor, *_: Tensor, c: Tensor, mean: Means) -> Pushes:
+def lever_arm(self: Program, state: Tensor, *_: Tensor, c: Tensor, mean: Means) -> Pushes:
     r"""a_forward = c ω², a_lateral = -c a_yaw
 
     equation: a_\mathrm{forward} = c\,\omega^2,\quad a_\mathrm{lateral} = -c\,a_\mathrm{yaw}
@@ -295,7 +295,7 @@ def lever_arm(self: Any, state: Tensor, *_: Tensor, c: Tensor, mean: Means) -> P
 
 
 @_where_it_slips("1/s", typical=0.2, limit=5.0, sign=1, profiled=("lead",), choices=_leads)
-def side_slip(self: Any, state: Tensor, *_: Tensor, c: Tensor, lead: Any) -> Pushes:
+def side_slip(self: Program, state: Tensor, *_: Tensor, c: Tensor, lead: Any) -> Pushes:
     r"""a_lateral = -c (v_y - k ω)
 
     equation: a_\mathrm{lateral} = -c\,(v_y - k\,\omega)
@@ -307,7 +307,7 @@ def side_slip(self: Any, state: Tensor, *_: Tensor, c: Tensor, lead: Any) -> Pus
 
 
 @_on_any("1/s", typical=0.5, limit=3.0, sign=1, profiled=("x", "y", "radius"), choices=_places)
-def sticky_patch(self: Any, state: Tensor, *_: Tensor, c: Tensor, x: Any, y: Any, radius: Any) -> Pushes:
+def sticky_patch(self: Program, state: Tensor, *_: Tensor, c: Tensor, x: Any, y: Any, radius: Any) -> Pushes:
     r"""a = -c v exp(-d²/2r²), d the distance from a place
 
     equation: a = -c\,v\,\exp(-d^2 / 2 r^2)
@@ -320,7 +320,7 @@ def sticky_patch(self: Any, state: Tensor, *_: Tensor, c: Tensor, x: Any, y: Any
 
 
 @_on_any("m/s²", typical=0.6, limit=10.0, sign=1, null=math.inf, probes=(0.1, 0.2, 0.4, 0.8, 1.6, 3.2), choices=_limits)
-def acceleration_limit(self: Any, state: Tensor, *_: Tensor, c: Tensor, channels: Names, mean: Means) -> Pushes:
+def acceleration_limit(self: Program, state: Tensor, *_: Tensor, c: Tensor, channels: Names, mean: Means) -> Pushes:
     r"""|a| ≤ c
 
     equation: |a| \le c

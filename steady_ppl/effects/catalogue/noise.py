@@ -1,7 +1,6 @@
 """What noise can be besides normal, constant and white."""
 
 from functools import partial
-from typing import Any
 
 from torch import Tensor
 
@@ -32,7 +31,7 @@ _noise = partial(declare, NOISE)
 
 
 @_noise("tails", "1", typical=1 / 3, limit=0.5, sign=1, between=(0.0, 0.49))
-def heavy_tails(self: Any, c: Tensor) -> Tensor:
+def heavy_tails(self: Program, c: Tensor) -> Tensor:
     r"""Student t measurement noise with ν = 1/c degrees of freedom
 
     equation: y \sim t_\nu,\quad c = 1/\nu
@@ -43,7 +42,7 @@ def heavy_tails(self: Any, c: Tensor) -> Tensor:
 
 
 @_noise("blur", "1", typical=1.5, limit=2.0, sign=1, null=1.0, lacks=needs(MEASURED))
-def measurement_noise(self: Any, state: Tensor, c: Tensor) -> Tensor:
+def measurement_noise(self: Program, state: Tensor, c: Tensor) -> Tensor:
     r"""σ → c σ of every measurement
 
     equation: \sigma \to c\,\sigma
@@ -54,7 +53,7 @@ def measurement_noise(self: Any, state: Tensor, c: Tensor) -> Tensor:
 
 
 @_noise("blur", "1/m", typical=0.1, limit=1.0, sign=1, lacks=needs(PLANAR, BEARINGS))
-def range_dependent_noise(self: Any, state: Tensor, c: Tensor) -> Tensor:
+def range_dependent_noise(self: Program, state: Tensor, c: Tensor) -> Tensor:
     r"""σ → σ (1 + c r), r the distance
 
     equation: \sigma \to \sigma\,(1 + c\,r)
@@ -65,7 +64,7 @@ def range_dependent_noise(self: Any, state: Tensor, c: Tensor) -> Tensor:
 
 
 @_noise("spread", "1", typical=2.0, limit=2.0, sign=1, null=1.0, choices=_groups, lacks=needs(CHANNELS))
-def process_noise(self: Any, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
+def process_noise(self: Program, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
     r"""σ → c σ of a channel
 
     equation: \sigma \to c\,\sigma
@@ -76,7 +75,7 @@ def process_noise(self: Any, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
 
 
 @_noise("spread", "s/m", typical=1.0, limit=5.0, sign=1, lacks=needs(SPEED_AND_TURN, PLANAR))
-def command_noise(self: Any, state: Tensor, control: Tensor, *_: Tensor, c: Tensor) -> Pushes:
+def command_noise(self: Program, state: Tensor, control: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""σ → σ (1 + c |command - state|)
 
     equation: \sigma \to \sigma\,(1 + c\,|u - v|)
@@ -90,7 +89,7 @@ def command_noise(self: Any, state: Tensor, control: Tensor, *_: Tensor, c: Tens
 
 
 @_noise("colour", "1", typical=0.6, limit=0.9, between=(-0.99, 0.99), choices=_groups, lacks=needs(MOTION))
-def coloured_noise(self: Any, c: Tensor, channels: Names) -> Pushes:
+def coloured_noise(self: Program, c: Tensor, channels: Names) -> Pushes:
     r"""noise(t+1) = c noise(t) + sqrt(1 - c²) σ ε
 
     equation: n_{t+1} = c\,n_t + \sqrt{1 - c^2}\,\sigma\,\varepsilon

@@ -45,7 +45,7 @@ _on_readings = partial(declare, SENSORS, "measured")
 
 
 @_on_readings("rad", typical=0.035, limit=0.5, lacks=needs(PLANAR, BEARINGS))
-def bearing_bias(self: Any, state: Tensor, measured: Tensor, c: Tensor) -> Tensor:
+def bearing_bias(self: Program, state: Tensor, measured: Tensor, c: Tensor) -> Tensor:
     r"""y → y + c, every bearing
 
     equation: y \to y + c
@@ -56,7 +56,7 @@ def bearing_bias(self: Any, state: Tensor, measured: Tensor, c: Tensor) -> Tenso
 
 
 @_on_readings("rad", typical=0.06, limit=0.5, choices=_each, lacks=needs(PLANAR, TWO_LANDMARKS, BEARINGS))
-def landmark_bias(self: Any, state: Tensor, measured: Tensor, c: Tensor, component: Any) -> Tensor:
+def landmark_bias(self: Program, state: Tensor, measured: Tensor, c: Tensor, component: Any) -> Tensor:
     r"""y_i → y_i + c, one landmark
 
     equation: y_i \to y_i + c
@@ -69,7 +69,7 @@ def landmark_bias(self: Any, state: Tensor, measured: Tensor, c: Tensor, compone
 
 
 @_on_readings("of the measurement", typical=0.05, limit=1.0, choices=_each_of_its_size, lacks=needs(OTHER_SENSORS))
-def sensor_bias(self: Any, state: Tensor, measured: Tensor, c: Tensor, component: Any) -> Tensor:
+def sensor_bias(self: Program, state: Tensor, measured: Tensor, c: Tensor, component: Any) -> Tensor:
     r"""y_i → y_i + c, one measurement
 
     equation: y_i \to y_i + c
@@ -80,7 +80,7 @@ def sensor_bias(self: Any, state: Tensor, measured: Tensor, c: Tensor, component
 
 
 @_on_readings("1", typical=0.03, limit=0.3, lacks=needs(ONE_UNIT))
-def sensor_scale(self: Any, state: Tensor, measured: Tensor, c: Tensor) -> Tensor:
+def sensor_scale(self: Program, state: Tensor, measured: Tensor, c: Tensor) -> Tensor:
     r"""y → (1 + c) y
 
     equation: y \to (1 + c)\,y
@@ -91,7 +91,7 @@ def sensor_scale(self: Any, state: Tensor, measured: Tensor, c: Tensor) -> Tenso
 
 
 @declare(SENSORS, "viewpoint", "s", typical=0.12, limit=1.0, lacks=needs(RATES))
-def clock_offset(self: Any, state: Tensor, c: Tensor) -> Tensor:
+def clock_offset(self: Program, state: Tensor, c: Tensor) -> Tensor:
     r"""y(t) → y(t - c)
 
     equation: y(t) \to y(t - c)

@@ -2,7 +2,6 @@
 
 import math
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -33,7 +32,7 @@ _on_wheels = partial(declare, WHEELS, "push", lacks=needs(SPEED_AND_TURN, PLANAR
     "s", typical=0.2, limit=2.0, sign=1, between=(0.0, math.inf), probes=(0.05, 0.15, 0.4), choices=_each_channel
 )
 def response_time(
-    self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, channels: Names, mean: Means
+    self: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, channels: Names, mean: Means
 ) -> Pushes:
     r"""dv/dt = (v_told - v) / (c + τ), τ what the program has (its step where it says nothing)
 
@@ -46,7 +45,7 @@ def response_time(
 
 
 @_on_command("1", typical=0.5, limit=2.0)
-def curvature_steering(self: Any, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
+def curvature_steering(self: Program, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     r"""turn → (1 - c) turn + c (turn / speed) v
 
     equation: u_\mathrm{turn} \to (1 - c)\,u_\mathrm{turn} + c\,u_\mathrm{turn}\,v / u_\mathrm{speed}
@@ -60,7 +59,7 @@ def curvature_steering(self: Any, state: Tensor, control: Tensor, time: Tensor, 
 
 
 @_on_command("rad/m", typical=0.05, limit=0.5)
-def steering_offset(self: Any, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
+def steering_offset(self: Program, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     r"""turn → turn + c v
 
     equation: u_\mathrm{turn} \to u_\mathrm{turn} + c\,v
@@ -72,7 +71,7 @@ def steering_offset(self: Any, state: Tensor, control: Tensor, time: Tensor, c: 
 
 
 @_on_command("s²/m²", typical=0.02, limit=0.5)
-def understeer(self: Any, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
+def understeer(self: Program, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     r"""turn → (1 - c v²) turn
 
     equation: u_\mathrm{turn} \to (1 - c\,v^2)\,u_\mathrm{turn}
@@ -84,7 +83,7 @@ def understeer(self: Any, state: Tensor, control: Tensor, time: Tensor, c: Tenso
 
 
 @_on_command("1", typical=0.1, limit=1.0)
-def reverse_steering(self: Any, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
+def reverse_steering(self: Program, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
     r"""turn → (1 - c tanh(v/0.1)) turn
 
     equation: u_\mathrm{turn} \to (1 - c\,\tanh(v / 0.1))\,u_\mathrm{turn}
@@ -97,7 +96,9 @@ def reverse_steering(self: Any, state: Tensor, control: Tensor, time: Tensor, c:
 
 
 @_on_lateral_velocity("m", typical=0.1, limit=1.0)
-def lever_arm(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Means) -> Pushes:
+def lever_arm(
+    self: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Means
+) -> Pushes:
     r"""v_y = c ω
 
     equation: v_y \to c\,\omega
@@ -108,7 +109,9 @@ def lever_arm(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Ten
 
 
 @_on_lateral_velocity("rad", typical=0.05, limit=0.5)
-def crab_angle(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Means) -> Pushes:
+def crab_angle(
+    self: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Means
+) -> Pushes:
     r"""v_y = c v_x
 
     equation: v_y \to c\,v_x
@@ -121,7 +124,9 @@ def crab_angle(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Te
 
 
 @_on_lateral_velocity("s", typical=0.05, limit=0.5)
-def slip_angle(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Means) -> Pushes:
+def slip_angle(
+    self: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor, c: Tensor, mean: Means
+) -> Pushes:
     r"""v_y = -c v_x ω
 
     equation: v_y \to -c\,v_x\,\omega
@@ -134,7 +139,7 @@ def slip_angle(self: Any, state: Tensor, control: Tensor, time: Tensor, step: Te
 
 
 @_on_wheels("1/m", typical=0.5, limit=5.0)
-def caster(self: Any, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
+def caster(self: Program, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     r"""a_yaw = -c v_x ω
 
     equation: a_\mathrm{yaw} = -c\,v_x\,\omega

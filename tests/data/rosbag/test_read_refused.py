@@ -20,7 +20,7 @@ Y = ("--map", "y.a=/scan:ranges[0]")
         ((), "Missing argument"),
         (("m.toml",), "import-bag needs at least one BAG and at most one MAPPING.toml"),
         (("drive", "a.toml", "b.toml"), "at most one MAPPING.toml"),
-        (("drive", "nowhere.toml", "--out", "t.csv"), "nowhere.toml: cannot be read: No such file"),
+        (("drive", "nowhere.toml", "--out", "t.csv"), "nowhere.toml cannot be read: No such file"),
         (("drive", "--out", "t.csv"), "name what to take from the bag"),
         (("drive", "--step", "0.1"), "name what to take from the bag"),
         (("drive", *Y, "--step", "0.1"), "name the table to write: --out TABLE"),

@@ -55,7 +55,10 @@ def test_what_a_bag_does_not_define_comes_from_files_or_else_from_humble(
     whole = write_bag(tmp_path / "whole" / "drive", "sqlite", drive())
     same(read_table(tmp_path / "t.csv"), read_bags([whole], BagMapping.read(tmp_path / "mapping.toml")))
     assert steady("import-bag", bag) == 0
-    assert 'nobody defines boat_msgs/msg/Thrust: messages = ["PACKAGE/msg/NAME.msg"]' in capsys.readouterr().out
+    assert (
+        'boat_msgs/msg/Thrust is not defined: name its file, messages = ["PACKAGE/msg/NAME.msg"]'
+        in capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize("types", ["geometry_msgs/%", "sensor_msgs/%"])
