@@ -3,8 +3,6 @@
 `__init__.pyi` lists the public names. Each is imported when it is first used, so that `steady --help` loads no torch.
 """
 
-from collections.abc import Callable
-from importlib import import_module
 from typing import Any
 
 import lazy_loader
@@ -14,10 +12,22 @@ from steady_ppl.utils import hooks
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
-def _imported_when_called(module: str, name: str) -> Callable[..., Any]:
-    return lambda *arguments, **options: getattr(import_module(module, __name__), name)(*arguments, **options)
+def _html(value: object) -> str:
+    from steady_ppl.plotting.notebook import html
+
+    return html(value)
 
 
-hooks.html = _imported_when_called(".plotting.notebook", "html")
-hooks.attach_listed = _imported_when_called(".effects.attach", "attach_listed")
-hooks.with_effect = _imported_when_called(".effects.attach", "with_effect")
+def _attach_listed(program: Any) -> Any:
+    from steady_ppl.effects.attach import attach_listed
+
+    return attach_listed(program)
+
+
+def _with_effect(program: Any, effect: Any, value: Any = None, **options: Any) -> Any:
+    from steady_ppl.effects.attach import with_effect
+
+    return with_effect(program, effect, value, **options)
+
+
+hooks.html, hooks.attach_listed, hooks.with_effect = _html, _attach_listed, _with_effect

@@ -30,8 +30,6 @@ CALLS = {
 }  # fmt: skip
 METHODS = {"exec_module", "load_module", "to_pickle", "read_pickle"}
 ALLOWED = {
-    ("steady_ppl/__init__.py", "importlib.import_module"): "imports its own modules when they are first used",
-    ("steady_ppl/__init__.py", "import_module"): "the same",
     ("steady_ppl/model/loading.py", "exec_module"): "a program or recipe that the person names is code",
     (
         "steady_ppl/studies/executors.py",
