@@ -47,6 +47,9 @@ class Watched:
     def __getattr__(self, name: str) -> None:
         raise Seen(torch.get_num_threads())
 
+    def __len__(self) -> int:
+        raise Seen(torch.get_num_threads())
+
 
 FILTER = {"particles": 2, "known_start": False}
 ENTRIES: dict[str, dict[str, object]] = {
