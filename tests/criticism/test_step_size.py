@@ -29,6 +29,7 @@ from steady_ppl import (
     discover,
     fit_by_likelihood,
     for_program,
+    load_program,
     read_table,
     seeded,
     simulate,
@@ -306,12 +307,16 @@ def test_an_unstable_step_is_told_by_every_command(tmp_path, capsys) -> None:
     source = (MODELS / "linear_gaussian.py").read_text()
     source = source.replace("PyroParam(tensor(0.8)", "PyroParam(tensor(60.0)").replace("LinearGaussian", "Stiff")
     model.write_text(source)
-    write_table(simulate(example("linear_gaussian"), 4, seed=1), tmp_path / "drives.csv")
+    write_table(simulate(example("linear_gaussian"), 10, seed=1), tmp_path / "drives.csv")
     out = tmp_path / "run"
-    assert steady("fit", model, tmp_path / "drives.csv", "--recipe", "likelihood", "--out", out) != 0
-    said = capsys.readouterr().err
-    assert "the model itself diverges at this step: damping · step = 6" in said
-    assert "impossible" not in said
+    for command in (("fit", "--recipe", "likelihood"), ("discover",)):
+        assert steady(command[0], model, tmp_path / "drives.csv", *command[1:], "--out", out) != 0
+        said = capsys.readouterr().err
+        assert "the model itself diverges at this step: damping · step = 6" in said
+        assert "impossible" not in said
+    drives = read_table(tmp_path / "drives.csv")
+    with pytest.raises(FilterError, match="the model itself diverges at this step: damping · step = 6"):
+        check(Fit(load_program(model), "hand"), drives, simulations=20)
 
 
 @pytest.mark.parametrize("seed", range(3))

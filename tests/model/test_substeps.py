@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 
+import numpy as np
 import pyro
 import pyro.distributions as dist
 import pytest
@@ -41,6 +42,7 @@ from steady_ppl.model.substeps import (
     sample_channels,
 )
 from steady_ppl.model.validate import probe
+from steady_ppl.runs.posterior import forecast
 from steady_ppl.smc.backends import CompiledStepping, Stepping, stepping_for
 from steady_ppl.smc.simulate import roll_out, simulated_in, simulated_substeps
 
@@ -201,6 +203,18 @@ def test_two_substeps_of_the_cart_have_its_exact_evidence() -> None:
         drawn = torch.stack([particle_filter(program, data, particles=4000).log_likelihood for _ in range(6)])
     error = drawn.std(0) / math.sqrt(6)
     assert ((drawn.mean(0) - exact).abs() < 5 * error + 0.5 * drawn.var(0)).all()
+
+
+def test_a_forecast_is_that_of_the_program_unrolled_by_hand(pair) -> None:
+    cut, unrolled, data = pair
+    when = float(data.elapsed[12, 0])
+    mine, theirs = (
+        forecast(program, data, after=when, draws=3, particles=50, known_start=True, seed=4)
+        for program in (cut, unrolled)
+    )
+    for group, names in (("posterior", cut.state_names), ("predictions", (*cut.state_names, "measured_bearing_0"))):
+        for name in names:
+            np.testing.assert_allclose(mine[group][name], theirs[group][name], rtol=0, atol=1e-12)
 
 
 def test_one_substep_is_the_program_itself(pair) -> None:
