@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import torch
-from examples import example
+from examples import drives, example
+from oracles import cart_evidence, cart_maximum
 
-from steady_ppl import Optimization, SMCGuide, Validation, train
+from steady_ppl import Optimization, SMCGuide, Trajectories, Validation, train
 
 Cart = type(example("linear_gaussian"))
 QUICK = Optimization(steps=6, validate_every=2, learning_rate=0.05)
@@ -19,6 +20,21 @@ class Wrong(Cart):
     def __init__(self):
         super().__init__()
         self.gain, self.damping = torch.tensor(0.4), torch.tensor(2.4)
+
+
+def slow_cart() -> tuple[Cart, Trajectories, float]:
+    """A wrong cart in double precision, its drives, and the largest log p(y) that it can have of them."""
+
+    class Slow(Wrong):
+        step = 0.5
+        rates = {"noise": 0.0, "measurement_sd": 0.0}
+
+    program, truth = Slow().double(), Cart().double()
+    truth.step = 0.5
+    data = drives(truth, 6, 16, gaps=True)
+    top = cart_maximum(Slow().double(), data)
+    assert top - float(cart_evidence(program, data).detach()) > 100
+    return program, data, top
 
 
 @dataclass(frozen=True)

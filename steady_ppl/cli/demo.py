@@ -119,7 +119,7 @@ def demonstrate(
         demo.steady(f"check runs/before train.csv{sets} --json check.json --picture check.png", keep="check.txt")
         demo.result(read_json(Path("check.json"), RunError)["verdict"])
         grown = add(demo, discover(demo, size))
-        demo.step("Fit again, in the same way, on the same drives; and the true structure, as the yardstick")
+        demo.step("Fit again, in the same way, on the same drives; and the true structure, as the reference")
         said = _fit(demo, grown, "after")
         _fit(demo, TRUE_PROGRAM, "oracle")
         demo.result(said)

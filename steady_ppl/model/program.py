@@ -288,7 +288,7 @@ def error_indices(program: Program) -> dict[str, tuple[int, ...]]:
 def parameter_rows(program: Program) -> list[tuple[str, str]]:
     """Name and value of each learnable parameter; of many numbers how many, and their range."""
     rows = []
-    for name in dict.fromkeys(name.removesuffix("_unconstrained") for name, _ in program.named_parameters()):
+    for name in dict.fromkeys(parameter_name(name) for name, _ in program.named_parameters()):
         value = attrgetter(name)(program)
         numbers = value.flatten().tolist()
         said = ", ".join(f"{number:.4g}" for number in numbers)

@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 from examples import drives, example
-from oracles import cart_evidence, cart_maximum
-from training_runs import same, values
+from oracles import cart_evidence
+from training_runs import Cart, Wrong, same, slow_cart, values
 
 from steady_ppl import (
     Constant,
@@ -26,15 +26,6 @@ from steady_ppl.utils.tensor_files import read_tensors
 
 GUIDES = (GaussianGuide, LookaheadGuide)
 REMEMBERED = ("states", "noise", "searched")
-Cart = type(example("linear_gaussian"))
-
-
-class Wrong(Cart):
-    """The cart with parameters far from those of its drives."""
-
-    def __init__(self):
-        super().__init__()
-        self.gain, self.damping = torch.tensor(0.4), torch.tensor(2.4)
 
 
 # --- from one refresh to the next -------------------------------------------------------------------------------------
@@ -156,16 +147,7 @@ def test_a_guide_refuses_other_drives_of_the_same_labels():
 
 @pytest.mark.parametrize("guide", GUIDES)
 def test_the_maximum_likelihood_estimate_of_the_cart_is_learned(guide):
-    class Slow(Wrong):
-        step = 0.5
-        rates = {"noise": 0.0, "measurement_sd": 0.0}
-
-    program, truth = Slow().double(), Cart().double()
-    truth.step = 0.5
-    data = drives(truth, 6, 16, gaps=True)
-
-    start, top = float(cart_evidence(program, data).detach()), cart_maximum(Slow().double(), data)
-    assert top - start > 100
+    program, data, top = slow_cart()
     # Adam soon forgets the first scores, which are exact and thereby huge
     optimization = Optimization(steps=60, learning_rate=0.2, betas=(0.8, 0.9), averaging=0.8, validate_every=60)
     fewer = {"particles": 30} if guide is LookaheadGuide else {}

@@ -10,10 +10,10 @@ import pyro
 import pytest
 import torch
 from examples import drives, example
-from oracles import cart_evidence, cart_maximum
+from oracles import cart_evidence
 from pyro.nn import pyro_method
 from torch import nn
-from training_runs import Cart, Scripted, Stopping, Wrong, run, same, values
+from training_runs import Cart, Scripted, Stopping, Wrong, run, same, slow_cart, values
 
 from steady_ppl import (
     Constant,
@@ -326,16 +326,7 @@ def test_padding_that_blows_up_does_not_spoil_the_parameters():
 
 
 def test_steady_learns_the_maximum_likelihood_estimate_of_the_cart():
-    class Slow(Wrong):
-        step = 0.5
-        rates = {"noise": 0.0, "measurement_sd": 0.0}
-
-    program, truth = Slow().double(), Cart().double()
-    truth.step = 0.5
-    data = drives(truth, 6, 16, gaps=True)
-
-    start, top = float(cart_evidence(program, data).detach()), cart_maximum(Slow().double(), data)
-    assert top - start > 100
+    program, data, top = slow_cart()
     guide = SMCGuide(program, particles=200, draws=20, tempering=Constant())
     optimization = Optimization(steps=100, learning_rate=0.2, validate_every=100)
     train(program, guide, data, Validation(), optimization, progress=False)
