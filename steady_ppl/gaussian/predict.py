@@ -15,8 +15,8 @@ from steady_ppl.kernels.rows import on_all_rows
 from steady_ppl.model.handlers import Observing, Recording, residual, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import RowInputs, joined, mean_step, row_inputs
-from steady_ppl.smc.backends import Stepping
 from steady_ppl.smc.simulate import measure
+from steady_ppl.smc.stepping import Stepping
 
 HALF_WIDTH = 1.6448536269514729  # of a normal's 90 % interval, in standard deviations
 
@@ -101,7 +101,7 @@ def simulate_again(
     states, noises = [starts.to(data.controls.dtype)], []
     for row in range(len(data.steps)):
         noise = torch.randn(sets, drives, channels).to(states[0])
-        moved, _ = stepping.transition(row, states[-1], None, noise)
+        moved, _ = stepping.transition(row, states[-1], noise)
         states.append(torch.where(data.transitions[row, :, None], moved, starts.to(moved)))
         noises.append(torch.where(data.transitions[row, :, None], noise, 0.0))
     path = torch.stack(states).flatten(1, 2)

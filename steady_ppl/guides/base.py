@@ -16,8 +16,9 @@ from steady_ppl.model.handlers import Recording, Substituting, masked, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import row_inputs, sample_row
 from steady_ppl.model.validate import noise_size
-from steady_ppl.smc.filter import STEPS_WORTH_COMPILING, Proposal, particle_filter
+from steady_ppl.smc.filter import STEPS_WORTH_COMPILING, particle_filter
 from steady_ppl.smc.genealogy import Paths, event_dims
+from steady_ppl.smc.proposal import Proposal
 from steady_ppl.utils.angles import wrap_angles
 
 TYPICAL_E_STEPS = 100  # of E steps are in a training

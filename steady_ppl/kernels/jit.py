@@ -45,7 +45,8 @@ class Kernel:
         self.outputs = outputs
         self._engine = machine_code(key, text)
         arguments = [ctypes.c_void_p] * (inputs + 4) + [ctypes.c_int64] * 3
-        self._call = ctypes.CFUNCTYPE(None, *arguments)(self._engine.get_function_address(KERNEL_NAME))
+        self.address = self._engine.get_function_address(KERNEL_NAME)
+        self._call = ctypes.CFUNCTYPE(None, *arguments)(self.address)
 
     def __call__(
         self, parameters: Array, uniform: Array, inputs: Sequence[Array], ancestors: Array | None, out: Array

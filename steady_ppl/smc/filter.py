@@ -6,11 +6,10 @@ Densities live in the channels: a particle is a start and its channel noise, its
 """
 
 import math
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,43 +20,14 @@ from steady_ppl.model.handlers import KnownStart, Recording, Standardised, runni
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import divergence
 from steady_ppl.model.substeps import channel_values
-from steady_ppl.smc.backends import Stepping, stepping_for
-from steady_ppl.smc.genealogy import Filtered, event_dims
+from steady_ppl.smc.compiled import CompiledFilter, OnFrame, compiled_filter
+from steady_ppl.smc.genealogy import Filtered, FilterState, History, Run, event_dims
+from steady_ppl.smc.proposal import Proposal
 from steady_ppl.smc.resampling import Resampler, effective_sample_size, normalise, systematic, take
+from steady_ppl.smc.stepping import Stepping
 from steady_ppl.utils.cores import one_thread
 
 STEPS_WORTH_COMPILING = 1_000_000  # steps of particles, which take the program's own lines a second
-OnFrame = Callable[[int, Tensor, Tensor, Tensor], None]
-
-
-class Proposal:
-    """The program's own noise: the bootstrap filter (Gordon, Salmond and Smith 1993).
-
-    A subclass draws the noise itself. Its log ratios enter the weights, and it may resample at every row.
-    """
-
-    looks_ahead = False  # whether weights know of later measurements, at measured rows and at others
-
-    def start(self, particles: int) -> tuple[Tensor | None, Tensor | float]:
-        """The standard normal noise of `initial`, `(N, B, C)`, and its log density less that of the proposal, `(N, B)`;
-        None lets the program draw."""
-        return None, 0.0
-
-    def step(self, row: int, state: Tensor) -> tuple[Tensor | None, Tensor | float]:
-        """The same for the `transition` after a row, from the states that it moves, `(N, B, D)`, already resampled."""
-        return None, 0.0
-
-    def log_future(self, row: int, state: Tensor) -> Tensor:
-        """What is thought of all measurements after a row, `(N, B)` in double precision."""
-        return state.new_zeros(state.shape[:-1], dtype=torch.float64)
-
-
-class FilterState(NamedTuple):
-    """The particles that have come to a row, whose measurements they have yet to meet; at the end, the last row's."""
-
-    states: Tensor  # (N, B, D)
-    log_weights: Tensor  # (N, B) double; their exponentials sum to one until a proposal's ratio enters
-    roots: Tensor  # (N, B), the first row's particle that each descends from
 
 
 class Step(NamedTuple):
@@ -74,7 +44,7 @@ class _Weighed(NamedTuple):
     """Particles with a row's measurements in their weights."""
 
     log_weights: Tensor
-    weights: Tensor  # (N, B), sum to one and know of the `future`
+    weights: Tensor | None  # (N, B), sum to one and know of the `future`; None where nothing was measured
     future: Tensor | None
     evidence: Tensor
     effective_sizes: Tensor
@@ -97,20 +67,17 @@ class ParticleFilter:
     resample_below: float = 0.5
     proposal: Proposal = field(default_factory=Proposal)
     resampler: Resampler = systematic
-    kernels: bool | None = None
     on_frame: OnFrame | None = None
     start: Recording = field(init=False)  # the sites of `initial`, known after `init`
-    stepping: Stepping = field(init=False)  # how the program's methods run, known after `init`
-    in_plain_torch: str | None = field(init=False, default=None)  # why no kernels serve, as in `Filtered`
+    stepping: Stepping = field(init=False)  # runs the program's methods, known after `init`
 
     def __post_init__(self) -> None:
-        particles, data, kernels = self.particles, self.data, self.kernels
+        particles, data = self.particles, self.data
         if self.proposal.looks_ahead and self.on_frame is not None:
             raise UsageError(
                 "on_frame sees what is predicted: a filter that looks ahead has seen the later measurements"
             )
         self.bootstrap = type(self.proposal) is Proposal
-        self.kernels = particles * data.time.numel() >= STEPS_WORTH_COMPILING if kernels is None else kernels
         self.last, self.left = len(data.time) - 1, torch.Size((particles, 1, len(data)))
         self.inside, self.ended = data.rows, (~data.rows).any(1).tolist()  # rows past a trajectory's end
         self.observed = data.observed.any(-1).any(-1).tolist()
@@ -133,8 +100,6 @@ class ParticleFilter:
                 "a known start needs initial() to return the sampled state as it is; it returns another", site="initial"
             )
         self.stepping = Stepping(program, data, self.observation_weight)
-        if self.kernels and self.last > 0:
-            self.stepping, self.in_plain_torch = stepping_for(self.stepping, states)
         size = (len(data), self.particles)
         even = states.new_full(size, -math.log(self.particles), dtype=torch.float64).t()
         self._unmoved = torch.arange(self.particles, device=states.device).expand(size).t()
@@ -158,10 +123,28 @@ class ParticleFilter:
             Step(weighed.evidence, weighed.effective_sizes, weighed.blown_up, ancestors, noise),
         )
 
+    def run(self, state: FilterState, keep_history: bool) -> Run:
+        """Go from the state that `init` returns through all rows."""
+        start, steps = state.states, list[Step]()
+        intervals, parents, sizes = list[Tensor](), list[Tensor | None](), dict[str, int]()
+        for row in range(self.last + 1):
+            state, step = self.step(state, row)
+            steps.append(step._replace(ancestors=None, noise={}))
+            if keep_history and row < self.last:
+                noise = {site: value.reshape(*value.shape[:2], -1) for site, value in step.noise.items()}
+                sizes = {site: value.shape[-1] for site, value in noise.items()}
+                intervals.append(torch.cat([state.states, *noise.values()], -1).permute(2, 1, 0).contiguous())
+                parents.append(None if step.ancestors is None else step.ancestors.t())
+        evidence, effective_sizes, blown_up = (
+            torch.stack(part) for part in zip(*(one[:3] for one in steps), strict=True)
+        )
+        history = History(start, intervals, parents, sizes, self.stepping.event_dims) if keep_history else None
+        return Run(state, evidence, effective_sizes, blown_up, history)
+
     def _weigh(self, state: FilterState, row: int) -> _Weighed:
         observed, future = self.observed[row], None
         if self.bootstrap and not observed:
-            return _Weighed(state.log_weights, state.log_weights, None, self._none, self._all, self._none)
+            return _Weighed(state.log_weights, None, None, self._none, self._all, self._none)
         log_weights = state.log_weights + (self.stepping.log_density(row, state.states) if observed else 0.0)
         if self.proposal.looks_ahead:
             future = self._within(row, self.proposal.log_future(row, state.states))
@@ -176,7 +159,11 @@ class ParticleFilter:
         """Log-weights, roots and ancestors of the particles that move on."""
         log_weights = weighed.log_weights
         exhausted = weighed.effective_sizes < self.resample_below * self.particles
-        if self.resample_below <= 0 or (log_weights.device.type == "cpu" and not bool(exhausted.any())):
+        if (
+            weighed.weights is None
+            or self.resample_below <= 0
+            or (log_weights.device.type == "cpu" and not bool(exhausted.any()))
+        ):
             return log_weights, roots, None
         ancestors = torch.where(exhausted, self.resampler(weighed.weights, self.particles), self._unmoved)
         fresh = -math.log(self.particles) - (0.0 if weighed.future is None else take(weighed.future, ancestors))
@@ -186,13 +173,10 @@ class ParticleFilter:
         self, row: int, states: Tensor, log_weights: Tensor, ancestors: Tensor | None
     ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         """States at the next row, their log-weights, and the noise that led there."""
-        if self.bootstrap:  # a kernel picks the ancestors as it moves them
-            moved, values = self.stepping.transition(row, states, ancestors, None)
-            return moved, log_weights, values
         if ancestors is not None:
             states = take(states, ancestors)
         noise, log_ratio = self.proposal.step(row, states)
-        moved, values = self.stepping.transition(row, states, None, noise)
+        moved, values = self.stepping.transition(row, states, noise)
         return moved, log_weights + self._within(row + 1, torch.as_tensor(log_ratio, dtype=torch.float64)), values
 
     def _within(self, row: int, values: Tensor) -> Tensor:
@@ -237,39 +221,30 @@ def particle_filter(
         FilterError: every weight is zero; names trajectory and time.
         UsageError: `on_frame` is given with a proposal that looks ahead.
     """
-    along = ParticleFilter(
-        program,
-        data,
-        particles=particles,
-        observation_weight=observation_weight,
-        known_start=known_start,
-        resample_below=resample_below,
-        proposal=proposal or Proposal(),
-        resampler=resampler,
-        kernels=kernels,
-        on_frame=on_frame,
-    )
-    state = along.init()
-    history, steps = list[Tensor](), list[Step]()
-    for row in range(len(data.time)):
-        if keep_history:
-            history.append(state.states)
-        state, step = along.step(state, row)
-        steps.append(step if keep_history else step._replace(ancestors=None, noise={}))
-    evidence, sizes, blown_up = (torch.stack(values) for values in zip(*(step[:3] for step in steps), strict=True))
-    _raise_if_broken(program, evidence, blown_up, data)
+    proposal = proposal or Proposal()
+    settings: Any = {"observation_weight": observation_weight, "known_start": known_start}
+    settings |= {"resample_below": resample_below, "proposal": proposal, "resampler": resampler, "on_frame": on_frame}
+    along = ParticleFilter(program, data, particles=particles, **settings)
+    state, rows, reason = along.init(), len(data.time), None
+    if kernels is None:
+        kernels = particles * data.time.numel() >= STEPS_WORTH_COMPILING
+    machine = compiled_filter(along.stepping, state.states, proposal, resampler) if kernels and rows > 1 else None
+    if isinstance(machine, CompiledFilter):
+        run = machine.run(state, resample_below * particles, keep_history, on_frame)
+    else:
+        run, reason = along.run(state, keep_history), machine
+    _raise_if_broken(program, run.evidence, run.blown_up, data)
+    roots = run.end.roots
     return Filtered(
-        log_likelihood=evidence.sum(0),
-        log_weights=state.log_weights,
-        effective_sizes=sizes,
-        roots=torch.zeros_like(state.log_weights).scatter_(0, state.roots, 1.0).sum(0),
-        blown_up=blown_up.sum(0),
-        states=history,
+        log_likelihood=run.evidence.sum(0),
+        log_weights=run.end.log_weights,
+        effective_sizes=run.effective_sizes,
+        roots=torch.zeros_like(run.end.log_weights).scatter_(0, roots, 1.0).sum(0),
+        blown_up=run.blown_up.sum(0),
         start={site: value.squeeze(1) for site, value in along.start.expanded(along.left).items()},
-        noise={site: [step.noise[site] for step in steps[:-1]] for site in steps[0].noise},
-        ancestors=[step.ancestors for step in steps] if keep_history else [],
         event_dims={"states": 1} | event_dims(along.start) | along.stepping.event_dims,
-        in_plain_torch=along.in_plain_torch,
+        history=run.history,
+        in_plain_torch=reason,
         channels=None if program.substeps == 1 else partial(channel_values, program, data),
     )
 

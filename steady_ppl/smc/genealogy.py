@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.errors import UsageError
 from steady_ppl.model.handlers import Recording, Replaying, running
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import row_inputs, sample_channels
@@ -62,9 +63,67 @@ class Paths:
         return replace(self, states=fill(self.states, data.rows), noise=noise)
 
 
+class FilterState(NamedTuple):
+    """The particles that have come to a row, whose measurements they have yet to meet; at the end, the last row's."""
+
+    states: Tensor  # (N, B, D)
+    log_weights: Tensor  # (N, B) double; their exponentials sum to one until a proposal's ratio enters
+    roots: Tensor  # (N, B), the first row's particle that each descends from
+
+
+@dataclass(frozen=True)
+class History:
+    """Where a filter's particles were, what moved them, and from which they descend.
+
+    Attributes:
+        start: the first row's states, `(N, B, D)`.
+        intervals: states that each leads to and noise of all channels, `(≥ D + C, B, N)`.
+        parents: which particles moved on in each, `(B, N)`; None: each.
+        sizes: how many channels each site of `transition` has.
+        event_dims: event dimension of each.
+    """
+
+    start: Tensor
+    intervals: list[Tensor]
+    parents: list[Tensor | None]
+    sizes: dict[str, int]
+    event_dims: dict[str, int]
+
+    def trace(self, index: Tensor) -> tuple[Tensor, dict[str, Tensor], Tensor]:
+        """Follow particles `(M, B)` of the last row back: states `(M, T + 1, B, D)`, noise `(M, T, B, ...)` of each
+        site, and the first row's particles, `(M, B)`."""
+        at, found = index.t(), list[Tensor]()
+        for interval, parents in zip(reversed(self.intervals), reversed(self.parents), strict=True):
+            found.append(interval.gather(2, at.expand(len(interval), -1, -1)))
+            at = at if parents is None else parents.gather(1, at)
+        start = take(self.start, at.t()).unsqueeze(1)
+        if not found:
+            return start, {}, at.t()
+        path = torch.stack(found[::-1]).permute(3, 0, 2, 1)
+        return torch.cat([start, path[..., : start.shape[-1]]], 1), self.by_site(path), at.t()
+
+    def by_site(self, interval: Tensor) -> dict[str, Tensor]:
+        """Noise of each site, `(..., C)` or `(...)`, of states and noise of all channels in the last dimension."""
+        first, found = self.start.shape[-1], {}
+        for site, size in self.sizes.items():
+            values = interval[..., first : first + size]
+            found[site], first = values if self.event_dims[site] else values.squeeze(-1), first + size
+        return found
+
+
+class Run(NamedTuple):
+    """What a filter does from the first row to the last."""
+
+    end: FilterState
+    evidence: Tensor  # (T + 1, B), log p(y_t | y_0 … y_{t-1}); looking ahead they telescope
+    effective_sizes: Tensor  # (T + 1, B)
+    blown_up: Tensor  # (T + 1, B)
+    history: History | None
+
+
 @dataclass(frozen=True)
 class Filtered:
-    """What a filter leaves behind. The particles' history has a tensor a row, and is empty when it was not kept.
+    """What a filter leaves behind.
 
     Attributes:
         log_likelihood: `(B,)` the estimate of log p(y), whose exponential is unbiased at observation weight 1.
@@ -72,13 +131,11 @@ class Filtered:
         effective_sizes: `(T + 1, B)` ESS after each observed row (each row when looking ahead), or N.
         roots: `(B,)` how many of the first row's particles still have descendants at the end.
         blown_up: `(B,)` how many weights were not numbers, summed over rows; they count as zero.
-        states: history, `(N, B, D)` each.
         start: value of each site of `initial`, `(N, B, ...)`.
-        noise: history of each site of `transition`, `(N, B, ...)` each.
-        ancestors: history, `(N, B)` each; None where each particle moved on.
         event_dims: event dimension of each site, and of "states".
+        history: of the particles; None when it was not kept.
         in_plain_torch: why no kernels served; None where they did or were not asked for.
-        channels: where `noise` is standardised, its sites' values, of states `(M, T + 1, B, D)` and their noise.
+        channels: where noise is standardised, its sites' values, of states `(M, T + 1, B, D)` and their noise.
     """
 
     log_likelihood: Tensor
@@ -86,13 +143,32 @@ class Filtered:
     effective_sizes: Tensor
     roots: Tensor
     blown_up: Tensor
-    states: list[Tensor]
     start: dict[str, Tensor]
-    noise: dict[str, list[Tensor]]
-    ancestors: list[Tensor | None]
     event_dims: dict[str, int]
+    history: History | None
     in_plain_torch: str | None = None
     channels: Callable[[Tensor, dict[str, Tensor]], dict[str, Tensor]] | None = None
+
+    @property
+    def states(self) -> list[Tensor]:
+        """The history's states, `(N, B, D)` a row; empty when it was not kept, as those below."""
+        if self.history is None:
+            return []
+        start = self.history.start
+        return [start, *(one[: start.shape[-1]].permute(2, 1, 0) for one in self.history.intervals)]
+
+    @property
+    def noise(self) -> dict[str, list[Tensor]]:
+        """The history's noise: of each site of `transition` values `(N, B, ...)`, an interval each."""
+        if self.history is None:
+            return {}
+        parts = [self.history.by_site(one.permute(2, 1, 0)) for one in self.history.intervals]
+        return {site: [part[site] for part in parts] for site in self.history.sizes}
+
+    @property
+    def ancestors(self) -> list[Tensor | None]:
+        """The history's ancestors, `(N, B)` an interval; None where each particle moved on."""
+        return [] if self.history is None else [None if one is None else one.t() for one in self.history.parents]
 
     def scarce(self, data: Trajectories) -> Tensor:
         """Share of a trajectory's measured rows after which fewer than `MIN_EFFECTIVE_SIZE` were in effect, `(B,)`."""
@@ -100,22 +176,18 @@ class Filtered:
         return ((self.effective_sizes < MIN_EFFECTIVE_SIZE) & measured).sum(0) / measured.sum(0).clamp(min=1)
 
     def paths(self, draws: int) -> Paths:
-        """Equally weighted paths, resampled systematically from all surviving lineages and traced back."""
-        index = systematic(self.log_weights.exp(), draws)
-        states, noise = [take(self.states[-1], index)], {site: list[Tensor]() for site in self.noise}
-        for row in range(len(self.states) - 2, -1, -1):
-            for site, values in self.noise.items():
-                noise[site].append(take(values[row], index))
-            ancestors = self.ancestors[row]
-            if ancestors is not None:
-                index = take(ancestors, index)
-            states.append(take(self.states[row], index))
-        path = torch.stack(states[::-1], 1)
-        along = {site: torch.stack(values[::-1], 1) for site, values in noise.items()}
+        """Equally weighted paths, resampled systematically from all surviving lineages and traced back.
+
+        Raises:
+            UsageError: the filter kept no history.
+        """
+        if self.history is None:
+            raise UsageError("paths need the particles' history: filter with keep_history=True")
+        states, noise, index = self.history.trace(systematic(self.log_weights.exp(), draws))
         return Paths(
-            states=path,
+            states=states,
             start={site: take(value, index).unsqueeze(1) for site, value in self.start.items()},
-            noise=along if self.channels is None else self.channels(path, along),
+            noise=noise if self.channels is None else self.channels(states, noise),
             event_dims=self.event_dims,
         )
 

@@ -50,27 +50,33 @@ def systematic(weights: Tensor, draws: int, uniform: Tensor | None = None) -> Te
 
 @njit(cache=True, error_model="numpy")
 def _systematic(weights: np.ndarray, uniform: np.ndarray, chosen: np.ndarray) -> None:
-    trajectories, particles = weights.shape
-    draws = chosen.shape[1]
-    first = np.empty(draws + 1, np.int64)  # the particle whose offspring begin at a draw; 0 within offspring
-    for b in range(trajectories):
-        first[:] = 0
-        total = 0.0
-        for i in range(particles):
-            total += weights[b, i]
-        cumulative, born = 0.0, 0
-        for i in range(particles):
-            first[born] = i  # the next particle takes the place where this one has no offspring: no branch
-            cumulative += weights[b, i]
-            share = cumulative / total  # where it is one all are born, also for u within rounding of one
-            until = math.ceil(share * draws - uniform[b]) if share < 1 else draws
-            born = max(born, until)
-        if born < draws:  # where a weight is not a number: the filter says so at its end
-            first[born] = particles - 1
-        parent = 0
-        for j in range(draws):
-            parent = max(parent, first[j])
-            chosen[b, j] = parent
+    first = np.empty(chosen.shape[1] + 1, np.int64)
+    for b in range(len(weights)):
+        choose(weights[b], uniform[b], first, chosen[b])
+
+
+@njit(cache=True, error_model="numpy")
+def choose(weights: np.ndarray, uniform: float, first: np.ndarray, chosen: np.ndarray) -> None:
+    """Choose particles of one trajectory as `systematic` does, for compiled loops; their weights need not sum to one.
+    `first` is room for an index more than is chosen."""
+    particles, draws = len(weights), len(chosen)
+    first[:] = 0  # the particle whose offspring begin at a draw; 0 within offspring
+    total = 0.0
+    for i in range(particles):
+        total += weights[i]
+    cumulative, born = 0.0, 0
+    for i in range(particles):
+        first[born] = i  # the next particle takes the place where this one has no offspring: no branch
+        cumulative += weights[i]
+        share = cumulative / total  # where it is one all are born, also for u within rounding of one
+        until = math.ceil(share * draws - uniform) if share < 1 else draws
+        born = max(born, until)
+    if born < draws:  # where a weight is not a number: the filter says so at its end
+        first[born] = particles - 1
+    parent = 0
+    for j in range(draws):
+        parent = max(parent, first[j])
+        chosen[j] = parent
 
 
 def systematic_in_parallel(weights: Tensor, draws: int, uniform: Tensor) -> Tensor:

@@ -15,7 +15,6 @@ from paths import anywhere, at_its_mode
 from torch import Tensor
 
 from steady_ppl import FilterError, UsageError, particle_filter, seeded, stack
-from steady_ppl.gaussian import twisted_proposal
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import smooth, smoother_paths
 from steady_ppl.gaussian.twisted_proposal import Twist
@@ -217,23 +216,6 @@ def anywhere_of(data, channels: int) -> ReferencePath:
     return ReferencePath(
         torch.zeros(rows, trajectories, 2).double(), torch.zeros(rows - 1, trajectories, channels).double()
     )
-
-
-def test_one_after_the_other_and_in_parallel_particles_are_steered_the_same() -> None:
-    torch.manual_seed(0)
-    double = {"dtype": torch.float64}
-    state, path = 5 * torch.randn(7, 3, 4, **double), torch.randn(3, 4, **double)
-    angles = torch.tensor([False, True, False, True])
-    factor = torch.randn(3, 2, 2, **double).triu() + 2 * torch.eye(2, **double)
-    steering = (torch.randn(3, 2, **double), torch.randn(3, 2, 4, **double), factor, twisted_proposal.inverse(factor))
-    own, stays = torch.randn(7, 3, 2, **double), torch.rand(7, 3) < 0.5
-    for share in (0.0, 0.3):
-        one = twisted_proposal.steer(state, path, angles, steering, own, stays & (share > 0), share)
-        other = twisted_proposal.steer_in_parallel(state, path, angles, steering, own, stays & (share > 0), share)
-        torch.testing.assert_close(one, other)
-    future = (torch.randn(3, 4, 4, **double), torch.randn(3, 4, **double), torch.randn(3, **double))
-    one = twisted_proposal.log_future(state, path, angles, *future)
-    torch.testing.assert_close(one, twisted_proposal.log_future_in_parallel(state, path, angles, *future))
 
 
 class Coarse(type(example("hovercraft:HovercraftTruth"))):

@@ -43,8 +43,11 @@ from steady_ppl.model.substeps import (
 )
 from steady_ppl.model.validate import probe
 from steady_ppl.runs.posterior import forecast
-from steady_ppl.smc.backends import CompiledStepping, Stepping, stepping_for
+from steady_ppl.smc.compiled import CompiledFilter, compiled_filter, standard_normal
+from steady_ppl.smc.proposal import Proposal
+from steady_ppl.smc.resampling import systematic
 from steady_ppl.smc.simulate import roll_out, simulated_in, simulated_substeps
+from steady_ppl.smc.stepping import Stepping
 
 K = 3
 
@@ -161,13 +164,14 @@ def test_kernels_compute_the_substeps() -> None:
     program = with_substeps(Braked(), K)
     data = for_program(program, drives(Braked(), 3, 12)).to(torch.float32)
     state = torch.randn(64, 3, 6)
-    stepping, reason = stepping_for(Stepping(program, data, 1.0), state)
-    assert isinstance(stepping, CompiledStepping), reason
-    noise = torch.randn(64, 3, 3)
-    moved, values = stepping.transition(4, state, None, noise)
-    plain, _ = Stepping(program, data, 1.0).transition(4, state, None, noise)
+    machine = compiled_filter(Stepping(program, data, 1.0), state, Proposal(), systematic)
+    assert isinstance(machine, CompiledFilter), machine
+    uniform = torch.rand(64, 3, 5)
+    noise, _ = standard_normal(uniform, 3)
+    moved, values, _ = machine.transition(4, state, uniform)
+    plain, _ = Stepping(program, data, 1.0).transition(4, state, noise)
     torch.testing.assert_close(moved, plain, rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(values["acceleration"], noise)
+    torch.testing.assert_close(values, noise, rtol=1e-5, atol=1e-5)
 
     def step(state, noise, control, time, step):
         with running(*state.shape[:-1]), Standardised(noise):

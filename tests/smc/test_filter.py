@@ -14,7 +14,8 @@ from oracles import assert_mean, cart_parameters, kalman
 from steady_ppl import DataError, FilterError, ProgramError, particle_filter, roll_out, seeded
 from steady_ppl.model.handlers import AtMean
 from steady_ppl.model.program import Program
-from steady_ppl.smc.filter import ParticleFilter, Proposal
+from steady_ppl.smc.filter import ParticleFilter
+from steady_ppl.smc.proposal import Proposal
 from steady_ppl.smc.resampling import multinomial, stratified, systematic, take
 
 

@@ -13,7 +13,7 @@ from steady_ppl import particle_filter, seeded
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.model.problem import Problem
-from steady_ppl.smc.filter import Proposal
+from steady_ppl.smc.proposal import Proposal
 from steady_ppl.smc.resampling import systematic
 
 
