@@ -100,7 +100,7 @@ class CompiledFilter:
         particles, trajectories, _ = state.states.shape
         outputs = methods.transition.kernel.outputs
         rows = 1 if on_frame else max(1, BLOCK_BYTES // (4 * outputs * trajectories * particles))
-        figures = np.empty((3, last + 1, trajectories))
+        kept, figures = keep_history or on_frame is not None, np.empty((3, last + 1, trajectories))
         begin = by_component(state.states)
         log_weights, roots = (part.t().clone(memory_format=torch.contiguous_format) for part in state[1:])
         generator = torch.randint(2**32, (4, STREAMS)).to(torch.uint32).numpy()
@@ -109,9 +109,9 @@ class CompiledFilter:
         for first in range(0, last + 1, rows):
             moves = min(rows, last - first)
             thresholds = torch.rand(moves, trajectories, dtype=torch.float64)
-            if keep_history or len(room) < 2:  # one to fill, and one whose last row is gone on from
+            if kept or len(room) < 2:  # one to fill, and one whose last row is gone on from
                 room.append(_room(moves, outputs, trajectories, particles))
-            moved, ancestors, resampled = room.pop() if keep_history else room[first // rows % 2]
+            moved, ancestors, resampled = room.pop() if kept else room[first // rows % 2]
             seen = log_weights.t().clone() if on_frame else log_weights[:0]
             weighed = torch.empty_like(log_weights) if on_frame else log_weights[:0]
             _go(
@@ -176,7 +176,7 @@ def compiled_filter(plain: Stepping, state: Tensor, proposal: Proposal, resample
         return f"fewer than {SIMD_LANES} particles"
     if resampler is not systematic:
         return "a resampler of one's own"
-    if type(proposal).step not in (Proposal.step, Steered.step):
+    if type(proposal) is not Proposal and not (isinstance(proposal, Steered) and type(proposal).step is Steered.step):
         return "a proposal whose step is no function of one particle"
     name = "filter that looks ahead" if proposal.looks_ahead else "filter"
     methods = compiled(plain.program, name, lambda: _Methods(plain, state, proposal))

@@ -18,7 +18,7 @@ from references import PROBLEMS, Reference, errors_off, reference, rolled_out, r
 from torch import Tensor
 
 from steady_ppl import Constant, GaussianGuide, LookaheadGuide, PathGuide, Program, SMCGuide, Trajectories, seeded
-from steady_ppl.smc.resampling import take
+from steady_ppl.smc.genealogy import History
 
 RUNS, LIMIT = 40, 4.0
 NOTICED = 2 * LIMIT
@@ -118,10 +118,13 @@ def test_measurements_in_another_order_are_noticed(engine):
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_ancestors_applied_twice_are_noticed(name, monkeypatch):
-    def twice(values: Tensor, index: Tensor) -> Tensor:
-        return take(values, index) if values.is_floating_point() else take(values, take(values, index))
+    trace = History.trace
 
-    monkeypatch.setattr("steady_ppl.smc.genealogy.take", twice)
+    def twice(history: History, index: Tensor) -> tuple[Tensor, dict[str, Tensor], Tensor]:
+        parents = [None if own is None else own.gather(1, own) for own in history.parents]
+        return trace(replace(history, parents=parents), index)
+
+    monkeypatch.setattr(History, "trace", twice)
     problem = reference(name)
     assert worst(problem, drawn(bootstrap(problem.program), problem.data)) > NOTICED
 
