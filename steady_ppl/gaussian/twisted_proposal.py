@@ -1,5 +1,6 @@
 """Particles steered by a lookahead, whatever the program: plain lines of torch, which kernels compile."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -9,7 +10,6 @@ from torch import Tensor
 from steady_ppl.errors import require
 from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
 from steady_ppl.smc.proposal import Steered
-from steady_ppl.utils.angles import wrap
 
 
 def log_steered(noise: Tensor, mean: Tensor, whitening: Tensor) -> Tensor:
@@ -33,14 +33,9 @@ def inverse(upper: Tensor) -> Tensor:
     return torch.linalg.solve_triangular(upper, torch.eye(upper.shape[-1]).to(upper), upper=True)
 
 
-def _deviation(state: Tensor, path: Tensor, circular: Tensor) -> Tensor:
-    deviation = state.to(path.dtype) - path
-    return torch.where(circular, wrap(deviation), deviation)
-
-
 def _times(matrix: Tensor, vectors: Tensor) -> Tensor:
-    """`(..., R, D)` times `(..., D)`: `(..., R)`."""
-    return (matrix * vectors.unsqueeze(-2)).sum(-1)
+    """`(..., B, R, D)` times `(N, ..., B, D)`: `(N, ..., B, R)`, one product a trajectory."""
+    return (vectors.movedim(0, -2) @ matrix.mT).movedim(-2, 0)
 
 
 class Twist(Steered):
@@ -70,8 +65,8 @@ class Twist(Steered):
             lookahead = look_ahead(weighted)
         self.lookahead, self.untwisted = lookahead, untwisted
         path, steps = lookahead.linearization.path.states, lookahead.steps
-        self.dtype, self.channels, self.path = path.dtype, steps.shift.shape[-1], path.double()
-        self.circular = lookahead.linearization.circular
+        self.channels, self.path = steps.shift.shape[-1], path.double()
+        self.turn = 2 * math.pi * lookahead.linearization.circular.double()  # of angles; no other component has turns
         self.whitening = inverse(steps.factor)
         # Λ = RᵀR and λ = Rᵀz; where rounding has left Λ no root, its diagonal serves: any future leaves p(y) unbiased
         own = lookahead.precision.diagonal(dim1=-2, dim2=-1).clamp(min=1e-30)
@@ -94,17 +89,21 @@ class Twist(Steered):
         """−½ |R δ − z|² of every particle's deviation δ from the path: log p(y_{row+1}, …, y_T | state) of the
         linearised program less its maximum. A sum of squares is never rounded to something likely."""
         path, root, target = given
-        return -0.5 * (_times(root, _deviation(state, path, self.circular)) - target).square().sum(-1)
+        return -0.5 * (_times(root, self._deviation(state, path)) - target).square().sum(-1)
 
     def steered(self, state: Tensor, own: Tensor, chance: Tensor, *given: Tensor) -> tuple[Tensor, Tensor]:
         """Every particle's noise: its `own`, standard normal, with the probability `untwisted`, else steered; and its
         log density less that of the mixture that it was drawn from."""
         path, shift, gain, factor, whitening, untwisted = given
         own, stays = own.to(path.dtype), chance < untwisted
-        mean = shift - _times(gain, _deviation(state, path, self.circular))
+        mean = shift - _times(gain, self._deviation(state, path))
         noise = torch.where(stays, own, mean + _times(factor, own))
         white = torch.where(stays, _times(whitening, own - mean), own)
         return noise, -mixture(_log_ratio(noise, white, whitening), untwisted.squeeze(-1))
+
+    def _deviation(self, state: Tensor, path: Tensor) -> Tensor:
+        deviation = state.to(path.dtype) - path
+        return deviation - self.turn.to(path.dtype) * (deviation / (2 * math.pi)).round()
 
     def log_future(self, row: int, state: Tensor) -> Tensor:
         """log p(y_{row+1}, …, y_T | state) of the linearised program, see `Proposal`."""
@@ -122,4 +121,4 @@ class Twist(Steered):
             ahead.winding_masses[k] + log_steered(noise, starts.shift[k], whitening[k])
             for k in range(len(ahead.windings))
         ]
-        return noise.to(self.dtype), -mixture(torch.stack(ratios).logsumexp(0), self.untwisted)
+        return noise, -mixture(torch.stack(ratios).logsumexp(0), self.untwisted)

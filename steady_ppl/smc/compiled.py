@@ -80,7 +80,7 @@ def _given(plain: Stepping, proposal: Proposal) -> tuple[list[Tensor], list[Tens
 
 def _examples(given: Sequence[Tensor]) -> dict[str, Tensor]:
     kinds = (values if values.dtype == torch.bool else values.float() for values in given)
-    return {f"given {index}": values[:1, :1].unsqueeze(0) for index, values in enumerate(kinds)}
+    return {f"given {index}": values[:1, :1] for index, values in enumerate(kinds)}
 
 
 class CompiledFilter:

@@ -90,7 +90,7 @@ class ParticleFilter:
         """
         program, data = self.program, self.data
         noise, log_ratio = (None, 0.0) if self.known_start else self.proposal.start(self.particles)
-        given = nullcontext() if noise is None else Standardised(noise.unsqueeze(1))
+        given = nullcontext() if noise is None else Standardised(noise.to(data.controls.dtype).unsqueeze(1))
         drawing = KnownStart(data.known_start) if self.known_start else given
         with running(*self.left), Recording() as self.start, drawing:
             states = program.initial()

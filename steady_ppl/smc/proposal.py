@@ -53,7 +53,6 @@ class Steered(Proposal):
     """A proposal that looks ahead, by its functions `future` and `steered` of one particle."""
 
     looks_ahead = True
-    dtype: torch.dtype  # of the program's states
     channels: int  # C
 
     def log_future(self, row: int, state: Tensor) -> Tensor:
@@ -62,8 +61,8 @@ class Steered(Proposal):
 
     def step(self, row: int, state: Tensor) -> tuple[Tensor | None, Tensor | float]:
         """By `steered`, see `Proposal`."""
-        kind: Any = {"device": state.device, "dtype": self.dtype}
+        kind: Any = {"device": state.device, "dtype": state.dtype}
         own = torch.randn(self.channels, *state.shape[1::-1], **kind).permute(2, 1, 0)
         chance = torch.rand(1, *state.shape[1::-1], **kind).permute(2, 1, 0)
         noise, ratio = self.steered(state, own, chance, *(given[row] for given in self.of_intervals()))
-        return noise.to(self.dtype), ratio
+        return noise.to(state.dtype), ratio
