@@ -1,6 +1,7 @@
 """The bootstrap filter's speed through a Pyro program, beside other libraries on the same problem in the same run.
 
     python benchmarks/throughput.py --bench FOLDER --rivals PYTHON      minutes; one core
+    python benchmarks/throughput.py --bench FOLDER --rivals PYTHON --only jax 'C, by hand'
     python benchmarks/throughput.py --quick                             one round, JAX only
 
 FOLDER holds the problem (`problem.npz`: one drive of 100 rows, a 5→64→3 network, four bearings) and a script a rival;
@@ -35,7 +36,8 @@ from steady_ppl import PlanarVehicle, Trajectories, bearings_to, dense, for_prog
 
 BENCH = ROOT.parent / "shared" / "bench"
 CASES = [(1, 20_000), (16, 200), (16, 2_000)]
-MUSTS = {(1, 20_000): 1.0, (16, 200): 0.8, (16, 2_000): 0.8}
+MUSTS = {(1, 20_000): 1.0, (16, 200): 0.8, (16, 2_000): 0.8}  # of JAX's speed
+MUST_OF_C = 0.6  # of that of C by hand, in each case
 VMAPPED = {"jax": "bench_jax.py --mode count", "cuthbert": "bench_cuthbert.py", "tfp": "bench_tfp.py"}
 ALONE = {
     "torch, plain": "bench_torch_plain.py",
@@ -153,6 +155,7 @@ def main() -> int:
     parser.add_argument("--rivals", default=sys.executable, metavar="PYTHON")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--large", action="store_true", help="also one trajectory of 200,000 particles")
+    parser.add_argument("--only", nargs="+", choices=[*VMAPPED, *ALONE], help="rivals to run")
     parser.add_argument("--quick", action="store_true")
     arguments = parser.parse_args()
     if not (arguments.bench / "problem.npz").is_file():
@@ -160,7 +163,8 @@ def main() -> int:
         return 2 if arguments.bench != BENCH else 0
     torch.set_num_threads(1)
     problem = dict(np.load(arguments.bench / "problem.npz"))
-    scripts = {"jax": VMAPPED["jax"]} if arguments.quick else VMAPPED | ALONE
+    chosen = arguments.only or (["jax"] if arguments.quick else [*VMAPPED, *ALONE])
+    scripts = {name: (VMAPPED | ALONE)[name] for name in chosen}
     cases = CASES + ([(1, 200_000)] if arguments.large else [])
     missed = 0
     for case in cases:
@@ -193,6 +197,11 @@ def compare(problem: dict[str, np.ndarray], arguments: argparse.Namespace, scrip
     for name, reason in absent.items():
         print(f"  {name:24} does not run: {reason[:90]}")
     missed = 0
+    if "C, by hand" in found:
+        ratio = statistics.median(one for one, _ in found["steady-ppl"])
+        ratio /= statistics.median(one for one, _ in found["C, by hand"])
+        missed |= ratio < MUST_OF_C
+        print(f"  ours ÷ C {ratio:.2f}, must ≥ {MUST_OF_C:g}  {'MISSED' if ratio < MUST_OF_C else 'ok'}")
     if not jax:
         print("  JAX does not run: name an interpreter that has it with --rivals")
         missed = 2
