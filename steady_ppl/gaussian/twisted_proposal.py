@@ -33,6 +33,11 @@ def inverse(upper: Tensor) -> Tensor:
     return torch.linalg.solve_triangular(upper, torch.eye(upper.shape[-1]).to(upper), upper=True)
 
 
+def _deviation(state: Tensor, path: Tensor, turn: Tensor) -> Tensor:
+    deviation = state.to(path.dtype) - path
+    return deviation - turn * (deviation / (2 * math.pi)).round()
+
+
 def _times(matrix: Tensor, vectors: Tensor) -> Tensor:
     """`(..., B, R, D)` times `(N, ..., B, D)`: `(N, ..., B, R)`, one product a trajectory."""
     return (vectors.movedim(0, -2) @ matrix.mT).movedim(-2, 0)
@@ -76,34 +81,38 @@ class Twist(Steered):
         self.target = torch.linalg.solve_triangular(lower, information, upper=False).squeeze(-1)
 
     def of_rows(self) -> Sequence[Tensor]:
-        """Path, root and target of each row, see `Proposal`."""
-        return self.path, self.root, self.target
+        """Path, turns, root and target of each row, see `Proposal`."""
+        return self.path, self.turn.expand_as(self.path), self.root, self.target
 
     def of_intervals(self) -> Sequence[Tensor]:
-        """The path and the steering of each interval, and the share that is not steered."""
+        """Path, turns and steering of each interval, and the share that is not steered."""
         steps, untwisted = self.lookahead.steps, self.path.new_tensor([self.untwisted])
         share = untwisted.expand(*steps.shift.shape[:2], 1)
-        return self.path[:-1], steps.shift, steps.gain, steps.factor, self.whitening, share
+        return (
+            self.path[:-1],
+            self.turn.expand_as(self.path[:-1]),
+            steps.shift,
+            steps.gain,
+            steps.factor,
+            self.whitening,
+            share,
+        )
 
     def future(self, state: Tensor, *given: Tensor) -> Tensor:
         """−½ |R δ − z|² of every particle's deviation δ from the path: log p(y_{row+1}, …, y_T | state) of the
         linearised program less its maximum. A sum of squares is never rounded to something likely."""
-        path, root, target = given
-        return -0.5 * (_times(root, self._deviation(state, path)) - target).square().sum(-1)
+        path, turn, root, target = given
+        return -0.5 * (_times(root, _deviation(state, path, turn)) - target).square().sum(-1)
 
     def steered(self, state: Tensor, own: Tensor, chance: Tensor, *given: Tensor) -> tuple[Tensor, Tensor]:
         """Every particle's noise: its `own`, standard normal, with the probability `untwisted`, else steered; and its
         log density less that of the mixture that it was drawn from."""
-        path, shift, gain, factor, whitening, untwisted = given
+        path, turn, shift, gain, factor, whitening, untwisted = given
         own, stays = own.to(path.dtype), chance < untwisted
-        mean = shift - _times(gain, self._deviation(state, path))
+        mean = shift - _times(gain, _deviation(state, path, turn))
         noise = torch.where(stays, own, mean + _times(factor, own))
         white = torch.where(stays, _times(whitening, own - mean), own)
         return noise, -mixture(_log_ratio(noise, white, whitening), untwisted.squeeze(-1))
-
-    def _deviation(self, state: Tensor, path: Tensor) -> Tensor:
-        deviation = state.to(path.dtype) - path
-        return deviation - self.turn.to(path.dtype) * (deviation / (2 * math.pi)).round()
 
     def log_future(self, row: int, state: Tensor) -> Tensor:
         """log p(y_{row+1}, …, y_T | state) of the linearised program, see `Proposal`."""

@@ -4,7 +4,7 @@ import ctypes
 import hashlib
 import itertools
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -194,7 +194,7 @@ def _kernel(graph: ScalarGraph, inputs: tuple[str, ...], columns: dict[str, int]
     return _KERNELS[key]
 
 
-def compiled(program: nn.Module, name: str, build: Callable[[], Value]) -> Value | str:
+def compiled(program: nn.Module, name: Hashable, build: Callable[[], Value]) -> Value | str:
     """What was compiled under a name for programs like this one, built once; or why there is none."""
     known = _COMPILED.setdefault(type(program), {})
     key = (name, signature(program))
@@ -210,7 +210,7 @@ def compiled(program: nn.Module, name: str, build: Callable[[], Value]) -> Value
     return known[key]
 
 
-def discard(program: nn.Module, name: str) -> str:
+def discard(program: nn.Module, name: Hashable) -> str:
     """Give up what was compiled under a name."""
     _COMPILED[type(program)][name, signature(program)] = RESULTS_DIFFER
     return RESULTS_DIFFER

@@ -228,11 +228,11 @@ def particle_filter(
     state, rows, reason = along.init(), len(data.time), None
     if kernels is None:
         kernels = particles * data.time.numel() >= STEPS_WORTH_COMPILING
-    machine = compiled_filter(along.stepping, state.states, proposal, resampler) if kernels and rows > 1 else None
-    if isinstance(machine, CompiledFilter):
-        run = machine.run(state, resample_below * particles, keep_history, on_frame)
+    by_kernels = compiled_filter(along.stepping, state.states, proposal, resampler) if kernels and rows > 1 else None
+    if isinstance(by_kernels, CompiledFilter):
+        run = by_kernels.run(state, resample_below * particles, keep_history, on_frame)
     else:
-        run, reason = along.run(state, keep_history), machine
+        run, reason = along.run(state, keep_history), by_kernels
     _raise_if_broken(program, run.evidence, run.blown_up, data)
     roots = run.end.roots
     return Filtered(

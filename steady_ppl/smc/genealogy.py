@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
@@ -149,7 +150,7 @@ class Filtered:
     in_plain_torch: str | None = None
     channels: Callable[[Tensor, dict[str, Tensor]], dict[str, Tensor]] | None = None
 
-    @property
+    @cached_property
     def states(self) -> list[Tensor]:
         """The history's states, `(N, B, D)` a row; empty when it was not kept, as those below."""
         if self.history is None:
@@ -157,7 +158,7 @@ class Filtered:
         start = self.history.start
         return [start, *(one[: start.shape[-1]].permute(2, 1, 0) for one in self.history.intervals)]
 
-    @property
+    @cached_property
     def noise(self) -> dict[str, list[Tensor]]:
         """The history's noise: of each site of `transition` values `(N, B, ...)`, an interval each."""
         if self.history is None:
@@ -165,7 +166,7 @@ class Filtered:
         parts = [self.history.by_site(one.permute(2, 1, 0)) for one in self.history.intervals]
         return {site: [part[site] for part in parts] for site in self.history.sizes}
 
-    @property
+    @cached_property
     def ancestors(self) -> list[Tensor | None]:
         """The history's ancestors, `(N, B)` an interval; None where each particle moved on."""
         return [] if self.history is None else [None if one is None else one.t() for one in self.history.parents]

@@ -7,10 +7,10 @@ on average. Systematic resampling takes one uniform a trajectory, stratified one
 import math
 from collections.abc import Callable
 
-import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
+
+from steady_ppl.smc.loops import choose_systematically
 
 Resampler = Callable[[Tensor, int], Tensor]
 """Of normalised weights `(N, B)` and a number of draws: indices `(draws, B)` in 0 … N − 1, in ascending order."""
@@ -44,39 +44,8 @@ def systematic(weights: Tensor, draws: int, uniform: Tensor | None = None) -> Te
     if weights.device.type != "cpu":
         return systematic_in_parallel(by_trajectory, draws, uniform).t()
     chosen = torch.empty(weights.shape[1], draws, dtype=torch.int64)
-    _systematic(by_trajectory.contiguous().numpy(), uniform.contiguous().numpy(), chosen.numpy())
+    choose_systematically(by_trajectory.contiguous().numpy(), uniform.contiguous().numpy(), chosen.numpy())
     return chosen.t()
-
-
-@njit(cache=True, error_model="numpy")
-def _systematic(weights: np.ndarray, uniform: np.ndarray, chosen: np.ndarray) -> None:
-    first = np.empty(chosen.shape[1] + 1, np.int64)
-    for b in range(len(weights)):
-        choose(weights[b], uniform[b], first, chosen[b])
-
-
-@njit(cache=True, error_model="numpy")
-def choose(weights: np.ndarray, uniform: float, first: np.ndarray, chosen: np.ndarray) -> None:
-    """Choose particles of one trajectory as `systematic` does, for compiled loops; their weights need not sum to one.
-    `first` is room for an index more than is chosen."""
-    particles, draws = len(weights), len(chosen)
-    first[:] = 0  # the particle whose offspring begin at a draw; 0 within offspring
-    total = 0.0
-    for i in range(particles):
-        total += weights[i]
-    cumulative, born = 0.0, 0
-    for i in range(particles):
-        first[born] = i  # the next particle takes the place where this one has no offspring: no branch
-        cumulative += weights[i]
-        share = cumulative / total  # where it is one all are born, also for u within rounding of one
-        until = math.ceil(share * draws - uniform) if share < 1 else draws
-        born = max(born, until)
-    if born < draws:  # where a weight is not a number: the filter says so at its end
-        first[born] = particles - 1
-    parent = 0
-    for j in range(draws):
-        parent = max(parent, first[j])
-        chosen[j] = parent
 
 
 def systematic_in_parallel(weights: Tensor, draws: int, uniform: Tensor) -> Tensor:

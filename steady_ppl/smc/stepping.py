@@ -1,6 +1,7 @@
 """A program's methods on particles, as they are written; `compiled` runs them as kernels."""
 
 from contextlib import nullcontext
+from typing import Any
 
 from torch import Tensor
 
@@ -9,6 +10,16 @@ from steady_ppl.model.handlers import Observing, Recording, Standardised, runnin
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, advance, standardised
 from steady_ppl.smc.genealogy import event_dims
+
+Row = int | Tensor  # a row, or one of each trajectory, `(B,)`
+
+
+def at_row(values: Any, row: Row) -> Any:
+    """What a tensor or array `(rows, B, ...)` has at a row, `(B, ...)`."""
+    if isinstance(row, int):
+        return values[row]
+    at = row if isinstance(values, Tensor) else row.numpy()  # numpy takes a tensor of one number for the number
+    return values[at, range(len(row))]
 
 
 class Stepping:
@@ -19,7 +30,7 @@ class Stepping:
         self.steps, self.elapsed, self.controls = data.steps, data.elapsed, acting_controls(program, data)
         self.event_dims: dict[str, int] = {}  # of each site of `transition`, known after the first
 
-    def transition(self, row: int, state: Tensor, noise: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+    def transition(self, row: Row, state: Tensor, noise: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Move states `(N, B, D)` on from a row: the next ones, and each site's values `(N, B, ...)`, which with
         several substeps are in standard deviations (see `substeps.channel_values`).
 
@@ -27,7 +38,7 @@ class Stepping:
             noise: `(N, B, C)`, in standard deviations of the channels; None: drawn by the program.
         """
         given = nullcontext() if noise is None else Standardised(noise.unsqueeze(1))
-        control, time, step = self.controls[row, None], self.elapsed[row, None], self.steps[row, None]
+        control, time, step = (at_row(part, row)[None] for part in (self.controls, self.elapsed, self.steps))
         with running(state.shape[0], 1, state.shape[1]), Recording() as recording, given:
             moved = advance(self.program, state.unsqueeze(1), control, time, step)
         self.event_dims = event_dims(recording)
@@ -36,9 +47,10 @@ class Stepping:
             values = {site: standardised(fn, values[site], site) for site, fn in recording.distributions.items()}
         return moved.squeeze(1), {site: value.squeeze(1) for site, value in values.items()}
 
-    def log_density(self, row: int, state: Tensor) -> Tensor:
+    def log_density(self, row: Row, state: Tensor) -> Tensor:
         """Tempered log-density of a row's measurements, `(N, B)`."""
-        measured = Observing(self.data.measurements[row, None], self.data.observed[row, None], self.observation_weight)
+        measurements, observed = (at_row(part, row)[None] for part in (self.data.measurements, self.data.observed))
+        measured = Observing(measurements, observed, self.observation_weight)
         with running(state.shape[0], 1, state.shape[1]), Recording() as recording, measured:
             self.program.observe(state.unsqueeze(1))
         return recording.total().squeeze(-2)

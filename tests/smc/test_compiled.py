@@ -15,15 +15,15 @@ from kernel_programs import EXAMPLES, HovercraftTruth, Stale, Switching, single
 from oracles import assert_mean
 from scipy import stats
 
-from steady_ppl import Constant, FilterError, SMCGuide, UsageError, particle_filter, seeded
+from steady_ppl import Constant, FilterError, SMCGuide, UsageError, bearings_to, particle_filter, seeded, with_substeps
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.kernels import jit
 from steady_ppl.model.handlers import Recording, running
 from steady_ppl.model.problem import Problem
-from steady_ppl.smc import compiled
+from steady_ppl.smc import compiled, loops
 from steady_ppl.smc.compiled import CompiledFilter, compiled_filter, standard_normal
-from steady_ppl.smc.proposal import Proposal
+from steady_ppl.smc.proposal import Proposal, Steered
 from steady_ppl.smc.resampling import stratified, systematic, take
 from steady_ppl.smc.stepping import Stepping
 
@@ -97,19 +97,33 @@ def test_other_settings_and_other_tensors_are_traced_anew():
 
 
 @pytest.mark.parametrize("look_ahead", [False, True])
-@pytest.mark.parametrize("gaps", [False, True])
-def test_a_filter_estimates_the_same_with_kernels_as_without(look_ahead, gaps):
-    program = single("hovercraft.py:HovercraftTruth")
+@pytest.mark.parametrize(
+    ("name", "substeps", "known_start", "gaps"),
+    [
+        ("hovercraft.py:HovercraftTruth", 1, True, False),
+        ("hovercraft.py:HovercraftTruth", 1, True, True),
+        ("hovercraft.py:HovercraftTruth", 3, True, True),
+        ("truck", 1, True, True),
+        ("pendulum", 2, False, True),
+        ("linear_gaussian", 1, False, False),
+    ],
+)
+def test_a_filter_estimates_the_same_with_kernels_as_without(name, substeps, known_start, gaps, look_ahead):
+    program = with_substeps(single(name), substeps)
     data = drives(program, 2, 9, gaps=gaps)
     many = data.subset(torch.arange(2).repeat_interleave(100))
-    proposal = Twist(find_and_smooth(Problem(program, many, True))) if look_ahead else None
+    problem, weights = Problem(program, many, known_start), torch.tensor([0.5, 1.0]).repeat(100)
+    settings = {"known_start": known_start, "observation_weight": weights, "particles": 128}
     ratios = []
     for kernels in (True, False):
+        proposal = Twist(find_and_smooth(problem), untwisted=0.0 if name == "truck" else 0.01) if look_ahead else None
         with seeded("filter", int(kernels)):
-            found = particle_filter(program, many, particles=128, known_start=True, proposal=proposal, kernels=kernels)
+            found = particle_filter(program, many, proposal=proposal, kernels=kernels, **settings)
         assert found.in_plain_torch is None
         paths = found.paths(4)
-        assert paths.states.shape == (4, 9, 200, 6) and paths.noise["acceleration"].shape == (4, 8, 200, 3)
+        assert paths.states.shape == (4, 9, 200, len(program.states))
+        channels = sum(value[0, 0, 0].numel() for value in paths.noise.values())
+        assert channels == len(program.channels)
         ratios.append(found.log_likelihood.view(2, 100))
     level = ratios[1].mean(1, keepdim=True)
     likelihood = [(ratio - level).exp() for ratio in ratios]
@@ -119,7 +133,7 @@ def test_a_filter_estimates_the_same_with_kernels_as_without(look_ahead, gaps):
 
 @pytest.mark.parametrize("look_ahead", [False, True])
 @pytest.mark.parametrize("resample_below", [0.0, 0.5, math.inf])
-@pytest.mark.parametrize("block_bytes", [compiled.BLOCK_BYTES, 100_000, 1])
+@pytest.mark.parametrize("block_bytes", [compiled.BLOCK_BYTES, 3 * 8000, 2 * 8000, 1])
 def test_plain_torch_weighs_the_particles_of_a_compiled_filter_the_same(
     look_ahead, resample_below, block_bytes, monkeypatch
 ):
@@ -169,7 +183,7 @@ def test_plain_torch_weighs_the_particles_of_a_compiled_filter_the_same(
         if look_ahead:  # the mixture's density, whichever of its parts a particle was drawn from
             means = channel_means_of(program, at, data, row)
             standard = ((noise - means) / program.noise).double()
-            path, shift, gain, _, whitening, share = (values[row] for values in proposal.of_intervals())
+            path, _, shift, gain, _, whitening, share = (values[row] for values in proposal.of_intervals())
             deviation = at.double() - path
             deviation[..., 2] = torch.remainder(deviation[..., 2] + math.pi, 2 * math.pi) - math.pi
             mean = shift - torch.einsum("bcd,nbd->nbc", gain, deviation)
@@ -196,7 +210,7 @@ def channel_means_of(program, states, data, row: int) -> torch.Tensor:
 def test_without_history_a_compiled_filter_comes_to_the_same(look_ahead, monkeypatch):
     program = single("hovercraft.py:HovercraftTruth")
     data = drives(program, 2, 9)
-    monkeypatch.setattr(compiled, "BLOCK_BYTES", 10_000)
+    monkeypatch.setattr(compiled, "BLOCK_BYTES", 2 * 5120)
     proposal = Twist(find_and_smooth(Problem(program, data, True))) if look_ahead else None
     found = []
     for keep in (True, False):
@@ -204,7 +218,8 @@ def test_without_history_a_compiled_filter_comes_to_the_same(look_ahead, monkeyp
             settings = {"particles": 64, "known_start": True, "proposal": proposal, "kernels": True}
             found.append(particle_filter(program, data, keep_history=keep, **settings))
     assert torch.equal(found[0].log_likelihood, found[1].log_likelihood)
-    assert torch.equal(found[0].log_weights, found[1].log_weights)
+    for name in ("log_weights", "roots", "effective_sizes"):
+        assert torch.equal(getattr(found[0], name), getattr(found[1], name))
     with pytest.raises(UsageError, match="keep_history=True"):
         found[1].paths(3)
 
@@ -234,7 +249,7 @@ def test_random_numbers_are_uniform_and_independent_streams():
     with seeded("uniform"):
         generator = torch.randint(2**32, (4, compiled.STREAMS)).to(torch.uint32).numpy()
     numbers = np.empty((160_000, compiled.STREAMS), np.float32)
-    compiled._draw(generator, numbers.reshape(-1))
+    loops.draw(generator, numbers.reshape(-1))
     assert numbers.min() >= 0 and numbers.max() < 1
     counts = np.bincount((numbers.reshape(-1) * 256).astype(int), minlength=256)
     assert stats.chisquare(counts).pvalue > 1e-4
@@ -250,11 +265,11 @@ def test_random_numbers_are_uniform_and_independent_streams():
 def test_numbers_at_most_zero_are_exponentiated_to_the_last_digits():
     values = torch.cat([-(10.0 ** torch.linspace(-18, 2.85, 4000, dtype=torch.float64)), torch.zeros(3).double()])
     mine = values.clone()
-    compiled._exponentiate(mine.numpy(), torch.empty(len(mine), dtype=torch.int64).numpy())
+    loops.exponentiate(mine.numpy(), torch.empty(len(mine), dtype=torch.int64).numpy())
     torch.testing.assert_close(mine, values.exp(), rtol=4e-16, atol=1e-307)
     gone = torch.tensor([-1e4, -math.inf], dtype=torch.float64)
-    compiled._exponentiate(gone.numpy(), torch.empty(2, dtype=torch.int64).numpy())
-    assert (gone < 1e-300).all()
+    loops.exponentiate(gone.numpy(), torch.empty(2, dtype=torch.int64).numpy())
+    assert (gone == 0).all()
 
 
 def test_paths_of_a_compiled_filter_are_paths_of_the_program():
@@ -267,6 +282,15 @@ def test_paths_of_a_compiled_filter_are_paths_of_the_program():
     states, noise = guide.paths.states, guide.paths.noise["acceleration"]
     moved = program.integrate(states[:, :-1], noise, data.steps)
     torch.testing.assert_close(moved, states[:, 1:], rtol=1e-5, atol=1e-5)
+
+
+def test_a_measurement_that_is_impossible_is_said_to_be_so():
+    program = single("linear_gaussian")
+    data = drives(program, 2, 6)
+    measurements = data.measurements.clone()
+    measurements[3, 1] = 1e30
+    with pytest.raises(FilterError, match="trajectory 2 at .* impossible"):
+        particle_filter(program, replace(data, measurements=measurements), particles=64, kernels=True)
 
 
 def test_a_program_that_blows_up_is_said_to_have_done_so():
@@ -327,6 +351,51 @@ def test_a_kernel_that_has_fallen_behind_its_program_is_found_out():
     assert "different numbers" in found.in_plain_torch
 
 
+class Nearsighted(HovercraftTruth):
+    """Measures with a number that a kernel takes for a constant."""
+
+    def observe(self, state):
+        scale = float(self.mass.detach().numpy())
+        pyro.sample("bearing", bearings_to(self.landmarks, state, sd=0.05 * scale))
+
+
+def test_a_stale_kernel_is_found_out_where_drives_are_measured_and_end_early():
+    program = Nearsighted()
+    data = drives(example("hovercraft", torch.float32), 4, 31, gaps=True)
+    data = replace(data, observed=data.observed & (torch.arange(31) % 2 == 0)[:, None, None])
+    assert not data.observed[-2].any()
+    settings = {"particles": 50, "known_start": True, "kernels": True}
+    assert particle_filter(program, data, **settings).in_plain_torch is None
+    with torch.no_grad():
+        program.mass += 0.5
+    assert "different numbers" in particle_filter(program, data, **settings).in_plain_torch
+
+
+class Straight(Steered):
+    """Looks ahead at nothing, by functions of its own."""
+
+    channels = 3
+
+    def future(self, state, *given):
+        return 0.0 * state[..., 0]
+
+
+class Blurred(Twist):
+    """Thinks otherwise of the future than the twist does."""
+
+    def future(self, state, *given):
+        return 0.5 * super().future(state, *given)
+
+
+def test_proposals_of_several_kinds_have_kernels_of_their_own():
+    program = single("hovercraft.py:HovercraftTruth")
+    data = drives(program, 2, 9)
+    ahead = find_and_smooth(Problem(program, data, True))
+    for proposal in (Twist(ahead), Straight(), Blurred(ahead), Twist(ahead), Proposal()):
+        found = particle_filter(program, data, particles=64, known_start=True, kernels=True, proposal=proposal)
+        assert found.in_plain_torch is None
+
+
 class Counting(HovercraftTruth):
     """Counts how often it is run."""
 
@@ -343,6 +412,13 @@ def test_a_program_whose_settings_never_rest_is_not_compiled_for_ever():
     assert reasons[0] is None and "change from run to run" in reasons[-1]
 
 
+class Drawn(Proposal):
+    """The program's own noise, by lines of its own."""
+
+    def step(self, row, state):
+        return torch.randn(*state.shape[:2], 3), 0.0
+
+
 class Aimless(Twist):
     """Draws its steps by lines of its own."""
 
@@ -356,7 +432,8 @@ def test_what_machine_code_cannot_take_runs_in_plain_torch_and_says_why():
     settings = {"particles": 50, "known_start": True, "kernels": True}
     assert "resampler" in particle_filter(program, data, resampler=stratified, **settings).in_plain_torch
     aimless = Aimless(find_and_smooth(Problem(program, data, True)))
-    assert "no function of one particle" in particle_filter(program, data, proposal=aimless, **settings).in_plain_torch
+    for proposal in (aimless, Drawn()):
+        assert "no function" in particle_filter(program, data, proposal=proposal, **settings).in_plain_torch
 
 
 def test_kernels_are_for_single_precision_and_more_than_a_few_particles():
