@@ -160,8 +160,7 @@ def discover(demo: Demo, size: Size) -> list[str]:
     )
     sentence = read_json(Path("discovery.json"), RunError)["sentence"]
     demo.result(sentence)
-    effects = read_record(Path("runs/found"))["effects"]
-    if not effects:
+    if not (effects := read_record(Path("runs/found"))["effects"]):
         raise ComputationError(f"there is nothing to add, and the demonstration ends here: {sentence}")
     return effects
 

@@ -127,8 +127,7 @@ def cut(
     pieces = st.cut(drives, seconds)
     st.write_table(pieces, out)
     tell(f"{out}: {len(pieces)} drives")
-    left_out = int(drives.lengths.sum() - pieces.lengths.sum())
-    if left_out:
+    if left_out := int(drives.lengths.sum() - pieces.lengths.sum()):
         say(f"{left_out} rows left out: before a piece's first measurement, or in pieces that have none or one row")
 
 

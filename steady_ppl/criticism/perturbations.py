@@ -160,8 +160,7 @@ class _Scores:
             "delay of": -change,
             "lag of": lagged(command.unsqueeze(-1), time, torch.tensor(LAG_SECONDS)).squeeze(-1) - command,
         }
-        speed = next(iter(self.program.velocities(self.states).values()), None)
-        if speed is not None:
+        if (speed := next(iter(self.program.velocities(self.states).values()), None)) is not None:
             shapes["speed-dependent gain of"] = command * speed.abs().double()
         return shapes
 

@@ -120,8 +120,7 @@ def misfit_of(both: Residuals, time: Array, controls: dict[str, Array], pairs: S
         DataError: too few residuals to average anywhere.
     """
     found = list(_all_cells(both, time, controls, pairs))
-    cells = [cell for cell, _ in found]
-    if not cells:
+    if not (cells := [cell for cell, _ in found]):
         rows, drives = time.shape
         what = f"{drives} drives of at most {rows} intervals hold no place, time or regime"
         raise DataError(f"{what} with enough residuals to average: take more drives, or longer ones")

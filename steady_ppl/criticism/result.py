@@ -136,8 +136,7 @@ def _component(found: Check, index: int) -> dict[str, Any]:
     for name, horizon in found.horizons.items():
         prediction = found.predictions[horizon]
         seen = prediction.observed[..., index]
-        count = int(seen.sum())
-        if not count:
+        if not (count := int(seen.sum())):
             continue
         theirs = found.reference.predictions[horizon] if isinstance(found.reference, Reference) else None
         error, both = found.held[horizon]
@@ -240,8 +239,7 @@ def verdict(found: Check) -> str:
             of_noise = "the effects of kind noise in `steady discover` say in which way"
             next_command = of_noise if blame.kind == "noise" else discover
             said += f"{VERDICTS[blame.kind][0]}{_most_clearly(blame)}; {next_command}"
-    loses = lost_horizons(found)
-    if loses:
+    if loses := lost_horizons(found):
         said += f"; it predicts worse than a vehicle that just keeps its velocity ({', '.join(loses)} ahead)"
     return f"{first}{said}."
 

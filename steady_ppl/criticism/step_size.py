@@ -275,8 +275,7 @@ def _uncompared(found: StepCheck, failure: str | None) -> str | None:
 def _trial(program: Program, maximum: Maximum, watched: Sequence[str]) -> StepTrial:
     likely, decrement = float(maximum.log_likelihood.sum()), maximum.decrement or 0.0
     found = StepTrial(program.substeps, likely, decrement, program, maximum.path)
-    chosen = {i: part for i, part in enumerate(elements(program)) if part.owner in watched}
-    if not chosen:
+    if not (chosen := {i: part for i, part in enumerate(elements(program)) if part.owner in watched}):
         return found
     at, parts = list(chosen), list(chosen.values())
     covariance = torch.linalg.pinv(maximum.information)[at][:, at]

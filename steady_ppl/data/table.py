@@ -234,8 +234,7 @@ def require_table_file(path: Path) -> str:
 
 
 def _suffix(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if suffix not in (".csv", ".parquet"):
+    if (suffix := path.suffix.lower()) not in (".csv", ".parquet"):
         raise DataError(f"{path.name}: a table is a .csv or .parquet file")
     return suffix
 
@@ -275,8 +274,7 @@ def from_arrays(drives: Sequence[Mapping[str, Any]], labels: Sequence[str] | Non
     labels = [str(i + 1) for i in range(len(drives))] if labels is None else list(labels)
     if not drives or len(labels) != len(drives):
         raise DataError(f"arrays: got {len(drives)} drives and {len(labels)} labels")
-    repeated = sorted({label for label in labels if labels.count(label) > 1})
-    if repeated:
+    if repeated := sorted({label for label in labels if labels.count(label) > 1}):
         raise DataError(f"arrays: {len(drives)} drives need {len(drives)} labels, and {repeated[0]} is there twice")
     frames = []
     for label, drive in zip(labels, drives, strict=True):
@@ -284,8 +282,7 @@ def from_arrays(drives: Sequence[Mapping[str, Any]], labels: Sequence[str] | Non
         for name, values in drive.items():
             values = np.asarray(values)
             parts = {name: values} if values.ndim < 2 else {f"{name}_{i}": part for i, part in enumerate(values.T)}
-            twice = sorted(parts.keys() & columns.keys() | ({name} & {"trajectory"}))
-            if twice:
+            if twice := sorted(parts.keys() & columns.keys() | ({name} & {"trajectory"})):
                 why = "is what the labels are called" if name == "trajectory" else "is there twice"
                 raise DataError(f"arrays: column {twice[0]} of trajectory {label} {why}", column=twice[0])
             columns |= parts

@@ -75,8 +75,7 @@ def read_alpha_truck(
     command_stamps, command = _read_log(folder / "vesc_drive.csv", COMMAND_COLUMNS)
     begin, end = max(pose_stamps[0], command_stamps[0]), min(pose_stamps[-1], command_stamps[-1])
     window = (end - begin) * 1e-9
-    count = int(window) // 10
-    if count < 1:
+    if (count := int(window) // 10) < 1:
         overlap = f"overlap by {window:.3g} s" if window > 0 else f"do not overlap (they are {-window:.3g} s apart)"
         raise DataError(f"{folder.name}: vrpn-pose.csv and vesc_drive.csv {overlap}, expected 10 s or more")
 

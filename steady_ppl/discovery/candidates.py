@@ -126,8 +126,7 @@ def screen_program(now: Refit, declared: Program, *, sets: int, seed: int, withh
     spread, sharpness = typical_spreads(program, fold.drives, smoothed(ahead, fold.drives))
     columns = columns_of([*variants, *curves(program, seen, spread, sharpness)])
     observed = scores_along(problem, ahead, parts, columns)
-    broken = (~torch.isfinite(observed).all(-1)).nonzero().flatten().tolist()
-    if broken:
+    if broken := (~torch.isfinite(observed).all(-1)).nonzero().flatten().tolist():
         raise FilterError(f"trajectory {fold.drives.labels[broken[0]]}: the fitted program blows up on it")
     starts = fold.path.states[0].expand(sets, -1, -1)  # known, or draws of their posterior
     if not fold.known_start:
@@ -275,8 +274,7 @@ def variance_of_places(now: Refit, candidate: Candidate) -> Tensor:
     curvature = torch.diag(torch.tensor([step.bend for step in steps], dtype=torch.float64))
     for (i, one), (j, other) in combinations(enumerate(steps), 2):
         options = {**one.beside.options, other.name: other.beside.options[other.name]}
-        both = moved_to(replace(one.beside, options=options))
-        if both is not None:
+        if (both := moved_to(replace(one.beside, options=options))) is not None:
             curvature[i, j] = curvature[j, i] = one.sign * other.sign * (both[1] - one.fall - other.fall)
     values, turn = torch.linalg.eigh(curvature)
     along = torch.stack([step.slope for step in steps], -1) @ turn

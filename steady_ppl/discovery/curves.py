@@ -44,8 +44,7 @@ def curves(program: Program, data: Trajectories, spread: Tensor, sharpness: Tens
     (along, mean), found = variables_along(program, data, data.states), list[Variant]()
     for variable, values in along.items():
         seen = values.expand(data.transitions.shape)[data.transitions]
-        knots = knots_of(seen, variable in program.angles)
-        if knots is None:
+        if (knots := knots_of(seen, variable in program.angles)) is None:
             continue
         for index, channel in enumerate(program.channel_names):
             for times in (ADDITIVE, COMMANDED) if variable == "time" else (ADDITIVE,):
@@ -201,8 +200,7 @@ def _of_readings(program: Program, data: Trajectories, sharpness: Tensor) -> lis
     for group in groups:
         index = order.index(group[0])
         circular = bool(turning[index])
-        knots = knots_of(data.measurements[..., index][data.observed[..., index]], circular)
-        if knots is None:
+        if (knots := knots_of(data.measurements[..., index][data.observed[..., index]], circular)) is None:
             continue
         at = group[0] if len(group) == 1 else "all"
         unit = program.measurement_units[index]

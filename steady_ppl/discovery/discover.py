@@ -27,9 +27,9 @@ from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.runs.diagnostics import diagnose_units
-from steady_ppl.runs.fit import Fit, program_source, versions
+from steady_ppl.runs.fit import Fit
 from steady_ppl.runs.folder import JOURNAL, require_same, run_folder, write_record
-from steady_ppl.runs.recipes import fingerprint
+from steady_ppl.runs.recipes import begun_record
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.journal import journal
 from steady_ppl.utils.progress import stages
@@ -278,19 +278,9 @@ def kept_search(
     parameters = hashlib.sha256()
     for name, value in program.state_dict().items():
         parameters.update(name.encode() + value.numpy(force=True).tobytes())
-    begun = {
-        "program": program_source(program, folder),
-        "begun_substeps": program.substeps,
-        "recipe": "discover",
-        "status": "searching",
-        "known_start": options["known_start"],
-        "seed": options["seed"],
-        "options": {**options, "parameters": parameters.hexdigest()},
-        "option_files": {},
-        "table_sha256": fingerprint(train),
-        "valid_sha256": fingerprint(valid) if valid is not None else None,
-        "versions": versions(),
-    }
+    said: dict[str, Any] = {name: options[name] for name in ("known_start", "seed")}
+    said |= {"options": {**options, "parameters": parameters.hexdigest()}, "option_files": {}}
+    begun = begun_record(program, folder, train, valid, recipe="discover", status="searching", **said)
     if resume:
         require_same(folder, begun)
     with run_folder(folder, force=force, resume=resume):

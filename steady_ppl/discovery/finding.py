@@ -119,8 +119,7 @@ def _departure(search: Search, tested: Tested) -> Finding:
 
 def shape_of(search: Search, program: Program) -> Shape | None:
     """The curve, if that is what was found."""
-    curve = search.curve
-    if curve is None or not isinstance(curve.refit, Refit):
+    if (curve := search.curve) is None or not isinstance(curve.refit, Refit):
         return None
     variant = curve.variant
     heights = curve.refit.coefficient(variant)

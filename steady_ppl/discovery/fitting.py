@@ -153,8 +153,7 @@ def with_common_noise(problems: Sequence[Problem], maxima: Sequence[Maximum]) ->
     their fits ended. A FilterError says that programs cannot follow their drives with one noise.
     """
     found = [noise_numbers(one.program, one.data, m.path) for one, m in zip(problems, maxima, strict=True)]
-    common = sorted(set().union(*found))
-    if not common:
+    if not (common := sorted(set().union(*found))):
         return Judges([problem.program for problem in problems], list(maxima))
     copies = [replace(problem, program=copy.deepcopy(problem.program)) for problem in problems]
     parts = [elements(problem.program) for problem in copies]

@@ -115,8 +115,7 @@ def screen(
     tests, curves = list[Tested](), list[Tested]()
     for members in groups.values():
         found = [_test(columns[i], places[i], projected, left, before) for i in members]
-        alive = [test for test in found if test is not None]
-        if alive:
+        if alive := [test for test in found if test is not None]:
             tests.append(_best_of(alive))
         else:
             why = CONTAINED if any(bool((before[places[i]] > 0).any()) for i in members) else UNEXCITED
@@ -279,8 +278,7 @@ def departures(declared: Program, now: Refit, parts: Sequence[Element]) -> list[
         mean = now.mean(judged)
         for variant in [v for effect in catalogue(program) if effect.name == name for v in effect.variants(program)]:
             channels = [program.channel_names.index(name) for name in variant.options.get("channels", ())]
-            index = [i for i in channels or range(slope.shape[1]) if is_tested[i]]
-            if index:
+            if index := [i for i in channels or range(slope.shape[1]) if is_tested[i]]:
                 of_first, of_all = float(away[index].mean()), float(mean[index].mean())
                 found.append(Departure(variant, of_first, of_all, now.first_share, slope[:, index].mean(1)))
     return found

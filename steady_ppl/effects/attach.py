@@ -66,8 +66,7 @@ def _class_with(base: type[Program], variant: Variant, name: str | None) -> type
     known = _CLASSES.setdefault(base, WeakValueDictionary())
     options = variant.options.items()
     key = _frozen((name, variant.effect, variant.at, *options, variant.called, variant.scale, variant.unit))
-    grown = known.get(key)
-    if grown is None:
+    if (grown := known.get(key)) is None:
         about = {"__module__": base.__module__, "__doc__": base.__doc__, "_attached": variant}
         methods = _METHODS_OF_FORM[variant.effect.form](base, variant)
         known[key] = grown = type(name, (base,), {**about, **methods})

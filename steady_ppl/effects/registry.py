@@ -43,8 +43,7 @@ def not_applicable(program: Program) -> dict[str, str]:
 
 def of_name(name: str) -> list[Effect]:
     """All effects of a name, which differ in what they apply to; UsageError, with the nearest name, without any."""
-    named = [effect for effect in _EFFECTS if effect.name == name]
-    if not named:
+    if not (named := [effect for effect in _EFFECTS if effect.name == name]):
         near = difflib.get_close_matches(name, [effect.name for effect in _EFFECTS], n=1, cutoff=0.5)
         meant = f"did you mean {near[0]}? " if near else ""
         raise UsageError(f"no effect {name!r}: {meant}there are {', '.join(sorted({e.name for e in _EFFECTS}))}")
@@ -58,8 +57,7 @@ def find(name: str, program: Program) -> Effect:
 
 def _applicable(effects: list[Effect], program: Program) -> Effect:
     for effect in effects:
-        reason = effect.lacks(program)
-        if not reason:
+        if not (reason := effect.lacks(program)):
             return effect
     raise UsageError(f"effect {effect.name} does not apply to {type(program).__name__}: {reason}")
 
@@ -100,8 +98,7 @@ def chosen_variant(program: Program, effect: str | Effect, at: str = "", **optio
         at, options = at or said, {**more, **options}
         effect = find(effect, program)
     _applicable([effect], program)
-    unknown = set(options) - set(effect.profiled)
-    if unknown:
+    if unknown := set(options) - set(effect.profiled):
         has = f"it has {', '.join(effect.profiled)}" if effect.profiled else "it has none"
         raise UsageError(f"effect {effect.name} has no option {sorted(unknown)[0]}: {has}")
     for option, number in options.items():
@@ -131,8 +128,7 @@ def page(program: Program | None = None) -> str:
     """All effects, or those that a program could have and why it could not have the others, in Markdown."""
     lines = [PAGE_HEAD]
     for verdict in dict.fromkeys(VERDICT_OF_FORM.values()):
-        chosen = [effect for effect in catalogue(program) if effect.verdict == verdict]
-        if chosen:
+        if chosen := [effect for effect in catalogue(program) if effect.verdict == verdict]:
             header = ["name", *(["at"] * bool(program)), "equation", "unit of c", "typical c", "options", "feels"]
             lines += [f"## {verdict.capitalize()}", "", f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
         for effect in chosen:

@@ -28,8 +28,7 @@ def array(tensor: Tensor) -> Array:
 def in_lanes(matrices: Tensor) -> Array:
     """`(..., B, R, C)` as `(..., blocks, R, C, LANES)` in the host's memory, the last block filled with zeros."""
     lanes = LANES if matrices.shape[-3] > 2 else 1  # blocks of mostly zeros would be no faster
-    missing = -matrices.shape[-3] % lanes
-    if missing:
+    if missing := -matrices.shape[-3] % lanes:
         matrices = torch.nn.functional.pad(matrices, (0, 0, 0, 0, 0, missing))
     return matrices.unflatten(-3, (-1, lanes)).movedim(-3, -1).contiguous().numpy(force=True)
 

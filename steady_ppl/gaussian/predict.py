@@ -107,10 +107,8 @@ def simulate_again(
     path = torch.stack(states).flatten(1, 2)
     drawn = measure(program, path)
     again = data.subset(torch.arange(drives).repeat(sets))
-    known = torch.full_like(path, torch.nan)
-    known[0] = path[0]
-    again = replace(again, measurements=torch.where(again.observed, drawn, 0.0), states=known)
-    return again, ReferencePath(path, torch.stack(noises).flatten(1, 2))
+    again = replace(again, measurements=torch.where(again.observed, drawn, 0.0), states=path)
+    return again.without_truth(keep_start=True), ReferencePath(path, torch.stack(noises).flatten(1, 2))
 
 
 @torch.no_grad()

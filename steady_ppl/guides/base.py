@@ -181,8 +181,7 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
         DataError: a state is unknown.
         ProgramError: no noise is found within `MAX_GAUSS_NEWTON_STEPS`, or the start is not one site.
     """
-    states = data.states
-    if states is None or not bool(torch.isfinite(states[data.rows]).all()):
+    if (states := data.states) is None or not bool(torch.isfinite(states[data.rows]).all()):
         raise DataError("supervised learning needs the true state of every row: the table's x. columns are incomplete")
     states = torch.where(data.rows[..., None], states, states[:1])
     exact, within = copy.deepcopy(program).double(), data.to(torch.float64)

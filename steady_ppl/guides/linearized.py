@@ -92,8 +92,7 @@ class LinearizedGuide(PathGuide):
         ahead = find_and_smooth(problem, observation_weight=weight, may_fail=known is not None)
         found = resting_path(ahead, part)
         better = ahead.log_likelihood > (-torch.inf if known is None else known[trajectories])  # not where it is a nan
-        kept = better.nonzero().flatten().tolist()
-        if kept:
+        if kept := better.nonzero().flatten().tolist():
             self.remember(ReferencePath(found.states[:, kept], found.noise[:, kept]), part.subset(kept))
 
     def _smooth(self, data: Trajectories, progress: float) -> Lookahead:
@@ -196,8 +195,7 @@ class SmootherGuide(VariationalGuide):
         self.index: list[int] = []
 
     def begin(self, data: Trajectories) -> Tensor:
-        unknown = [label for label in data.labels if label not in self.labels]
-        if unknown:
+        if unknown := [label for label in data.labels if label not in self.labels]:
             raise UsageError(f"this guide has parameters for its own drives only, not for drive {unknown[0]}")
         self.index = [self.labels.index(label) for label in data.labels]
         return super().begin(data)

@@ -215,8 +215,7 @@ def _line_search(here: _LinearizedObjective, move: Tensor, passes: int) -> tuple
     while share > 0.01:
         for term, values in zip(terms, before, strict=True):
             set_values(term.parts, values + share * move[term.columns])
-        there = _tried(terms, passes, here.objective - MAX_DECREASE)
-        if there is not None:
+        if (there := _tried(terms, passes, here.objective - MAX_DECREASE)) is not None:
             return share, there
         share /= 3
     for term, values in zip(terms, before, strict=True):

@@ -207,8 +207,7 @@ def channel_moments(
 def _moments_of_channels(
     program: Program, states: Tensor, control: Tensor, time: Tensor, step: Tensor
 ) -> tuple[Tensor, Tensor]:
-    seen = Recording()
-    with running(*states.shape[:-1]), seen, AtMean():
+    with running(*states.shape[:-1]), Recording() as seen, AtMean():
         sample_channels(program, states, control, time, step)
     sites = (
         [as_vector(part, fn.event_dim).expand(*states.shape[:-1], -1) for part in normal_moments(fn, site)]
@@ -293,8 +292,7 @@ class Measured:
 @torch.no_grad()
 def measured(program: Program, states: Tensor) -> Measured:
     """What is measured at states `(..., D)`."""
-    seen = Recording()
-    with running(*states.shape[:-1]), seen, AtMean():
+    with running(*states.shape[:-1]), Recording() as seen, AtMean():
         program.observe(states)
     return Measured(seen.distributions)
 

@@ -124,8 +124,7 @@ class Coloured(Transforming):
 
 def channel_means(program: Program, transition: Callable[..., Tensor], *arguments: Tensor) -> dict[str, Tensor]:
     """The means of the channels that a transition of some arguments samples, by name, each `(...)`."""
-    seen = Recording()
-    with poutine.block(), seen, AtMean():
+    with poutine.block(), Recording() as seen, AtMean():
         transition(*arguments)
     parts = [as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()]
     return dict(zip(program.channel_names, torch.cat(parts, -1).unbind(-1), strict=True))

@@ -122,8 +122,7 @@ def counts_rows(program: Program) -> bool:
     `actuators` is looked at, so that a lag on top of such a delay does not hide it.
     """
     kinds = [kind for kind in type(program).__mro__ if kind is not Program]
-    methods = [vars(kind)["actuators"] for kind in kinds if "actuators" in vars(kind)]
-    if not methods:
+    if not (methods := [vars(kind)["actuators"] for kind in kinds if "actuators" in vars(kind)]):
         return False
     like = next(program.parameters(), torch.zeros(()))
     with seeded("commands"):

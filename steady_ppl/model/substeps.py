@@ -82,8 +82,7 @@ def advance(program: Program, state: Tensor, control: Tensor, time: Tensor, step
     if program.substeps == 1:
         return program.transition(state, control, time, step)
     (first, _), *others = _parts(program, control, time, step)
-    seen = Recording()
-    with seen, within_row():
+    with Recording() as seen, within_row():
         state = program.transition(state, *first)
     noise = {site: standardised(fn, seen.values[site], site) for site, fn in seen.distributions.items()}
     for after, _ in _through(program, state, others, noise):
@@ -272,8 +271,7 @@ def _through(
 ) -> Iterator[tuple[Tensor, Recording]]:
     """The state after each substep with given noise in scales, and what was sampled in it."""
     for given, ends in parts:
-        seen = Recording()
-        with poutine.block(), seen, Held(noise), within_row(ends):
+        with poutine.block(), Recording() as seen, Held(noise), within_row(ends):
             state = program.transition(state, *given)
         yield state, seen
 

@@ -185,17 +185,15 @@ def _check_state(method: str, state: object, size: int) -> None:
 
 def start_size(program: Program) -> int:
     """How many numbers `initial` draws."""
-    seen = Recording()
-    with running(1, 1), seen:
+    with running(1, 1), Recording() as seen:
         program.initial()
     return sum(fn.event_shape.numel() for fn in seen.distributions.values())
 
 
 def noise_size(program: Program) -> int:
     """How many numbers each `transition` draws."""
-    seen = Recording()
     state = draw_starts(program, 1, 1)
     control, one = state.new_zeros(1, 1, len(program.controls)), state.new_ones(1, 1)
-    with running(1, 1), seen:
+    with running(1, 1), Recording() as seen:
         program.transition(state, control, 0.0 * one, one)
     return sum(fn.event_shape.numel() for fn in seen.distributions.values())

@@ -99,8 +99,7 @@ def where_and_when(found: Check, axes: Axes) -> None:
 
 def regime_panel(found: Check, axes: Axes) -> None:
     """The mean residual over the ranges of the variable in which it stands out most."""
-    cells = found.misfit.of_map("regime")
-    if not cells:
+    if not (cells := found.misfit.of_map("regime")):
         axes.set_axis_off()
         return
     strongest, _ = max(cells, key=lambda pair: abs(pair[1]))

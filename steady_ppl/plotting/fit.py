@@ -222,8 +222,7 @@ def _drawn(posterior: arviz.InferenceData, trajectory: str, components: Sequence
     """Times, draws of these state components, and their true values where all are known beyond a start."""
     time, states = _time(posterior, trajectory), posterior["posterior"]
     plain = [str(name) for name, values in states.data_vars.items() if values.ndim == 4]
-    lacking = [name for name in components if name not in plain]
-    if lacking:
+    if lacking := [name for name in components if name not in plain]:
         raise UsageError(f"no state {', '.join(lacking)} in this posterior; there are {', '.join(plain)}")
     constants = posterior["constant_data"].sel(trajectory=trajectory)
     true = [constants.get(f"true_{name}") for name in components]
@@ -258,8 +257,7 @@ def _in_body_frame(heading: Any, vx: Any, vy: Any) -> tuple[Any, Any]:
 def _logged(fit: Fit, figure: str, why_not: str) -> tuple[list[float], list[float]]:
     if fit.trained is None:
         raise UsageError(f"recipe {fit.recipe} does not train: there is no history to draw")
-    entries = [entry for entry in fit.trained.history if figure in entry]
-    if not entries:
+    if not (entries := [entry for entry in fit.trained.history if figure in entry]):
         raise UsageError(f"the history has no {figure}: {why_not}")
     return [entry["step"] for entry in entries], [entry[figure] for entry in entries]
 

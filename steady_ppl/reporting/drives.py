@@ -13,13 +13,12 @@ from steady_ppl.criticism.result import Check, band, measured_values, place, str
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.model.program import Program, names, units
 from steady_ppl.runs.fit import Fit
-from steady_ppl.runs.posterior import drawn_states
+from steady_ppl.runs.posterior import INTERVAL_QUANTILES, drawn_states
 from steady_ppl.utils.angles import nearest_turn
 
 MARGIN_SECONDS = 0.5  # shown before and after a stretch
 MAX_CODE, MISSING_CODE = 65534, -32768  # codes of sixteen bits, which are finer than a screen
 MAX_PACKED_NUMBERS = 300_000  # of all drives and runs: .8 MB of text
-QUANTILES = (0.05, 0.5, 0.95)
 PATHS_SHOWN = 8  # draws in the plane
 DriveInterval = tuple[int, float, float]  # drive, and from when to when
 
@@ -172,7 +171,7 @@ def data_of_run(found: Check, fit: Fit, table: Trajectories, shown: Shown, *, dr
     data = found.data.subset(shown.drives)
     posterior = drawn_states(fit.program, data, draws=draws, known_start=fit.known_start, seed=seed)["posterior"]
     states = found.program.state_names
-    by_state = [posterior[name].quantile(QUANTILES, ("chain", "draw"), skipna=False).values for name in states]
+    by_state = [posterior[name].quantile(INTERVAL_QUANTILES, ("chain", "draw"), skipna=False).values for name in states]
     quantiles = np.stack(by_state, -1).swapaxes(1, 2)  # (3, rows, B, D)
     all_of_them = Shown(list(range(len(data))), shown.every, len(data))
     across = [states[i] for i in plane(found.program)]

@@ -35,7 +35,7 @@ OF_ROW = ("trajectory", "row")
 DIMENSIONS = ("chain", "draw", *OF_ROW)
 Groups = Mapping[str, xarray.Dataset]
 """Those of ArviZ's InferenceData, which is such a mapping itself."""
-INTERVAL_QUANTILES = (0.05, 0.95)
+INTERVAL_QUANTILES = (0.05, 0.5, 0.95)
 STATES_SUFFIXES = (".csv", ".parquet", ".nc")
 
 
@@ -177,9 +177,7 @@ def states_frame(posterior: Groups) -> pd.DataFrame:
     labels = np.repeat(time["trajectory"].values, inside.sum(1))
     columns: dict[str, np.ndarray] = {"trajectory": labels, "time": time.values[inside]}
     for name in plain:
-        low, middle, high = np.quantile(
-            states[name].values[0][:, inside], (INTERVAL_QUANTILES[0], 0.5, INTERVAL_QUANTILES[1]), axis=0
-        )
+        low, middle, high = np.quantile(states[name].values[0][:, inside], INTERVAL_QUANTILES, axis=0)
         columns |= {str(name): middle, f"{name}_low": low, f"{name}_high": high}
     return pd.DataFrame(columns)
 

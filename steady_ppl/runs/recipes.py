@@ -75,8 +75,7 @@ def require_settings(name: str, recipe: Callable[..., Any], options: Mapping[str
 
 def trains(recipe: Recipe) -> bool:
     """Whether a recipe takes checkpoint, resume and progress of `train`."""
-    parameters = inspect.signature(recipe).parameters.values()
-    return any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+    return any(parameter.kind is parameter.VAR_KEYWORD for parameter in inspect.signature(recipe).parameters.values())
 
 
 def suited_recipe(
@@ -88,8 +87,7 @@ def suited_recipe(
     and settings (`options`) that `likelihood` has not ask for it.
     """
     own = inspect.signature(find_recipe("likelihood")).parameters
-    foreign = [name for name in options if name not in own]
-    if foreign:
+    if foreign := [name for name in options if name not in own]:
         return "steady", f"{foreign[0]} is a setting of it"
     if device != "cpu":
         return "steady", f"it computes on {device}"
@@ -146,23 +144,13 @@ def run_recipe(
     for part in (table, valid):
         if part is not None:
             columns = for_program(program, part)
-            doubts += [said for said in diagnose_units(program, columns) if said not in doubts]
+            doubts += [doubt for doubt in diagnose_units(program, columns) if doubt not in doubts]
             if known_start:
                 columns.require_known_start()
     declared = {key: value.clone() for key, value in program.state_dict().items()}
-    begun = {
-        "program": program_source(program, folder),
-        "begun_substeps": program.substeps,
-        "recipe": name,
-        "status": "training",
-        "known_start": known_start,
-        "seed": seed,
-        "options": json.loads(json.dumps(dict(options))),  # as the record will say them
-        "option_files": _files(options),
-        "table_sha256": fingerprint(table),
-        "valid_sha256": fingerprint(valid) if valid is not None else None,
-        "versions": versions(),
-    }
+    said: dict[str, Any] = {"recipe": name, "status": "training", "known_start": known_start, "seed": seed}
+    said["options"] = json.loads(json.dumps(dict(options)))  # as the record will say them
+    begun = begun_record(program, folder, table, valid, **said, option_files=_files(options))
     arguments = {"known_start": known_start, "seed": seed, **options}
     if trains(recipe):
         arguments |= {"checkpoint": folder / CHECKPOINT, "resume": resume, "progress": progress}
@@ -186,6 +174,20 @@ def run_recipe(
             fitted.notes.append("no --valid table: trained to the last step, nothing held out decides when to stop")
         fitted.save_into(folder, table, begun)
     return fitted
+
+
+def begun_record(
+    program: Program, folder: Path, table: Trajectories, valid: Trajectories | None, **said: Any
+) -> dict[str, Any]:
+    """What the record of a run says before there is a result: its program and tables, and what else is `said`."""
+    return {
+        "program": program_source(program, folder),
+        "begun_substeps": program.substeps,
+        "table_sha256": fingerprint(table),
+        "valid_sha256": fingerprint(valid) if valid is not None else None,
+        "versions": versions(),
+        **said,
+    }
 
 
 def fingerprint(table: Trajectories) -> str:

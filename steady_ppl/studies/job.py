@@ -353,8 +353,7 @@ def planted_effect(job: Job) -> tuple[Variant | None, list[float]]:
 
 def with_noise(program: Program, job: Job) -> Program:
     """With the noise of its bearings, which is known."""
-    degrees = job.data.get("sigma_deg")
-    if degrees is not None:
+    if (degrees := job.data.get("sigma_deg")) is not None:
         if not hasattr(program, "bearing_sd"):
             raise UsageError(f"{type(program).__name__} has no bearing_sd that sigma_deg could set")
         program.bearing_sd = math.radians(degrees)
@@ -370,7 +369,6 @@ def settings_with_noise(job: Job) -> dict[str, Any]:
 
 def _table(folder: Path, part: str) -> Path:
     files = [folder / f"{part}{ending}" for ending in TABLE_SUFFIXES]
-    found = [file for file in files if file.is_file()]
-    if not found:
+    if not (found := [file for file in files if file.is_file()]):
         raise DataError(f"{folder} has no {' and no '.join(file.name for file in files)}")
     return found[0]

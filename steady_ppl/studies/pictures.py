@@ -46,8 +46,7 @@ def study_picture(plan: Plan, results: pd.DataFrame) -> Figure:
         own = own[~own["method"].isin(picture.leave_out)]
     if not len(own) or not (own["outcome"] == "done").any():
         raise UsageError("no job of the study is done yet")
-    missing = [name for name in picture.columns if name not in own]
-    if missing:
+    if missing := [name for name in picture.columns if name not in own]:
         raise UsageError(f"the table has no column {missing[0]}; it has {', '.join(map(str, own))}")
     own = own.assign(**{name: _numbers(own, name) for name in picture.columns})
     own = own.iloc[np.argsort([order[key] for key in own["key"]], kind="stable")]

@@ -110,8 +110,7 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
     problem = mismatch(content, PLAN_FORM) or _unknown(content)
     if problem := problem or _undrawable(content["title"], content.get("picture")):
         raise UsageError(problem)
-    task = content.get("task", "fit")
-    if task not in TASKS:
+    if (task := content.get("task", "fit")) not in TASKS:
         raise UsageError(f"task is {task!r}, expected {' or '.join(TASKS)}")
     if task == "discover" and "simulate" not in content["data"]:
         raise UsageError("task discover needs data that are simulated, of which it knows what is missing")

@@ -59,8 +59,7 @@ class StudyTable:
 
     def merge(self) -> None:
         """Write the table with all that has come."""
-        arrived = list((self.folder / ARRIVED).glob("*.parquet"))
-        if arrived:
+        if arrived := list((self.folder / ARRIVED).glob("*.parquet")):
             everything = read_results(self.folder)
             _write(everything, self.folder / TABLE)
             self.rows = len(everything)

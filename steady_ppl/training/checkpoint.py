@@ -61,8 +61,7 @@ def read_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimi
         raise damaged(path, "the averaged parameters are others than the program's")
     if groups["kept"] and _shapes(groups["kept"]) != _shapes(state.averaged):
         raise damaged(path, "the kept parameters are others than the program's")
-    broken = [name for name, value in groups["parameters"].items() if not value.isfinite().all()]
-    if broken:
+    if broken := [name for name, value in groups["parameters"].items() if not value.isfinite().all()]:
         raise damaged(path, f"the parameters {', '.join(broken)} are not finite")
     numbers = _numbers(path, text)
     with torch.no_grad():
@@ -88,8 +87,7 @@ def _numbers(path: Path, text: Mapping[str, str]) -> dict[str, Any]:
         found = {name: json.loads(text[name]) for name in PROGRESS_FORM if name in text}
     except (ValueError, RecursionError):
         raise damaged(path, "the text beside the tensors is no JSON") from None
-    problem = mismatch(found, PROGRESS_FORM)
-    if problem is not None:
+    if (problem := mismatch(found, PROGRESS_FORM)) is not None:
         raise damaged(path, problem)
     return found
 

@@ -47,11 +47,9 @@ def journal(folder: Path) -> Iterator[None]:
 def journaled(compute: Callable[[], Output]) -> Output:
     """The next piece: tensors, and what JSON can hold. A `FilterError` is a result like any other. Outside of a journal
     nothing is kept."""
-    files = _files.get()
-    if files is None:
+    if (files := _files.get()) is None:
         return compute()
-    file = next(files)
-    if not file.is_file():
+    if not (file := next(files)).is_file():
         _write(file, compute)
     tensors, said = _read(file)
     torch.set_rng_state(tensors.pop(RANDOM_STATE))

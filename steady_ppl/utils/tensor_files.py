@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load, save, save_file
+from safetensors.torch import load, save
 from torch import Tensor
 
 from steady_ppl.errors import RunError
@@ -30,12 +30,9 @@ def unpacked(content: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: Mapping[str, str] | None = None) -> None:
     """Write tensors and text to a safetensors file, whole or not at all, with their hash, by which damage is told."""
-    kept = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    text = text or {}
     with whole_file(path, RunError) as beside:
-        try:
-            save_file(kept, beside, {**(text or {}), HASH: _hash(kept, text or {})})
-        except SafetensorError as error:  # what the file system refuses comes as its own
-            raise RunError(f"{path} cannot be written: {error}") from error
+        beside.write_bytes(packed(tensors, {**text, HASH: _hash(tensors, text)}))
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -46,11 +43,10 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     except FileNotFoundError:
         raise RunError(f"no file {path.name} in {path.parent}") from None
     except SafetensorError as error:
-        raise RunError(f"{path.name} in {path.parent} is damaged ({error})") from error
+        raise damaged(path, str(error)) from error
     except OSError as error:
         raise RunError(f"{path.name} in {path.parent} cannot be read: {error.strerror or error}") from error
-    written = text.pop(HASH, None)
-    if written is not None and written != _hash(tensors, text):
+    if (written := text.pop(HASH, None)) is not None and written != _hash(tensors, text):
         raise damaged(path, "its numbers are not those that were written")
     return tensors, text
 
@@ -59,7 +55,7 @@ def _hash(tensors: Mapping[str, Tensor], text: Mapping[str, str]) -> str:
     digest = hashlib.sha256(json.dumps(sorted(text.items())).encode())
     for name, value in sorted(tensors.items()):
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode(errors="surrogatepass"))
-        digest.update(value.contiguous().reshape(-1).view(torch.uint8).numpy(force=True).tobytes())
+        digest.update(value.detach().contiguous().reshape(-1).view(torch.uint8).numpy(force=True).tobytes())
     return digest.hexdigest()
 
 

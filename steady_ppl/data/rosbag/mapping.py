@@ -59,12 +59,10 @@ class BagColumn:
     def _check(self) -> None:
         if self.name[:2] not in ("u.", "y.", "x.") or len(self.name) < 3:
             raise UsageError("expected u.NAME (a control), y.NAME (a measurement) or x.NAME (a known state)")
-        problem = mismatch(vars(self), KEY_FORMS)
-        if problem or not self.topic:
+        if (problem := mismatch(vars(self), KEY_FORMS)) or not self.topic:
             raise UsageError(problem or "topic is '', expected text")
         for key, choices in ALLOWED_VALUES.items():
-            value = getattr(self, key)
-            if value not in choices:
+            if (value := getattr(self, key)) not in choices:
                 known = " or ".join(f'"{choice}"' for choice in choices if choice)
                 raise UsageError(f"{'as' if key == 'reading' else key} is {value!r}, expected {known}")
         if self.kind != "u" and (self.between is not None or self.longest is not None):

@@ -85,8 +85,7 @@ def _series_of(bag: Bag, mapping: BagMapping, say: Say) -> list[Series]:
         if column.clock != "bag" and not has_stamp(bag.store, type_name):
             raise DataError(f'{where}: a {type_name} has no header.stamp; expected clock = "bag"')
         topics.setdefault(column.topic, []).append(column)
-    lacking = sorted({bag.type_of(topic, bag.name) for topic in topics} - bag.defined)
-    if lacking:
+    if lacking := sorted({bag.type_of(topic, bag.name) for topic in topics} - bag.defined):
         say(f"{bag.name} does not define {', '.join(lacking)}: taken from `messages`, else from ROS 2 Humble")
     found: dict[str, Series] = {}
     with stages(*((topic, 1) for topic in topics)) as begin:
@@ -110,8 +109,7 @@ def _of_topic(bag: Bag, topic: str, columns: list[BagColumn], say: Say) -> list[
         values.append([value_at(message, steps, yaw=yaw) for steps, yaw in fields])
     received, stamps = np.array(arrivals, dtype=np.int64), np.array(headers, dtype=np.int64)
     table = np.array(values, dtype=np.float64).reshape(len(arrivals), len(columns))  # None becomes NaN
-    unset = int((stamps == 0).sum())
-    if unset:
+    if unset := int((stamps == 0).sum()):
         what = f"the header.stamp of {unset} of {len(stamps)} messages is zero, nobody set it"
         raise DataError(f'{bag.name}: topic {topic}: {what}; use clock = "bag"')
     times = {"bag": received, "header": stamps}

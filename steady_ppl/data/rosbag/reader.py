@@ -61,8 +61,7 @@ class Bag:
         names = self.types(topic)
         if len(names) > 1:
             raise DataError(f"{where}: its messages are of several types, {' and '.join(names)}; expected one")
-        missing = undefined_type(self.store, names[0])
-        if missing:
+        if missing := undefined_type(self.store, names[0]):
             what = f"neither {self.name} nor rosbags' typestore defines the message type {missing}"
             how = 'name its file in the mapping: messages = ["PACKAGE/msg/NAME.msg"], or a folder of such files'
             raise DataError(f"{where}: {what}; {how}")
@@ -304,8 +303,7 @@ def _of_bag(bag: Bag, sections: dict[tuple[str, str], list[str]]) -> list[str]:
         middle = float(np.median(gaps)) if len(gaps) else 0.0
         rate = f"  {1e9 / middle:.4g} Hz" if middle > 0 else ""
         lines += ["#", f"# {topic}  {' and '.join(types)}  {len(at)} message{'' if len(at) == 1 else 's'}{rate}"]
-        missing = next(filter(None, (undefined_type(bag.store, one) for one in types)), None)
-        if missing:
+        if missing := next(filter(None, (undefined_type(bag.store, one) for one in types)), None):
             lines.append(
                 f'#     {missing} is not defined: name its file, messages = ["PACKAGE/msg/NAME.msg"], in the mapping'
             )
