@@ -32,6 +32,7 @@ MAX_DECREMENT = 1.0  # nats that a scoring step may promise; beyond it more step
 REFIT_PRECISION = 0.005  # nats
 MAX_SUBSTEPS_TRIED = 32  # of a trial, unless more are asked for; a program may always be tried at twice its own
 MAX_REFIT_STEPS = 25  # scoring steps of a fit
+MAX_NATS_A_NUMBER = 50.0  # log-density of a measured number; of what is known to sixteen digits it is 37 at most
 UNKNOWN = "whether the time step suits is not known"
 
 
@@ -201,7 +202,7 @@ def check_step(
             with seeded(substeps, "wider noise"):
                 path = widen_noise(problem, path)
         maximum = maximise(problem, path, steps=steps, precision=REFIT_PRECISION)
-        return _trial(changed, maximum, names)
+        return _trial(changed, data, maximum, names)
 
     def again(coarse: StepTrial, fine: StepTrial) -> StepTrial:
         try:
@@ -213,7 +214,7 @@ def check_step(
     own = program.substeps
     most = min(MAX_SUBSTEPS, max(finest, 2 * own))
     if isinstance(at, Maximum):
-        first = _trial(program, at, names)
+        first = _trial(program, data, at, names)
     else:
         first = trial(own, program, at or find_path(Problem(program, data, known_start)), 0)
     if counts_rows(program):  # in substeps its delay is another
@@ -272,8 +273,10 @@ def _uncompared(found: StepCheck, failure: str | None) -> str | None:
     return None
 
 
-def _trial(program: Program, maximum: Maximum, watched: Sequence[str]) -> StepTrial:
+def _trial(program: Program, data: Trajectories, maximum: Maximum, watched: Sequence[str]) -> StepTrial:
     likely, decrement = float(maximum.log_likelihood.sum()), maximum.decrement or 0.0
+    if not bool(maximum.information.isfinite().all()) or likely > MAX_NATS_A_NUMBER * int(data.observed.sum()):
+        raise FilterError("its likelihood has no maximum on these drives: a standard deviation goes to zero")
     found = StepTrial(program.substeps, likely, decrement, program, maximum.path)
     if not (chosen := {i: part for i, part in enumerate(elements(program)) if part.owner in watched}):
         return found

@@ -319,6 +319,26 @@ def test_an_unstable_step_is_told_by_every_command(tmp_path, capsys) -> None:
         check(Fit(load_program(model), "hand"), drives, simulations=20)
 
 
+@pytest.mark.parametrize("change", [{"information": torch.nan}, {"log_likelihood": 1e30}])
+def test_parameters_that_diverge_are_no_trial(change, monkeypatch) -> None:
+    """A measurement that never changes has a likelihood without a maximum: its noise shrinks without end."""
+    cart = example("linear_gaussian")
+    data = for_program(cart, simulate(cart, 4, seed=1)).without_truth()
+    own, found = step_size.maximise, []
+
+    def diverging(problem, path, **settings):
+        maximum = own(problem, path, **settings)
+        found.append(maximum)
+        if len(found) < 3:
+            return maximum
+        return replace(maximum, **{name: torch.full_like(getattr(maximum, name), to) for name, to in change.items()})
+
+    monkeypatch.setattr(step_size, "maximise", diverging)
+    monkeypatch.setattr(step_size, "MAX_DECREMENT", -1.0)  # finer steps are always fitted
+    said = check_step(cart, data)
+    assert len(found) > 2 and "likelihood has no maximum on these drives" in said.uncompared
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_two_maxima_of_one_program_are_no_matter_of_its_step(seed) -> None:
     """From a bias of 30 m/s² the coarser fit ends at a lower maximum than the finer one, which begins where it ends."""
