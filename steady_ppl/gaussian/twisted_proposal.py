@@ -71,8 +71,8 @@ class Twist(Steered):
         self.lookahead, self.untwisted = lookahead, untwisted
         path, steps = lookahead.linearization.path.states, lookahead.steps
         self.channels, self.path = steps.shift.shape[-1], path.double()
-        self.turn = 2 * math.pi * lookahead.linearization.circular.double()  # of angles; no other component has turns
-        self.whitening = inverse(steps.factor)
+        turn = 2 * math.pi * lookahead.linearization.circular.double()  # of angles; no other component has turns
+        whitening = inverse(steps.factor)
         # Λ = RᵀR and λ = Rᵀz; where rounding has left Λ no root, its diagonal serves: any future leaves p(y) unbiased
         own = lookahead.precision.diagonal(dim1=-2, dim2=-1).clamp(min=1e-30)
         lower, failed = torch.linalg.cholesky_ex(lookahead.precision + torch.diag_embed(1e-13 * own))
@@ -80,23 +80,19 @@ class Twist(Steered):
         self.root, information = lower.mT, lookahead.information.unsqueeze(-1)
         self.target = torch.linalg.solve_triangular(lower, information, upper=False).squeeze(-1)
 
+        turns = turn.expand_as(self.path)
+        share = self.path.new_tensor([untwisted]).expand(*steps.shift.shape[:2], 1)
+        steering = (steps.shift, steps.gain, steps.factor, whitening)
+        self.rows = (self.path, turns, self.root, self.target)
+        self.intervals = (self.path[:-1], turns[:-1], *steering, share)
+
     def of_rows(self) -> Sequence[Tensor]:
         """Path, turns, root and target of each row, see `Proposal`."""
-        return self.path, self.turn.expand_as(self.path), self.root, self.target
+        return self.rows
 
     def of_intervals(self) -> Sequence[Tensor]:
         """Path, turns and steering of each interval, and the share that is not steered."""
-        steps, untwisted = self.lookahead.steps, self.path.new_tensor([self.untwisted])
-        share = untwisted.expand(*steps.shift.shape[:2], 1)
-        return (
-            self.path[:-1],
-            self.turn.expand_as(self.path[:-1]),
-            steps.shift,
-            steps.gain,
-            steps.factor,
-            self.whitening,
-            share,
-        )
+        return self.intervals
 
     def future(self, state: Tensor, *given: Tensor) -> Tensor:
         """−½ |R δ − z|² of every particle's deviation δ from the path: log p(y_{row+1}, …, y_T | state) of the

@@ -1,7 +1,7 @@
 """Loops over particles and rows that numba compiles.
 
-They stand in one file: numba's cache of a loop does not see that another file changes. What a loop is told to fill
-changes; all arrays are contiguous.
+They stand in one file: numba's cache of a loop does not see that another file changes. A loop fills the arrays that
+its caller gives for results. All arrays are contiguous.
 """
 
 from __future__ import annotations
