@@ -204,7 +204,7 @@ class Variant:
         return f"{self.name} ({said})" if said else self.name
 
     def coefficient(self, value: Value | None, like: Tensor) -> Tensor:
-        """A value as a tensor, the typical one when None; UsageError for another number of components."""
+        """A value as a tensor of its own, the typical one when None; UsageError for another number of components."""
         given = torch.as_tensor(self.effect.typical if value is None else value, dtype=like.dtype, device=like.device)
         wanted = self.effect.components
         if not wanted and given.shape == (1,):
@@ -212,7 +212,7 @@ class Variant:
         if given.shape != torch.Size([len(wanted)] if wanted else []):
             takes = f"{len(wanted)} numbers ({', '.join(wanted)})" if wanted else "one number"
             raise UsageError(f"effect {self.effect.name} takes {takes}, got {given.numel()}")
-        return given
+        return given.clone()
 
     def require_meaning(self, value: Value | None) -> None:
         """Raise UsageError for a coefficient outside of the effect's bounds."""

@@ -154,6 +154,14 @@ def written_table(folder: Path) -> Path:
     return table
 
 
+def test_programs_that_begin_at_one_tensor_have_coefficients_of_their_own() -> None:
+    begin = torch.tensor(0.1)
+    one, other = (example("hovercraft").with_effect("linear_drag", begin) for _ in range(2))
+    with torch.no_grad():
+        one.linear_drag_unconstrained.fill_(0.5)
+    assert other.linear_drag.item() == begin.item() == pytest.approx(0.1)
+
+
 def test_an_effect_is_added_once() -> None:
     program = example("hovercraft").with_effect("landmark_bias:1")
     program = program.with_effect("landmark_bias:2")  # another landmark is another effect
