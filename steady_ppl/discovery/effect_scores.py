@@ -70,6 +70,7 @@ class Scoring:
         self.row_spread = spread[0]
         self.substep_spread = substep_spreads(program, data, at.channels.points[:1], self.acting)[0]
         self._around = cache(at.channels.around)
+        self._means_around = cache(self._means_near)
         self._values: dict[int, dict[str, Tensor]] = {}
 
     def __call__(self, column: Column) -> Tensor:
@@ -138,7 +139,8 @@ class Scoring:
             self._values[index] = {name: value.expand(shape) for name, value in found.items()}
         return self._values[index]
 
-    def _means_around(self, index: int) -> dict[str, Tensor]:
+    def _means_near(self, index: int) -> dict[str, Tensor]:
+        """The channels' means at the points of one of them, each `(3, T, B)`."""
         count = self.means.shape[-1]
         at = [0, 1 + index, 1 + count + index]
         return {name: self.means[at, ..., k] for k, name in enumerate(self.program.channel_names)}

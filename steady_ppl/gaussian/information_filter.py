@@ -15,6 +15,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -71,16 +72,33 @@ class Lookahead:
     """The likelihood of all later measurements after every row, and the noise that it asks for."""
 
     linearization: Linearization  # of the program; deviations are from its path
-    precision: Tensor  # Λ (T + 1, B, D, D)
-    information: Tensor  # λ (T + 1, B, D)
-    log_scale: Tensor  # c (T + 1, B)
     windings: Tensor  # (W, D), turns from the one nearest to the prior's mean on which the start may lie, none first
     winding_masses: Tensor  # (W, B), log posterior probability of each
     starts: Steering  # of the start's noise, (W, B, ...), its deviation zero
-    steps: Steering  # of every interval's noise, (T, B, ...)
     log_likelihood: Tensor  # log p(y) of the linearised program, (B,), observations tempered as in the linearization
     given: LinearArrays = field(repr=False)  # the linearization in lanes
-    steering: Steering = field(repr=False)  # `steps` in lanes
+    futures: Potential = field(repr=False)  # after every row, in lanes
+    steering: Steering = field(repr=False)  # of every interval's noise, in lanes
+
+    @cached_property
+    def precision(self) -> Tensor:
+        """Λ `(T + 1, B, D, D)`."""
+        return self._tensor(self.futures.precision)
+
+    @cached_property
+    def information(self) -> Tensor:
+        """λ `(T + 1, B, D)`."""
+        return self._tensor(self.futures.information).squeeze(-1)
+
+    @cached_property
+    def log_scale(self) -> Tensor:
+        """c `(T + 1, B)`."""
+        return self._tensor(self.futures.log_scale).flatten(1)
+
+    @cached_property
+    def steps(self) -> Steering:
+        """Of every interval's noise, `(T, B, ...)`."""
+        return self.steering.tensors(self.linearization.offset)
 
     def means(self) -> tuple[Tensor, Tensor]:
         """Posterior means of the linearised program, on the path's own turn: states `(T + 1, B, D)` and noise
@@ -158,18 +176,14 @@ def look_ahead(linear: Linearization) -> Lookahead:
         vague = (spread > 1).any(-1)  # the measurements leave an angle open: one turn's integral covers the others
         masses[1:].masked_fill_(vague, -torch.inf)
     log_likelihood = masses.logsumexp(0)
-    precision, information, log_scale = (out_of_lanes(part, trajectories).to(device) for part in futures)
     return Lookahead(
         linearization=linear,
-        precision=precision,
-        information=information.squeeze(-1),
-        log_scale=log_scale.flatten(1),
         windings=windings,
         winding_masses=masses - log_likelihood,
         starts=starts,
-        steps=steps.tensors(linear.offset),
         log_likelihood=log_likelihood,
         given=given,
+        futures=futures,
         steering=steps,
     )
 

@@ -121,6 +121,7 @@ def linearize(
         ProgramError: a site has another distribution, or an operation has no derivative.
     """
     program, data, states, noise = problem.program, problem.data, path.states, path.noise
+    moving = data.transitions
     if angles is None:
         angles = angles_on_a_circle(program, data, states[0, :1])
     given = {"state": states[:-1], "noise": noise} | row_inputs(program, data)._asdict()
@@ -140,9 +141,9 @@ def linearize(
         start_offset=start_offset - start_turn,
         start_turn=start_turn,
         start_noise=start_noise,
-        offset=torch.where(data.transitions[..., None], offset, 0.0),
-        state=torch.where(data.transitions[..., None, None], by_state, 0.0).double(),
-        noise=torch.where(data.transitions[..., None, None], by_noise, 0.0).double(),
+        offset=_where(moving[..., None], offset),
+        state=_where(moving[..., None, None], by_state).double(),
+        noise=_where(moving[..., None, None], by_noise).double(),
         **both,
     )
 
@@ -164,12 +165,17 @@ def linearize_sensors(
     by_measured = -by[..., :count, :]
     observed = data.observed & torch.isfinite(by_measured.sum(-1))  # a bearing to where one stands has no derivative
     return Sensors(
-        residual=torch.where(observed, residuals, 0.0).double(),
-        measurement=torch.where(observed[..., None], by_measured, 0.0).double(),
-        precision=observation_weight * torch.where(observed, (-2 * log_sd).exp(), 0.0).double(),
-        log_scale=observation_weight * torch.where(observed, log_density, 0.0).double().sum(-1),
+        residual=_where(observed, residuals).double(),
+        measurement=_where(observed[..., None], by_measured).double(),
+        precision=observation_weight * _where(observed, (-2 * log_sd).exp()).double(),
+        log_scale=observation_weight * _where(observed, log_density).double().sum(-1),
         in_plain_torch=in_plain_torch,
     )
+
+
+def _where(there: Tensor, values: Tensor) -> Tensor:
+    """Zero where nothing is there."""
+    return values.contiguous() if bool(there.all()) else torch.where(there, values, 0.0)
 
 
 @torch.no_grad()

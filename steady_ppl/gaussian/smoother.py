@@ -71,18 +71,21 @@ def smooth(
             ahead = look(path)
             density, defect = _merit(ahead)
             worse = torch.isfinite(most) & ~(_cost(density, defect, penalty) <= most)  # or not a number
-            accepted = _either(worse, accepted, path)
+            any_worse = bool(worse.any())
+            accepted = _either(worse, accepted, path) if any_worse else path
             if index == passes - 1:
                 break
-            halfway = ReferencePath((accepted.states + path.states) / 2, (accepted.noise + path.noise) / 2)
-            moved = _either(worse, halfway, means_as_path(ahead, data))
+            moved = means_as_path(ahead, data)
+            if any_worse:
+                halfway = ReferencePath((accepted.states + path.states) / 2, (accepted.noise + path.noise) / 2)
+                moved = _either(worse, halfway, moved)
             change = torch.nan_to_num((moved.noise - path.noise).abs(), nan=0.0).max()  # of what has not blown up
+            if not bool(change > tolerance):
+                break
             penalty = torch.where(worse[:, None], penalty, _penalty(ahead, moved))
             most = torch.where(worse, most, _cost(density, defect, penalty) + MAX_INCREASE)
             path = moved
-            if not bool(change > tolerance):
-                break
-        return look(accepted) if bool(worse.any()) else ahead
+        return look(accepted) if any_worse else ahead
 
 
 def _merit(ahead: Lookahead) -> tuple[Tensor, Tensor]:

@@ -182,6 +182,21 @@ class ScalarGraph:
                 left += self._operands(kind, number)
         return found["scalar"], found["vector"]
 
+    def dependents(self, leaf: int) -> set[int]:
+        """A leaf and the scalars that it may change."""
+        found = {"scalar": {leaf}, "vector": set[int](), "parameters": set[int]()}
+        for number, (operation, arguments) in enumerate(self.scalars):
+            if operation == "element":
+                vector, k = arguments
+                if k == 0 and any(one in found[kind] for kind, one in self._operands("vector", vector)):
+                    found["vector"].add(vector)
+                moved = vector in found["vector"]
+            else:
+                moved = operation not in LEAVES and not found["scalar"].isdisjoint(arguments)
+            if moved:
+                found["scalar"].add(number)
+        return found["scalar"]
+
     def _operands(self, kind: str, number: int) -> list[tuple[str, int]]:
         """What one scalar or vector is computed from, as in `Elementwise`."""
         if kind == "scalar":
@@ -202,16 +217,19 @@ class Tangents:
 
     def __init__(self, graph: ScalarGraph, along: int) -> None:
         self.graph, self.along = graph, along
+        self.moved = graph.dependents(along)
         self.known: dict[int, int | None] = {}
 
     def of(self, number: int) -> int | None:
         """The derivative of a scalar; None where it is zero."""
+        if number not in self.moved:
+            return None
         if number not in self.known:
             operation, arguments = self.graph.scalars[number]
             if operation == "element":
                 self._of_elements(arguments[0])
-            elif operation in LEAVES:
-                self.known[number] = self.graph.constant(1.0) if number == self.along else None
+            elif number == self.along:
+                self.known[number] = self.graph.constant(1.0)
             else:
                 found = self._rule(operation, [[n] for n in arguments], [number])
                 self.known[number] = found[0] if found else None
@@ -339,5 +357,6 @@ def derivatives(graph: ScalarGraph, outputs: Sequence[int], inputs: Sequence[int
     by_input = [Tangents(graph, number) for number in inputs]
     for number in range(max(outputs) + 1):  # in their order, so that no recursion gets deep
         for tangents in by_input:
-            tangents.of(number)
+            if number in tangents.moved:
+                tangents.of(number)
     return [[tangents.of(output) for tangents in by_input] for output in outputs]

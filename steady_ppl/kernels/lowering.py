@@ -1,7 +1,7 @@
 """From what torch does in a method to scalars: tensors of values become tensors of scalars' numbers. What it computes
 of a program's tensors alone is noted on a tape, to be computed again when they have changed."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partialmethod
 from typing import Any
@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 from torch._ops import OpOverload
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
 
 from steady_ppl.kernels.graph import NotCompilable, ScalarGraph
 
@@ -70,10 +69,26 @@ class _Step:
 
 
 def _filled(argument: Any, values: Sequence[Tensor]) -> Any:
-    """An argument with values where it has places; `tree_map` takes ten times as long."""
+    """An argument with values where it has places."""
     if isinstance(argument, _Place):
         return values[argument.number]
     return [_filled(part, values) for part in argument] if isinstance(argument, list) else argument
+
+
+def _leaves(*arguments: Any) -> Iterator[Any]:
+    """What arguments of an operation hold, or what it made; torch's `tree_leaves` takes ten times as long."""
+    for argument in arguments:
+        if isinstance(argument, list | tuple):
+            yield from _leaves(*argument)
+        else:
+            yield argument
+
+
+def _mapped(function: Callable[[Any], Any], argument: Any) -> Any:
+    """An argument of an operation with a function of what it holds."""
+    if isinstance(argument, list | tuple):
+        return [_mapped(function, part) for part in argument]
+    return function(argument)
 
 
 def where(tensor: Tensor) -> tuple[Any, ...]:
@@ -132,10 +147,12 @@ class Tape:
         def placed(leaf: Any) -> Any:
             return _Place(self.place(leaf)) if isinstance(leaf, Tensor) else leaf
 
-        arguments, keywords = tree_map(placed, (tuple(arguments), keywords))
-        needs = frozenset(leaf.number for leaf in tree_leaves((arguments, keywords)) if isinstance(leaf, _Place))
+        arguments = _mapped(placed, arguments)
+        keywords = {name: _mapped(placed, value) for name, value in keywords.items()}
+        leaves = _leaves(*arguments, *keywords.values())
+        needs = frozenset(leaf.number for leaf in leaves if isinstance(leaf, _Place))
         first = len(self._values)
-        for value in tree_leaves(made):
+        for value in _leaves(made):
             self._add(value)
         makes = range(first, len(self._values))
         if not needs.isdisjoint(self._varying):
@@ -212,11 +229,11 @@ class Translation(TorchDispatchMode):
         if torch.Tag.nondeterministic_seeded in func.tags:
             raise NotCompilable(f"{func} draws random numbers of its own")
         made = func(*args, **kwargs)
-        if not any(id(leaf) in self._numbers for leaf in tree_leaves((args, kwargs))):
+        if not any(id(leaf) in self._numbers for leaf in _leaves(*args, *kwargs.values())):
             self.tape.note(func, args, kwargs, made)
             return made
         numbers = self._translate(func, args, kwargs, made)
-        for value, own in zip(tree_leaves(made), tree_leaves(numbers), strict=True):
+        for value, own in zip(_leaves(made), _leaves(numbers), strict=True):
             self._keep(value, own)
         return made
 
@@ -247,7 +264,8 @@ class Translation(TorchDispatchMode):
         self._check_kind(packet, args, kwargs, made)
         if packet in (aten.index, aten.index_select):
             return self._at_known(func, args)
-        arguments, keywords = tree_map(self._number, (args, kwargs))
+        arguments = _mapped(self._number, args)
+        keywords = {name: _mapped(self._number, value) for name, value in kwargs.items()}
         if packet in MOVING:
             return MOVING[packet](*arguments, **keywords)
         if packet in ELEMENTWISE and not keywords:
@@ -261,12 +279,12 @@ class Translation(TorchDispatchMode):
 
     def _check_kind(self, packet: Any, args: Any, kwargs: Any, made: Any) -> None:
         """Kernels compute in single precision and with truth values."""
-        first, name = tree_leaves(made)[0].dtype, packet.__name__
+        first, name = next(_leaves(made)).dtype, packet.__name__
         if first not in (torch.float32, torch.bool):
             raise NotCompilable(f"it computes in {str(first).removeprefix('torch.')}")
         if first == torch.bool and name in ("add", "mul", "maximum", "minimum"):
             raise NotCompilable("arithmetic with truth values")
-        taken = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+        taken = [leaf for leaf in _leaves(*args, *kwargs.values()) if isinstance(leaf, Tensor)]
         for value in taken[:1] if "index" in name else taken:
             if value.dtype not in (torch.float32, torch.bool):
                 raise NotCompilable(f"it computes with {str(value.dtype).removeprefix('torch.')}")
@@ -281,9 +299,9 @@ class Translation(TorchDispatchMode):
     def _at_known(self, func: Any, args: Any) -> Tensor:
         """Elements at places that are known now."""
         value, *rest = args
-        if any(id(leaf) in self._numbers for leaf in tree_leaves(rest)):
+        if any(id(leaf) in self._numbers for leaf in _leaves(rest)):
             raise NotCompilable("it looks elements up at places that depend on the state")
-        if any(isinstance(leaf, Tensor) and self.tape.varies(leaf) for leaf in tree_leaves(rest)):
+        if any(isinstance(leaf, Tensor) and self.tape.varies(leaf) for leaf in _leaves(rest)):
             raise NotCompilable("it looks elements up at places that depend on parameters")
         return func(self._number(value), *rest)
 
