@@ -11,7 +11,7 @@ from scipy import special
 from torch import Tensor
 
 from steady_ppl.comparison.evaluate import has_truth, squared_errors
-from steady_ppl.criticism.baselines import ConstantVelocity, constant_velocity
+from steady_ppl.criticism.baselines import constant_velocity
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
@@ -144,10 +144,10 @@ def judge_program(
         return replace(judged, neglected=str(error))
 
 
-def compare_predictions(problem: Problem, ahead: Lookahead, kernels: bool | None = None) -> Judged:
+def compare_predictions(problem: Problem, ahead: Lookahead) -> Judged:
     """Track along a path that was found and compare what is predicted from every row with measurements and truth."""
     program, data, unseen = problem.program, problem.data, problem.without_truth()
-    tracked = track(unseen, ahead.linearization.path, kernels=kernels)
+    tracked = track(unseen, ahead.linearization.path)
     named = named_horizons(data, PROOF_HORIZONS_SECONDS)
     longest, states = max(named.values()), dict[tuple[str, int], tuple[Tensor, Tensor]]()
     horizons = {round(rows) for rows in np.geomspace(1, longest, CURVE_HORIZONS).tolist()} | set(named.values())
@@ -169,13 +169,12 @@ def judge_constant_velocity(before: Judged) -> Judged | str:
     found = constant_velocity(unseen, before.tracked, [1])
     if isinstance(found, str):
         return found
-    coasting = ConstantVelocity(unseen.program, found.scales)
     path = before.tracked.path(unseen.data)
     still = ReferencePath(path.states, torch.zeros_like(path.noise))
-    ahead = smooth(replace(unseen, program=coasting), still, kernels=False)
+    ahead = smooth(replace(unseen, program=found.program), still)
     if not bool(torch.isfinite(ahead.log_likelihood).all()):
         return "it blows up on these drives"
-    return compare_predictions(replace(before.problem, program=coasting), ahead, kernels=False)
+    return compare_predictions(replace(before.problem, program=found.program), ahead)
 
 
 def noise_floor(true: Judged, seed: int) -> Judged | str:

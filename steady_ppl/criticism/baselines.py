@@ -28,25 +28,25 @@ DEFINITION = (
 class ZeroMeanChannels(ByColumn):
     """Give latent sites mean zero and each channel another standard deviation, in the order in which they are met."""
 
-    def __init__(self, scales: Sequence[float]) -> None:
+    def __init__(self, scales: Tensor) -> None:
         super().__init__()
-        self.scales = scales
+        self.scales = scales  # (C,)
 
     def _pyro_sample(self, message: Any) -> None:
         if message["is_observed"]:
             return
         fn = message["fn"]
         zero = torch.zeros_like(normal_moments(fn, message["name"])[0])
-        scale = as_event(zero.new_tensor(self.scales[self.take(fn)]), fn.event_dim)
+        scale = as_event(self.scales[self.take(fn)].to(zero), fn.event_dim)
         message["fn"] = dist.Normal(zero, scale.expand_as(zero)).to_event(fn.event_dim)
 
 
 class ConstantVelocity(Program):
-    """Another program's start, kinematics and sensors, but no acceleration other than noise of these scales."""
+    """Another program's start, kinematics and sensors, but no acceleration other than noise of these scales `(C,)`."""
 
-    def __init__(self, program: Program, scales: Sequence[float]) -> None:
+    def __init__(self, program: Program, scales: Tensor) -> None:
         super().__init__()
-        self.scales = tuple(scales)
+        self.register_buffer("scales", scales)
         for name in ("states", "controls", "channels", "measurements", "substeps", "angles", "error_groups"):
             setattr(self, name, getattr(program, name))
         object.__setattr__(self, "of", program)  # not a part of this one: Pyro would rename it
@@ -69,9 +69,14 @@ class ConstantVelocity(Program):
 class Reference:
     """Predictions of the vehicle that keeps its velocity."""
 
-    scales: tuple[float, ...]  # standard deviation of each channel
+    program: ConstantVelocity
     log_likelihood: float  # log p(y) of all drives, linearised
     predictions: dict[int, Prediction]  # by how many rows ahead
+
+    @property
+    def scales(self) -> tuple[float, ...]:
+        """Standard deviation of each channel."""
+        return tuple(self.program.scales.tolist())
 
 
 @torch.no_grad()
@@ -93,21 +98,22 @@ def constant_velocity(problem: Problem, tracked: Tracked, horizons: Sequence[int
     if not bool((sizes > 0).all() and torch.isfinite(sizes).all()):
         return "a channel of the program never moves"
     moved = mean_step(program, path.states[:-1], *inputs)
-    coasted = mean_step(ConstantVelocity(program, sizes.tolist()), path.states[:-1], *inputs)
+    kind = type("ConstantVelocity", (ConstantVelocity,), {})  # whose kernels have this program's parameters in them
+    coasted = mean_step(kind(program, sizes), path.states[:-1], *inputs)
     if torch.allclose(moved, coasted, rtol=1e-6, atol=1e-7):
         return "the program's channels have no mean that could be taken away"
     best: tuple[float, ConstantVelocity, Tracked] | None = None
     for multiple in NOISE_MULTIPLES:
-        coasting = ConstantVelocity(program, (multiple * sizes).tolist())
+        coasting = kind(program, multiple * sizes)
         start = ReferencePath(path.states, (values / (multiple * sizes)).to(values.dtype))
-        found = track(replace(problem, program=coasting), start, passes=3, kernels=False)
+        found = track(replace(problem, program=coasting), start, passes=3)
         likely = float(found.log_likelihood.sum())
         if math.isfinite(likely) and (best is None or likely > best[0]):
             best = likely, coasting, found
     if best is None:
         return "it blows up on these drives"
     likely, coasting, found = best
-    return Reference(tuple(coasting.scales), likely, predict(coasting, data, found, horizons))
+    return Reference(coasting, likely, predict(coasting, data, found, horizons))
 
 
 @torch.no_grad()

@@ -18,6 +18,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import torch
 from scipy import special
 
 from steady_ppl.errors import DataError
@@ -241,16 +242,23 @@ def _correlations(data: Residuals, inside: Array, controls: dict[str, Array]) ->
     for name, values in controls.items():
         regressors[name] = np.where(inside, values - values[inside].mean(), 0.0)
         regressors[f"change of {name}"] = np.where(inside, np.diff(values, axis=0, prepend=values[:1]), 0.0)
+    given = np.array([*regressors.values()])
     for residual in range(len(data.names)):
         values, there = data.values[..., residual], data.there[..., residual]
         for lag in (lag for lag in LAGS if lag < len(inside) // 2):
             now, before = slice(lag, None), slice(0, len(inside) - lag)
-            for name, regressor in regressors.items():
-                square = ((regressor[before] ** 2) * there[:, now]).sum((1, 2))
+            squares = _products(given[:, before] ** 2, there[:, now])
+            products = _products(given[:, before], values[:, now]) / np.sqrt(np.maximum(squares, 1e-12))
+            for name, square, product in zip(regressors, squares, products, strict=True):
                 if square[0] > 1e-12:
-                    product = (regressor[before] * values[:, now]).sum((1, 2)) / np.sqrt(np.maximum(square, 1e-12))
                     yield Cell("lag", residual, {name: lag}, int(there[0, now].sum())), product
             both = there[:, now] & there[:, before]
             if lag and both[0].sum() >= MIN_RESIDUALS:
                 product = (values[:, now] * values[:, before]).sum((1, 2)) / np.sqrt(np.maximum(both.sum((1, 2)), 1))
                 yield Cell("memory", residual, {"lag": lag}, int(both[0].sum())), product
+
+
+def _products(regressors: Array, values: Array) -> Array:
+    """Sums over rows and drives of each regressor `(N, T, B)` times each set's values `(M, T, B)`, `(N, M)`."""
+    one, other = (np.ascontiguousarray(part, np.float64).reshape(len(part), -1) for part in (regressors, values))
+    return (torch.from_numpy(one) @ torch.from_numpy(other).T).numpy()

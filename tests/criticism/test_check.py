@@ -16,9 +16,14 @@ from oracles import assert_mean, cart_parameters, kalman
 from small import finite
 
 import steady_ppl as st
-from steady_ppl.criticism.baselines import ConstantVelocity, Reference
+from steady_ppl.criticism.baselines import ConstantVelocity, Reference, constant_velocity
 from steady_ppl.criticism.check import _in_own_spreads
 from steady_ppl.criticism.residual_maps import Residuals
+from steady_ppl.gaussian.kalman import track
+from steady_ppl.gaussian.linearize import ReferencePath
+from steady_ppl.gaussian.smoother import find_path
+from steady_ppl.kernels.rows import kernel_failures
+from steady_ppl.model.problem import Problem
 
 CHANCE = 1e-4
 
@@ -187,13 +192,30 @@ def test_the_reference_ignores_controls_and_scans_its_noise(clean):
     assert "ignores the controls" in figures["constant_velocity"]["what"]
     row = figures["measurements"]["bearing_0"]["horizons"]["3 s"]
     assert row["noise_floor_90"][0] < row["rmse"] < row["constant_velocity"] < row["last_measurement"]
-    coasting = ConstantVelocity(clean.program, reference.scales)
+    coasting = ConstantVelocity(clean.program, torch.tensor(reference.scales))
     state, time, step = torch.randn(2, 3, 6), torch.zeros(2, 3), torch.full((2, 3), 0.1)
     moved = []
     for control in (torch.zeros(2, 3, 2), torch.ones(2, 3, 2)):
         with st.seeded("coast"):
             moved.append(coasting.transition(state, control, time, step))
     assert bool((moved[0] == moved[1]).all())
+
+
+def test_the_reference_of_a_program_takes_no_parameters_of_another():
+    """Kernels have them as constants."""
+    data = table(hovercraft(), 16)
+    for bearing_sd in (0.02, 0.2):
+        program = hovercraft()
+        program.bearing_sd = bearing_sd
+        problem = Problem(program, st.for_program(program, data), True)
+        tracked = track(problem, find_path(problem))
+        with kernel_failures() as why:
+            reference = constant_velocity(problem, tracked, [1])
+        assert why == {}
+        own = replace(problem, program=reference.program)
+        start = ReferencePath(tracked.path(problem.data).states, torch.zeros_like(tracked.noise).float())
+        plain = track(own, start, passes=6, kernels=False).log_likelihood
+        assert reference.log_likelihood == pytest.approx(float(plain.sum()), rel=1e-3)
 
 
 def test_a_program_that_loses_to_constant_velocity_is_told_so():
