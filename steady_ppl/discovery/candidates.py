@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations, pairwise
 from typing import Any, NamedTuple
 
@@ -16,11 +17,15 @@ from steady_ppl.discovery.effect_scores import Column, columns_of, scores_along,
 from steady_ppl.discovery.refits import (
     BY_LIKELIHOOD,
     NO_THRESHOLD,
+    Attempt,
     Fits,
     Refit,
     Threshold,
+    begun,
+    finished,
     fit_near,
     judged_fits,
+    prepared,
     refit_with,
 )
 from steady_ppl.discovery.screening import FAMILY_LEVEL, Screened, Tested, departures, screen
@@ -158,20 +163,41 @@ def leaders(screened: Screened, first: bool) -> list[Tested]:
     return [tested for i, tested in alive if i in few or float(screened.correlations[top, i]) > MIN_ALIAS_CORRELATION]
 
 
-def fitted(now: Refit, tested: Tested, screening: Screening, threshold: Threshold = NO_THRESHOLD) -> Candidate:
-    """A program with a candidate, by the screening that tested it; see `refit_with` for `threshold`."""
-    effect = tested.variant.effect
-    known = screening.information[_key(tested.column)] if effect.null == 0 and effect.form in LINEAR_FORMS else None
+def attempts(
+    now: Refit, chosen: Sequence[Tested], screening: Screening, threshold: Threshold = NO_THRESHOLD
+) -> list[Callable[[Threshold], Candidate]]:
+    """The program with each candidate, by the screening that tested it, to be fitted one after another given what the
+    drives of each must reach. One `threshold` is known before."""
+    known = [_known(tested, screening) for tested in chosen]
+    from_zero = [
+        one is not None and tested.column.probe is None and now.fitting == BY_LIKELIHOOD
+        for tested, one in zip(chosen, known, strict=True)
+    ]  # scoring steps go from there as far as the likelihood rises
+    starts = [_absent(tested) if zero else _start(tested) for tested, zero in zip(chosen, from_zero, strict=True)]
+    prepare = (prepared(now, t.variant, start, one) for t, start, one in zip(chosen, starts, known, strict=True))
+    given = zip(chosen, begun(now, list(prepare), threshold), known, from_zero, strict=True)
+    return [partial(_fitted, now, *one) for one in given]
 
-    def fit(start: Any) -> Candidate:
-        return judged(now, tested, refit_with(now, tested.variant, start, information=known, threshold=threshold))
 
-    absent = [0.0] * len(tested.coefficient)
-    if known is not None and tested.column.probe is None and now.fitting == BY_LIKELIHOOD:
-        return fit(absent)  # scoring steps go from there as far as the likelihood rises
-    candidate = fit(_start(tested))
+def _fitted(
+    now: Refit, tested: Tested, first: Attempt | str, known: Tensor | None, from_zero: bool, threshold: Threshold
+) -> Candidate:
+    candidate = judged(now, tested, finished(now, first, threshold))
     lost = isinstance(candidate.refit, str) or gain_of_fits(now, candidate.refit, folds=1) < 0
-    return fit(absent) if lost and known is not None and tested.statistic > MIN_STATISTIC_TO_RETRY else candidate
+    if from_zero or known is None or not lost or tested.statistic <= MIN_STATISTIC_TO_RETRY:
+        return candidate
+    again = refit_with(now, tested.variant, _absent(tested), information=known, threshold=threshold)
+    return judged(now, tested, again)
+
+
+def _known(tested: Tested, screening: Screening) -> Tensor | None:
+    """The information of the first fold's drives about a candidate whose effect is linear in its coefficient."""
+    effect = tested.variant.effect
+    return screening.information[_key(tested.column)] if effect.null == 0 and effect.form in LINEAR_FORMS else None
+
+
+def _absent(tested: Tested) -> list[float]:
+    return [0.0] * len(tested.coefficient)
 
 
 def judged(now: Refit, tested: Tested, refit: Refit | str) -> Candidate:

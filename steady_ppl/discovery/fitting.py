@@ -11,8 +11,9 @@ of nats, whatever its physics.
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -27,7 +28,15 @@ from steady_ppl.gaussian.smoother import find_path, require_found, resting_path,
 from steady_ppl.guides.base import Constant
 from steady_ppl.guides.linearized import LookaheadGuide
 from steady_ppl.likelihood.evidence import neglected
-from steady_ppl.likelihood.maximize import Maximum, Term, kept_maximum, maximise, maximise_sum
+from steady_ppl.likelihood.maximize import (
+    Maximum,
+    Term,
+    kept_maximum,
+    maximise,
+    maximise_each,
+    maximise_sum,
+    output_of,
+)
 from steady_ppl.likelihood.parameters import Element, elements, moved, set_values, values_of
 from steady_ppl.likelihood.scores import channel_moments, substep_spreads
 from steady_ppl.model.problem import Problem
@@ -41,6 +50,8 @@ NOISE_FORMS = ("spread", "colour")  # of effects that are process noise
 PROBE_MOVE = 0.1  # by how much a number is moved
 SPREAD_TOLERANCE = 1e-3  # by which log spreads may change otherwise in one row than in another
 MAX_JOINT_STEPS, JOINT_PRECISION = 25, 0.01  # scoring steps of the sum at most, and nats that another would gain
+
+Fit = Callable[[], Maximum]
 
 
 @dataclass(frozen=True)
@@ -58,6 +69,10 @@ class ByLikelihood:
     def fit(self, problem: Problem, path: ReferencePath | None = None, **settings: Any) -> Maximum:
         """Move a program's parameters, in place, from a path that is found when None; see `maximise`."""
         return maximise(problem, path, **settings)
+
+    def fit_each(self, problems: Sequence[Problem], paths: Sequence[ReferencePath], *settings: Any) -> list[Fit]:
+        """Fits to be made one after another, see `maximise_each`."""
+        return maximise_each(problems, paths, *settings)
 
     def judge(self, problem: Problem, path: ReferencePath) -> Judgement:
         """Log p(y) of drives, linearised along a path that is improved from here."""
@@ -78,7 +93,15 @@ class ByDraws:
 
     def fit(self, problem: Problem, path: ReferencePath | None = None, **_: Any) -> Maximum:
         """See `ByLikelihood`."""
-        return kept_maximum(problem.program, lambda: self._train(problem, path or find_path(problem)))
+
+        def find() -> Maximum:
+            return self._train(problem, path or find_path(problem))
+
+        return kept_maximum(problem.program, lambda: output_of(problem.program, find))
+
+    def fit_each(self, problems: Sequence[Problem], paths: Sequence[ReferencePath], *_: Any) -> list[Fit]:
+        """See `ByLikelihood`; they draw random numbers, so that none begins before its turn."""
+        return [partial(self.fit, *one) for one in zip(problems, paths, strict=True)]
 
     def _train(self, problem: Problem, path: ReferencePath) -> Maximum:
         program, data, known_start = problem.program, problem.data, problem.known_start

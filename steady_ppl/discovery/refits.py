@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, Fitting, Judges, is_doubtful, with_common_noise
+from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, Fit, Fitting, Judges, is_doubtful, with_common_noise
 from steady_ppl.effects import Variant, attach, attached, coefficient
 from steady_ppl.errors import FilterError, SteadyError
 from steady_ppl.gaussian.linearize import ReferencePath
@@ -27,7 +27,7 @@ from steady_ppl.utils.random import seeded
 
 MAX_LOG_NOISE_RATIO = math.log(20.0)  # of noise after a fit and before, beyond which a program explains nothing
 AlongStates = TypeVar("AlongStates", bound=Trajectories | ReferencePath)
-MAX_LOSS = 2.0  # nats below the program without, after which a fit is given up: a candidate at zero is that program
+MAX_LOSS = 2.0  # nats below the program without, after which a fit is given up
 
 
 @dataclass(frozen=True)
@@ -207,6 +207,65 @@ def first_by_draws(given: Program, fitted: list[Program], folds: list[Fold], see
     return replace(refit, fitting=BY_DRAWS)
 
 
+@dataclass(frozen=True)
+class Attempt:
+    """A program with an effect, where its fits begin."""
+
+    programs: list[Program]  # one a fold
+    information: Tensor | None  # of the first fold's drives, the coefficient last
+    first: Fit | None = None  # the fit to these drives, if it has been asked for
+
+
+def prepared(
+    base: Refit,
+    variant: Variant,
+    value: float | Sequence[float] | Tensor,
+    information: Tensor | Maximum | None = None,
+) -> Attempt | str:
+    """The program with an effect whose coefficient begins at `value`, or why it cannot be had.
+
+    `information` is that of the first fold's drives, the coefficient last, or a fit that learned all these numbers.
+    """
+    try:
+        programs = [attach(copy.deepcopy(program), variant, value) for program in base.programs]
+    except SteadyError as error:
+        return str(error)
+    if isinstance(information, Maximum):
+        information = _information(information, elements(programs[0]))
+    return Attempt(programs, information)
+
+
+def begun(base: Refit, attempts: Sequence[Attempt | str], threshold: Threshold = NO_THRESHOLD) -> list[Attempt | str]:
+    """Attempts whose first fits are computed side by side where cores are free; they are finished in this order."""
+    able = [one for one in attempts if isinstance(one, Attempt)]
+    if base.unwidened is not None or not able:
+        return list(attempts)
+    folds = [base.folds[0].wide(one.programs[0]) for one in able]
+    problems = [fold.fitting(one.programs[0]) for fold, one in zip(folds, able, strict=True)]
+    floors = [_floor(base.maxima[0], threshold)] * len(able)
+    known = [one.information for one in able]
+    fits = iter(base.fitting.fit_each(problems, [fold.path for fold in folds], known, floors))
+    return [replace(one, first=next(fits)) if isinstance(one, Attempt) else one for one in attempts]
+
+
+def finished(base: Refit, attempt: Attempt | str, threshold: Threshold = NO_THRESHOLD) -> Refit | str:
+    """What an attempt comes to, or why it cannot be fitted."""
+    if isinstance(attempt, str):
+        return attempt
+    least = [_floor(base.maxima[0], threshold), *(_floor(maximum) for maximum in base.maxima[1:])]
+    given = (attempt.programs, base.folds, [None] * len(attempt.programs), attempt.information)
+    try:
+        return _refit(*given, least, threshold, base.unwidened, base.fitting, attempt.first)
+    except SteadyError as error:
+        return str(error)
+
+
+def _floor(without: Maximum, threshold: Threshold = NO_THRESHOLD) -> float:
+    """The log p(y) below which a fit is given up: a candidate at zero is the program without."""
+    least = float(without.log_likelihood.sum()) - MAX_LOSS
+    return max(least, threshold.drives) if threshold.stops_early else least
+
+
 def refit_with(
     base: Refit,
     variant: Variant,
@@ -215,19 +274,8 @@ def refit_with(
     information: Tensor | Maximum | None = None,
     threshold: Threshold = NO_THRESHOLD,
 ) -> Refit | str:
-    """The program with an effect whose coefficient begins at `value`, or why it cannot be fitted.
-
-    `information` is that of the first fold's drives, the coefficient last, or a fit that learned all these numbers.
-    """
-    try:
-        programs = [attach(copy.deepcopy(program), variant, value) for program in base.programs]
-        least = [float(maximum.log_likelihood.sum()) - MAX_LOSS for maximum in base.maxima]
-        if isinstance(information, Maximum):
-            information = _information(information, elements(programs[0]))
-        nothing = [None] * len(programs)
-        return _refit(programs, base.folds, nothing, information, least, threshold, base.unwidened, base.fitting)
-    except SteadyError as error:
-        return str(error)
+    """The program with an effect, see `prepared`, fitted."""
+    return finished(base, prepared(base, variant, value, information), threshold)
 
 
 def fit_near(base: Fits, near: Fits, variants: Sequence[Variant]) -> Fits | str:
@@ -244,12 +292,10 @@ def fit_near(base: Fits, near: Fits, variants: Sequence[Variant]) -> Fits | str:
         for program, fitted in zip(programs, near.programs, strict=True):
             own = program.state_dict()
             program.load_state_dict(own | {name: value for name, value in fitted.state_dict().items() if name in own})
-        known, maxima, folds = _information(near.maxima[0], elements(programs[0])), list[Maximum](), list[Fold]()
-        for program, before in zip(programs, near.folds, strict=True):
-            fold = before.wide(program)
-            guess = fold.information(known, near.folds[0])
-            maxima.append(near.fitting.fit(fold.fitting(program), fold.path, information=guess))
-            folds.append(replace(fold, path=maxima[-1].path))
+        folds = [fold.wide(program) for program, fold in zip(programs, near.folds, strict=True)]
+        known = _information(near.maxima[0], elements(programs[0]))
+        maxima = [fit() for fit in _fits(near.fitting, programs, folds, known, [-math.inf] * len(folds))]
+        folds = [replace(fold, path=maximum.path) for fold, maximum in zip(folds, maxima, strict=True)]
         return Fits(programs, maxima, folds, near.fitting)
     except SteadyError as error:
         return str(error)
@@ -282,17 +328,24 @@ def _refit(
     threshold: Threshold = NO_THRESHOLD,
     unwidened: Program | None = None,
     fitting: Fitting = BY_LIKELIHOOD,
+    first: Fit | None = None,
 ) -> Refit:
     fitted, found, held_out, judged_folds = list[Program](), list[Maximum](), list[Tensor](), list[Fold]()
-    for program, before, known, floor in zip(programs, folds, maxima, least, strict=True):
-        fold = before.wide(program)
+    folds = [fold.wide(program) for program, fold in zip(programs, folds, strict=True)]
+    fits: Sequence[Fit | None] = [first, *[None] * (len(folds) - 1)]
+    if unwidened is None and threshold == NO_THRESHOLD and first is None:  # all are made
+        fits = _fits(fitting, programs, folds, information, least)
+    for program, fold, known, fit, floor in zip(programs, folds, maxima, fits, least, strict=True):
         guess = fold.information(information, folds[0])
-        if threshold.stops_early and not fitted:
-            floor = max(floor, threshold.drives)
         anew = None if unwidened is None else _fit_anew(fold.fitting(as_declared(unwidened, program)), floor)
         if anew is not None:
             floor = max(floor, float(anew[1].log_likelihood.sum()))
-        maximum = known or fitting.fit(fold.fitting(program), fold.path, information=guess, hopeless=floor)
+        if known is not None:
+            maximum = known
+        elif fit is not None:
+            maximum = fit()
+        else:
+            maximum = fitting.fit(fold.fitting(program), fold.path, information=guess, hopeless=floor)
         held_out_path = fold.held_out_path
         if anew is not None and anew[1].objective > maximum.objective:
             program, maximum = anew
@@ -315,6 +368,15 @@ def _refit(
             for program, fold in zip(judges.programs, judged_folds, strict=True)
         ]
     return Refit(fitted, found, judged_folds, fitting, judges, torch.cat(held_out), alone, unwidened)
+
+
+def _fits(
+    fitting: Fitting, programs: Sequence[Program], folds: Sequence[Fold], known: Tensor | None, least: Sequence[float]
+) -> list[Fit]:
+    """Those of all folds; `known` is the information of the first fold's drives."""
+    problems = [fold.fitting(program) for program, fold in zip(programs, folds, strict=True)]
+    guesses = [fold.information(known, folds[0]) for fold in folds]
+    return fitting.fit_each(problems, [fold.path for fold in folds], guesses, least)
 
 
 def _fit_anew(problem: Problem, floor: float) -> tuple[Program, Maximum] | None:

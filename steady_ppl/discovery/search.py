@@ -20,7 +20,7 @@ from steady_ppl.discovery.candidates import (
     Candidate,
     Screening,
     at_its_best_place,
-    fitted,
+    attempts,
     judged,
     leaders,
     screen_program,
@@ -240,9 +240,9 @@ def _add_best(found: Search, screening: Screening, index: int) -> bool:
 def _refits(now: Refit, screening: Screening, first: bool) -> list[Candidate]:
     candidates, chosen = list[Candidate](), leaders(screening.tests, first)
     with stages(*((f"fitting with {tested.variant.label}", 1) for tested in chosen)) as begin:
-        for tested in chosen:
+        for fit in attempts(now, chosen, screening):
             begin()
-            candidates.append(fitted(now, tested, screening, _threshold(candidates)))
+            candidates.append(fit(_threshold(candidates)))
     best = max((c for c in candidates if c.is_judged), key=lambda c: c.total, default=None)
     candidates = [c if c.is_judged else replace(c, behind=best) for c in candidates]
     least = max((c.total for c in candidates), default=0.0) - MAX_NATS_OF_RIVAL
@@ -275,7 +275,7 @@ def _curves(search: Search) -> list[Candidate]:
     adding = [tested for tested in screening.tests.curves if not multiplies(tested)]
     multiplying = [tested for tested in screening.tests.curves if multiplies(tested)]
     chosen = [*adding[:MAX_CURVES], *multiplying[:1]]
-    found = [replace(fitted(base, tested, screening, threshold), behind=named) for tested in chosen]
+    found = [replace(fit(threshold), behind=named) for fit in attempts(base, chosen, screening, threshold)]
     # the simpler one, unless the other brings clearly more
     return sorted(found, key=lambda c: c.total - MIN_GAIN_OF_CURVE * multiplies(c), reverse=True)
 

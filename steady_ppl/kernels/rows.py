@@ -176,10 +176,14 @@ def _computed(
     return method, values, rest
 
 
+def note_failures(why: Mapping[str, str]) -> None:
+    """Add what `kernel_failures` gave elsewhere to that of the block."""
+    if (found := _WHY.get()) is not None:
+        found.update(why)
+
+
 def _noted(name: str, reason: str) -> str:
-    found = _WHY.get()
-    if found is not None:
-        found[name] = reason
+    note_failures({name: reason})
     return reason
 
 

@@ -9,10 +9,12 @@ Hall, Hall and Hausman 1974) unless it is known, and learns on the way (Broyden,
 
 from __future__ import annotations
 
+import copy
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -22,11 +24,12 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
+from steady_ppl.kernels.rows import kernel_failures, note_failures
 from steady_ppl.likelihood.parameters import Element, elements, on_both_sides, set_values, values_of
 from steady_ppl.likelihood.scores import parameter_scores, smoothed, widens
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
-from steady_ppl.utils.cores import Output, one_thread
+from steady_ppl.utils.cores import Computation, Output, in_batches, one_thread
 from steady_ppl.utils.journal import journaled
 from steady_ppl.utils.progress import stages
 
@@ -85,29 +88,51 @@ def maximise(
         FilterError: the program cannot be smoothed at its initial parameters.
     """
 
-    def compute() -> Maximum:
+    def find() -> Maximum:
         terms = [Term.alone(problem, path or find_path(problem))]
         (found,) = maximise_sum(terms, information=information, steps=steps, precision=precision, hopeless=hopeless)
         return found
 
-    return kept_maximum(problem.program, compute)
+    return kept_maximum(problem.program, lambda: output_of(problem.program, find))
 
 
-def kept_maximum(program: Program, find: Callable[[], Maximum]) -> Maximum:
-    """A maximum as a piece of a journal: what `find` returns, with the program moved there."""
+def maximise_each(
+    problems: Sequence[Problem],
+    paths: Sequence[ReferencePath],
+    informations: Sequence[Tensor | None],
+    hopeless: Sequence[float],
+) -> list[Callable[[], Maximum]]:
+    """Calls of `maximise` for several programs, to be made in this order; where cores are free the next ones begin."""
 
-    def compute() -> Output:
+    def compute(problem: Problem, path: ReferencePath, information: Tensor | None, least: float) -> Output:
+        own = replace(problem, program=copy.deepcopy(problem.program))
+        terms = [Term.alone(own, path)]
+        return output_of(own.program, lambda: maximise_sum(terms, information=information, hopeless=least)[0])
+
+    each = zip(problems, paths, informations, hopeless, strict=True)
+    outputs = zip(problems, in_batches([partial(compute, *one) for one in each]), strict=True)
+    return [partial(kept_maximum, problem.program, output) for problem, output in outputs]
+
+
+def output_of(program: Program, find: Callable[[], Maximum]) -> Output:
+    """What `find` returns, which moves the program, and where that is then, as `kept_maximum` takes it."""
+    with kernel_failures() as why:
         found = find()
-        tensors = {name: getattr(found, name) for name in ("log_likelihood", "information")}
-        tensors |= {"states": found.path.states, "noise": found.path.noise}
-        tensors |= {f"program/{name}": value for name, value in program.state_dict().items()}
-        return tensors, {name: getattr(found, name) for name in ("objective", "names", "steps", "decrement", "gained")}
+    tensors = {name: getattr(found, name) for name in ("log_likelihood", "information")}
+    tensors |= {"states": found.path.states, "noise": found.path.noise}
+    tensors |= {f"program/{name}": value for name, value in program.state_dict().items()}
+    values = {name: getattr(found, name) for name in ("objective", "names", "steps", "decrement", "gained")}
+    return tensors, {"found": values, "in plain torch": why}
 
+
+def kept_maximum(program: Program, compute: Computation) -> Maximum:
+    """A maximum as a piece of a journal: what `compute` returns, see `output_of`, with the program moved there."""
     tensors, values = journaled(compute)
+    note_failures(values["in plain torch"])
     program.load_state_dict({name: tensors[f"program/{name}"] for name in program.state_dict()})
     path = ReferencePath(tensors["states"], tensors["noise"])
-    values = {**values, "names": tuple(values["names"])}
-    return Maximum(log_likelihood=tensors["log_likelihood"], information=tensors["information"], path=path, **values)
+    found = {**values["found"], "names": tuple(values["found"]["names"])}
+    return Maximum(log_likelihood=tensors["log_likelihood"], information=tensors["information"], path=path, **found)
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,13 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from contextvars import ContextVar
+from functools import partial
 from multiprocessing.connection import wait
 from typing import IO, TYPE_CHECKING, Any
 
+from steady_ppl.errors import SteadyError
 from steady_ppl.utils.context import bound
+from steady_ppl.utils.progress import unheard
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -81,7 +84,7 @@ def run_in_parallel(computations: Sequence[Computation]) -> list[Output]:
     Those whose process fails, hangs or cannot be had are run here, where their errors are raised as any other.
     """
     with one_thread(), ExitStack() as ends:  # of two threads one would be missing after a fork
-        processes = max(1, min(_most.get(), _cores(), len(computations)))
+        processes = _processes(len(computations))
         shares = [range(first, len(computations), processes) for first in range(processes)]
         children = []
         for share in shares[1:]:
@@ -94,6 +97,28 @@ def run_in_parallel(computations: Sequence[Computation]) -> list[Output]:
         for child in children:
             found.update(child.results(patience))
         return [found[index] if index in found else computations[index]() for index in range(len(computations))]
+
+
+def in_batches(computations: Sequence[Computation]) -> list[Computation]:
+    """The same, to be called one after another: with the first of them that has no output yet, the next ones are run
+    on other cores. One that fails there is run again when it is called."""
+    found: dict[int, Output] = {}
+
+    def tried(index: int) -> Output:
+        try:
+            return computations[index]()
+        except SteadyError:
+            return {}, {"failed": True}
+
+    def output(index: int) -> Output:
+        if index not in found:
+            later = range(index + 1, min(index + _processes(len(computations)), len(computations)))
+            jobs: list[Computation] = [computations[index], *(partial(tried, other) for other in later)]
+            outputs = zip((index, *later), run_in_parallel(jobs), strict=True)
+            found.update({at: one for at, one in outputs if one[1] != {"failed": True}})
+        return found.pop(index)
+
+    return [partial(output, index) for index in range(len(computations))]
 
 
 class _Child:
@@ -127,11 +152,11 @@ class _Child:
                 signal.signal(ending, signal.SIG_DFL)
             signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
             if self.file is not None and os.getppid() == parent:
-                _most.set(1)
-                for index in self.share:
-                    tensors, values = self.computations[index]()
-                    content = packed(tensors, {"values": json.dumps(values)})
-                    self.file.write(len(content).to_bytes(8, "little") + content)
+                with one_core(), unheard():
+                    for index in self.share:
+                        tensors, values = self.computations[index]()
+                        content = packed(tensors, {"values": json.dumps(values)})
+                        self.file.write(len(content).to_bytes(8, "little") + content)
                 self.file.write(END_MARK)
                 self.file.flush()
         finally:
@@ -179,6 +204,11 @@ def _no_signals() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _processes(most: int) -> int:
+    """How many to take, of so many at most."""
+    return max(1, min(_most.get(), _cores(), most))
 
 
 def _cores() -> int:

@@ -35,6 +35,11 @@ def listening(listener: Listener) -> AbstractContextManager[None]:
     return bound(_stage, _Stage(listener))
 
 
+def unheard() -> AbstractContextManager[None]:
+    """Let the block tell nobody how far it has come."""
+    return bound(_stage, None)
+
+
 @contextmanager
 def stages(*named: tuple[str, float]) -> Iterator[Callable[[], None]]:
     """Divide what is going on into stages, one after another: what each does, and how long it takes relative to the

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import replace
 
 import pyro.distributions as dist
@@ -11,10 +12,12 @@ import torch
 from examples import drives, example
 
 from steady_ppl import for_program, simulate
+from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path, smooth
-from steady_ppl.likelihood.maximize import maximise, refit_outliers, widen_noise
+from steady_ppl.likelihood.maximize import maximise, maximise_each, refit_outliers, widen_noise
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
+from steady_ppl.utils import cores
 
 
 def likelihood_of_cart(program, data) -> float:
@@ -52,6 +55,26 @@ def test_the_start_does_not_matter(cart):
     assert again.objective == pytest.approx(maximum.objective, abs=0.05)
     for ours, theirs in zip(elements(far), elements(program), strict=True):
         torch.testing.assert_close(ours.parameter.data, theirs.parameter.data, atol=0.02, rtol=0.02)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_fits_that_are_made_one_after_another_are_the_same_on_any_cores(count, monkeypatch):
+    monkeypatch.setattr(cores, "_cores", lambda: count)
+    programs = [example("linear_gaussian") for _ in range(3)]
+    problems = [Problem(one, drives(one, 6, 30, seed=seed), True) for seed, one in enumerate(programs)]
+    paths = [find_path(problem) for problem in problems]
+    paths[1] = replace(paths[1], states=torch.full_like(paths[1].states, torch.nan))
+    fits = maximise_each(problems, paths, [None] * 3, [-math.inf] * 3)
+    expected = copy.deepcopy([problems[0], problems[2]])
+    for fit, problem, path in zip(fits[::2], expected, paths[::2], strict=True):
+        found, alone = fit(), maximise(problem, path)
+        assert found.objective == alone.objective and found.steps == alone.steps
+        assert bool((found.path.states == alone.path.states).all())
+    with pytest.raises(FilterError):
+        fits[1]()
+    for problem, other in zip(expected, (programs[0], programs[2]), strict=True):
+        for name, value in problem.program.state_dict().items():
+            assert bool((value == other.state_dict()[name]).all())
 
 
 def test_a_prior_pulls(cart):

@@ -13,7 +13,8 @@ import torch
 
 from steady_ppl.errors import FilterError
 from steady_ppl.utils import cores
-from steady_ppl.utils.cores import one_core, run_in_parallel
+from steady_ppl.utils.cores import in_batches, one_core, run_in_parallel
+from steady_ppl.utils.progress import listening, stages
 
 
 @pytest.fixture(autouse=True)
@@ -73,6 +74,43 @@ def test_jobs_of_a_process_that_is_killed_are_run_here():
     found = run_in_parallel(jobs_of(6, die))
     assert [values["at"][0] for _, values in found] == list(range(6))
     assert found[1][1]["pid"] == mine and found[4][1]["pid"] == mine and found[2][1]["pid"] != mine
+
+
+def test_the_next_ones_are_run_with_the_first_that_is_asked_for():
+    begun = []
+    calls = in_batches(jobs_of(4, lambda index: begun.append(index)))
+    assert begun == [] and calls[0]()[1]["at"] == [0, "é"]
+    pids = [call()[1]["pid"] for call in calls[1:]]
+    assert pids[0] != pids[1] and os.getpid() not in pids[:2] and pids[2] == os.getpid()
+    assert begun == [0, 3]  # of this process
+    with one_core():
+        assert {call()[1]["pid"] for call in in_batches(jobs_of(3))} == {os.getpid()}
+
+
+def test_one_that_fails_elsewhere_fails_when_it_is_its_turn():
+    def fail(index):
+        if index == 1:
+            raise FilterError("trajectory 3 blew up", trajectory="3")
+
+    calls = in_batches(jobs_of(3, fail))
+    assert calls[0]()[1]["at"][0] == 0
+    with pytest.raises(FilterError, match="trajectory 3 blew up") as caught:
+        calls[1]()
+    assert caught.value.trajectory == "3"
+    assert calls[2]()[1]["at"][0] == 2
+
+
+def test_other_processes_say_nothing_of_how_far_they_are():
+    heard = []
+
+    def work():
+        with stages(("working", 1)) as begin:
+            begin()
+        return {}, {"heard": len(heard)}
+
+    with listening(lambda doing, share: heard.append(doing)):
+        found = run_in_parallel([work, work])
+    assert heard == ["working", ""] and found[1][1]["heard"] == 0
 
 
 def test_an_error_here_ends_the_other_processes(tmp_path):
