@@ -98,7 +98,7 @@ def constant_velocity(problem: Problem, tracked: Tracked, horizons: Sequence[int
     if not bool((sizes > 0).all() and torch.isfinite(sizes).all()):
         return "a channel of the program never moves"
     moved = mean_step(program, path.states[:-1], *inputs)
-    kind = type("ConstantVelocity", (ConstantVelocity,), {})  # whose kernels have this program's parameters in them
+    kind = type("ConstantVelocity", (ConstantVelocity,), {})  # kernels take the inner program's parameters as constants
     coasted = mean_step(kind(program, sizes), path.states[:-1], *inputs)
     if torch.allclose(moved, coasted, rtol=1e-6, atol=1e-7):
         return "the program's channels have no mean that could be taken away"

@@ -22,6 +22,7 @@ import torch
 from scipy import special
 
 from steady_ppl.errors import DataError
+from steady_ppl.utils.cores import one_thread
 
 MAX_TIME_STRIPS, REGIME_BINS, PAIR_BINS = 10, 5, 4  # of a drive, and ranges of a variable alone or of two each
 MIN_RESIDUALS = 8  # residuals in a cell
@@ -261,4 +262,5 @@ def _correlations(data: Residuals, inside: Array, controls: dict[str, Array]) ->
 def _products(regressors: Array, values: Array) -> Array:
     """Sums over rows and drives of each regressor `(N, T, B)` times each set's values `(M, T, B)`, `(N, M)`."""
     one, other = (np.ascontiguousarray(part, np.float64).reshape(len(part), -1) for part in (regressors, values))
-    return (torch.from_numpy(one) @ torch.from_numpy(other).T).numpy()
+    with one_thread():
+        return (torch.from_numpy(one) @ torch.from_numpy(other).T).numpy()

@@ -21,11 +21,11 @@ from steady_ppl.discovery.refits import (
     Fits,
     Refit,
     Threshold,
-    begun,
-    finished,
+    attempt_with,
+    begin,
+    finish,
     fit_near,
     judged_fits,
-    prepared,
     refit_with,
 )
 from steady_ppl.discovery.screening import FAMILY_LEVEL, Screened, Tested, departures, screen
@@ -166,25 +166,26 @@ def leaders(screened: Screened, first: bool) -> list[Tested]:
 def attempts(
     now: Refit, chosen: Sequence[Tested], screening: Screening, threshold: Threshold = NO_THRESHOLD
 ) -> list[Callable[[Threshold], Candidate]]:
-    """The program with each candidate, by the screening that tested it, to be fitted one after another given what the
-    drives of each must reach. One `threshold` is known before."""
+    """Calls that fit the program with each candidate, in order, by the screening that tested it. Each is given what its
+    drives must reach; one that stops fits early must be given here as well."""
     known = [_known(tested, screening) for tested in chosen]
     from_zero = [
         one is not None and tested.column.probe is None and now.fitting == BY_LIKELIHOOD
         for tested, one in zip(chosen, known, strict=True)
     ]  # scoring steps go from there as far as the likelihood rises
     starts = [_absent(tested) if zero else _start(tested) for tested, zero in zip(chosen, from_zero, strict=True)]
-    prepare = (prepared(now, t.variant, start, one) for t, start, one in zip(chosen, starts, known, strict=True))
-    given = zip(chosen, begun(now, list(prepare), threshold), known, from_zero, strict=True)
+    made = [attempt_with(now, t.variant, start, one) for t, start, one in zip(chosen, starts, known, strict=True)]
+    given = zip(chosen, begin(now, made, threshold), known, from_zero, strict=True)
     return [partial(_fitted, now, *one) for one in given]
 
 
 def _fitted(
     now: Refit, tested: Tested, first: Attempt | str, known: Tensor | None, from_zero: bool, threshold: Threshold
 ) -> Candidate:
-    candidate = judged(now, tested, finished(now, first, threshold))
-    lost = isinstance(candidate.refit, str) or gain_of_fits(now, candidate.refit, folds=1) < 0
-    if from_zero or known is None or not lost or tested.statistic <= MIN_STATISTIC_TO_RETRY:
+    candidate = judged(now, tested, finish(now, first, threshold))
+    if from_zero or known is None or not tested.statistic > MIN_STATISTIC_TO_RETRY:
+        return candidate
+    if isinstance(candidate.refit, Refit) and gain_of_fits(now, candidate.refit, folds=1) >= 0:
         return candidate
     again = refit_with(now, tested.variant, _absent(tested), information=known, threshold=threshold)
     return judged(now, tested, again)

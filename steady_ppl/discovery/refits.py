@@ -213,10 +213,10 @@ class Attempt:
 
     programs: list[Program]  # one a fold
     information: Tensor | None  # of the first fold's drives, the coefficient last
-    first: Fit | None = None  # the fit to these drives, if it has been asked for
+    first: Fit | None = None  # the fit to these drives; None where it is made in its turn
 
 
-def prepared(
+def attempt_with(
     base: Refit,
     variant: Variant,
     value: float | Sequence[float] | Tensor,
@@ -228,15 +228,18 @@ def prepared(
     """
     try:
         programs = [attach(copy.deepcopy(program), variant, value) for program in base.programs]
+        if isinstance(information, Maximum):
+            information = _information(information, elements(programs[0]))
+        return Attempt(programs, information)
     except SteadyError as error:
         return str(error)
-    if isinstance(information, Maximum):
-        information = _information(information, elements(programs[0]))
-    return Attempt(programs, information)
 
 
-def begun(base: Refit, attempts: Sequence[Attempt | str], threshold: Threshold = NO_THRESHOLD) -> list[Attempt | str]:
-    """Attempts whose first fits are computed side by side where cores are free; they are finished in this order."""
+def begin(base: Refit, attempts: Sequence[Attempt | str], threshold: Threshold = NO_THRESHOLD) -> list[Attempt | str]:
+    """Attempts whose first fits run side by side where cores are free; they are to be finished in this order.
+
+    A `threshold` that stops fits early must be given here as well.
+    """
     able = [one for one in attempts if isinstance(one, Attempt)]
     if base.unwidened is not None or not able:
         return list(attempts)
@@ -248,7 +251,7 @@ def begun(base: Refit, attempts: Sequence[Attempt | str], threshold: Threshold =
     return [replace(one, first=next(fits)) if isinstance(one, Attempt) else one for one in attempts]
 
 
-def finished(base: Refit, attempt: Attempt | str, threshold: Threshold = NO_THRESHOLD) -> Refit | str:
+def finish(base: Refit, attempt: Attempt | str, threshold: Threshold = NO_THRESHOLD) -> Refit | str:
     """What an attempt comes to, or why it cannot be fitted."""
     if isinstance(attempt, str):
         return attempt
@@ -274,8 +277,8 @@ def refit_with(
     information: Tensor | Maximum | None = None,
     threshold: Threshold = NO_THRESHOLD,
 ) -> Refit | str:
-    """The program with an effect, see `prepared`, fitted."""
-    return finished(base, prepared(base, variant, value, information), threshold)
+    """The program with an effect, see `attempt_with`, fitted."""
+    return finish(base, attempt_with(base, variant, value, information), threshold)
 
 
 def fit_near(base: Fits, near: Fits, variants: Sequence[Variant]) -> Fits | str:
@@ -333,7 +336,7 @@ def _refit(
     fitted, found, held_out, judged_folds = list[Program](), list[Maximum](), list[Tensor](), list[Fold]()
     folds = [fold.wide(program) for program, fold in zip(programs, folds, strict=True)]
     fits: Sequence[Fit | None] = [first, *[None] * (len(folds) - 1)]
-    if unwidened is None and threshold == NO_THRESHOLD and first is None:  # all are made
+    if unwidened is None and threshold == NO_THRESHOLD and first is None and not any(maxima):  # all are made
         fits = _fits(fitting, programs, folds, information, least)
     for program, fold, known, fit, floor in zip(programs, folds, maxima, fits, least, strict=True):
         guess = fold.information(information, folds[0])
@@ -371,11 +374,15 @@ def _refit(
 
 
 def _fits(
-    fitting: Fitting, programs: Sequence[Program], folds: Sequence[Fold], known: Tensor | None, least: Sequence[float]
+    fitting: Fitting,
+    programs: Sequence[Program],
+    folds: Sequence[Fold],
+    information: Tensor | None,
+    least: Sequence[float],
 ) -> list[Fit]:
-    """Those of all folds; `known` is the information of the first fold's drives."""
+    """The fits of all folds, to be made in order; `information` is that of the first fold's drives."""
     problems = [fold.fitting(program) for program, fold in zip(programs, folds, strict=True)]
-    guesses = [fold.information(known, folds[0]) for fold in folds]
+    guesses = [fold.information(information, folds[0]) for fold in folds]
     return fitting.fit_each(problems, [fold.path for fold in folds], guesses, least)
 
 

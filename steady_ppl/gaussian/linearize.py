@@ -174,7 +174,7 @@ def linearize_sensors(
 
 
 def _where(there: Tensor, values: Tensor) -> Tensor:
-    """Zero where nothing is there."""
+    """The values, contiguous, and zero where nothing is there."""
     return values.contiguous() if bool(there.all()) else torch.where(there, values, 0.0)
 
 

@@ -183,7 +183,7 @@ class ScalarGraph:
         return found["scalar"], found["vector"]
 
     def dependents(self, leaf: int) -> set[int]:
-        """A leaf and the scalars that it may change."""
+        """A leaf and the scalars that it may change. Parameters are not followed into vectors, see `Method`."""
         found = {"scalar": {leaf}, "vector": set[int](), "parameters": set[int]()}
         for number, (operation, arguments) in enumerate(self.scalars):
             if operation == "element":

@@ -32,6 +32,7 @@ Array = np.ndarray
 Examples = dict[str, Tensor]  # of the arguments of a function
 _COMPILED: WeakKeyDictionary[type[nn.Module], dict[Any, Any]] = WeakKeyDictionary()
 _NAMES: WeakKeyDictionary[type[nn.Module], list[tuple[int, list[str]]]] = WeakKeyDictionary()
+_DISCARDED: WeakKeyDictionary[nn.Module, set[Hashable]] = WeakKeyDictionary()  # names of what a program gave up
 _READ: WeakKeyDictionary[nn.Module, dict[Any, Any]] = WeakKeyDictionary()  # of programs that are `unchanged` for now
 
 
@@ -196,6 +197,8 @@ def _kernel(graph: ScalarGraph, inputs: tuple[str, ...], columns: dict[str, int]
 
 def compiled(program: nn.Module, name: Hashable, build: Callable[[], Value]) -> Value | str:
     """What was compiled under a name for programs like this one, built once; or why there is none."""
+    if name in _DISCARDED.get(program, ()):
+        return RESULTS_DIFFER
     known = _COMPILED.setdefault(type(program), {})
     key = (name, signature(program))
     if key in known:
@@ -211,8 +214,9 @@ def compiled(program: nn.Module, name: Hashable, build: Callable[[], Value]) -> 
 
 
 def discard(program: nn.Module, name: Hashable) -> str:
-    """Give up what was compiled under a name."""
-    _COMPILED[type(program)][name, signature(program)] = RESULTS_DIFFER
+    """Give up what was compiled under a name, for this very program: a copy of it in another process knows nothing of
+    this, nor does this one of what that gives up."""
+    _DISCARDED.setdefault(program, set()).add(name)
     return RESULTS_DIFFER
 
 
@@ -269,7 +273,7 @@ def _signature(program: nn.Module) -> tuple[Any, ...]:
 
 
 def _content(value: Any) -> Any:
-    """What a setting tells; of a tensor the numbers, or which it is if there are many."""
+    """What a setting tells; of a tensor the numbers, or their digest if there are many."""
     if isinstance(value, dict):
         return tuple((repr(name), _content(part)) for name, part in value.items() if isinstance(part, SETTING_KINDS))
     if isinstance(value, tuple | list):
@@ -278,7 +282,9 @@ def _content(value: Any) -> Any:
         return str(value.dtype), value.shape, value.tobytes()
     if not isinstance(value, Tensor):
         return repr(value)
-    return (tuple(value.shape), *value.flatten().tolist()) if value.numel() <= MAX_NUMBERS_READ else id(value)
+    if value.numel() <= MAX_NUMBERS_READ:
+        return tuple(value.shape), *value.flatten().tolist()
+    return tuple(value.shape), str(value.dtype), hashlib.sha256(value.detach().numpy(force=True).tobytes()).digest()
 
 
 def _settings(module: nn.Module) -> Iterator[tuple[str, Any]]:

@@ -15,6 +15,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -88,12 +89,8 @@ def maximise(
         FilterError: the program cannot be smoothed at its initial parameters.
     """
 
-    def find() -> Maximum:
-        terms = [Term.alone(problem, path or find_path(problem))]
-        (found,) = maximise_sum(terms, information=information, steps=steps, precision=precision, hopeless=hopeless)
-        return found
-
-    return kept_maximum(problem.program, lambda: output_of(problem.program, find))
+    given = {"information": information, "steps": steps, "precision": precision, "hopeless": hopeless}
+    return kept_maximum(problem.program, lambda: _maximum_of_copy(problem, path or find_path(problem), **given))
 
 
 def maximise_each(
@@ -102,22 +99,32 @@ def maximise_each(
     informations: Sequence[Tensor | None],
     hopeless: Sequence[float],
 ) -> list[Callable[[], Maximum]]:
-    """Calls of `maximise` for several programs, to be made in this order; where cores are free the next ones begin."""
-
-    def compute(problem: Problem, path: ReferencePath, information: Tensor | None, least: float) -> Output:
-        own = replace(problem, program=copy.deepcopy(problem.program))
-        terms = [Term.alone(own, path)]
-        return output_of(own.program, lambda: maximise_sum(terms, information=information, hopeless=least)[0])
-
+    """Calls of `maximise` for several programs, to be made in this order; where cores are free the next ones begin. A
+    program moves when its call is made."""
     each = zip(problems, paths, informations, hopeless, strict=True)
-    outputs = zip(problems, in_batches([partial(compute, *one) for one in each]), strict=True)
+    computations = [
+        partial(_maximum_of_copy, problem, path, information=information, hopeless=least)
+        for problem, path, information, least in each
+    ]
+    outputs = zip(problems, in_batches(computations), strict=True)
     return [partial(kept_maximum, problem.program, output) for problem, output in outputs]
 
 
+def _maximum_of_copy(problem: Problem, path: ReferencePath, **settings: Any) -> Output:
+    """The output of `maximise_sum` for a copy of a program: whether its kernels are given up on the way is no matter of
+    the program, which may be fitted in another process or come from a journal."""
+    own = replace(problem, program=copy.deepcopy(problem.program))
+    return output_of(own.program, lambda: maximise_sum([Term.alone(own, path)], **settings)[0])
+
+
 def output_of(program: Program, find: Callable[[], Maximum]) -> Output:
-    """What `find` returns, which moves the program, and where that is then, as `kept_maximum` takes it."""
-    with kernel_failures() as why:
-        found = find()
+    """Run `find`, which moves the program, and return what `kept_maximum` takes."""
+    why: dict[str, str] = {}
+    try:
+        with kernel_failures() as why:
+            found = find()
+    finally:
+        note_failures(why)
     tensors = {name: getattr(found, name) for name in ("log_likelihood", "information")}
     tensors |= {"states": found.path.states, "noise": found.path.noise}
     tensors |= {f"program/{name}": value for name, value in program.state_dict().items()}

@@ -25,7 +25,6 @@ from functools import partial
 from multiprocessing.connection import wait
 from typing import IO, TYPE_CHECKING, Any
 
-from steady_ppl.errors import SteadyError
 from steady_ppl.utils.context import bound
 from steady_ppl.utils.progress import unheard
 
@@ -100,22 +99,22 @@ def run_in_parallel(computations: Sequence[Computation]) -> list[Output]:
 
 
 def in_batches(computations: Sequence[Computation]) -> list[Computation]:
-    """The same, to be called one after another: with the first of them that has no output yet, the next ones are run
-    on other cores. One that fails there is run again when it is called."""
+    """Computations with the same outputs, each to be called once and in order. One whose output is not there yet runs
+    the next ones on other cores meanwhile. What fails there runs again in its turn."""
     found: dict[int, Output] = {}
+    here = os.getpid()
+    nothing: Output = ({}, {})
 
-    def tried(index: int) -> Output:
-        try:
-            return computations[index]()
-        except SteadyError:
-            return {}, {"failed": True}
+    def elsewhere(index: int) -> Output:
+        return nothing if os.getpid() == here else computations[index]()
 
     def output(index: int) -> Output:
         if index not in found:
-            later = range(index + 1, min(index + _processes(len(computations)), len(computations)))
-            jobs: list[Computation] = [computations[index], *(partial(tried, other) for other in later)]
+            last = min(index + _processes(len(computations)), len(computations))
+            later = [other for other in range(index + 1, last) if other not in found]
+            jobs: list[Computation] = [computations[index], *(partial(elsewhere, other) for other in later)]
             outputs = zip((index, *later), run_in_parallel(jobs), strict=True)
-            found.update({at: one for at, one in outputs if one[1] != {"failed": True}})
+            found.update({at: one for at, one in outputs if one is not nothing})
         return found.pop(index)
 
     return [partial(output, index) for index in range(len(computations))]

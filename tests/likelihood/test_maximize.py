@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import replace
+from operator import attrgetter
 
 import pyro.distributions as dist
 import pytest
@@ -14,6 +15,7 @@ from examples import drives, example
 from steady_ppl import for_program, simulate
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path, smooth
+from steady_ppl.kernels import jit, rows
 from steady_ppl.likelihood.maximize import maximise, maximise_each, refit_outliers, widen_noise
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
@@ -60,21 +62,53 @@ def test_the_start_does_not_matter(cart):
 @pytest.mark.parametrize("count", [1, 2])
 def test_fits_that_are_made_one_after_another_are_the_same_on_any_cores(count, monkeypatch):
     monkeypatch.setattr(cores, "_cores", lambda: count)
-    programs = [example("linear_gaussian") for _ in range(3)]
-    problems = [Problem(one, drives(one, 6, 30, seed=seed), True) for seed, one in enumerate(programs)]
+    programs = [example("linear_gaussian", torch.float32) for _ in range(3)]
+    problems = [Problem(one, drives(one, 20, 61, seed=seed), True) for seed, one in enumerate(programs)]
     paths = [find_path(problem) for problem in problems]
     paths[1] = replace(paths[1], states=torch.full_like(paths[1].states, torch.nan))
     fits = maximise_each(problems, paths, [None] * 3, [-math.inf] * 3)
     expected = copy.deepcopy([problems[0], problems[2]])
     for fit, problem, path in zip(fits[::2], expected, paths[::2], strict=True):
         found, alone = fit(), maximise(problem, path)
-        assert found.objective == alone.objective and found.steps == alone.steps
-        assert bool((found.path.states == alone.path.states).all())
+        for name in ("objective", "steps", "decrement", "gained"):
+            assert getattr(found, name) == getattr(alone, name)
+        for part in ("path.states", "path.noise", "log_likelihood", "information"):
+            assert torch.equal(attrgetter(part)(found), attrgetter(part)(alone))
     with pytest.raises(FilterError):
         fits[1]()
     for problem, other in zip(expected, (programs[0], programs[2]), strict=True):
         for name, value in problem.program.state_dict().items():
             assert bool((value == other.state_dict()[name]).all())
+
+
+def test_a_fit_says_why_it_had_no_kernels_wherever_it_ran(monkeypatch):
+    monkeypatch.setattr(rows, "close", lambda mine, theirs: False)
+    programs = [example("linear_gaussian", torch.float32) for _ in range(2)]
+    problems = [Problem(one, drives(one, 20, 61), True) for one in programs]
+    paths = [find_path(problem) for problem in problems]
+    found = []
+    for count in (1, 2):
+        monkeypatch.setattr(cores, "_cores", lambda count=count: count)
+        fits = maximise_each(copy.deepcopy(problems), paths, [None] * 2, [-math.inf] * 2)
+        fits[0]()
+        with rows.kernel_failures() as why:
+            fits[1]()
+        found.append(why)
+    assert found[0] == found[1] and set(found[0].values()) == {jit.RESULTS_DIFFER}
+
+
+def test_what_a_fit_gives_up_is_no_matter_of_the_program(monkeypatch):
+    program = example("linear_gaussian", torch.float32)
+    problem = Problem(program, drives(program, 20, 61), True)
+    path = find_path(problem)
+    with monkeypatch.context() as patched:
+        patched.setattr(rows, "close", lambda mine, theirs: False)
+        with rows.kernel_failures() as why:
+            maximise(problem, path)
+        assert why
+    with rows.kernel_failures() as why:
+        smooth(problem, path)
+    assert why == {}
 
 
 def test_a_prior_pulls(cart):

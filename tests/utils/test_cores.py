@@ -100,6 +100,29 @@ def test_one_that_fails_elsewhere_fails_when_it_is_its_turn():
     assert calls[2]()[1]["at"][0] == 2
 
 
+@pytest.mark.parametrize("how", ["error", "killed"])
+def test_one_that_ends_its_process_is_run_in_its_turn_and_the_others_once(how, tmp_path):
+    mine = os.getpid()
+
+    def fail(index):
+        (tmp_path / f"{index}-{time.monotonic_ns()}").touch()
+        if index == 1 and how == "error":
+            raise RuntimeError("of computation 1")
+        if index == 1 and os.getpid() != mine:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    calls = in_batches(jobs_of(5, fail))
+    assert calls[0]()[1]["at"][0] == 0
+    if how == "error":
+        with pytest.raises(RuntimeError, match="of computation 1"):
+            calls[1]()
+    else:
+        assert calls[1]()[1]["pid"] == mine
+    assert [call()[1]["at"][0] for call in calls[2:]] == [2, 3, 4]
+    runs = [int(file.name[0]) for file in tmp_path.iterdir()]
+    assert [runs.count(index) for index in (0, 1, 2)] == [1, 2, 1]
+
+
 def test_other_processes_say_nothing_of_how_far_they_are():
     heard = []
 
