@@ -263,7 +263,8 @@ def at_its_best_place(now: Refit, candidate: Candidate) -> Candidate:
         refit = begun if best is begun else judged_fits(best)
         if isinstance(refit, Refit):
             there = judged(now, replace(tested, column=replace(tested.column, variant=variant)), refit)
-            return there if there.total > candidate.total or not candidate.is_judged else candidate
+            is_denied = candidate.is_judged and there.total < candidate.total - CLEAR_GAIN
+            return candidate if is_denied else there
     return candidate
 
 
@@ -328,8 +329,16 @@ def _grid(now: Refit, candidate: Candidate) -> list[Variant]:
 
 
 def _neighbours(at: Variant, grid: Sequence[Variant], name: str, share: float) -> list[Variant]:
-    """The effect on either side of a place: by a share of the grid's spacing, or of the value where there is none."""
+    """The effect on either side of a place: by a share of the grid's spacing, or of the value where there is none.
+
+    A scale goes by a share of the grid's ratio.
+    """
     value = at.profiled[name]
     values = sorted({float(variant.profiled[name]) for variant in grid})
-    apart = min((b - a for a, b in pairwise(values)), default=0.8 * value)
-    return [replace(at, options={**at.options, name: value + sign * share * apart}) for sign in (1, -1)]
+    if name in at.effect.scales:
+        ratio = min(b / a for a, b in pairwise(values))
+        beside = [value * ratio**share, value / ratio**share]
+    else:
+        apart = min((b - a for a, b in pairwise(values)), default=0.8 * value)
+        beside = [value + share * apart, value - share * apart]
+    return [replace(at, options={**at.options, name: place}) for place in beside]

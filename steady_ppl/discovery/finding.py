@@ -15,7 +15,7 @@ from steady_ppl.discovery.candidates import Candidate, variance_of_places
 from steady_ppl.discovery.refits import Refit, with_states_of
 from steady_ppl.discovery.screening import Tested
 from steady_ppl.discovery.search import MIN_GAIN_OF_CURVE, Found, Search
-from steady_ppl.effects import Variant, attached
+from steady_ppl.effects import Effect, Variant, attached
 from steady_ppl.gaussian.predict import HALF_WIDTH, simulate_again
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.model.problem import Problem
@@ -68,10 +68,12 @@ def _finding(search: Search, found: Found) -> Finding:
     values = refit.coefficient(variant).flatten().double().numpy()
     spread = _spread(search, variant, len(values))
     is_positive = effect.null != 0  # and learned as its logarithm
+    places = np.zeros_like(spread)
     if variant.profiled:
-        places = variance_of_places(found.without, found.candidate)
-        spread = np.sqrt(spread**2 + places.numpy() / (values if is_positive else 1.0) ** 2)
-    pairs = [(value, HALF_WIDTH * sd) for value, sd in zip(values.tolist(), spread.tolist(), strict=True)]
+        variance = variance_of_places(found.without, found.candidate)
+        places = variance.sqrt().numpy() / (values if is_positive else 1.0)
+    of_each = zip(values.tolist(), spread.tolist(), places.tolist(), strict=True)
+    spread = np.hypot(spread, places)
     return Finding(
         variant=variant,
         kind=effect.verdict,
@@ -79,9 +81,20 @@ def _finding(search: Search, found: Found) -> Finding:
         confidence=_confidence(search, found),
         coefficient=values.tolist(),
         sd=(values * spread if is_positive else spread).tolist(),
-        interval=[_around(value, by) if is_positive else (value - by, value + by) for value, by in pairs],
+        interval=[_interval(effect, *told) for told in of_each],
         gain=found.candidate.total,
     )
+
+
+def _interval(effect: Effect, value: float, sd: float, of_places: float) -> tuple[float, float]:
+    """With 90 % probability. A place that is uncertain by a factor makes the coefficient so."""
+    by = HALF_WIDTH * math.hypot(sd, of_places)
+    if effect.null != 0:
+        return _around(value, by)
+    if not effect.scales or value == 0:
+        return value - by, value + by
+    low, high = sorted(_around(value, HALF_WIDTH * of_places / abs(value)))
+    return value - math.hypot(HALF_WIDTH * sd, value - low), value + math.hypot(HALF_WIDTH * sd, high - value)
 
 
 def _around(value: float, by: float) -> tuple[float, float]:

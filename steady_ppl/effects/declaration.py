@@ -79,6 +79,7 @@ class Effect:
         choices: the function's further arguments, a mapping a choice: channels, controls or component, called `at`, and
             knees, widths or places.
         profiled: the arguments among these that are knees, widths or places.
+        scales: those of the profiled that are positive and uncertain by a factor; their choices are spaced by ratios.
         prior: of the coefficient, a Pyro distribution; a wide-tailed Cauchy of scale `limit` about its absence if None.
         lacks: why it does not apply to a program, or None.
     """
@@ -100,6 +101,7 @@ class Effect:
     probes: tuple[float, ...] = ()
     choices: Callable[[Program, Trajectories | None], Choices] = field(default=lambda program, data: [{}])
     profiled: tuple[str, ...] = ()
+    scales: tuple[str, ...] = ()
     prior: Any = None
     lacks: Callable[[Program], str | None] = field(default=lambda program: None)
 
@@ -112,6 +114,7 @@ class Effect:
             (len(typical) == self.size, f"{len(typical)} typical numbers for {self.size} components"),
             (felt, f"its typical coefficient must be finite and not zero, got {self.typical}"),
             (not (self.components and self.sign), "a coefficient of several components has no sign"),
+            (set(self.scales) <= set(self.profiled), f"its scales {self.scales} are not all profiled"),
             (self.limit > 0, f"its limit is a magnitude above zero, got {self.limit}"),
         ):
             if not holds:

@@ -15,10 +15,10 @@ from small import finite
 from torch.distributions import constraints
 
 import steady_ppl as st
-from steady_ppl.discovery.candidates import variance_of_places
+from steady_ppl.discovery.candidates import _neighbours, variance_of_places
 from steady_ppl.discovery.curves import knots_of
 from steady_ppl.discovery.discover import NOT_CONVERGED, _note_of_one_drive
-from steady_ppl.discovery.finding import _spread, next_run
+from steady_ppl.discovery.finding import _interval, _spread, next_run
 from steady_ppl.effects import Effect, chosen_variant, parsed
 from steady_ppl.effects.registry import _EFFECTS, register
 from steady_ppl.likelihood.maximize import maximise
@@ -199,6 +199,24 @@ def test_not_knowing_a_knee_is_in_the_coefficients_interval():
     (one,) = found.search.found
     places = float(variance_of_places(one.without, one.candidate))
     assert places > 0.1 * alone**2 and finding.sd[0] ** 2 == pytest.approx(alone**2 + places, rel=1e-3)
+
+
+def test_a_scale_goes_by_factors_and_a_place_by_steps():
+    """The drag of a wind is on a grid of .02, .06 and .2; a knee has no such grid."""
+    program = example("hovercraft", torch.float32)
+    grid = chosen_variant(program, "wind").effect.variants(program)
+    assert [round(one.profiled["drag"] / 0.06, 4) for one in _neighbours(grid[0], grid, "drag", 1.0)] == [3, 0.3333]
+    knee = chosen_variant(program, "thrust_saturation", knee=0.6)
+    assert [one.profiled["knee"] for one in _neighbours(knee, [knee], "knee", 0.25)] == pytest.approx([0.72, 0.48])
+
+
+def test_what_a_factor_leaves_open_is_in_an_interval_by_a_factor():
+    program = example("hovercraft", torch.float32)
+    wind, knee = (chosen_variant(program, name).effect for name in ("wind", "thrust_saturation"))
+    low, high = _interval(wind, -0.5, 0.0, 0.25)
+    assert low * high == pytest.approx(0.25) and low < -0.5 < high < 0
+    assert _interval(wind, 0.5, 0.1, 0.0) == pytest.approx(_interval(knee, 0.5, 0.1, 0.0))
+    assert sum(_interval(knee, 0.5, 0.0, 0.25)) == pytest.approx(1.0)
 
 
 @pytest.mark.slow

@@ -227,7 +227,9 @@ def slope(self: Program, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     return {"forward": cos * x + sin * y, "lateral": cos * y - sin * x}
 
 
-@_where_it_slips("m/s", typical=(1.0, 0.5), limit=10.0, components=("x", "y"), profiled=("drag",), choices=_drags)
+@_where_it_slips(
+    "m/s", typical=(1.0, 0.5), limit=10.0, components=("x", "y"), profiled=("drag",), scales=("drag",), choices=_drags
+)
 def wind(self: Program, state: Tensor, *_: Tensor, c: Tensor, drag: Any) -> Pushes:
     r"""a = -k (v-w)|v-w| + k v|v| per axis, w the world-frame wind (c₁, c₂) in the body frame
 
