@@ -61,11 +61,9 @@ def write_table(data: Trajectories, path: str | Path) -> None:
     suffix = require_table_file(path)
     frame = to_frame(data)
     from_frame(frame, name=path.name)
+    write = frame.to_csv if suffix == ".csv" else frame.to_parquet
     with whole_file(path, DataError) as beside:
-        if suffix == ".csv":
-            frame.to_csv(beside, index=False)
-        else:
-            frame.to_parquet(beside, index=False)
+        write(beside, index=False)
 
 
 def to_frame(data: Trajectories) -> pd.DataFrame:
@@ -109,13 +107,7 @@ def from_frame(frame: pd.DataFrame, name: str = "table") -> Trajectories:
     every, none = np.ones_like(inner), np.zeros_like(inner)
 
     def numbers(column: str, required: np.ndarray) -> np.ndarray:
-        values, bad = parse_cells(frame[column])
-        bad = bad | np.isinf(values) | (np.isnan(values) & required)
-        for row in np.flatnonzero(bad)[:1].tolist():
-            wanted = "a finite number" if required[row] else "a finite number or an empty cell"
-            problem = f"got {cell_text(frame[column].iloc[row])}, expected {wanted}"
-            fail(name, problem, column=column, trajectory=row_labels[row], row=row + 1)
-        return values
+        return finite_numbers(frame[column], name, required, row_labels)
 
     def split(columns: list[str], required: np.ndarray) -> tuple[Tensor, ...]:
         block = np.stack([np.empty(len(frame)), *(numbers(column, required) for column in columns)], -1)[:, 1:]
@@ -184,7 +176,22 @@ def _trajectories(cells: pd.Series, name: str) -> tuple[np.ndarray, np.ndarray]:
     return labels, lengths
 
 
-def parse_cells(cells: pd.Series) -> tuple[np.ndarray, np.ndarray]:
+def finite_numbers(
+    cells: pd.Series, name: str, required: np.ndarray, trajectories: np.ndarray | None = None
+) -> np.ndarray:
+    """A column as float64, NaN for an empty cell that is not `required`; any other cell is a DataError."""
+    values, bad = _parse_cells(cells)
+    bad = bad | np.isinf(values) | (np.isnan(values) & required)
+    for row in np.flatnonzero(bad)[:1].tolist():
+        wanted = "a finite number" if required[row] else "a finite number or an empty cell"
+        cell, trajectory = cells.iloc[row], None if trajectories is None else trajectories[row]
+        empty = not str(cell).strip() or (pd.api.types.is_scalar(cell) and pd.isna(cell))
+        got = "an empty cell" if empty else f"{str(cell)[:40]!r}"
+        fail(name, f"got {got}, expected {wanted}", column=str(cells.name), trajectory=trajectory, row=row + 1)
+    return values
+
+
+def _parse_cells(cells: pd.Series) -> tuple[np.ndarray, np.ndarray]:
     """The cells as float64, NaN where empty, and where they are not numbers."""
     bad = np.zeros(len(cells), dtype=bool)
     if pd.api.types.is_float_dtype(cells.dtype) or pd.api.types.is_integer_dtype(cells.dtype):
@@ -237,12 +244,6 @@ def _suffix(path: Path) -> str:
     if (suffix := path.suffix.lower()) not in (".csv", ".parquet"):
         raise DataError(f"{path.name}: a table is a .csv or .parquet file")
     return suffix
-
-
-def cell_text(cell: Any) -> str:
-    """What an error message says came in a cell."""
-    empty = not str(cell).strip() or (pd.api.types.is_scalar(cell) and pd.isna(cell))
-    return "an empty cell" if empty else f"{str(cell)[:40]!r}"
 
 
 def fail(

@@ -75,12 +75,12 @@ class Trajectories(Displayed):
     @property
     def steps(self) -> Tensor:
         """`(T, B)` the length of each interval, s; the difference is taken in double precision."""
-        return (self.time[1:] - self.time[:-1]).to(self.controls.dtype)
+        return self.time.diff(dim=0).to(self.controls.dtype)
 
     @property
     def median_step(self) -> float:
         """Of all intervals, s; in double precision."""
-        return float((self.time[1:] - self.time[:-1])[self.transitions].median())
+        return float(self.time.diff(dim=0)[self.transitions].median())
 
     def rows_ahead(self, seconds: float) -> int:
         """How many rows make up a time, at the median step of all drives."""
@@ -89,7 +89,7 @@ class Trajectories(Displayed):
     @property
     def uneven_steps(self) -> list[str]:
         """What is to be said of times ahead where drives are sampled at different rates; they are counted in rows."""
-        steps = torch.where(self.transitions, (self.time[1:] - self.time[:-1]), torch.nan).nanmedian(0).values
+        steps = torch.where(self.transitions, self.time.diff(dim=0), torch.nan).nanmedian(0).values
         least, most = float(steps.min()), float(steps.max())
         if most < MAX_STEP_RATIO * least:
             return []
@@ -165,14 +165,13 @@ class Trajectories(Displayed):
             rest = values.new_full((len(plan), *values.shape[2:]), fill)
             return pad([torch.cat([values[:end, b], rest]) for b, end in enumerate(ends)], fill)
 
-        def acting(drive: int, end: int) -> Tensor:
-            return torch.cat([self.controls[: end - 1, drive], plan[:, drive], plan.new_zeros(1, plan.shape[-1])])
-
+        last = plan.new_zeros(1, plan.shape[-1])
+        acting = [torch.cat([self.controls[: end - 1, b], plan[:, b], last]) for b, end in enumerate(ends)]
         times = [torch.cat([self.time[:end, b], self.time[end - 1, b] + later]) for b, end in enumerate(ends)]
         return replace(
             self,
             time=pad_time(times),
-            controls=pad([acting(drive, end) for drive, end in enumerate(ends)]),
+            controls=pad(acting),
             measurements=continued(self.measurements),
             observed=continued(self.observed, False),
             lengths=self.lengths + len(plan),

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from steady_ppl.data.table import cell_text, fail, parse_cells
+from steady_ppl.data.table import fail, finite_numbers
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.model.planar_vehicle import bearings_to
@@ -135,11 +135,7 @@ def _read_log(path: Path, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarra
     for column in (*STAMP_COLUMNS, *columns):
         if column not in log.columns:
             raise DataError(f"{where}: column {column} is missing", column=column)
-        numbers, bad = parse_cells(log[column])
-        for row in np.flatnonzero(bad | ~np.isfinite(numbers))[:1].tolist():
-            problem = f"got {cell_text(log[column].iloc[row])}, expected a finite number"
-            fail(where, problem, column=column, row=row + 1)
-        log[column] = numbers
+        log[column] = finite_numbers(log[column], where, np.ones(len(log), dtype=bool))
     if len(log) == 0:
         raise DataError(f"{where}: the log has no rows")
     for column, most in zip(STAMP_COLUMNS, (MAX_STAMP_SECONDS, 10**9), strict=True):

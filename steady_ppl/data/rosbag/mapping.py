@@ -54,27 +54,24 @@ class BagColumn:
 
     def __post_init__(self) -> None:
         with labelled(f"column {self.name}"):
-            self._check()
-
-    def _check(self) -> None:
-        if self.name[:2] not in ("u.", "y.", "x.") or len(self.name) < 3:
-            raise UsageError("expected u.NAME (a control), y.NAME (a measurement) or x.NAME (a known state)")
-        if (problem := mismatch(vars(self), KEY_FORMS)) or not self.topic:
-            raise UsageError(problem or "topic is '', expected text")
-        for key, choices in ALLOWED_VALUES.items():
-            if (value := getattr(self, key)) not in choices:
-                known = " or ".join(f'"{choice}"' for choice in choices if choice)
-                raise UsageError(f"{'as' if key == 'reading' else key} is {value!r}, expected {known}")
-        if self.kind != "u" and (self.between is not None or self.longest is not None):
-            key = "between" if self.between is not None else "longest"
-            raise UsageError(f"{key} is for controls (u.); measurements and states are not held: leave it out")
-        if abs(self.late) > MAX_LATE:
-            raise UsageError(f"late is {self.late:g} s, expected at most {MAX_LATE:g} s")
-        if self.scale == 0:
-            raise UsageError("scale must not be 0")
-        if not SPELLING.fullmatch(self.field):
-            wanted = "expected names and indices such as linear.x or data[0]"
-            raise UsageError(f"field {self.field!r} is not spelt as one: {wanted}")
+            if self.name[:2] not in ("u.", "y.", "x.") or len(self.name) < 3:
+                raise UsageError("expected u.NAME (a control), y.NAME (a measurement) or x.NAME (a known state)")
+            if (problem := mismatch(vars(self), KEY_FORMS)) or not self.topic:
+                raise UsageError(problem or "topic is '', expected text")
+            for key, choices in ALLOWED_VALUES.items():
+                if (value := getattr(self, key)) not in choices:
+                    known = " or ".join(f'"{choice}"' for choice in choices if choice)
+                    raise UsageError(f"{'as' if key == 'reading' else key} is {value!r}, expected {known}")
+            for key in ("between", "longest") if self.kind != "u" else ():
+                if getattr(self, key) is not None:
+                    raise UsageError(f"{key} is for controls (u.); measurements and states are not held: leave it out")
+            if abs(self.late) > MAX_LATE:
+                raise UsageError(f"late is {self.late:g} s, expected at most {MAX_LATE:g} s")
+            if self.scale == 0:
+                raise UsageError("scale must not be 0")
+            if not SPELLING.fullmatch(self.field):
+                wanted = "expected names and indices such as linear.x or data[0]"
+                raise UsageError(f"field {self.field!r} is not spelt as one: {wanted}")
 
     @property
     def kind(self) -> str:

@@ -98,9 +98,7 @@ def _series_of(bag: Bag, mapping: BagMapping, say: Say) -> list[Series]:
 def _of_topic(bag: Bag, topic: str, columns: list[BagColumn], say: Say) -> list[Series]:
     stamped = any(column.clock != "bag" for column in columns)
     fields = [(column.steps, column.reading == "yaw") for column in columns]
-    arrivals: list[int] = []
-    headers: list[int] = []
-    values: list[list[float | None]] = []
+    arrivals, headers, values = list[int](), list[int](), list[list[float | None]]()
     for connection, arrival, raw in bag.messages([topic]):
         message = bag.content(connection, raw)
         arrivals.append(arrival)

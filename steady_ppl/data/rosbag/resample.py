@@ -49,22 +49,24 @@ def in_rows(series: Sequence[Series], step: float, name: str = "bag") -> list[Ev
     if not measured:
         return []
     controls = [one for one in series if one.column.kind == "u"]
-    first = min(times[0] for times in [one.times for one in controls] or measured)
     last = max(times[-1] for times in measured)
-    spans = [(first, last)]
-    for control in controls:
-        spans = _intersection(spans, _stretches(control, last))
-    return [_piece(series, int(start), int(end), step, name) for start, end in spans]
+    everything = min(times[:1] for times in measured), np.array([last])
+    known = [_stretches(control, last) for control in controls] or [everything]
+    starts = np.unique(np.concatenate([first for first, _ in known]))
+    starts = starts[starts >= max(first[0] for first, _ in known)]
+    ends = np.min([end[np.searchsorted(first, starts, side="right") - 1] for first, end in known], 0).clip(max=last)
+    spans = zip(starts.tolist(), ends.tolist(), strict=True)
+    return [_piece(series, start, end, step, name) for start, end in spans if start <= end]
 
 
-def _stretches(control: Series, last: int) -> list[tuple[int, int]]:
+def _stretches(control: Series, last: int) -> tuple[np.ndarray, np.ndarray]:
     """From when to when a control is known: without a pause longer than is allowed; else to the last measurement."""
     times, longest = control.times, math.inf if control.column.longest is None else control.column.longest * 1e9
     pauses = np.flatnonzero(np.diff(times) > longest)
     first, end = times[np.append(0, pauses + 1)], times[np.append(pauses, len(times) - 1)]
     if last - end[-1] <= longest:
         end[-1] = max(end[-1], last)
-    return list(zip(first.tolist(), end.tolist(), strict=True))
+    return first, end
 
 
 def long_holds(series: Sequence[Series], step: float) -> Iterator[str]:
@@ -82,20 +84,6 @@ def long_holds(series: Sequence[Series], step: float) -> Iterator[str]:
             what = "interpolated over it" if control.column.between == "interpolate" else "held as if it still acted"
             how = f"`longest = {10 * usual / 1e9:.2g}` would end the trajectory there"
             yield f"{pause}: {control.column.name} is {what}; {how}"
-
-
-def _intersection(a: list[tuple[int, int]], b: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """The stretches that lie in one of `a` and in one of `b`; both are sorted and do not overlap."""
-    found, i, j = [], 0, 0
-    while i < len(a) and j < len(b):
-        start, end = max(a[i][0], b[j][0]), min(a[i][1], b[j][1])
-        if start <= end:
-            found.append((start, end))
-        if a[i][1] <= b[j][1]:
-            i += 1
-        else:
-            j += 1
-    return found
 
 
 def _piece(series: Sequence[Series], start: int, end: int, step: float, name: str) -> EvenRows:
