@@ -71,24 +71,17 @@ def runs_and_table(command: str, arguments: Sequence[Path]) -> tuple[list[Path],
 
 def run_labels(runs: Sequence[Path], taken: Collection[str] = ()) -> dict[str, Path]:
     """Names of the rows of runs: the folders', or the whole paths where these are alike or `taken` by another row."""
-    names = [run.name for run in runs]
-    if len(set(names)) == len(names) and not set(taken) & set(names):
-        return dict(zip(names, runs, strict=True))
-    labels = {str(run): run for run in runs}
-    if len(labels) < len(runs) or set(taken) & labels.keys():
-        raise UsageError(
-            f"the runs {', '.join(map(str, runs))} cannot be told apart by name, or are called as another row"
-        )
-    return labels
+    for labels in ({run.name: run for run in runs}, {str(run): run for run in runs}):
+        if len(labels) == len(runs) and labels.keys().isdisjoint(taken):
+            return labels
+    raise UsageError(f"the runs {', '.join(map(str, runs))} cannot be told apart by name, or are called as another row")
 
 
 def load_runs(labels: Mapping[str, Path], programs: Sequence[str] | None) -> "dict[str, st.Fit]":
     """The fits of runs by label, with the programs that `--program` names, one for each, or their own."""
-    if programs and len(programs) != len(labels):
-        raise UsageError(
-            f"--program is given {len(programs)} times for {len(labels)} runs: name one for each, in order"
-        )
     sources: Sequence[str | None] = programs or [None] * len(labels)
+    if len(sources) != len(labels):
+        raise UsageError(f"--program is given {len(sources)} times for {len(labels)} runs: name one for each, in order")
     return {label: st.Fit.load(run, source) for (label, run), source in zip(labels.items(), sources, strict=True)}
 
 

@@ -40,15 +40,21 @@ class Demo:
         self.say(f"\n{len(self.steps)}. {title}")
 
     def steady(self, command: str, *, keep: str = "") -> str:
-        """Run `steady COMMAND`; what it prints is returned, and written to the file `keep`."""
+        """Run `steady COMMAND`; what it prints is returned, and written to the file `keep`. Its bars are shown on a
+        terminal only. Raises what the command does, and KeyboardInterrupt where it was interrupted."""
         overwrites = self.force and command.split()[0] in ("fit", "discover", "add")
         line = f"steady {command}{' --force' * overwrites}"
         self.steps[-1]["commands"].append(line)
         self.say(f"   $ {line}")
-        said = run(self.command, shlex.split(line)[1:])
+        said = io.StringIO()
+        quiet = nullcontext() if sys.stderr.isatty() else redirect_stderr(io.StringIO())
+        with redirect_stdout(said), quiet:
+            code = self.command.main(shlex.split(line)[1:], prog_name="steady", standalone_mode=False)
+        if code:
+            raise KeyboardInterrupt
         if keep:
-            Path(keep).write_text(said, encoding="utf-8")
-        return said
+            Path(keep).write_text(said.getvalue(), encoding="utf-8")
+        return said.getvalue()
 
     def result(self, text: str) -> None:
         """End a step with what came out."""
@@ -56,18 +62,6 @@ class Demo:
         step["seconds"], step["result"] = round(time.perf_counter() - step.pop("began"), 1), text
         said = f"{text} ({step['seconds']:.0f} s)"
         self.say(textwrap.fill(said, TEXT_WIDTH, initial_indent="   → ", subsequent_indent="     "))
-
-
-def run(command: Any, arguments: Sequence[str]) -> str:
-    """What the command `steady ARGUMENTS` prints; its bars are shown on a terminal only. Raises what the command does,
-    and KeyboardInterrupt where it was interrupted."""
-    said = io.StringIO()
-    quiet = nullcontext() if sys.stderr.isatty() else redirect_stderr(io.StringIO())
-    with redirect_stdout(said), quiet:
-        code = command.main(list(arguments), prog_name="steady", standalone_mode=False)
-    if code:
-        raise KeyboardInterrupt
-    return said.getvalue()
 
 
 DEMO_RECORD = "demo.json"  # of a demonstration; a folder without one is not a demonstration's
@@ -186,9 +180,7 @@ def prove(demo: Demo) -> None:
     )
     figures = read_json(Path("proof.json"), RunError)
     demo.result(figures["verdict"])
-    demo.say("")
-    for line in _summary(figures):
-        demo.say(f"     {line}")
+    demo.say(textwrap.indent("\n".join(["", *_summary(figures)]), "     "))
 
 
 def _summary(figures: Mapping[str, Any]) -> list[str]:

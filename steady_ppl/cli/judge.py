@@ -109,9 +109,8 @@ def evaluate(
     fits = list(load_runs(labels, program).values())
     drives = st.read_table(table)
     true_map = st.load_program(surveyed) if surveyed else None
-    settings: dict[str, Any] = {"particles": particles, "rollouts": rollouts, "seed": seed, "surveyed": true_map}
     folders = [str(run) for run in runs]
-    results = evaluate_all(fits, folders, drives, **settings)
+    results = evaluate_all(fits, folders, drives, particles=particles, rollouts=rollouts, seed=seed, surveyed=true_map)
     lines = [table_of(results, [f"{label} ({found['recipe']})" for label, found in zip(labels, results, strict=True)])]
     if true_map is not None:
         for label, result in zip(labels, results, strict=True):

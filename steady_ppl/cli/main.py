@@ -27,110 +27,100 @@ COMPLETION_OPTIONS = ("install_completion", "show_completion")
 GLOBAL_OPTIONS = {"--debug": "debug", "--quiet": "quiet", "-q": "quiet"}  # before or after the command
 
 
-class Command:
-    """A command, what `steady --help` says of it, examples for its own help, and whether another one's help names it:
-    one screen is full."""
-
-    def __init__(self, function: Callable[..., None], about: str, *examples: str, hidden: bool = False) -> None:
-        self.function, self.about, self.examples, self.hidden = function, about, examples, hidden
-        self.name = function.__name__.replace("_", "-")
-
-
-COMMANDS = (
-    Command(demo.demo, "Show the whole loop on drives with a hidden effect.", "steady demo --out demo"),
-    Command(make.init, "Make a folder to work in, with first drives.", "steady init lab"),
-    Command(
-        make.import_bag,
-        "Turn ROS 1 or 2 bags and MCAP files into a table.",
-        "steady import-bag drive.bag > mapping.toml",
-        "steady import-bag monday/*.mcap mapping.toml --out drives.csv",
-        "steady import-bag drive.bag --map u.speed=/cmd_vel:linear.x \\",
-        "                            --map y.range=/range:range --step 0.1 --out drive.csv",
-    ),
-    Command(
-        make.simulate,
-        "Simulate drives of a program.",
-        "steady simulate models/hovercraft.py --trajectories 16 --out train.csv",
-        "steady simulate models/hovercraft.py --effect wind=1,0.5 --out windy.csv",
-        "steady simulate mine.py:Boat --controls drives.csv --out again.csv",
-    ),
-    Command(
-        learn.fit,
-        "Learn a program's parameters from measurements.",
-        "steady fit mine.py train.csv --valid valid.csv --recipe likelihood --out runs/first",
-        "steady fit models/neural_vehicle.py:NeuralHovercraft train.csv --known-start --out runs/net",
-        "steady fit mine.py train.csv --recipe svi --set learning_rate=1e-3 --out runs/svi",
-    ),
-    Command(
-        judge.check,
-        "Say where and when a run fails, and who is at fault.",
-        "steady check runs/first test.csv --picture check.png",
-        "steady check runs/first test.csv --quiet --json - | jq .who",
-    ),
-    Command(
-        learn.discover,
-        "Learn which physical effect a program lacks, or none.",
-        "steady discover runs/first train.csv --valid valid.csv --out runs/found",
-        "steady discover mine.py drives.csv --json found.json",
-    ),
-    Command(
-        learn.add,
-        "Write a program with physical effects.",
-        "steady add runs/found --out models/with_drag.py",
-        "steady add models/hovercraft.py yaw_linear_drag=0.05 wind --out models/windy.py",
-    ),
-    Command(
-        judge.prove,
-        "Prove on other drives that runs are better than the first.",
-        "steady prove runs/before runs/after test.csv --picture proof.png",
-    ),
-    Command(
-        judge.evaluate,
-        "Errors of runs, against true states where they exist.",
-        "steady evaluate runs/first runs/svi test.csv --json errors.json",
-    ),
-    Command(
-        judge.report,
-        "Write all of it on one page of HTML.",
-        "steady report runs/before runs/after test.csv --discovery runs/found --out report.html",
-    ),
-    Command(
-        judge.states,
-        "Write where the vehicle probably was.",
-        "steady states runs/after test.csv --out states.csv",
-        "steady states runs/after test.csv --draws 200 --out states.nc",
-    ),
-    Command(
-        learn.study,
-        "Compute a grid of fits or searches, here or on a cluster.",
-        "steady study studies/observation-noise.toml --data logs --out noise",
-        "steady study mine.toml --cluster tcp://scheduler:8786 --out mine",
-    ),
-    Command(
-        learn.plot_study, "Draw what a study has found so far.", "steady plot-study noise --out noise.png", hidden=True
-    ),
-    Command(
-        learn.effects,
-        "List the physical effects that a program may lack.",
-        "steady effects",
-        "steady effects models/hovercraft.py",
-    ),
-)
-
 app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in COMMANDS:
-    title = "Example:" if len(command.examples) == 1 else "Examples:"
-    app.command(
-        command.name,
-        short_help=command.about,
-        epilog="\n".join(["\b", title, *(f"  {line}" for line in command.examples)]),
-        hidden=command.hidden,
-    )(command.function)
+
+
+def register(function: Callable[..., None], about: str, *examples: str, hidden: bool = False) -> None:
+    """Add a command, what `steady --help` says of it, examples for its own help, and whether another one's help names
+    it: one screen is full."""
+    title = "Example:" if len(examples) == 1 else "Examples:"
+    epilog = "\n".join(["\b", title, *(f"  {line}" for line in examples)])
+    app.command(function.__name__.replace("_", "-"), short_help=about, epilog=epilog, hidden=hidden)(function)
+
+
+register(demo.demo, "Show the whole loop on drives with a hidden effect.", "steady demo --out demo")
+register(make.init, "Make a folder to work in, with first drives.", "steady init lab")
+register(
+    make.import_bag,
+    "Turn ROS 1 or 2 bags and MCAP files into a table.",
+    "steady import-bag drive.bag > mapping.toml",
+    "steady import-bag monday/*.mcap mapping.toml --out drives.csv",
+    "steady import-bag drive.bag --map u.speed=/cmd_vel:linear.x \\",
+    "                            --map y.range=/range:range --step 0.1 --out drive.csv",
+)
+register(
+    make.simulate,
+    "Simulate drives of a program.",
+    "steady simulate models/hovercraft.py --trajectories 16 --out train.csv",
+    "steady simulate models/hovercraft.py --effect wind=1,0.5 --out windy.csv",
+    "steady simulate mine.py:Boat --controls drives.csv --out again.csv",
+)
+register(
+    learn.fit,
+    "Learn a program's parameters from measurements.",
+    "steady fit mine.py train.csv --valid valid.csv --recipe likelihood --out runs/first",
+    "steady fit models/neural_vehicle.py:NeuralHovercraft train.csv --known-start --out runs/net",
+    "steady fit mine.py train.csv --recipe svi --set learning_rate=1e-3 --out runs/svi",
+)
+register(
+    judge.check,
+    "Say where and when a run fails, and who is at fault.",
+    "steady check runs/first test.csv --picture check.png",
+    "steady check runs/first test.csv --quiet --json - | jq .who",
+)
+register(
+    learn.discover,
+    "Learn which physical effect a program lacks, or none.",
+    "steady discover runs/first train.csv --valid valid.csv --out runs/found",
+    "steady discover mine.py drives.csv --json found.json",
+)
+register(
+    learn.add,
+    "Write a program with physical effects.",
+    "steady add runs/found --out models/with_drag.py",
+    "steady add models/hovercraft.py yaw_linear_drag=0.05 wind --out models/windy.py",
+)
+register(
+    judge.prove,
+    "Prove on other drives that runs are better than the first.",
+    "steady prove runs/before runs/after test.csv --picture proof.png",
+)
+register(
+    judge.evaluate,
+    "Errors of runs, against true states where they exist.",
+    "steady evaluate runs/first runs/svi test.csv --json errors.json",
+)
+register(
+    judge.report,
+    "Write all of it on one page of HTML.",
+    "steady report runs/before runs/after test.csv --discovery runs/found --out report.html",
+)
+register(
+    judge.states,
+    "Write where the vehicle probably was.",
+    "steady states runs/after test.csv --out states.csv",
+    "steady states runs/after test.csv --draws 200 --out states.nc",
+)
+register(
+    learn.study,
+    "Compute a grid of fits or searches, here or on a cluster.",
+    "steady study studies/observation-noise.toml --data logs --out noise",
+    "steady study mine.toml --cluster tcp://scheduler:8786 --out mine",
+)
+register(
+    learn.plot_study, "Draw what a study has found so far.", "steady plot-study noise --out noise.png", hidden=True
+)
+register(
+    learn.effects,
+    "List the physical effects that a program may lack.",
+    "steady effects",
+    "steady effects models/hovercraft.py",
+)
 app.add_typer(make.app, name="data", short_help="Published logs to tables; long drives in pieces.")
 
 

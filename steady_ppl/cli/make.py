@@ -76,14 +76,13 @@ def _mapping(file: Path | None, maps: list[str], step: float | None) -> "st.BagM
     content: dict[str, Any] = read_mapping(file) if file else {}
     if step is not None:
         content["step"] = step
-    columns, added = content.get("columns", {}), dict[str, Any]()
+    columns = content.setdefault("columns", {})
     for text in maps:
         name, said = parse_map(text)
-        if name in added or (isinstance(columns, dict) and name in columns):
-            raise UsageError(f"--map {text}: column {name} is given twice")
-        added[name] = said
-    if added and isinstance(columns, dict):
-        content["columns"] = columns | added
+        if isinstance(columns, dict):  # else the mapping is refused
+            if name in columns:
+                raise UsageError(f"--map {text}: column {name} is given twice")
+            columns[name] = said
     return st.BagMapping.parse(content, file.name if file else "--map")
 
 

@@ -75,7 +75,7 @@ def test_a_search_that_finds_nothing_to_add_is_its_end(tmp_path: Path, monkeypat
     (tmp_path / "discovery.json").write_text('{"sentence": "No effect is missing."}')
     write_record(tmp_path / "runs" / "found", {"program": None, "recipe": "discover", "status": "", "effects": []})
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(demo, "run", lambda command, arguments: "")
+    monkeypatch.setattr(demo.Demo, "steady", lambda self, command, *, keep: "")
     with pytest.raises(ComputationError, match="nothing to add.*No effect is missing"):
         demo.discover(demo.Demo(STEADY, [].append), QUICK)
 

@@ -12,7 +12,7 @@ import typer
 from small import TRUTH, steady, written
 
 from steady_ppl.cli import main as command_line
-from steady_ppl.cli.main import COMMANDS, app, main
+from steady_ppl.cli.main import app, main
 
 LINES, COLUMNS = 24, 80
 
@@ -28,17 +28,18 @@ def test_help_fits_one_screen_and_cuts_no_sentence(capsys: pytest.CaptureFixture
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= LINES and max(map(len, lines)) <= COLUMNS
     assert not any(line.endswith("...") for line in lines if "ARGS" not in line)
-    assert all(any(command.about in line for line in lines) or command.hidden for command in COMMANDS)
+    assert all(any(one.short_help in line for line in lines) or one.hidden for one in app.registered_commands)
 
 
-@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
+@pytest.mark.parametrize("command", app.registered_commands, ids=lambda command: command.name)
 def test_every_command_has_examples_that_parse(command, capsys: pytest.CaptureFixture[str]) -> None:
     name = command.name
     assert steady(name, "--help") == 0
     said = capsys.readouterr().out
     parser = typer.main.get_command(app).commands[name]
-    assert all(line in said for line in command.examples)
-    for example in "\n".join(command.examples).replace("\\\n", " ").splitlines():
+    examples = [line.removeprefix("  ") for line in command.epilog.splitlines()[2:]]
+    assert examples and all(line in said for line in examples)
+    for example in "\n".join(examples).replace("\\\n", " ").splitlines():
         program, found, *words = shlex.split(example.partition(" | ")[0])
         assert (program, found) == ("steady", name)
         words = [word for word in words[: (*words, ">").index(">")] if word not in command_line.GLOBAL_OPTIONS]
