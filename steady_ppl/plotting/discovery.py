@@ -43,24 +43,16 @@ class GainRow(NamedTuple):
     beside: str = ""
 
 
-class Group(NamedTuple):
-    """Candidates for one place, best first, with the names of those that are chosen and of those that are like them."""
-
-    heading: str
-    candidates: list[Candidate]
-    chosen: list[str]
-    aliases: list[str]
-
-
 def discovery_picture(found: Discovery) -> Figure:
     """One figure of everything; made without pyplot's list of figures, so that nothing needs to be closed."""
-    rows = sum(2 + len(group.candidates) for group in _groups(found))
-    height = max(7.5, 4.5 + 0.24 * rows) if rows else 2.2 + 0.19 * len(_remaining(found))
+    groups = _groups(found)
+    lines = sum(2 + sum(bool(row.label) for row in group) for group in groups)
+    height = max(7.5, 4.5 + 0.24 * lines) if groups else 2.2 + 0.19 * len(_remaining(found))
     figure = plt.Figure(figsize=(12, height), layout="constrained")
-    if rows:
+    if groups:
         left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1, 1.05), squeeze=False))
         above, below = left.subplots(2, 1, height_ratios=(height - 3.5, 3))
-        gains(found, above)
+        gains([row for group in groups for row in group], above)
         open_loop_picture(found.proof, axes=below)
         titled(below, "predictions of the validation drives", below.get_xlabel())
         if found.shape:
@@ -75,9 +67,8 @@ def discovery_picture(found: Discovery) -> Figure:
     return figure
 
 
-def gains(found: Discovery, axes: Axes) -> None:
+def gains(rows: Sequence[GainRow], axes: Axes) -> None:
     """Held-out log p(y) that each fitted candidate brings, one group for each effect that was found."""
-    rows = [row for group in _groups(found) for row in _of_group(group, found.before.seed)]
     most = max(row.value for row in rows if row.label)
     left = min([-0.25 * most, *(row.interval[0] for row in rows if row.interval and row.color != OTHER_COLOR)])
     for place, row in enumerate(rows):
@@ -137,37 +128,35 @@ def tests(found: Discovery, axes: Axes) -> None:
     titled(axes, f"score tests: family-wise p = {found.p_value:.2g}", about)
 
 
-def _groups(found: Discovery) -> list[Group]:
-    """What was fitted: alone, and in the place of each effect; nothing where nothing was fitted."""
+def _groups(found: Discovery) -> list[list[GainRow]]:
+    """What was fitted: alone, and in the place of each effect, best first; a heading is a line without a label."""
     search = found.search
+
+    def group(heading: str, candidates: list[Candidate], chosen: list[str], like: Sequence[str] = ()) -> list[GainRow]:
+        rows = [GainRow("", 0.0, None, OTHER_COLOR, heading)] if heading else []
+        for candidate in candidates:
+            label = _label(candidate.variant)
+            color = CHOSEN_COLOR if label in chosen else ALIAS_COLOR if label in like else OTHER_COLOR
+            rows.append(GainRow(label, candidate.total, gain_interval(candidate, found.before.seed), color))
+        return rows
+
     if found.shape is not None or not search.found:
         candidates = _fitted([*search.rounds[0].candidates, *search.curves])
-        return [Group("", candidates, [_label(search.curve.variant)] if search.curve else [], [])] if candidates else []
+        return [group("", candidates, [_label(search.curve.variant)] if search.curve else [])] if candidates else []
     ordered = sorted(search.found, key=lambda one: -one.candidate.total)
     chosen = [_label(one.candidate.variant) for one in ordered]
     aliases = [[_label(candidate.variant) for candidate in one.aliases] for one in ordered]
     if len(ordered) == 1:
-        return [Group("", _fitted(ordered[0].candidates), chosen, aliases[0])]
-    alone = Group("each alone", _fitted(search.rounds[0].candidates), chosen, [])
+        return [group("", _fitted(ordered[0].candidates), chosen, aliases[0])]
+    groups = [group("each alone", _fitted(search.rounds[0].candidates), chosen)]
     if all(len(one.candidates) == 1 for one in ordered):
         together = [candidate for one in ordered for candidate in _fitted(one.candidates)]
-        return [alone, Group("each beside the others", together, chosen, [])]
-    groups = []
+        return [*groups, group("each beside the others", together, chosen)]
     for own, one, like in zip(chosen, ordered, aliases, strict=True):
         others = [label for label in chosen if label != own]
         beside = others[0] if len(others) == 1 else f"the other {len(others)}"
-        groups.append(Group(f"beside {beside}", _fitted(one.candidates), [own], like))
-    return [alone, *groups]
-
-
-def _of_group(group: Group, seed: int) -> list[GainRow]:
-    """A line for the heading, which has no label, and one for each candidate."""
-    rows = [GainRow("", 0.0, None, OTHER_COLOR, group.heading)] if group.heading else []
-    for candidate in group.candidates:
-        label = _label(candidate.variant)
-        color = CHOSEN_COLOR if label in group.chosen else ALIAS_COLOR if label in group.aliases else OTHER_COLOR
-        rows.append(GainRow(label, candidate.total, gain_interval(candidate, seed), color))
-    return rows
+        groups.append(group(f"beside {beside}", _fitted(one.candidates), [own], like))
+    return groups
 
 
 def _fitted(candidates: Sequence[Candidate]) -> list[Candidate]:

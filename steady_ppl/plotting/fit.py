@@ -49,9 +49,8 @@ def posterior_trajectories(
     """
     _, draws, true = _drawn(posterior, trajectory, plane)
     axes = axes if axes is not None else plt.subplots(figsize=(5, 5))[1]
-    for index in range(min(shown, draws[0].sizes["draw"])):
-        first = label if index == 0 else None
-        axes.plot(*(one.isel(draw=index) for one in draws), color=color, alpha=0.15, lw=0.8, label=first)
+    lines = axes.plot(*(one[:shown].T for one in draws), color=color, alpha=0.15, lw=0.8, rasterized=True)
+    plt.setp(lines[:1], label=label)
     if true is not None:
         axes.plot(*true, color=BLACK, lw=1.4, ls="--", label="truth")
     if len(landmarks):
@@ -62,9 +61,6 @@ def posterior_trajectories(
     if units[0] == units[1]:
         axes.set_aspect("equal", "box")
     axes.set_title(f"trajectory {trajectory}", parse_math=False)
-    for line in axes.get_lines():
-        if line.get_label() == label:
-            line.set_rasterized(True)
     return axes
 
 
