@@ -94,9 +94,6 @@ class _Process:
             dead.set_exception(error)
             return dead
 
-    def end(self) -> None:
-        self.executor.shutdown(kill_workers=True)
-
 
 def _rows(jobs: Sequence[Job], workers: int, died: list[Job], say: Say) -> Generator[ResultRow]:
     """The rows of jobs, but of those whose processes have `died`."""
@@ -113,7 +110,7 @@ def _rows(jobs: Sequence[Job], workers: int, died: list[Job], say: Say) -> Gener
                     unloaded = 0
                     yield future.result()
                     continue
-                process.end()
+                process.executor.shutdown(kill_workers=True)
                 if reason := process.loaded.exception():
                     unloaded += 1
                     if unloaded == MAX_UNLOADED:
@@ -125,7 +122,7 @@ def _rows(jobs: Sequence[Job], workers: int, died: list[Job], say: Say) -> Gener
                     died.append(job)
     finally:
         for process in [*idle, *(process for _, process in running.values())]:
-            process.end()
+            process.executor.shutdown(kill_workers=True)
 
 
 class Cluster(Executor):

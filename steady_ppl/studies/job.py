@@ -203,7 +203,9 @@ def run(job: Job) -> dict[str, Any]:
     """
     with _one_at_a_time, one_thread(), one_core():
         began = time.perf_counter()
-        _reset_peak_memory()
+        if sys.platform == "linux":
+            with suppress(OSError):  # some containers refuse: the most memory is then that since the process began
+                Path("/proc/self/clear_refs").write_text("5")
         try:
             # files change while a study goes on, and may be others on another machine
             if JobFiles().is_of(job):
@@ -214,13 +216,6 @@ def run(job: Job) -> dict[str, Any]:
             found = {"outcome": "failed", "reason": one_line(error)}
         spent = {"seconds": time.perf_counter() - began, "peak_mib": _peak_mib(), "packages": packages_text()}
         return job.columns | spent | found
-
-
-def _reset_peak_memory() -> None:
-    """Count the most memory from here on, where the system can do that (Linux, but for some containers)."""
-    if sys.platform == "linux":
-        with suppress(OSError):  # then it is counted from the process's beginning
-            Path("/proc/self/clear_refs").write_text("5")
 
 
 def _peak_mib() -> float:
@@ -272,12 +267,10 @@ def _fit(job: Job) -> dict[str, Any]:
 def _held_out(fitted: Fit, valid: Trajectories, seed: int) -> float:
     """log p(y) of a validation drive at 1 Hz, as that of the test drives: what settings may be chosen by."""
     program, data, start = fitted.program, for_program(fitted.program, valid), fitted.known_start
-    choice = choose_filter(program, data, known_start=start)
+    filters = choose_filter(program, data, known_start=start)
+    settings = {"particles": filters.particles, "look_ahead": filters.look_ahead, "known_start": start}
     with seeded(seed, "valid"):
-        found = log_likelihood(
-            program, data, particles=choice.particles, look_ahead=choice.look_ahead, known_start=start
-        )
-    return float(found.mean())
+        return float(log_likelihood(program, data, **settings).mean())
 
 
 def _discover(job: Job) -> dict[str, Any]:

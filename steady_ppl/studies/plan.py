@@ -9,6 +9,7 @@ import itertools
 import json
 import math
 import os
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -154,11 +155,8 @@ def _jobs(content: Mapping[str, Any], task: str, source: Axes, methods: list[dic
 
 def _labelled(jobs: tuple[Job, ...]) -> tuple[Job, ...]:
     """By their methods and by the values of the axes."""
-    seen: dict[str, set[str]] = {}
-    for job in jobs:
-        for name, value in (job.data | job.settings).items():
-            seen.setdefault(name, set()).add(repr(value))
-    varied = {name for name, values in seen.items() if len(values) > 1}
+    seen = {(name, repr(value)) for job in jobs for name, value in (job.data | job.settings).items()}
+    varied = {name for name, times in Counter(name for name, _ in seen).items() if times > 1}
 
     def label(job: Job) -> str:
         said = (job.data | job.settings).items()
@@ -174,13 +172,11 @@ def _require_columns(picture: Picture, task: str, jobs: tuple[Job, ...]) -> None
         raise UsageError(f"picture: chosen_by is {picture.chosen_by}, expected {HELD_OUT}: of drives that are held out")
     if picture.chosen_by and not picture.x.startswith("data."):
         raise UsageError(f"picture: chosen_by picks settings for the same data; x is {picture.x}, expected data.…")
-    said: dict[str, list[Any]] = {}
-    for job in jobs:
-        for name, value in job.columns.items():
-            said.setdefault(name, []).append(value)
+    rows = [job.columns for job in jobs]
+    said = dict.fromkeys(name for row in rows for name in row)
     for name in picture.columns:
         known = any(name == figure or (figure.endswith(".") and name.startswith(figure)) for figure in FIGURES[task])
-        if name in said and not all(isinstance(value, int | float) for value in said[name]):
+        if not all(isinstance(row[name], int | float) for row in rows if name in row):
             raise UsageError(f"picture: column {name} is no number")
         if name not in said and not known:
             figures = [f"{figure}…" if figure.endswith(".") else figure for figure in FIGURES[task]]

@@ -40,7 +40,10 @@ def run_study(plan: Plan, folder: Path, place: Executor, *, again: bool = False,
     """
     with study_table(folder) as table:
         wanted = {job.key: job for job in plan.jobs}
-        _require_same_study(plan, folder)
+        if (folder / STUDY_RECORD).exists():  # whose results must not be put aside for those of another study
+            there = recorded_plan(folder)
+            if there.title != plan.title and wanted.keys().isdisjoint(job.key for job in there.jobs):
+                raise RunError(f"{folder} holds another study, {there.title!r}: choose another folder")
         table.keep(wanted)
         record_plan(plan, folder)
         rows = read_results(folder).to_dict("records")
@@ -78,14 +81,6 @@ def run_study(plan: Plan, folder: Path, place: Executor, *, again: bool = False,
             reason = str(error) if isinstance(error, ComputationError) else gone
             raise ComputationError(f"{reason}: {so_far}") from error
     return sum(outcome == "failed" for outcome in kept.values())
-
-
-def _require_same_study(plan: Plan, folder: Path) -> None:
-    """Keep its results from being put aside for those of another."""
-    if (folder / STUDY_RECORD).exists():
-        there = recorded_plan(folder)
-        if there.title != plan.title and not {job.key for job in there.jobs} & {job.key for job in plan.jobs}:
-            raise RunError(f"{folder} holds another study, {there.title!r}: choose another folder")
 
 
 def _time_left(began: float, done: int, left: int) -> str:
