@@ -153,8 +153,8 @@ def incomparable(results: Sequence[Mapping[str, Any]], labels: Sequence[str]) ->
     lacks, known, drawn, reasons = list[str](), list[str](), list[str](), list[str]()
     for label, result in zip(labels, results, strict=True):
         (known if result["known_start"] else drawn).append(label)
-        unread = [f"y.{name}" for name in columns if name not in result["measured"]]
-        lacks += [f"{label} does not read {', '.join(unread)}"] if unread else []
+        if unread := [f"y.{name}" for name in columns if name not in result["measured"]]:
+            lacks.append(f"{label} does not read {', '.join(unread)}")
     if lacks:
         reasons.append(
             f"log p(y) is not comparable, nor are errors in measurement space: {'; '.join(lacks)}; compare runs that "

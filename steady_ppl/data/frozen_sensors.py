@@ -38,8 +38,7 @@ class Stretch:
 def frozen_stretches(data: Trajectories) -> list[Stretch]:
     """Stretches in which a measurement or a known state, which was logged too, is on a line over time though it
     scatters elsewhere."""
-    runs: list[RowRange] = []
-    moving: set[RowRange] = set()
+    runs, moving = list[RowRange](), set[RowRange]()
     for column, values, there in _columns(data):
         of_column = _runs(data.time, values, there)
         if sum(last - first for _, first, last in of_column) < 0.5 * float(there.sum()):

@@ -73,24 +73,20 @@ def drawn_states(
     """
     run = for_program(program, data).observed_every(every)
     refuse_long(run)
-    states, evidence, sizes, roots = (list[Tensor]() for _ in range(4))
-    noise: dict[str, list[Tensor]] = {}
+    found, noise = list[tuple[Tensor, ...]](), dict[str, list[Tensor]]()
     with seeded(seed, "posterior"):
         choice = choose_filter(program, run, known_start=known_start, particles=particles)
-        groups = list(in_parts(run, choice.particles, look_ahead=choice.look_ahead))
+        settings: dict[str, Any] = {"particles": choice.particles, "look_ahead": choice.look_ahead}
+        groups = list(in_parts(run, **settings))
         with stages(*(("drawing states", len(part)) for part in groups)) as begin:
             for part in groups:
                 begin()
-                filtered = run_filter(
-                    program, part, particles=choice.particles, known_start=known_start, look_ahead=choice.look_ahead
-                )
+                filtered = run_filter(program, part, known_start=known_start, **settings)
                 paths = filtered.paths(draws)
-                states.append(paths.states)
-                evidence.append(filtered.log_likelihood)
-                sizes.append(filtered.effective_sizes)
-                roots.append(filtered.roots)
+                found.append((paths.states, filtered.log_likelihood, filtered.effective_sizes, filtered.roots))
                 for site, value in paths.noise.items():
                     noise.setdefault(site, []).append(as_vector(value, paths.event_dims[site]))
+    states, evidence, sizes, roots = zip(*found, strict=True)
     coordinates: dict[str, list | np.ndarray] = {"chain": [0], "draw": np.arange(draws)}
     coordinates |= {"trajectory": list(run.labels), "row": np.arange(run.time.shape[0])}
     inside = run.rows.t().numpy(force=True)
@@ -99,8 +95,7 @@ def drawn_states(
     for index in () if known_start else program.angle_indices:
         path[0, ..., index] = paths_on_one_turn(path[0, ..., index], inside)
     for index, (name, unit) in enumerate(zip(program.state_names, program.state_units, strict=True)):
-        values = np.where(inside, path[..., index], np.nan)
-        variables[name] = (DIMENSIONS, values, {"units": unit})
+        variables[name] = (DIMENSIONS, np.where(inside, path[..., index], np.nan), {"units": unit})
     for site, parts in noise.items():
         values = np.pad(_draws(torch.cat(parts, 2)), [(0, 0)] * 3 + [(0, 1), (0, 0)], constant_values=np.nan)
         values[:, :, ~np.roll(inside, -1, 1) | ~inside] = np.nan

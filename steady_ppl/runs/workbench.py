@@ -38,6 +38,10 @@ def make_workbench(folder: Path) -> list[Path]:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder} exists and is not empty: choose another folder")
+    from steady_ppl.data.table import write_table  # here, for it loads torch
+    from steady_ppl.model.loading import load_program
+    from steady_ppl.smc.simulate import simulate
+
     bench = workbench()
     with cleared_on_failure(folder):
         for file in sorted(file for room in FOLDERS for file in (bench / room).rglob("*") if file.is_file()):
@@ -45,7 +49,15 @@ def make_workbench(folder: Path) -> list[Path]:
             if not LEFT_OUT & {*place.parts}:
                 (folder / place).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(file, folder / place)
-        return _simulate_tables(folder)
+        program = load_program(str(folder / TRUE_PROGRAM))
+        tables = []
+        with stages(*((f"simulating {name}", count) for name, count in DRIVES_OF_TABLE.items())) as begin:
+            for seed, (name, count) in enumerate(DRIVES_OF_TABLE.items(), 1):
+                begin()
+                drives = simulate(program, count, seed=seed)
+                tables.append(folder / f"{name}.csv")
+                write_table(drives if name == "test" else drives.without_truth(keep_start=True), tables[-1])
+        return tables
 
 
 @contextmanager
@@ -69,19 +81,3 @@ def cleared_on_failure(folder: Path) -> Iterator[None]:
         if isinstance(error, OSError):
             raise UsageError(f"{folder} cannot be written: {error.strerror or error}") from error
         raise
-
-
-def _simulate_tables(folder: Path) -> list[Path]:
-    from steady_ppl.data.table import write_table  # here, for it loads torch
-    from steady_ppl.model.loading import load_program
-    from steady_ppl.smc.simulate import simulate
-
-    program = load_program(str(folder / TRUE_PROGRAM))
-    tables = []
-    with stages(*((f"simulating {name}", count) for name, count in DRIVES_OF_TABLE.items())) as begin:
-        for seed, (name, count) in enumerate(DRIVES_OF_TABLE.items(), 1):
-            begin()
-            drives = simulate(program, count, seed=seed)
-            tables.append(folder / f"{name}.csv")
-            write_table(drives if name == "test" else drives.without_truth(keep_start=True), tables[-1])
-    return tables
