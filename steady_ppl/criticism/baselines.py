@@ -12,7 +12,8 @@ from torch import Tensor
 from steady_ppl.gaussian.kalman import Tracked, track
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, on_a_circle, predict
-from steady_ppl.model.handlers import ByColumn, Recording, Standardised, as_event, normal_moments, running
+from steady_ppl.model.handlers import Recording, Standardised, as_event, normal_moments, running
+from steady_ppl.model.interventions import Transforming
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import joined, mean_step, row_inputs, sample_channels
@@ -23,22 +24,6 @@ DEFINITION = (
     "the program with every channel's mean replaced by zero, so that it ignores the controls and keeps its velocity; "
     "its channel noise is the one of a scan under which these measurements are most likely"
 )
-
-
-class ZeroMeanChannels(ByColumn):
-    """Give latent sites mean zero and each channel another standard deviation, in the order in which they are met."""
-
-    def __init__(self, scales: Tensor) -> None:
-        super().__init__()
-        self.scales = scales  # (C,)
-
-    def _pyro_sample(self, message: Any) -> None:
-        if message["is_observed"]:
-            return
-        fn = message["fn"]
-        zero = torch.zeros_like(normal_moments(fn, message["name"])[0])
-        scale = as_event(self.scales[self.take(fn)].to(zero), fn.event_dim)
-        message["fn"] = dist.Normal(zero, scale.expand_as(zero)).to_event(fn.event_dim)
 
 
 class ConstantVelocity(Program):
@@ -55,8 +40,14 @@ class ConstantVelocity(Program):
         return self.of.initial()
 
     def transition(self, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
-        with ZeroMeanChannels(self.scales):
+        with Transforming(self._noise_alone):
             return self.of.transition(state, control, time, step)
+
+    def _noise_alone(self, fn: Any, columns: slice) -> Any:
+        """A channel's distribution with mean zero and the scale of its columns."""
+        zero = torch.zeros_like(normal_moments(fn, "channel")[0])
+        scale = as_event(self.scales[columns].to(zero), fn.event_dim)
+        return dist.Normal(zero, scale.expand_as(zero)).to_event(fn.event_dim)
 
     def observe(self, state: Tensor) -> None:
         self.of.observe(state)
