@@ -95,20 +95,6 @@ class PlanarVehicle(Program):
         in them too."""
         return self.integrate(state, acceleration, 0.5 * step)
 
-    def integrate_euler(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
-        """Move on by one explicit Euler step, with the old pose and velocity; see `ExplicitEuler`."""
-        x, y, heading, vx, vy, yaw_rate = state.unbind(-1)
-        forward, lateral, yaw = acceleration.unbind(-1)
-        cos, sin = heading.cos(), heading.sin()
-        return stack(
-            x + vx * step,
-            y + vy * step,
-            heading + yaw_rate * step,
-            vx + (cos * forward - sin * lateral) * step,
-            vy + (sin * forward + cos * lateral) * step,
-            yaw_rate + yaw * step,
-        )
-
     def body_velocity(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Forward and lateral velocity (m/s) and yaw rate (rad/s), each `(...)`."""
         _, _, heading, vx, vy, yaw_rate = state[..., :6].unbind(-1)
@@ -202,7 +188,18 @@ class ExplicitEuler(PlanarVehicle):
     simulated_step = math.inf
 
     def integrate(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
-        return self.integrate_euler(state, acceleration, step)
+        """With the old pose and velocity."""
+        x, y, heading, vx, vy, yaw_rate = state.unbind(-1)
+        forward, lateral, yaw = acceleration.unbind(-1)
+        cos, sin = heading.cos(), heading.sin()
+        return stack(
+            x + vx * step,
+            y + vy * step,
+            heading + yaw_rate * step,
+            vx + (cos * forward - sin * lateral) * step,
+            vy + (sin * forward + cos * lateral) * step,
+            yaw_rate + yaw * step,
+        )
 
     def halfway(self, state: Tensor, acceleration: Tensor, step: Tensor) -> Tensor:
         return state
