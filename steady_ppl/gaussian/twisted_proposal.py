@@ -1,7 +1,6 @@
 """Particles steered by a lookahead, whatever the program: plain lines of torch, which kernels compile."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -12,12 +11,8 @@ from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
 from steady_ppl.smc.proposal import Steered
 
 
-def log_steered(noise: Tensor, mean: Tensor, whitening: Tensor) -> Tensor:
-    """log N(noise; mean, factor factorᵀ) − log N(noise; 0, I), `(N, B)`."""
-    return _log_ratio(noise, _times(whitening, noise - mean), whitening)
-
-
 def _log_ratio(noise: Tensor, white: Tensor, whitening: Tensor) -> Tensor:
+    """log N(noise; mean, factor factorᵀ) − log N(noise; 0, I), `(N, B)`, where `white` is whitening (noise − mean)."""
     log_determinant = whitening.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     return 0.5 * (noise.square().sum(-1) - white.square().sum(-1)) + log_determinant
 
@@ -84,15 +79,7 @@ class Twist(Steered):
         share = self.path.new_tensor([untwisted]).expand(*steps.shift.shape[:2], 1)
         steering = (steps.shift, steps.gain, steps.factor, whitening)
         self.rows = (self.path, turns, self.root, self.target)
-        self.intervals = (self.path[:-1], turns[:-1], *steering, share)
-
-    def of_rows(self) -> Sequence[Tensor]:
-        """Path, turns, root and target of each row, see `Proposal`."""
-        return self.rows
-
-    def of_intervals(self) -> Sequence[Tensor]:
-        """Path, turns and steering of each interval, and the share that is not steered."""
-        return self.intervals
+        self.intervals = (self.path[:-1], turns[:-1], *steering, share)  # with the share that is not steered
 
     def future(self, state: Tensor, *given: Tensor) -> Tensor:
         """−½ |R δ − z|² of every particle's deviation δ from the path: log p(y_{row+1}, …, y_T | state) of the
@@ -121,9 +108,6 @@ class Twist(Steered):
         _, twisted, own = ahead.draw_starts(particles)
         stays = torch.rand(own.shape[:-1], dtype=torch.float64, device=own.device) < self.untwisted
         noise = torch.where(stays.unsqueeze(-1), own, twisted)
-        whitening = inverse(starts.factor)
-        ratios = [
-            ahead.winding_masses[k] + log_steered(noise, starts.shift[k], whitening[k])
-            for k in range(len(ahead.windings))
-        ]
+        windings = zip(ahead.winding_masses, starts.shift, inverse(starts.factor), strict=True)
+        ratios = [mass + _log_ratio(noise, _times(of, noise - mean), of) for mass, mean, of in windings]
         return noise, -mixture(torch.stack(ratios).logsumexp(0), self.untwisted)

@@ -1,11 +1,9 @@
 """Effect handlers that run a program's sites: condition, temper, replay, record."""
 
 import math
-import operator
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import reduce
 from typing import Any, Self, cast
 
 import numpy as np
@@ -198,7 +196,7 @@ class Recording(Messenger):
 
     def total(self) -> Tensor:
         """The sum of the observed sites' log-densities, `(...)`."""
-        return reduce(operator.add, self.log_likelihood)
+        return sum(self.log_likelihood[1:], self.log_likelihood[0])
 
     def expanded(self, left: Sequence[int]) -> dict[str, Tensor]:
         """Values of latent sites, by site, of batch shape `left`."""

@@ -69,8 +69,8 @@ def _given(plain: Stepping, proposal: Proposal) -> tuple[list[Tensor], list[Tens
     """What `transition` takes of each interval and `observe` of each row, `(rows, B, ...)` each."""
     data = plain.data
     weight = torch.as_tensor(plain.observation_weight, dtype=torch.float32).expand(data.time.shape)
-    moved = [plain.controls[:-1], data.elapsed[:-1], data.steps, *proposal.of_intervals()]
-    return moved, [data.measurements, data.observed, weight, *proposal.of_rows()]
+    moved = [plain.controls[:-1], data.elapsed[:-1], data.steps, *proposal.intervals]
+    return moved, [data.measurements, data.observed, weight, *proposal.rows]
 
 
 def _examples(given: Sequence[Tensor]) -> dict[str, Tensor]:
@@ -153,10 +153,10 @@ class CompiledFilter:
         uniform = torch.rand(*size, self.methods.uniforms, generator=torch.Generator().manual_seed(0))
         moved, values, ratio = self.transition(interval, state, uniform)
         own = standard_normal(uniform, self.methods.channels)
-        noise, expected = proposal.steered(state, *own, *(at_row(one, interval) for one in proposal.of_intervals()))
+        noise, expected = proposal.steered(state, *own, *(at_row(one, interval) for one in proposal.intervals))
         plain, sites = self.plain.transition(interval, state, noise.float())
         flat = [sites[site].expand(*size, *sites[site].shape[2:]).reshape(*size, -1) for site in self.methods.sizes]
-        future = proposal.future(moved, *(at_row(one, seen) for one in proposal.of_rows()))
+        future = proposal.future(moved, *(at_row(one, seen) for one in proposal.rows))
         density = torch.stack([self.plain.log_density(seen, moved).expand(size), future.float()], -1)
         pairs = [(moved, plain), (values, torch.cat(flat, -1)), (ratio, expected.float())]
         pairs += list(zip(self.log_density(seen, moved).unbind(-1), density.unbind(-1), strict=True))
@@ -177,7 +177,7 @@ def compiled_filter(plain: Stepping, state: Tensor, proposal: Proposal, resample
     steered = isinstance(proposal, Steered) and type(proposal).step is Steered.step and proposal.looks_ahead
     if type(proposal) is not Proposal and not steered:
         return "a proposal whose step is no function of one particle"
-    shapes = [one.shape[2:] for one in (*proposal.of_intervals(), *proposal.of_rows())]
+    shapes = [one.shape[2:] for one in (*proposal.intervals, *proposal.rows)]
     name = ("filter", type(proposal), *shapes)
     methods = compiled(plain.program, name, lambda: _Methods(plain, state, proposal))
     if isinstance(methods, str):

@@ -32,13 +32,8 @@ class Proposal:
 
     # The same as functions of one particle `(..., D)`, for kernels; what differs between rows and trajectories is given
 
-    def of_rows(self) -> Sequence[Tensor]:
-        """What `future` takes of each row, `(T + 1, B, ...)` each."""
-        return ()
-
-    def of_intervals(self) -> Sequence[Tensor]:
-        """What `steered` takes of each interval, `(T, B, ...)` each."""
-        return ()
+    rows: Sequence[Tensor] = ()  # what `future` takes of each, (T + 1, B, ...)
+    intervals: Sequence[Tensor] = ()  # what `steered` takes of each, (T, B, ...)
 
     def future(self, state: Tensor, *given: Tensor) -> Tensor:
         """`log_future` `(...)`, but for a number of the trajectory: no weight needs it."""
@@ -57,12 +52,12 @@ class Steered(Proposal):
 
     def log_future(self, row: int, state: Tensor) -> Tensor:
         """By `future`, see `Proposal`."""
-        return self.future(state, *(given[row] for given in self.of_rows()))
+        return self.future(state, *(given[row] for given in self.rows))
 
     def step(self, row: int, state: Tensor) -> tuple[Tensor | None, Tensor | float]:
         """By `steered`, see `Proposal`."""
         kind: Any = {"device": state.device, "dtype": state.dtype}
         own = torch.randn(self.channels, *state.shape[1::-1], **kind).permute(2, 1, 0)
         chance = torch.rand(1, *state.shape[1::-1], **kind).permute(2, 1, 0)
-        noise, ratio = self.steered(state, own, chance, *(given[row] for given in self.of_intervals()))
+        noise, ratio = self.steered(state, own, chance, *(given[row] for given in self.intervals))
         return noise.to(state.dtype), ratio

@@ -157,7 +157,7 @@ def test_plain_torch_weighs_the_particles_of_a_compiled_filter_the_same(
         if measured:
             log_weights = log_weights + plain.log_density(row, states[row])
         if look_ahead:
-            given = (values[row] for values in proposal.of_rows())
+            given = (values[row] for values in proposal.rows)
             future = torch.where(data.rows[row], proposal.future(states[row], *given), 0.0)
         if measured or look_ahead:
             total = (log_weights + future).logsumexp(0)
@@ -183,7 +183,7 @@ def test_plain_torch_weighs_the_particles_of_a_compiled_filter_the_same(
         if look_ahead:  # the mixture's density, whichever of its parts a particle was drawn from
             means = channel_means_of(program, at, data, row)
             standard = ((noise - means) / program.noise).double()
-            path, _, shift, gain, _, whitening, share = (values[row] for values in proposal.of_intervals())
+            path, _, shift, gain, _, whitening, share = (values[row] for values in proposal.intervals)
             deviation = at.double() - path
             deviation[..., 2] = torch.remainder(deviation[..., 2] + math.pi, 2 * math.pi) - math.pi
             mean = shift - torch.einsum("bcd,nbd->nbc", gain, deviation)
