@@ -185,10 +185,13 @@ def train(
     with bar, pyro.settings.context(module_local_params=True), pyro.validation_enabled(False):
         try:
             while state.step < optimization.steps and state.step - state.kept_step < patience:
+                done, final_rate = state.step / optimization.steps, optimization.final_rate
+                share = final_rate + (1 - final_rate) * 0.5 * (1 + math.cos(math.pi * done))
+                for group, rate in zip(optimizer.param_groups, full_rates, strict=True):
+                    group["lr"] = rate * share
                 with seeded(seed, "step", state.step):
                     part = data if batch >= len(data) else data.subset(torch.randperm(len(data))[:batch])
-                    figures = guide.refresh(part, state.step / optimization.steps)
-                    _set_rates(optimizer, full_rates, state.step / optimization.steps, optimization.final_rate)
+                    figures = guide.refresh(part, done)
                     for _ in range(optimization.gradient_steps):
                         loss = elbo.differentiable_loss(joint, guide, part) / int(part.transitions.sum())
                         _require_finite(loss, state.step)
@@ -286,12 +289,6 @@ def _groups(program: Program, guide: Guide, own: Iterable[Tensor], optimization:
         groups.append({"params": [value], "lr": rate, "weight_decay": decay})
     rate = optimization.learning_rate * getattr(guide, "rate", 1.0)
     return [*groups, *({"params": [value], "lr": rate, "weight_decay": 0.0} for value in own)]
-
-
-def _set_rates(optimizer: torch.optim.Optimizer, full: list[float], progress: float, final: float) -> None:
-    share = final + (1 - final) * 0.5 * (1 + math.cos(math.pi * progress))
-    for group, rate in zip(optimizer.param_groups, full, strict=True):
-        group["lr"] = rate * share
 
 
 def _require_finite(loss: Tensor, step: int) -> None:
