@@ -7,7 +7,7 @@ import torch
 from steady_ppl import seeded
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.gaussian.smoother import find_path, means_as_path, smooth
+from steady_ppl.gaussian.smoother import find_path, smooth
 from steady_ppl.likelihood.scores import Smoothed, smoothed
 from steady_ppl.model.problem import Problem
 
@@ -36,7 +36,7 @@ def settled(program, data, path: ReferencePath | None = None) -> tuple[Lookahead
     path = path or find_path(Problem(program, data, True))
     for _ in range(4):
         ahead = smooth(Problem(program, data, True), path, passes=5, kernels=False)
-        path = means_as_path(ahead, data)
+        path = ahead.path(data)
     return ahead, path
 
 

@@ -16,11 +16,11 @@ from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, labelled
 from steady_ppl.likelihood.evidence import choose_filter, evidence, in_parts, run_filter
-from steady_ppl.model.handlers import AtMean, Recording, residual, running
+from steady_ppl.model.handlers import AtMean, Recording, joined, parted, residual, running
 from steady_ppl.model.planar_vehicle import PlanarVehicle, UnknownMap
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, error_indices, for_program
-from steady_ppl.model.substeps import acting_controls, joined, parted
+from steady_ppl.model.substeps import acting_controls
 from steady_ppl.runs.fit import Fit
 from steady_ppl.smc.filter import particle_filter
 from steady_ppl.smc.resampling import systematic, take

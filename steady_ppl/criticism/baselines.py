@@ -12,11 +12,11 @@ from torch import Tensor
 from steady_ppl.gaussian.kalman import Tracked, track
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, on_a_circle, predict
-from steady_ppl.model.handlers import Recording, Standardised, as_event, normal_moments, running
+from steady_ppl.model.handlers import Recording, Standardised, as_event, joined, normal_moments, running
 from steady_ppl.model.interventions import Transforming
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import joined, mean_step, row_inputs, sample_channels
+from steady_ppl.model.substeps import mean_step, row_inputs, sample_channels
 from steady_ppl.utils.angles import wrap
 
 NOISE_MULTIPLES = (0.5, 1.0, 2.0, 4.0, 8.0)  # of the channels' root mean squares, that are scanned
@@ -63,11 +63,6 @@ class Reference:
     program: ConstantVelocity
     log_likelihood: float  # log p(y) of all drives, linearised
     predictions: dict[int, Prediction]  # by how many rows ahead
-
-    @property
-    def scales(self) -> tuple[float, ...]:
-        """Standard deviation of each channel."""
-        return tuple(self.program.scales.tolist())
 
 
 @torch.no_grad()

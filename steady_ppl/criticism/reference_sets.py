@@ -19,7 +19,7 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.kalman import Tracked, track
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, predict, simulate_again
-from steady_ppl.gaussian.smoother import REST_TOLERANCE, means_as_path, smooth
+from steady_ppl.gaussian.smoother import REST_TOLERANCE, smooth
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.angles import wrap_angles
@@ -111,7 +111,7 @@ def _block(problem: Problem, starts: Tensor, channels: int, horizons: Sequence[i
 def _tracked(problem: Problem, truth: ReferencePath) -> tuple[ReferencePath, Tracked]:
     """Paths near the posterior's modes, and the drives along them. Drives whose path is still on its way after a single
     step from the truth take more."""
-    near = means_as_path(smooth(problem, truth, passes=1), problem.data)
+    near = smooth(problem, truth, passes=1).path(problem.data)
     tracked = track(problem, near, passes=1)
     far = ~((tracked.noise - near.noise).abs().amax((0, 2)) <= REST_TOLERANCE) | _starts_elsewhere(tracked, near)
     if bool(far.any()):

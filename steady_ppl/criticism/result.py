@@ -76,7 +76,7 @@ class Check(Displayed):
         scatter = zip(self.residuals, misfit.dispersion.tolist(), strict=True)
         about: dict[str, Any] = {"what": DEFINITION, "why_not": reference if isinstance(reference, str) else None}
         if isinstance(reference, Reference):
-            about |= {"noise": list(reference.scales), "log_likelihood": reference.log_likelihood}
+            about |= {"noise": reference.program.scales.tolist(), "log_likelihood": reference.log_likelihood}
         return {
             "verdict": verdict(self),
             "who": blame.kind,

@@ -23,6 +23,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.lanes import (
     Array,
     add_dot,
@@ -33,7 +34,7 @@ from steady_ppl.gaussian.lanes import (
     out_of_lanes,
     set_scaled,
 )
-from steady_ppl.gaussian.linearize import LinearArrays, Linearization
+from steady_ppl.gaussian.linearize import LinearArrays, Linearization, ReferencePath
 
 
 class Potential(NamedTuple):
@@ -105,6 +106,10 @@ class Lookahead:
         `(T, B, C)`."""
         moved, noise = (self._tensor(part).squeeze(-1) for part in self.means_in_lanes())
         return self.linearization.path.states + moved, noise
+
+    def path(self, data: Trajectories) -> ReferencePath:
+        """The posterior mean as a path to linearise along."""
+        return ReferencePath.of_means(*self.means(), data)
 
     def means_in_lanes(self) -> tuple[Array, Array]:
         """The means, of the states less the path's: `(T + 1, blocks, D, 1, LANES)`; and `(T, blocks, C, 1, LANES)`."""

@@ -56,10 +56,7 @@ class Tracked:
 
     def variances_ahead(self, horizon: int) -> Tensor:
         """Variances of measurements predicted `horizon` rows ahead, `(T + 1 − horizon, B, K)`; NaN where missing."""
-        rows, drives, components = self.linearization.residual.shape
-        out = np.empty((rows - horizon, drives, components))
-        spread_ahead(self.linearization.arrays(), array(self.covariances), horizon, out)
-        return torch.from_numpy(out)
+        return torch.from_numpy(spread_ahead(self.linearization.arrays(), array(self.covariances), horizon))
 
 
 def track(problem: Problem, path: ReferencePath, *, passes: int = 2, kernels: bool | None = None) -> Tracked:
@@ -165,12 +162,11 @@ def backward(given: LinearArrays, filtered: FilteredMoments, arrival: Array, rea
 
 
 @njit(cache=True, error_model="numpy")
-def spread_ahead(given: LinearArrays, covariances: Array, horizon: int, variances: Array) -> None:
-    """Fill the variances of measurements `horizon` rows ahead, their own noise included; NaN where one is missing.
-
-    Covariances are of the states given all up to a row, `(T + 1, B, D, D)`; variances are `(T + 1 − horizon, B, K)`.
-    """
+def spread_ahead(given: LinearArrays, covariances: Array, horizon: int) -> Array:
+    """Variances of measurements `horizon` rows ahead, `(T + 1 − horizon, B, K)`, their own noise included; NaN where
+    one is missing. Covariances are of the states given all up to a row, `(T + 1, B, D, D)`."""
     rows, trajectories, components, dimension = given.measurement.shape
+    variances = np.empty((rows - horizon, trajectories, components))
     along, moved = np.zeros((components, dimension)), np.zeros((components, dimension))
     pushed = np.zeros((components, given.noise.shape[3]))
     for b in range(trajectories):
@@ -191,6 +187,7 @@ def spread_ahead(given: LinearArrays, covariances: Array, horizon: int, variance
                 for i in range(dimension):
                     for j in range(dimension):
                         variance[k] += along[k, i] * covariances[t, b, i, j] * along[k, j]
+    return variances
 
 
 @njit(cache=True, error_model="numpy", inline="always")

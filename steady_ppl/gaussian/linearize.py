@@ -26,13 +26,14 @@ from steady_ppl.model.handlers import (
     Recording,
     Standardised,
     draw_starts,
+    joined,
     residual,
     running,
     tangent_normal,
 )
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import joined, mean_step, noisy_step, row_inputs
+from steady_ppl.model.substeps import mean_step, noisy_step, row_inputs
 from steady_ppl.model.validate import noise_size, start_size
 from steady_ppl.utils.angles import wrap
 

@@ -12,9 +12,9 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.kalman import Tracked
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.kernels.rows import on_all_rows
-from steady_ppl.model.handlers import Observing, Recording, residual, running
+from steady_ppl.model.handlers import Observing, Recording, joined, residual, running
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import RowInputs, joined, mean_step, row_inputs
+from steady_ppl.model.substeps import RowInputs, mean_step, row_inputs
 from steady_ppl.smc.simulate import measure
 from steady_ppl.smc.stepping import Stepping
 

@@ -17,11 +17,11 @@ from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
 from steady_ppl.gaussian.linearize import ReferencePath, angles_on_a_circle, linearize
 from steady_ppl.kernels.jit import unchanged
 from steady_ppl.kernels.rows import on_all_rows
-from steady_ppl.model.handlers import KnownStart, Recording, Standardised, normal_moments, running
+from steady_ppl.model.handlers import KnownStart, Recording, Standardised, joined, normal_moments, parted, running
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import divergence
-from steady_ppl.model.substeps import all_rows, joined, parted, sample_channels
+from steady_ppl.model.substeps import all_rows, sample_channels
 from steady_ppl.smc.filter import particle_filter
 from steady_ppl.smc.genealogy import Paths, event_dims
 from steady_ppl.utils.angles import wrap_angles
@@ -75,7 +75,7 @@ def smooth(
             accepted = _either(worse, accepted, path) if any_worse else path
             if index == passes - 1:
                 break
-            moved = means_as_path(ahead, data)
+            moved = ahead.path(data)
             if any_worse:
                 halfway = ReferencePath((accepted.states + path.states) / 2, (accepted.noise + path.noise) / 2)
                 moved = _either(worse, halfway, moved)
@@ -157,15 +157,10 @@ def require_found(ahead: Lookahead, problem: Problem) -> None:
         raise FilterError(f"trajectory {label}: {why}", trajectory=label)
 
 
-def means_as_path(ahead: Lookahead, data: Trajectories) -> ReferencePath:
-    """The posterior mean as a path to linearise along."""
-    return ReferencePath.of_means(*ahead.means(), data)
-
-
 def resting_path(ahead: Lookahead, data: Trajectories) -> ReferencePath:
-    """`means_as_path` after several passes, to go on from. What has not come to rest stays where it was linearised: how
-    good a path is a step further is not known there. After a single pass it would never move."""
-    means, path = means_as_path(ahead, data), ahead.linearization.path
+    """The posterior mean after several passes, to go on from. What has not come to rest stays where it was linearised:
+    how good a path is a step further is not known there. After a single pass it would never move."""
+    means, path = ahead.path(data), ahead.linearization.path
     far = ~((means.noise - path.noise).abs().amax((0, 2)) <= REST_TOLERANCE)
     return _either(far, path, means)
 

@@ -10,14 +10,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, UsageError, require
 from steady_ppl.gaussian.information_filter import Lookahead, Steering
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.gaussian.smoother import (
-    find_and_smooth,
-    means_as_path,
-    require_found,
-    resting_path,
-    smooth,
-    smoother_paths,
-)
+from steady_ppl.gaussian.smoother import find_and_smooth, require_found, resting_path, smooth, smoother_paths
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.guides.base import FilteringGuide, LinearRamp, PathGuide, Tempering
 from steady_ppl.guides.variational import VariationalGuide, log_ratio, times
@@ -74,7 +67,7 @@ class LinearizedGuide(PathGuide):
             counts["searches_failed"] = 1.0
         if lost or due:
             ahead = self._smooth(data, progress)
-        self.remember(means_as_path(ahead, data), data)
+        self.remember(ahead.path(data), data)
         self.in_plain_torch = ahead.linearization.in_plain_torch
         figures = {"observation_weight": self.tempering(progress), "log_evidence": float(ahead.log_likelihood.mean())}
         return ahead, figures | {name: count for name, count in counts.items() if count}

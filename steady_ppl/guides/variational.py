@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, require
 from steady_ppl.gaussian.predict import on_a_circle
-from steady_ppl.gaussian.smoother import find_and_smooth, means_as_path
+from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.guides.base import Constant, Tempering, sample_known
 from steady_ppl.likelihood.scores import channel_moments
 from steady_ppl.model.handlers import KnownStart, Recording, Replaying, Standardised, Substituting, running
@@ -95,7 +95,10 @@ class VariationalGuide(nn.Module):
         if not self.known_start:
             density = density + _prior_of_start(self.program, paths)
         if not self.centred or weight != 1:
-            density = density + (1 - weight * self.centred) * _prior_of_noise(self.program, data, paths)
+            channels = paths.channels(self.program, data)
+            logs = torch.stack([fn.log_prob(paths.noise[site]) for site, fn in channels.items()]).sum(0)
+            of_noise = torch.where(data.transitions, logs, 0.0).sum((1, 2))  # under the program, as `Joint` scores it
+            density = density + (1 - weight * self.centred) * of_noise
         pyro.factor("proposal", density.reshape(-1, 1, 1) if self.draws > 1 else density[0], has_rsample=True)
 
     def roll_out(self, data: Trajectories) -> tuple[Paths, Tensor, Tensor]:
@@ -131,12 +134,6 @@ class VariationalGuide(nn.Module):
             event_dims=dims | {"states": 1},
         )
         return paths, at_start, later
-
-
-def _prior_of_noise(program: Program, data: Trajectories, paths: Paths) -> Tensor:
-    """Log-density of the channel noise under the program, as `Joint` scores it, `(M,)`."""
-    logs = [fn.log_prob(paths.noise[site]) for site, fn in paths.channels(program, data).items()]
-    return torch.where(data.transitions, torch.stack(logs).sum(0), 0.0).sum((1, 2))
 
 
 def _prior_of_start(program: Program, paths: Paths) -> Tensor:
@@ -248,7 +245,7 @@ class InferenceNetwork(VariationalGuide):
         super().__init__(program, **more)
         require(width >= 1, "width", width, "at least 1")
         self.width, self.centred = width, centred
-        path = means_as_path(find_and_smooth(Problem(program, data, self.known_start)), data)
+        path = find_and_smooth(Problem(program, data, self.known_start)).path(data)
         states = path.states
         self.angles = program.angle_indices
         self.register_buffer("circular", on_a_circle(program, data, states))

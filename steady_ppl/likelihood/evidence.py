@@ -15,7 +15,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import DataError, require
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import why_not_linear
-from steady_ppl.gaussian.smoother import find_and_smooth, means_as_path
+from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
@@ -156,7 +156,7 @@ def smoothed_states(program: Program, data: Trajectories, *, known_start: bool) 
     lineages of a bootstrap filter. With a `known_start` the first state is the true one.
     """
     if why_not_linear(program, data, known_start=known_start) is None:
-        return means_as_path(find_and_smooth(Problem(program, data, known_start)), data).states
+        return find_and_smooth(Problem(program, data, known_start)).path(data).states
     parts = [
         particle_filter(program, part, particles=2000, known_start=known_start).paths(100).states.mean(0)
         for part in in_parts(data, 2000)

@@ -273,6 +273,18 @@ def as_event(values: Tensor, event_dim: int) -> Tensor:
     return values if event_dim else values.squeeze(-1)
 
 
+def joined(values: Mapping[str, Tensor], kinds: Mapping[str, Any], left: Sequence[int]) -> Tensor:
+    """The sites' values side by side, `(*left, C)`."""
+    parts = [as_vector(value, kinds[site].event_dim) for site, value in values.items()]
+    return torch.cat([part.expand(*left, part.shape[-1]) for part in parts], -1)
+
+
+def parted(values: Tensor, kinds: Mapping[str, Any]) -> dict[str, Tensor]:
+    """What `joined` puts side by side, by site."""
+    parts = values.split([fn.event_shape.numel() for fn in kinds.values()], -1)
+    return {site: as_event(part, fn.event_dim) for (site, fn), part in zip(kinds.items(), parts, strict=True)}
+
+
 def with_moments(fn: Any, loc: Tensor | None = None, scale: Tensor | None = None) -> Any:
     """A distribution of the kind of another one, with another location or scale."""
     base = unwrapped(fn)

@@ -28,16 +28,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError, UsageError
 from steady_ppl.model.actuation import row_spans
-from steady_ppl.model.handlers import (
-    AtMean,
-    Recording,
-    Standardised,
-    as_event,
-    as_vector,
-    running,
-    unwrapped,
-    with_moments,
-)
+from steady_ppl.model.handlers import AtMean, Recording, Standardised, joined, parted, running, unwrapped, with_moments
 from steady_ppl.model.program import Program
 from steady_ppl.utils.context import bound
 
@@ -278,15 +269,3 @@ def _through(
 
 def _mean(values: Sequence[Tensor]) -> Tensor:
     return sum(values[1:], values[0]) / len(values)
-
-
-def joined(values: Mapping[str, Tensor], kinds: Mapping[str, Any], left: Sequence[int]) -> Tensor:
-    """Return the sites' values side by side, `(*left, C)`."""
-    parts = [as_vector(value, kinds[site].event_dim) for site, value in values.items()]
-    return torch.cat([part.expand(*left, part.shape[-1]) for part in parts], -1)
-
-
-def parted(values: Tensor, kinds: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return what `joined` puts side by side, by site."""
-    parts = values.split([fn.event_shape.numel() for fn in kinds.values()], -1)
-    return {site: as_event(part, fn.event_dim) for (site, fn), part in zip(kinds.items(), parts, strict=True)}

@@ -187,12 +187,12 @@ def test_the_noise_floor_is_what_kalman_expects_of_its_own_errors(cart, even):
 
 def test_the_reference_ignores_controls_and_scans_its_noise(clean):
     reference = clean.reference
-    assert isinstance(reference, Reference) and len(reference.scales) == 3
+    assert isinstance(reference, Reference) and len(reference.program.scales) == 3
     figures = clean.figures
     assert "ignores the controls" in figures["constant_velocity"]["what"]
     row = figures["measurements"]["bearing_0"]["horizons"]["3 s"]
     assert row["noise_floor_90"][0] < row["rmse"] < row["constant_velocity"] < row["last_measurement"]
-    coasting = ConstantVelocity(clean.program, torch.tensor(reference.scales))
+    coasting = ConstantVelocity(clean.program, reference.program.scales)
     state, time, step = torch.randn(2, 3, 6), torch.zeros(2, 3), torch.full((2, 3), 0.1)
     moved = []
     for control in (torch.zeros(2, 3, 2), torch.ones(2, 3, 2)):

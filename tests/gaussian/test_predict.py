@@ -13,7 +13,7 @@ from paths import anywhere
 from steady_ppl import seeded
 from steady_ppl.gaussian.kalman import track
 from steady_ppl.gaussian.predict import on_a_circle, predict, simulate_again
-from steady_ppl.gaussian.smoother import find_and_smooth, means_as_path
+from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.model.problem import Problem
 
 
@@ -40,7 +40,7 @@ def test_predictions_are_kalmans(cart, uneven, horizon):
 def test_ninety_percent_bands_cover_ninety_percent_of_what_the_program_makes():
     program = example("hovercraft").requires_grad_(False)
     data = drives(program, 40, 41)
-    path = means_as_path(find_and_smooth(Problem(program, data, True)), data)
+    path = find_and_smooth(Problem(program, data, True)).path(data)
     tracked = track(Problem(program, data, True), path)
     for horizon, found in predict(program, data, tracked, [1, 10]).items():
         independent = int(found.observed.sum()) / (1 if horizon == 1 else 4 * horizon)  # errors overlap and go together

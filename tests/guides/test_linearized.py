@@ -27,7 +27,7 @@ from steady_ppl import (
     stack,
 )
 from steady_ppl.comparison.evaluate import evaluate
-from steady_ppl.gaussian.smoother import find_path, means_as_path, smooth, smoother_paths
+from steady_ppl.gaussian.smoother import find_path, smooth, smoother_paths
 from steady_ppl.model.handlers import AtMean, Recording, Replaying, Standardised, running
 from steady_ppl.model.problem import Problem
 
@@ -162,7 +162,7 @@ def test_gaussian_draws_agree_with_the_transition_to_first_order():
     program = example("hovercraft:HovercraftTruth").requires_grad_(False)
     data = drives(program, 2, 12)
     ahead = smooth(Problem(program, data, True), find_path(Problem(program, data, True)), passes=40, tolerance=0)
-    mean = means_as_path(ahead, data)
+    mean = ahead.path(data)
     _, states, noise = ahead.draws(50)
 
     def gap(share: float) -> Tensor:

@@ -8,7 +8,7 @@ from examples import example
 from oracles import joint_density
 
 from steady_ppl import fit_by_likelihood, for_program, seeded, simulate, with_substeps
-from steady_ppl.gaussian.smoother import find_path, means_as_path, smooth, smoother_paths
+from steady_ppl.gaussian.smoother import find_path, smooth, smoother_paths
 from steady_ppl.likelihood.parameters import elements, moved
 from steady_ppl.likelihood.scores import parameter_scores, smoothed
 from steady_ppl.model.problem import Problem
@@ -44,7 +44,7 @@ def beside_the_maximum(damping, substeps):
 @pytest.mark.parametrize(("damping", "substeps"), [(0.8, 1), (0.8, 4), (10.0, 16), (30.0, 32)])
 def test_scores_are_slopes(damping, substeps) -> None:
     program, data, ahead = beside_the_maximum(damping, substeps)
-    parts, path = elements(program), means_as_path(ahead, data)
+    parts, path = elements(program), ahead.path(data)
     scores = parameter_scores(program, data, smoothed(ahead, data), parts).sum(0)
     assert [part.name for part in parts] == ["gain", "damping", "noise", "measurement_sd"]
     for part, score in zip(parts, scores.tolist(), strict=True):
