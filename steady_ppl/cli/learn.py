@@ -10,7 +10,7 @@ import steady_ppl as st
 from steady_ppl.cli import options
 from steady_ppl.cli.common import fit_or_program, present, program_from, write_json
 from steady_ppl.errors import RunError, UsageError
-from steady_ppl.utils.context import is_quiet
+from steady_ppl.utils.context import QUIET
 from steady_ppl.utils.files import require_picture, require_place, write_picture
 from steady_ppl.utils.text import say, shown, tell
 
@@ -68,7 +68,7 @@ def fit(
         device=device,
         resume=resume,
         force=force,
-        progress=not is_quiet(),
+        progress=not QUIET.get(),
     )
     say(*result.notes)
     tell(f"{out}: {result.program}")

@@ -4,6 +4,7 @@ Exit codes: 0 done, 1 the computation failed or was interrupted, 2 bad usage or 
 """
 
 import os
+import shlex
 import sys
 import traceback
 from collections.abc import Callable
@@ -16,7 +17,7 @@ from steady_ppl.cli import demo, judge, learn, make
 from steady_ppl.cli.common import as_refusal
 from steady_ppl.cli.progress import progress_line
 from steady_ppl.errors import SteadyError
-from steady_ppl.utils.context import commanded, quietly
+from steady_ppl.utils.context import COMMAND, QUIET, bound
 from steady_ppl.utils.cores import ONE_THREAD
 from steady_ppl.utils.progress import listening
 from steady_ppl.utils.text import one_line, say, tell
@@ -152,7 +153,8 @@ def main(arguments: list[str] | None = None) -> int:
         if isinstance(option, typer.core.TyperOption) and option.name in COMPLETION_OPTIONS:
             option.hidden = True
     words = ["steady", *(word for word in arguments if word not in ("--resume", "--force"))]
-    with quietly("quiet" in asked), commanded(words), progress_line() as line, listening(line):
+    record = bound(COMMAND, shlex.join(words))
+    with bound(QUIET, "quiet" in asked), record, progress_line() as line, listening(line):
         try:
             code = command.main(arguments, prog_name="steady", standalone_mode=False) or 0
             if code == INTERRUPTED_CODE:

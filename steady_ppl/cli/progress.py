@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from steady_ppl.utils.context import is_quiet
+from steady_ppl.utils.context import QUIET
 from steady_ppl.utils.text import printable
 
 PATIENCE_SECONDS = 2.0  # before anything is said
@@ -53,7 +53,7 @@ class _Line:
 @contextmanager
 def progress_line() -> Iterator[Callable[[str, float], None]]:
     """Yields what is to be told of stages; shows nothing where stderr is no terminal, or in quiet."""
-    if is_quiet() or not sys.stderr.isatty():
+    if QUIET.get() or not sys.stderr.isatty():
         yield lambda doing, share: None
         return
     line = _Line()

@@ -11,7 +11,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from steady_ppl.errors import RunError
-from steady_ppl.utils.context import command_line
+from steady_ppl.utils.context import COMMAND
 from steady_ppl.utils.files import read_json, require_file, whole_file
 from steady_ppl.utils.schema import ANYTHING, BOOL, LINES, TEXT, WHOLE, mismatch
 from steady_ppl.utils.tensor_files import read_tensors
@@ -145,7 +145,7 @@ def _remove(folder: Path, files: Sequence[str] = FILES) -> None:
 def write_record(folder: Path, record: dict[str, Any]) -> None:
     """Write `run.json`, whole or not at all."""
     with whole_file(folder / RUN_RECORD, RunError) as beside:
-        beside.write_text(json.dumps({"format": RUN_FORMAT, "command": command_line(), **record}, indent=1) + "\n")
+        beside.write_text(json.dumps({"format": RUN_FORMAT, "command": COMMAND.get(), **record}, indent=1) + "\n")
 
 
 def require_same(folder: Path, begun: Mapping[str, Any]) -> None:

@@ -1,14 +1,15 @@
 """What holds for a block: that only results are wanted, and the command line, for a run's record."""
 
-import shlex
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TypeVar
 
 Value = TypeVar("Value")
-_quiet: ContextVar[bool] = ContextVar("quiet", default=False)
-_command: ContextVar[str | None] = ContextVar("command", default=None)
+QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
+"""Whether nothing but errors and results is said."""
+COMMAND: ContextVar[str | None] = ContextVar("command", default=None)
+"""The command line, for the record of every run that the block makes, as a shell takes it; None in Python."""
 
 
 @contextmanager
@@ -19,23 +20,3 @@ def bound(variable: ContextVar[Value], value: Value) -> Iterator[None]:
         yield
     finally:
         variable.reset(token)
-
-
-def quietly(quiet: bool) -> AbstractContextManager[None]:
-    """Say nothing but errors and results, if asked for."""
-    return bound(_quiet, quiet)
-
-
-def is_quiet() -> bool:
-    """Whether only errors and results are wanted."""
-    return _quiet.get()
-
-
-def commanded(words: Sequence[str]) -> AbstractContextManager[None]:
-    """Let the record of every run that the block makes say which command line made it."""
-    return bound(_command, shlex.join(words))
-
-
-def command_line() -> str | None:
-    """The words of it as a shell takes them; None in Python."""
-    return _command.get()

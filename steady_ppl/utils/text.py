@@ -4,7 +4,7 @@ import sys
 import unicodedata
 from collections.abc import Callable, Collection, Sequence
 
-from steady_ppl.utils.context import is_quiet
+from steady_ppl.utils.context import QUIET
 
 # what moves the cursor, colours, renames the window, turns lines round, is not seen, or cannot be written at all
 INVISIBLE = ("Cc", "Cf", "Cs", "Zl", "Zp")  # categories of Unicode: control, format, half of a pair, line separators
@@ -51,7 +51,7 @@ def one_line(error: BaseException) -> str:
 
 def say(*remarks: str, always: bool = False) -> None:
     """Words to the person, beside what a script reads; errors are said `always`."""
-    for remark in remarks if always or not is_quiet() else ():
+    for remark in remarks if always or not QUIET.get() else ():
         lines = [shown(part, MAX_LINE_LENGTH) for part in remark.splitlines()]
         tell("\n".join([f"steady: {part}" for part in lines[:1]] + lines[1:]), aside=True)
 
