@@ -105,14 +105,6 @@ class PlanarVehicle(Program):
         """Velocity in the body frame and yaw rate by channel, each `(...)`."""
         return dict(zip(self.channel_names, self.body_velocity(state), strict=True))
 
-    def positions(self, state: Tensor) -> dict[str, Tensor]:
-        """None: no channel of the body frame has a position in it."""
-        return {}
-
-    def earlier(self, state: Tensor, ago: Tensor) -> Tensor:
-        """The pose `ago` seconds before, at its velocity, and the velocity as it is, `(..., 6)`."""
-        return torch.cat([state[..., :3] - ago * state[..., 3:6], state[..., 3:]], -1)
-
     def settles_in(self, step: Tensor) -> Tensor | float:
         """Time constant of what the program holds, s: `settling`, or the step."""
         return step if self.settling is None else self.settling
