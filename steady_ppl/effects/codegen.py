@@ -124,13 +124,9 @@ def _carried_over(program: Program, base: type[Program]) -> tuple[list[str], lis
     if lines:
         lines.insert(0, "# where its own parameters begin; they are learned as before")
     before = fresh.state_dict()
-    modules: dict[str, None] = {}
-    for name, value in program.state_dict().items():
-        if parameter_name(name) not in program._pyro_params and not (
-            name in before and torch.equal(value, before[name].to(value))
-        ):
-            modules[name.partition(".")[0]] = None
-    if modules:
+    others = {k: value for k, value in program.state_dict().items() if parameter_name(k) not in program._pyro_params}
+    changed = [k for k, value in others.items() if k not in before or not torch.equal(value, before[k].to(value))]
+    if modules := dict.fromkeys(name.partition(".")[0] for name in changed):
         notes.append(f"not carried over, being too much for a program file: {', '.join(modules)}; fit them again")
     return lines, notes
 

@@ -364,6 +364,5 @@ def within_one_standard_error(candidate: Sequence[float], best: Sequence[float])
     if not candidate or not best:
         return True
     loss = torch.tensor(best, dtype=torch.float64) - torch.tensor(candidate, dtype=torch.float64)
-    if len(loss) < 2:
-        return bool(loss.mean() <= 0)
-    return bool(loss.mean() <= loss.std() / math.sqrt(len(loss)))
+    error = loss.std() / math.sqrt(len(loss)) if len(loss) > 1 else 0.0
+    return bool(loss.mean() <= error)

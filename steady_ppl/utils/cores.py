@@ -165,9 +165,7 @@ class _Child:
         """By their numbers, when it has ended; nothing if it failed, or does not end within so many seconds."""
         from steady_ppl.utils.tensor_files import unpacked
 
-        if self.file is None or self.handle < 0:
-            return {}
-        if not wait([self.handle], patience):
+        if self.file is None or self.handle < 0 or not wait([self.handle], patience):
             return {}
         size = self.file.seek(0, os.SEEK_END)
         self.file.seek(max(0, size - len(END_MARK)))
