@@ -326,10 +326,10 @@ def measure_limits(groups: Sequence[Group], workers: int) -> None:
     jobs = [(group.name, effect) for group in groups if group.effects for effect in _runs(group)]
     found = json.loads(LIMITS.read_text()) if LIMITS.exists() else {}
     with ProcessPoolExecutor(workers) as pool:
-        for (group, _), limits in zip(jobs, pool.map(limits_of, *zip(*jobs, strict=True)), strict=True):
-            found.setdefault(group, {}).update(limits)
+        for (name, _), limits in zip(jobs, pool.map(limits_of, *zip(*jobs, strict=True)), strict=True):
+            found.setdefault(name, {}).update(limits)
             LIMITS.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-            print(f"{group}: {', '.join(limits)}")
+            print(f"{name}: {', '.join(limits)}")
     for group in groups:
         missing = [effect for effect in group.effects if effect not in found.get(group.name, {})]
         if missing:

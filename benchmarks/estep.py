@@ -19,6 +19,7 @@ import os
 import resource
 import sys
 import time
+from dataclasses import replace
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -136,7 +137,8 @@ def gradient_by_trajectory(program: Program, guide: PathGuide, data: Trajectorie
     whole = guide.paths
     assert whole is not None
     for b in range(len(data)):
-        guide.paths = whole.of([b])
+        start, noise = ({site: value[:, :, [b]] for site, value in part.items()} for part in (whole.start, whole.noise))
+        guide.paths = replace(whole, states=whole.states[:, :, [b]], start=start, noise=noise)
         elbo = Trace_ELBO(num_particles=guide.draws, vectorize_particles=True, max_plate_nesting=2)
         loss = elbo.differentiable_loss(Joint(program, known_start=known_start), guide, data.subset([b]))
         grads = torch.autograd.grad(loss, list(program.parameters()), allow_unused=True)

@@ -73,7 +73,7 @@ def judged(logs: Path, name: str, draw: int) -> dict[str, Any]:
     began = time.perf_counter()
     fit, moved = learnt(name, data, draw)
     seconds = time.perf_counter() - began
-    record = {"program": name, "draw": draw, "seconds": seconds} | evaluate(fit, data[2])
+    record: dict[str, Any] = {"program": name, "draw": draw, "seconds": seconds} | evaluate(fit, data[2])
     if moved:
         record["likeliest"] = asdict(moved)
     record["authors_starts"] = evaluate(fit, truck(logs, draw)[2])  # their velocities know the next row's place
