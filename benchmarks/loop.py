@@ -161,7 +161,7 @@ def row(record: Record) -> str:
     cells = [f"{figure(new, 'wall', cold=cold):.2f} ({figure(new, 'cpu', cold=cold):.2f})" for cold in (True, False)]
     cells.append(f"{figure(new, 'peak'):.0f}")
     if isinstance(old, str):
-        cells.append(f"old: {old[-120:]}")
+        cells.append(f"old: {old.splitlines()[-1][-120:]}")
     elif old:
         kinds = (("wall", True), ("cpu", True), ("wall", False), ("cpu", False), ("peak", False))
         cells += [f"{figure(old, kind, cold=cold) / figure(new, kind, cold=cold):.2f}" for kind, cold in kinds]

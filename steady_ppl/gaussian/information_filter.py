@@ -26,12 +26,14 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.lanes import (
     Array,
+    add,
     add_dot,
     add_gram,
     add_outer,
     add_product,
     in_lanes,
     out_of_lanes,
+    put,
     set_scaled,
 )
 from steady_ppl.gaussian.linearize import LinearArrays, Linearization, ReferencePath
@@ -242,7 +244,7 @@ def integrate(ahead: Potential, noise: Array, offset: Array, out: Steering, room
     add_gram(log_scale, information, offset, 1.0)
     add_product(pushed, precision, offset, 1.0)
     add_gram(log_scale, pushed, offset, -0.5)
-    information -= pushed
+    add(information, pushed, -1.0)
     add_gram(by_noise, noise, precision, 1.0)
     add_product(gram, by_noise, noise, 1.0)
     add_gram(pull, noise, information, 1.0)
@@ -259,7 +261,8 @@ def integrate(ahead: Potential, noise: Array, offset: Array, out: Steering, room
             add_dot(
                 out.factor, b * channels + a, out.factor, b * channels + b, 1, root, a * channels + b, 1, a - b, -1.0
             )
-            out.factor[b, a] *= scale
+            for lane in range(len(pivot)):
+                out.factor[b, a, lane] *= scale[lane]
     # root⁻¹ (GᵀΛ, Gᵀu), and root⁻ᵀ times these
     add_gram(half, out.factor, by_noise, 1.0)
     add_gram(white, out.factor, pull, 1.0)
@@ -281,7 +284,7 @@ def integrate_starts(noise: Array, ahead: Potential, offset: Array, steering: St
     for w in range(offset.shape[0]):
         for k in range(offset.shape[1]):
             out = Steering(steering.shift[w, k], steering.gain[w, k], steering.factor[w, k])
-            total[w, k] = ahead.log_scale[k]
+            put(total[w, k], ahead.log_scale[k])
             first = Potential(ahead.precision[k].copy(), ahead.information[k].copy(), total[w, k])
             integrate(first, noise[k], offset[w, k], out, room)
     return total
@@ -301,22 +304,24 @@ def backward(given: LinearArrays, log_scale: Array, first: Potential, futures: P
     for k in range(blocks):
         ahead = Potential(first.precision[k], first.information[k], first.log_scale[k])
         for t in range(rows - 1, -1, -1):
-            futures.precision[t, k], futures.information[t, k] = ahead.precision, ahead.information
-            futures.log_scale[t, k] = ahead.log_scale
+            put(futures.precision[t, k], ahead.precision)
+            put(futures.information[t, k], ahead.information)
+            put(futures.log_scale[t, k], ahead.log_scale)
             by_state, apart = given.measurement[t, k], given.residual[t, k]
             set_scaled(weighted, by_state, given.precision[t, k])
             set_scaled(pull, apart, given.precision[t, k])
             add_gram(ahead.precision, weighted, by_state, 1.0)
             add_gram(ahead.information, by_state, pull, 1.0)
             add_gram(ahead.log_scale, apart, pull, -0.5)
-            ahead.log_scale[:] += log_scale[t, k]
+            add(ahead.log_scale, log_scale[t, k], 1.0)
             if t > 0:
                 forward = given.state[t - 1, k]
                 out = Steering(steering.shift[t - 1, k], gain, steering.factor[t - 1, k])
                 integrate(ahead, given.noise[t - 1, k], given.offset[t - 1, k], out, room)
                 steering.gain[t - 1, k] = 0.0
                 add_product(steering.gain[t - 1, k], gain, forward, 1.0)
-                half[:], moved[:] = 0.0, ahead.information
+                half[:] = 0.0
+                put(moved, ahead.information)
                 add_product(half, ahead.precision, forward, 1.0)
                 ahead.precision[:], ahead.information[:] = 0.0, 0.0
                 add_gram(ahead.precision, forward, half, 1.0)
@@ -332,9 +337,9 @@ def roll_deviations(given: LinearArrays, gain: Array, begin: Array, noise: Array
     draws, intervals, blocks = noise.shape[:3]
     deviations = np.empty((draws, intervals + 1, *begin.shape[1:]))
     for m in range(draws):
-        deviations[m, 0] = begin[m]
+        put(deviations[m, 0], begin[m])
         for t in range(intervals):
-            deviations[m, t + 1] = given.offset[t]
+            put(deviations[m, t + 1], given.offset[t])
             for k in range(blocks):
                 here, there, own = deviations[m, t, k], deviations[m, t + 1, k], noise[m, t, k]
                 add_product(own, gain[t, k], here, -1.0)
@@ -353,14 +358,15 @@ def covariances(given: LinearArrays, steering: Steering, first: Array) -> tuple[
     across = np.zeros((intervals, blocks, dimension, channels, lanes))
     moved, spread = np.zeros((dimension, dimension, lanes)), np.zeros((dimension, channels, lanes))
     half = np.zeros((dimension, dimension, lanes))
-    states[0] = first
+    put(states[0], first)
     for t in range(intervals):
         for k in range(blocks):
             gain, factor, noise = steering.gain[t, k], steering.factor[t, k], given.noise[t, k]
             add_outer(across[t, k], states[t, k], gain, -1.0)
             add_outer(noises[t, k], factor, factor, 1.0)
             add_product(noises[t, k], gain, across[t, k], -1.0)
-            moved[:], half[:], spread[:] = given.state[t, k], 0.0, 0.0
+            half[:], spread[:] = 0.0, 0.0
+            put(moved, given.state[t, k])
             add_product(moved, noise, gain, -1.0)
             add_product(half, moved, states[t, k], 1.0)
             add_product(spread, noise, factor, 1.0)
@@ -376,4 +382,4 @@ def _add_symmetric(out: Array, left: Array, right: Array) -> None:
     for i in range(rows):
         for j in range(i + 1):
             add_dot(out, i * rows + j, left, i * inner, 1, right, j * inner, 1, inner, 1.0)
-            out[j, i] = out[i, j]
+            put(out[j, i], out[i, j])

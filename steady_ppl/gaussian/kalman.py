@@ -21,7 +21,7 @@ from numba import njit
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.gaussian.lanes import Array, array
+from steady_ppl.gaussian.lanes import Array, array, put
 from steady_ppl.gaussian.linearize import LinearArrays, Linearization, ReferencePath, linearize
 from steady_ppl.model.problem import Problem
 
@@ -102,10 +102,10 @@ def forward(given: LinearArrays, filtered: FilteredMoments) -> None:
         for b in range(trajectories):
             mean, covariance = filtered.means[t, b], filtered.covariances[t, b]
             if t == 0:
-                mean[:] = given.start_offset[b]
+                put(mean, given.start_offset[b])
                 set_product(covariance, given.start_noise[b], given.start_noise[b].T)
             else:
-                mean[:] = given.offset[t - 1, b]
+                put(mean, given.offset[t - 1, b])
                 add_times(mean, given.state[t - 1, b], filtered.means[t - 1, b])
                 before = filtered.covariances[t - 1, b]
                 propagate(covariance, before, given.state[t - 1, b], given.noise[t - 1, b])
@@ -149,7 +149,7 @@ def backward(given: LinearArrays, filtered: FilteredMoments, arrival: Array, rea
             later[:] = 0.0
             if t < rows - 1:
                 add_times(later, given.state[t, b].T, arrival[t + 1, b])
-            smoothed[t, b] = filtered.means[t, b]
+            put(smoothed[t, b], filtered.means[t, b])
             add_times(smoothed[t, b], filtered.covariances[t, b], later)
             for k in range(components - 1, -1, -1):
                 gain, by_state = filtered.gain[t, b, k], given.measurement[t, b, k]
@@ -171,7 +171,7 @@ def spread_ahead(given: LinearArrays, covariances: Array, horizon: int) -> Array
     pushed = np.zeros((components, given.noise.shape[3]))
     for b in range(trajectories):
         for t in range(rows - horizon):
-            along[:] = given.measurement[t + horizon, b]
+            put(along, given.measurement[t + horizon, b])
             variance = variances[t, b]
             for k in range(components):
                 precision = given.precision[t + horizon, b, k]
@@ -182,7 +182,7 @@ def spread_ahead(given: LinearArrays, covariances: Array, horizon: int) -> Array
                     for push in pushed[k]:
                         variance[k] += push * push
                 set_product(moved, along, given.state[back, b])
-                along[:] = moved
+                put(along, moved)
             for k in range(components):
                 for i in range(dimension):
                     for j in range(dimension):

@@ -86,6 +86,20 @@ def add_dot(typing, out, at, left, first, step, right, start, stride, count, sig
 
 
 @njit(cache=True, error_model="numpy")
+def put(out: Array, values: Array) -> None:
+    """out = values, contiguous and of one shape. `out[:] = values` takes numba seconds to compile."""
+    for i in range(values.size):
+        out.flat[i] = values.flat[i]
+
+
+@njit(cache=True, error_model="numpy")
+def add(out: Array, values: Array, sign: float) -> None:
+    """out += sign · values, contiguous and of one shape."""
+    for i in range(values.size):
+        out.flat[i] += sign * values.flat[i]
+
+
+@njit(cache=True, error_model="numpy")
 def add_product(out: Array, left: Array, right: Array, sign: float) -> None:
     """out += sign · left right."""
     (rows, columns, _), inner = out.shape, left.shape[1]

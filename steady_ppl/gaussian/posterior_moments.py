@@ -3,6 +3,7 @@
 Beside each stand three points of the state, for expectations of what the deviation multiplies: see `likelihood.scores`.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import Lookahead, Steering
-from steady_ppl.gaussian.lanes import Array, add_outer, add_product, out_of_lanes
+from steady_ppl.gaussian.lanes import Array, add_outer, add_product, out_of_lanes, set_scaled
 from steady_ppl.gaussian.linearize import LinearArrays
 
 
@@ -74,15 +75,17 @@ def fill_moments(
     rows, blocks, count, dimension, lanes = given.measurement.shape
     drives, driven = states.shape[2], noise.shape[2]
     then, shift = np.zeros((dimension, driven, lanes)), np.zeros((driven, driven, lanes))
-    by_state, apart = np.zeros((count, dimension, lanes)), np.zeros((count, 1, lanes))
+    weight, apart = np.zeros((count, 1, lanes)), np.zeros((count, 1, lanes))
+    by_state = np.zeros((count, dimension, lanes))
     across, variance = np.zeros((dimension, count, lanes)), np.zeros((count, count, lanes))
     for t in range(rows):
         for k in range(blocks):
             few = min(lanes, drives - k * lanes)
-            weight = np.sqrt(given.precision[t, k])
             for a in range(count):
-                apart[a] = weight[a] * given.residual[t, k, a]
-                by_state[a] = weight[a, 0] * given.measurement[t, k, a]
+                for lane in range(lanes):
+                    weight[a, 0, lane] = math.sqrt(given.precision[t, k, a, 0, lane])
+            set_scaled(apart, given.residual[t, k], weight)
+            set_scaled(by_state, given.measurement[t, k], weight)
             across[:], variance[:] = 0.0, 0.0
             add_product(apart, by_state, deviations[t, k], -1.0)
             add_outer(across, spread[t, k], by_state, -1.0)

@@ -185,7 +185,9 @@ def filter_rows(
                 figures[0, row, b], figures[1, row, b], figures[2, row, b] = found
                 any_exhausted |= found[1] < threshold
         if len(weighed):
-            weighed[:] = log_weights
+            for b in range(trajectories):
+                for n in range(particles):
+                    weighed[b, n] = log_weights[b, n]
         if row == len(moved):
             break
         resampled[r] = any_exhausted
@@ -194,7 +196,8 @@ def filter_rows(
                 chosen = ancestors[r, b]
                 if figures[1, row, b] < threshold:
                     _choose(weights[b], thresholds[r, b], first, chosen)
-                    before[:] = roots[b]
+                    for n in range(particles):
+                        before[n] = roots[b, n]
                     for n in range(particles):
                         roots[b, n] = before[chosen[n]]
                         log_weights[b, n] = even - (seen[1, b, chosen[n]] if inside[row, b] else 0.0)
