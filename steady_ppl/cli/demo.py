@@ -180,7 +180,9 @@ def prove(demo: Demo) -> None:
     )
     figures = read_json(Path("proof.json"), RunError)
     demo.result(figures["verdict"])
-    demo.say(textwrap.indent("\n".join(["", *_summary(figures)]), "     "))
+    demo.say("")
+    for line in _summary(figures):
+        demo.say(f"     {line}")
 
 
 def _summary(figures: Mapping[str, Any]) -> list[str]:

@@ -36,7 +36,7 @@ app = typer.Typer(
 )
 
 
-def register(function: Callable[..., None], about: str, *examples: str, hidden: bool = False) -> None:
+def add_command(function: Callable[..., None], about: str, *examples: str, hidden: bool = False) -> None:
     """Add a command, what `steady --help` says of it, examples for its own help, and whether another one's help names
     it: one screen is full."""
     title = "Example:" if len(examples) == 1 else "Examples:"
@@ -44,9 +44,9 @@ def register(function: Callable[..., None], about: str, *examples: str, hidden: 
     app.command(function.__name__.replace("_", "-"), short_help=about, epilog=epilog, hidden=hidden)(function)
 
 
-register(demo.demo, "Show the whole loop on drives with a hidden effect.", "steady demo --out demo")
-register(make.init, "Make a folder to work in, with first drives.", "steady init lab")
-register(
+add_command(demo.demo, "Show the whole loop on drives with a hidden effect.", "steady demo --out demo")
+add_command(make.init, "Make a folder to work in, with first drives.", "steady init lab")
+add_command(
     make.import_bag,
     "Turn ROS 1 or 2 bags and MCAP files into a table.",
     "steady import-bag drive.bag > mapping.toml",
@@ -54,69 +54,69 @@ register(
     "steady import-bag drive.bag --map u.speed=/cmd_vel:linear.x \\",
     "                            --map y.range=/range:range --step 0.1 --out drive.csv",
 )
-register(
+add_command(
     make.simulate,
     "Simulate drives of a program.",
     "steady simulate models/hovercraft.py --trajectories 16 --out train.csv",
     "steady simulate models/hovercraft.py --effect wind=1,0.5 --out windy.csv",
     "steady simulate mine.py:Boat --controls drives.csv --out again.csv",
 )
-register(
+add_command(
     learn.fit,
     "Learn a program's parameters from measurements.",
     "steady fit mine.py train.csv --valid valid.csv --recipe likelihood --out runs/first",
     "steady fit models/neural_vehicle.py:NeuralHovercraft train.csv --known-start --out runs/net",
     "steady fit mine.py train.csv --recipe svi --set learning_rate=1e-3 --out runs/svi",
 )
-register(
+add_command(
     judge.check,
     "Say where and when a run fails, and who is at fault.",
     "steady check runs/first test.csv --picture check.png",
     "steady check runs/first test.csv --quiet --json - | jq .who",
 )
-register(
+add_command(
     learn.discover,
     "Learn which physical effect a program lacks, or none.",
     "steady discover runs/first train.csv --valid valid.csv --out runs/found",
     "steady discover mine.py drives.csv --json found.json",
 )
-register(
+add_command(
     learn.add,
     "Write a program with physical effects.",
     "steady add runs/found --out models/with_drag.py",
     "steady add models/hovercraft.py yaw_linear_drag=0.05 wind --out models/windy.py",
 )
-register(
+add_command(
     judge.prove,
     "Prove on other drives that runs are better than the first.",
     "steady prove runs/before runs/after test.csv --picture proof.png",
 )
-register(
+add_command(
     judge.evaluate,
     "Errors of runs, against true states where they exist.",
     "steady evaluate runs/first runs/svi test.csv --json errors.json",
 )
-register(
+add_command(
     judge.report,
     "Write all of it on one page of HTML.",
     "steady report runs/before runs/after test.csv --discovery runs/found --out report.html",
 )
-register(
+add_command(
     judge.states,
     "Write where the vehicle probably was.",
     "steady states runs/after test.csv --out states.csv",
     "steady states runs/after test.csv --draws 200 --out states.nc",
 )
-register(
+add_command(
     learn.study,
     "Compute a grid of fits or searches, here or on a cluster.",
     "steady study studies/observation-noise.toml --data logs --out noise",
     "steady study mine.toml --cluster tcp://scheduler:8786 --out mine",
 )
-register(
+add_command(
     learn.plot_study, "Draw what a study has found so far.", "steady plot-study noise --out noise.png", hidden=True
 )
-register(
+add_command(
     learn.effects,
     "List the physical effects that a program may lack.",
     "steady effects",

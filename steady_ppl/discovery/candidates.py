@@ -235,7 +235,8 @@ def _key(column: Column) -> str:
 
 
 def at_its_best_place(now: Refit, candidate: Candidate) -> Candidate:
-    """A candidate with the knee, width or place at which it gains most: on its grid, and then between its points."""
+    """A candidate with its likeliest knee, width or place, on its grid and then between its points, as far as the
+    held-out drives do not clearly deny that."""
     if isinstance(candidate.refit, str) or not candidate.variant.profiled:
         return candidate
     grid, at, tested = _grid(now, candidate), candidate.variant, candidate.tested
@@ -244,11 +245,14 @@ def at_its_best_place(now: Refit, candidate: Candidate) -> Candidate:
         return candidate
     fits: list[tuple[Variant, Fits]] = [(at, begun)]  # each likelier than the one before
 
+    def score(variant: Variant, fitted: Fits) -> float:
+        return gain_of_fits(now, fitted) + _log_prior(variant, grid)
+
     def try_all(variants: Iterable[Variant]) -> None:
         for variant in variants:
             best = fits[-1][1]
             other = fit_near(now, best, [variant])
-            if isinstance(other, Fits) and gain_of_fits(now, other) > gain_of_fits(now, best) + MIN_GAIN_OF_PLACE:
+            if isinstance(other, Fits) and score(variant, other) > score(fits[-1][0], best) + MIN_GAIN_OF_PLACE:
                 fits.append((variant, other))
 
     try_all(variant for variant in grid if variant.label != candidate.variant.label)
@@ -263,8 +267,8 @@ def at_its_best_place(now: Refit, candidate: Candidate) -> Candidate:
         refit = begun if best is begun else judged_fits(best)
         if isinstance(refit, Refit):
             there = judged(now, replace(tested, column=replace(tested.column, variant=variant)), refit)
-            is_denied = candidate.is_judged and there.total < candidate.total - CLEAR_GAIN
-            return candidate if is_denied else there
+            if not candidate.is_judged or there.total >= candidate.total - CLEAR_GAIN:
+                return there
     return candidate
 
 
@@ -328,15 +332,25 @@ def _grid(now: Refit, candidate: Candidate) -> list[Variant]:
     return [variant for variant in every if variant.name == candidate.variant.name]
 
 
+def _log_prior(at: Variant, grid: Sequence[Variant]) -> float:
+    """Of what is uncertain by a factor: a normal in its logarithm, as wide as its grid; the rest has none."""
+    total = 0.0
+    for name in at.effect.by_factor:
+        logs = [math.log(variant.profiled[name]) for variant in grid]
+        if half := 0.5 * (max(logs) - min(logs)):
+            total -= 0.5 * ((math.log(at.profiled[name]) - min(logs)) / half - 1) ** 2
+    return total
+
+
 def _neighbours(at: Variant, grid: Sequence[Variant], name: str, share: float) -> list[Variant]:
     """The effect on either side of a place: by a share of the grid's spacing, or of the value where there is none.
 
-    A scale goes by a share of the grid's ratio.
+    What is uncertain by a factor goes by a share of the grid's ratio.
     """
     value = at.profiled[name]
     values = sorted({float(variant.profiled[name]) for variant in grid})
-    if name in at.effect.scales:
-        ratio = min(b / a for a, b in pairwise(values))
+    if name in at.effect.by_factor:
+        ratio = min((b / a for a, b in pairwise(values)), default=1.8)
         beside = [value * ratio**share, value / ratio**share]
     else:
         apart = min((b - a for a, b in pairwise(values)), default=0.8 * value)

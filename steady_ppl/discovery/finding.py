@@ -22,6 +22,7 @@ from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, unit_of
 from steady_ppl.utils.random import seeded
 
+MAX_LOG_SD = 2.0  # of a factor: beyond it nothing is known but the sign
 BAND_COVERAGE = 0.9  # of the whole band of a curve
 MAX_SIMULATED_DRIVES = 24  # of each proposed excitation
 EXCITATIONS_OF_KIND = 3  # that are held, pushed, stepped and swung
@@ -72,6 +73,9 @@ def _finding(search: Search, found: Found) -> Finding:
     if variant.profiled:
         variance = variance_of_places(found.without, found.candidate)
         places = variance.sqrt().numpy() / (values if is_positive else 1.0)
+    by_factor = 0.0
+    if effect.by_factor:  # one for the whole vector: a component near zero tells none
+        by_factor = min(MAX_LOG_SD, float(np.linalg.norm(places)) / max(1e-12, float(np.linalg.norm(values))))
     of_each = zip(values.tolist(), spread.tolist(), places.tolist(), strict=True)
     spread = np.hypot(spread, places)
     return Finding(
@@ -81,20 +85,19 @@ def _finding(search: Search, found: Found) -> Finding:
         confidence=_confidence(search, found),
         coefficient=values.tolist(),
         sd=(values * spread if is_positive else spread).tolist(),
-        interval=[_interval(effect, *told) for told in of_each],
+        interval=[_interval(effect, *told, by_factor) for told in of_each],
         gain=found.candidate.total,
     )
 
 
-def _interval(effect: Effect, value: float, sd: float, of_places: float) -> tuple[float, float]:
-    """With 90 % probability. A place that is uncertain by a factor makes the coefficient so."""
-    by = HALF_WIDTH * math.hypot(sd, of_places)
+def _interval(effect: Effect, value: float, sd: float, of_places: float, by_factor: float) -> tuple[float, float]:
+    """With 90 % probability, lopsided by what is uncertain by a factor: `by_factor` is the sd of its logarithm."""
     if effect.null != 0:
-        return _around(value, by)
-    if not effect.scales or value == 0:
-        return value - by, value + by
-    low, high = sorted(_around(value, HALF_WIDTH * of_places / abs(value)))
-    return value - math.hypot(HALF_WIDTH * sd, value - low), value + math.hypot(HALF_WIDTH * sd, high - value)
+        return _around(value, HALF_WIDTH * math.hypot(sd, of_places))
+    rest = math.sqrt(max(0.0, of_places**2 - (by_factor * value) ** 2))
+    by = HALF_WIDTH * math.hypot(sd, rest)
+    low, high = sorted(_around(value, HALF_WIDTH * by_factor))
+    return value - math.hypot(by, value - low), value + math.hypot(by, high - value)
 
 
 def _around(value: float, by: float) -> tuple[float, float]:

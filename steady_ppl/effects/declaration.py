@@ -79,7 +79,7 @@ class Effect:
         choices: the function's further arguments, a mapping a choice: channels, controls or component, called `at`, and
             knees, widths or places.
         profiled: the arguments among these that are knees, widths or places.
-        scales: those of the profiled that are positive and uncertain by a factor; their choices are spaced by ratios.
+        by_factor: those of the profiled that are positive and uncertain by a factor; choices are spaced by ratios.
         prior: of the coefficient, a Pyro distribution; a wide-tailed Cauchy of scale `limit` about its absence if None.
         lacks: why it does not apply to a program, or None.
     """
@@ -101,7 +101,7 @@ class Effect:
     probes: tuple[float, ...] = ()
     choices: Callable[[Program, Trajectories | None], Choices] = field(default=lambda program, data: [{}])
     profiled: tuple[str, ...] = ()
-    scales: tuple[str, ...] = ()
+    by_factor: tuple[str, ...] = ()
     prior: Any = None
     lacks: Callable[[Program], str | None] = field(default=lambda program: None)
 
@@ -114,7 +114,7 @@ class Effect:
             (len(typical) == self.size, f"{len(typical)} typical numbers for {self.size} components"),
             (felt, f"its typical coefficient must be finite and not zero, got {self.typical}"),
             (not (self.components and self.sign), "a coefficient of several components has no sign"),
-            (set(self.scales) <= set(self.profiled), f"its scales {self.scales} are not all profiled"),
+            (set(self.by_factor) <= set(self.profiled), f"of {self.by_factor} not all are profiled"),
             (self.limit > 0, f"its limit is a magnitude above zero, got {self.limit}"),
         ):
             if not holds:
@@ -135,6 +135,11 @@ class Effect:
         if self.lacks(program):
             return []
         found = [self.variant(**choice) for choice in self.choices(program, data)]
+        for name in self.by_factor:
+            if any(not variant.options[name] > 0 for variant in found):
+                raise UsageError(
+                    f"effect {self.name}: {name} is uncertain by a factor, so that its choices are above zero"
+                )
         return [replace(variant, unit=_unit(program, variant)) for variant in found]
 
     def variant(self, at: str = "", scale: float = 1.0, **options: Any) -> Variant:

@@ -78,8 +78,8 @@ class Twist(Steered):
         turns = turn.expand_as(self.path)
         share = self.path.new_tensor([untwisted]).expand(*steps.shift.shape[:2], 1)
         steering = (steps.shift, steps.gain, steps.factor, whitening)
-        self.rows = (self.path, turns, self.root, self.target)
-        self.intervals = (self.path[:-1], turns[:-1], *steering, share)  # with the share that is not steered
+        self.rows = (self.path, turns, self.root, self.target)  # path, turns, root and target, see `future`
+        self.intervals = (self.path[:-1], turns[:-1], *steering, share)  # and steering, and the share not steered
 
     def future(self, state: Tensor, *given: Tensor) -> Tensor:
         """−½ |R δ − z|² of every particle's deviation δ from the path: log p(y_{row+1}, …, y_T | state) of the

@@ -15,7 +15,7 @@ from small import finite
 from torch.distributions import constraints
 
 import steady_ppl as st
-from steady_ppl.discovery.candidates import _neighbours, variance_of_places
+from steady_ppl.discovery.candidates import _log_prior, _neighbours, variance_of_places
 from steady_ppl.discovery.curves import knots_of
 from steady_ppl.discovery.discover import NOT_CONVERGED, _note_of_one_drive
 from steady_ppl.discovery.finding import _interval, _spread, next_run
@@ -211,12 +211,30 @@ def test_a_scale_goes_by_factors_and_a_place_by_steps():
 
 
 def test_what_a_factor_leaves_open_is_in_an_interval_by_a_factor():
-    program = example("hovercraft", torch.float32)
-    wind, knee = (chosen_variant(program, name).effect for name in ("wind", "thrust_saturation"))
-    low, high = _interval(wind, -0.5, 0.0, 0.25)
+    effect = chosen_variant(example("hovercraft", torch.float32), "wind").effect
+    low, high = _interval(effect, -0.5, 0.0, 0.25, 0.5)
     assert low * high == pytest.approx(0.25) and low < -0.5 < high < 0
-    assert _interval(wind, 0.5, 0.1, 0.0) == pytest.approx(_interval(knee, 0.5, 0.1, 0.0))
-    assert sum(_interval(knee, 0.5, 0.0, 0.25)) == pytest.approx(1.0)
+    assert sum(_interval(effect, 0.5, 0.1, 0.25, 0.0)) == pytest.approx(1.0)
+    low, high = _interval(effect, 1e-5, 0.02, 0.01, 0.5)  # a component near zero
+    assert high == pytest.approx(-low, rel=0.01) and high < 0.04
+
+
+def test_choices_of_a_factor_are_above_zero():
+    program = example("hovercraft", torch.float32)
+    wind = chosen_variant(program, "wind").effect
+    with pytest.raises(st.UsageError, match="drag is uncertain by a factor"):
+        replace(wind, choices=lambda program, data: [{"drag": 0.0}]).variants(program)
+    (alone,) = replace(wind, choices=lambda program, data: [{"drag": 0.1}]).variants(program)
+    assert [one.profiled["drag"] for one in _neighbours(alone, [alone], "drag", 1.0)] == pytest.approx(
+        [0.18, 0.1 / 1.8]
+    )
+    assert _log_prior(alone, [alone]) == 0.0
+
+
+def test_the_prior_of_a_factor_is_as_wide_as_its_grid():
+    grid = chosen_variant(example("hovercraft", torch.float32), "wind").effect.variants(example("hovercraft"))
+    (least,) = (one for one in grid if one.profiled["drag"] == 0.02)
+    assert _log_prior(least, grid) == pytest.approx(-0.5)
 
 
 @pytest.mark.slow

@@ -228,7 +228,13 @@ def slope(self: Program, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
 
 
 @_where_it_slips(
-    "m/s", typical=(1.0, 0.5), limit=10.0, components=("x", "y"), profiled=("drag",), scales=("drag",), choices=_drags
+    "m/s",
+    typical=(1.0, 0.5),
+    limit=10.0,
+    components=("x", "y"),
+    profiled=("drag",),
+    by_factor=("drag",),
+    choices=_drags,
 )
 def wind(self: Program, state: Tensor, *_: Tensor, c: Tensor, drag: Any) -> Pushes:
     r"""a = -k (v-w)|v-w| + k v|v| per axis, w the world-frame wind (c₁, c₂) in the body frame
