@@ -333,12 +333,13 @@ def _grid(now: Refit, candidate: Candidate) -> list[Variant]:
 
 
 def _log_prior(at: Variant, grid: Sequence[Variant]) -> float:
-    """Of what is uncertain by a factor: a normal in its logarithm, as wide as its grid; the rest has none."""
+    """Of a knee, width or place: a normal as wide as its grid, in the logarithm of what is uncertain by a factor."""
     total = 0.0
-    for name in at.effect.by_factor:
-        logs = [math.log(variant.profiled[name]) for variant in grid]
-        if half := 0.5 * (max(logs) - min(logs)):
-            total -= 0.5 * ((math.log(at.profiled[name]) - min(logs)) / half - 1) ** 2
+    for name, value in at.profiled.items():
+        scale = math.log if name in at.effect.by_factor else float
+        values = [scale(variant.profiled[name]) for variant in grid]
+        if half := 0.5 * (max(values) - min(values)):
+            total -= 0.5 * ((scale(value) - min(values)) / half - 1) ** 2
     return total
 
 

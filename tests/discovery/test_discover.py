@@ -231,8 +231,10 @@ def test_choices_of_a_factor_are_above_zero():
     assert _log_prior(alone, [alone]) == 0.0
 
 
-def test_the_prior_of_a_factor_is_as_wide_as_its_grid():
-    grid = chosen_variant(example("hovercraft", torch.float32), "wind").effect.variants(example("hovercraft"))
+def test_the_prior_of_a_place_is_as_wide_as_its_grid():
+    slip = chosen_variant(example("hovercraft"), "side_slip").effect.variants(example("hovercraft"))  # leads 0 to .5
+    assert _log_prior(replace(slip[0], options={**slip[0].options, "lead": 1.0}), slip) == pytest.approx(-4.5)
+    grid = chosen_variant(example("hovercraft"), "wind").effect.variants(example("hovercraft"))
     (least,) = (one for one in grid if one.profiled["drag"] == 0.02)
     assert _log_prior(least, grid) == pytest.approx(-0.5)
 
