@@ -160,7 +160,10 @@ def filter_rows(
     weighed: Array,
     figures: Array,
 ) -> None:
-    """Take particles through a block's rows; what `tables` holds begins at the table's first row."""
+    """Take particles through a block's rows; what `tables` holds begins at the table's first row.
+
+    Arrays are copied by loops: an assignment to a slice takes numba seconds to compile.
+    """
     measured, moved, observed, inside = tables
     first_row, end, threshold, looks_ahead = settings
     generator, uniform, thresholds = random
