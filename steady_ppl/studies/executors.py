@@ -82,17 +82,23 @@ class _Process:
 
     def __init__(self) -> None:
         self.executor = ProcessPoolExecutor(1, env=ONE_THREAD)
-        self.loaded = self.executor.submit(packages)
+        self.last = self.loaded = self.executor.submit(packages)
         self.died_idle = False
 
     def submit(self, job: Job) -> Future:
         """The job's row, or that the process has died."""
         try:
-            return self.executor.submit(run, job)
+            self.last = self.executor.submit(run, job)
         except BrokenProcessPool as error:
-            self.died_idle, dead = True, Future[ResultRow]()
-            dead.set_exception(error)
-            return dead
+            self.died_idle, self.last = True, Future()
+            self.last.set_exception(error)
+        return self.last
+
+    def end(self) -> None:
+        """Kill it. loky's thread fails where it has not yet taken what was submitted: KeyError."""
+        while not (self.last.running() or self.last.done()):
+            time.sleep(0.001)
+        self.executor.shutdown(kill_workers=True)
 
 
 def _rows(jobs: Sequence[Job], workers: int, died: list[Job], say: Say) -> Generator[ResultRow]:
@@ -110,7 +116,7 @@ def _rows(jobs: Sequence[Job], workers: int, died: list[Job], say: Say) -> Gener
                     unloaded = 0
                     yield future.result()
                     continue
-                process.executor.shutdown(kill_workers=True)
+                process.end()
                 if reason := process.loaded.exception():
                     unloaded += 1
                     if unloaded == MAX_UNLOADED:
@@ -122,7 +128,7 @@ def _rows(jobs: Sequence[Job], workers: int, died: list[Job], say: Say) -> Gener
                     died.append(job)
     finally:
         for process in [*idle, *(process for _, process in running.values())]:
-            process.executor.shutdown(kill_workers=True)
+            process.end()
 
 
 class Cluster(Executor):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -91,6 +93,17 @@ def test_workers_that_die_before_they_begin_end_a_study(tmp_path: Path, monkeypa
     monkeypatch.setattr(executors, "packages", os.abort)  # what a worker does first
     with pytest.raises(ComputationError, match="workers die before they begin: 0 of 6 jobs are kept"):
         run_study(read_plan(written(tmp_path)), tmp_path / "out", Local(2))
+
+
+def test_a_worker_ends_at_once_without_a_word(monkeypatch: pytest.MonkeyPatch):
+    failed: list[BaseException | None] = []
+    monkeypatch.setattr(threading, "excepthook", lambda given: failed.append(given.exc_value))
+    monkeypatch.setattr(executors, "run", time.sleep)
+    for _ in range(20):  # one in ten failed when nothing waited
+        worker = executors._Process()
+        worker.submit(60.0)  # type: ignore[arg-type]
+        worker.end()
+    assert failed == []
 
 
 @pytest.mark.slow
