@@ -299,7 +299,8 @@ def variance_of_places(now: Refit, candidate: Candidate) -> Tensor:
         sign, variant, _, fall = sides[0]
         slope = torch.stack([sign * change for sign, _, change, _ in sides]).mean(0)
         bend = sum(2 * fall for *_, fall in sides) / len(sides)
-        prior = (2 * NEIGHBOUR_SHARE / max(1, len({v.profiled[name] for v in grid}) - 1)) ** 2
+        axis = _axis(at, grid, name)
+        prior = (NEIGHBOUR_SHARE * axis.spacing / axis.half_width) ** 2
         steps.append(_GridStep(name, sign, variant, fall, slope, bend, prior))
     if not steps:
         return variance
@@ -332,28 +333,36 @@ def _grid(now: Refit, candidate: Candidate) -> list[Variant]:
     return [variant for variant in every if variant.name == candidate.variant.name]
 
 
+class _Axis(NamedTuple):
+    """The grid of a knee, width or place, in the logarithm of what is uncertain by a factor."""
+
+    to: Callable[[float], float]
+    back: Callable[[float], float]
+    spacing: float  # the least; of one point: a share of its value
+    middle: float
+    half_width: float
+
+    def deviation(self, value: float) -> float:
+        """From the middle, in half widths: the prior's standard deviations."""
+        return (self.to(value) - self.middle) / self.half_width
+
+
+def _axis(at: Variant, grid: Sequence[Variant], name: str) -> _Axis:
+    by_factor = name in at.effect.by_factor
+    to, back = (math.log, math.exp) if by_factor else (float, float)
+    values = sorted({to(variant.profiled[name]) for variant in grid})
+    alone = math.log(1.8) if by_factor else 0.8 * abs(values[0]) or 1.0
+    spacing = min((b - a for a, b in pairwise(values)), default=alone)
+    return _Axis(to, back, spacing, 0.5 * (values[0] + values[-1]), 0.5 * max(values[-1] - values[0], spacing))
+
+
 def _log_prior(at: Variant, grid: Sequence[Variant]) -> float:
-    """Of a knee, width or place: a normal as wide as its grid, in the logarithm of what is uncertain by a factor."""
-    total = 0.0
-    for name, value in at.profiled.items():
-        scale = math.log if name in at.effect.by_factor else float
-        values = [scale(variant.profiled[name]) for variant in grid]
-        if half := 0.5 * (max(values) - min(values)):
-            total -= 0.5 * ((scale(value) - min(values)) / half - 1) ** 2
-    return total
+    """Of a knee, width or place: a normal as wide as its grid."""
+    return -0.5 * sum(_axis(at, grid, name).deviation(value) ** 2 for name, value in at.profiled.items())
 
 
 def _neighbours(at: Variant, grid: Sequence[Variant], name: str, share: float) -> list[Variant]:
-    """The effect on either side of a place: by a share of the grid's spacing, or of the value where there is none.
-
-    What is uncertain by a factor goes by a share of the grid's ratio.
-    """
-    value = at.profiled[name]
-    values = sorted({float(variant.profiled[name]) for variant in grid})
-    if name in at.effect.by_factor:
-        ratio = min((b / a for a, b in pairwise(values)), default=1.8)
-        beside = [value * ratio**share, value / ratio**share]
-    else:
-        apart = min((b - a for a, b in pairwise(values)), default=0.8 * value)
-        beside = [value + share * apart, value - share * apart]
+    """The effect on either side of a place, by a share of the grid's spacing."""
+    axis, value = _axis(at, grid, name), at.profiled[name]
+    beside = [axis.back(axis.to(value) + sign * share * axis.spacing) for sign in (1, -1)]
     return [replace(at, options={**at.options, name: place}) for place in beside]

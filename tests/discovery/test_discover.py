@@ -15,7 +15,7 @@ from small import finite
 from torch.distributions import constraints
 
 import steady_ppl as st
-from steady_ppl.discovery.candidates import _log_prior, _neighbours, variance_of_places
+from steady_ppl.discovery.candidates import _axis, _log_prior, _neighbours, variance_of_places
 from steady_ppl.discovery.curves import knots_of
 from steady_ppl.discovery.discover import NOT_CONVERGED, _note_of_one_drive
 from steady_ppl.discovery.finding import _interval, _spread, next_run
@@ -229,6 +229,22 @@ def test_choices_of_a_factor_are_above_zero():
         [0.18, 0.1 / 1.8]
     )
     assert _log_prior(alone, [alone]) == 0.0
+
+
+def test_the_prior_of_a_place_and_its_variance_are_one():
+    """Leads of 0, .2 and .5 s: a step of a quarter of .2 s is .2 of half the grid's width."""
+    slip = chosen_variant(example("hovercraft"), "side_slip").effect.variants(example("hovercraft"))
+    middle = replace(slip[0], options={**slip[0].options, "lead": 0.25})
+    axis, falls = (
+        _axis(middle, slip, "lead"),
+        [_log_prior(one, slip) for one in _neighbours(middle, slip, "lead", 0.25)],
+    )
+    assert -2 * sum(falls) / 2 == pytest.approx((0.25 * axis.spacing / axis.half_width) ** 2) == pytest.approx(0.04)
+
+
+def test_a_grid_of_one_point_at_zero_has_neighbours():
+    flat = chosen_variant(example("hovercraft"), "thrust_saturation", knee=0.0)
+    assert [one.profiled["knee"] for one in _neighbours(flat, [flat], "knee", 0.25)] == [0.25, -0.25]
 
 
 def test_the_prior_of_a_place_is_as_wide_as_its_grid():
