@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from steady_ppl.gaussian.kalman import Tracked, track
 from steady_ppl.gaussian.linearize import ReferencePath, require_linear
 from steady_ppl.gaussian.predict import Prediction, named_horizons, predict, simulate_again, states_ahead
 from steady_ppl.gaussian.smoother import find_and_smooth, smooth
+from steady_ppl.kernels.jit import unchanged
 from steady_ppl.likelihood.evidence import neglected
 from steady_ppl.likelihood.scores import measured, substep_spreads
 from steady_ppl.model.problem import Problem
@@ -85,8 +87,7 @@ def paired(ours: Sums, theirs: Sums, *, seed: int) -> Change | None:
         return None
     ours, theirs = (replace(sums, total=sums.total[both], count=sums.count[both]) for sums in (ours, theirs))
     drives = int(both.sum())
-    drawn = np.random.default_rng([seed, drives]).multinomial(drives, np.full(drives, 1 / drives), RESAMPLES)
-    weights = np.concatenate([np.ones((1, drives)), drawn])
+    weights = _weights(drives, seed)
     one, other = ours.of(weights), theirs.of(weights)
     if not np.isfinite(one).all() or not np.isfinite(other).all():
         return None
@@ -98,6 +99,13 @@ def paired(ours: Sums, theirs: Sums, *, seed: int) -> Change | None:
     for values in changes:
         found += [float(values[0]), np.quantile(values[1:], [tail, 1 - tail]).tolist()]
     return Change(*found)
+
+
+@lru_cache(maxsize=2)
+def _weights(drives: int, seed: int) -> np.ndarray:
+    """How often each drive counts, `(1 + R, B)`: once, and in each resample."""
+    drawn = np.random.default_rng([seed, drives]).multinomial(drives, np.full(drives, 1 / drives), RESAMPLES)
+    return np.concatenate([np.ones((1, drives)), drawn])
 
 
 @dataclass(frozen=True)
@@ -131,17 +139,18 @@ def judge_program(
     problem = Problem(program, for_program(program, data), known_start)
     unseen = problem.without_truth()
     require_linear(unseen, f"{name}: prove needs programs that can be linearised", " (`steady evaluate` takes any)")
-    try:
-        with seeded(seed, "prove"):
-            ahead = find_and_smooth(unseen, path=path)
-    except FilterError as error:
-        raise FilterError(f"{name}: {error}", trajectory=error.trajectory, time=error.time) from error
-    judged = compare_predictions(problem, ahead)
-    try:
-        with seeded(seed, "prove by particles"):
-            return replace(judged, neglected=neglected(program, unseen.data, known_start=known_start, ahead=ahead))
-    except FilterError as error:
-        return replace(judged, neglected=str(error))
+    with unchanged(program):
+        try:
+            with seeded(seed, "prove"):
+                ahead = find_and_smooth(unseen, path=path)
+        except FilterError as error:
+            raise FilterError(f"{name}: {error}", trajectory=error.trajectory, time=error.time) from error
+        judged = compare_predictions(problem, ahead)
+        try:
+            with seeded(seed, "prove by particles"):
+                return replace(judged, neglected=neglected(program, unseen.data, known_start=known_start, ahead=ahead))
+        except FilterError as error:
+            return replace(judged, neglected=str(error))
 
 
 def compare_predictions(problem: Problem, ahead: Lookahead) -> Judged:
