@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from llvmlite import ir
+from numba.core import cgutils
 
 from steady_ppl.kernels.graph import PARTICLE, Elementwise, NotCompilable, Product, ScalarGraph
 from steady_ppl.kernels.simd import FLOAT, OPERATIONS, Lanes
@@ -57,18 +58,8 @@ class _Writer:
     @contextmanager
     def _loop(self, end: Any, step: int = 1) -> Any:
         """for i in range(0, end, step)."""
-        builder, before = self.builder, self.builder.block
-        head, body, after = (builder.append_basic_block(name) for name in ("head", "body", "after"))
-        builder.branch(head)
-        builder.position_at_end(head)
-        i = builder.phi(LONG)
-        i.add_incoming(LONG(0), before)
-        builder.cbranch(builder.icmp_signed("<", i, end), body, after)
-        builder.position_at_end(body)
-        yield i
-        i.add_incoming(builder.add(i, LONG(step)), builder.block)
-        builder.branch(head)
-        builder.position_at_end(after)
+        with cgutils.for_range_slice(self.builder, LONG(0), end, LONG(step)) as (i, _):
+            yield i
 
     def _reserve(self, kind: Any, count: int) -> Any:
         with self.builder.goto_block(self.entry):
@@ -137,7 +128,6 @@ class _Writer:
             self.values[number] = Lanes(builder, builder.load(place))
 
     def scalar(self, number: int) -> Lanes:
-        """The value of a scalar of the graph."""
         if number in self.values:
             return self.values[number]
         operation, arguments = self.graph.scalars[number]

@@ -289,10 +289,6 @@ class Tangents:
         return self.graph.each(operation, *lists)
 
 
-def _over(d: Tangents, value: Values, x: Values) -> Values:
-    return d.do("div", value, x)
-
-
 def _silu(d: Tangents, value: Values, x: Values) -> tuple[Values, ...]:
     share = d.do("sigmoid", x)
     return (d.do("add", share, d.do("mul", value, d.do("sub", 1.0, share))),)
@@ -312,13 +308,13 @@ PARTIALS: dict[str, Callable[..., tuple[Values | None, ...]]] = {
     "add": lambda d, value, x, y: (None, None),
     "sub": lambda d, value, x, y: (None, d.constants(-1.0, value)),
     "mul": lambda d, value, x, y: (y, x),
-    "div": lambda d, value, x, y: (d.do("reciprocal", y), d.do("neg", _over(d, value, y))),
+    "div": lambda d, value, x, y: (d.do("reciprocal", y), d.do("neg", d.do("div", value, y))),
     "neg": lambda d, value, x: (d.constants(-1.0, value),),
     "number": lambda d, value, x: (None,),
     "abs": lambda d, value, x: (d.do("sign", x),),
     "square": lambda d, value, x: (d.do("mul", x, 2.0),),
-    "sqrt": lambda d, value, x: (_over(d, d.constants(0.5, value), value),),
-    "rsqrt": lambda d, value, x: (d.do("mul", _over(d, value, x), -0.5),),
+    "sqrt": lambda d, value, x: (d.do("div", 0.5, value),),
+    "rsqrt": lambda d, value, x: (d.do("mul", d.do("div", value, x), -0.5),),
     "reciprocal": lambda d, value, x: (d.do("neg", d.do("mul", value, value)),),
     "sin": lambda d, value, x: (d.do("cos", x),),
     "cos": lambda d, value, x: (d.do("neg", d.do("sin", x)),),
@@ -335,7 +331,7 @@ PARTIALS: dict[str, Callable[..., tuple[Values | None, ...]]] = {
     "asin": lambda d, value, x: (_asin_slope(d, x),),
     "acos": lambda d, value, x: (d.do("neg", _asin_slope(d, x)),),
     "atan2": _atan2,
-    "hypot": lambda d, value, x, y: (_over(d, x, value), _over(d, y, value)),
+    "hypot": lambda d, value, x, y: (d.do("div", x, value), d.do("div", y, value)),
     "pow": lambda d, value, x, y: (
         d.do("mul", y, d.do("pow", x, d.do("sub", y, 1.0))),
         d.do("mul", value, d.do("log", x)),

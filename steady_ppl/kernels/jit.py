@@ -86,9 +86,7 @@ def _compiling() -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Number:
-    """One learnable number."""
-
-    parameter: Tensor
+    parameter: Tensor  # learnable
     index: int  # in its flat form
     step: float  # by which finite differences move it
 

@@ -39,8 +39,6 @@ def fallback_notes(why: Mapping[str, str]) -> list[str]:
 
 
 class Computed(NamedTuple):
-    """A function on all rows."""
-
     values: Tensor  # (rows, B, V)
     jacobians: list[Tensor]  # in each argument that was asked for, (rows, B, V, ·)
     in_plain_torch: str | None  # why no kernel served; None where one did or was not worth it
@@ -125,11 +123,10 @@ def slopes_on_all_rows(
     function: Callable[..., Tensor],
     arguments: dict[str, Tensor],
     numbers: Sequence[Number],
-    kernels: bool | None = None,
 ) -> Slopes | str | None:
     """A function's slopes in a program's learnable numbers, if by a kernel; why there is none; or None where it is not
     worth one. The arguments are those of `on_all_rows`."""
-    found = _computed(program, name, function, arguments, kernels, by_parameters=True)
+    found = _computed(program, name, function, arguments, None, by_parameters=True)
     if not isinstance(found, tuple):
         return found
     method, values, rest = found
@@ -150,11 +147,10 @@ def _computed(
     """The kernel, the function's value and the derivatives `(rows, B, ·)`."""
     first = next(iter(arguments.values()))
     rows, trajectories = first.shape[:2]
-    if kernels is None:
-        kernels = rows * trajectories >= ROWS_WORTH_COMPILING
-    if not kernels:
+    cells = rows * trajectories
+    if not (cells >= ROWS_WORTH_COMPILING if kernels is None else kernels):
         return None
-    if rows * trajectories < SIMD_LANES:
+    if cells < SIMD_LANES:
         return f"fewer than {SIMD_LANES} rows"
     if first.device.type != "cpu" or first.dtype != torch.float32:
         return f"{str(first.dtype).removeprefix('torch.')} on {first.device.type}"
@@ -165,7 +161,10 @@ def _computed(
     )
     if isinstance(method, str):
         return _noted(name, method)
-    found = _run(method, program, arguments, rows, trajectories)
+    inputs = [value.float().reshape(cells, 1, -1).permute(2, 1, 0).contiguous().numpy() for value in arguments.values()]
+    out = torch.empty(len(method.graph.outputs), 1, cells)
+    method.kernel(method.parameters(program), np.zeros((1, 0), np.float32), inputs, None, out.numpy())
+    found = out.squeeze(1).t().reshape(rows, trajectories, -1)
     values, rest = found[..., : method.values], found[..., method.values :]
     runs = _RUNS.setdefault(program, Counter())
     runs[method] += 1
@@ -190,12 +189,3 @@ def _noted(name: str, reason: str) -> str:
 def _subsample(values: Tensor) -> Tensor:
     """Some sixteen of all rows, `(1, ·, ·)`."""
     return values.flatten(0, 1)[None, :: max(1, values.shape[0] * values.shape[1] // SIMD_LANES)]
-
-
-def _run(method: Method, program: nn.Module, arguments: dict[str, Tensor], rows: int, trajectories: int) -> Tensor:
-    """Everything that the kernel computes, `(rows, B, ·)`."""
-    cells = rows * trajectories
-    inputs = [value.float().reshape(cells, 1, -1).permute(2, 1, 0).contiguous().numpy() for value in arguments.values()]
-    out = torch.empty(len(method.graph.outputs), 1, cells)
-    method.kernel(method.parameters(program), np.zeros((1, 0), np.float32), inputs, None, out.numpy())
-    return out.squeeze(1).t().reshape(rows, trajectories, -1)

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import llvmlite
+import numba
 from llvmlite import binding
 
 ENVIRONMENT_VARIABLE = "STEADY_KERNEL_CACHE"
@@ -41,8 +42,8 @@ def machine_code(key: str, text: Callable[[], str]) -> Any:
     """The engine of a kernel, from the disk if its code is there.
 
     Args:
-        key: a digest of all that the text is made of. With the sources of this package, its version and that of
-            llvmlite it must determine the text: kernels of the same key are taken for the same.
+        key: a digest of all that the text is made of. With the sources of this package, its version and those of
+            numba and llvmlite it must determine the text: kernels of the same key are taken for the same.
         text: writes the code for LLVM, which must hold no address. It is called only where none is kept.
     """
     name, made = _name(key), list[bytes]()
@@ -87,7 +88,8 @@ def _versions() -> tuple[str, ...]:
     sources = sha256()  # a line of theirs may change without a new version
     for file in sorted(Path(__file__).parent.glob("*.py")):
         sources.update(file.read_bytes())
-    return ours, sources.hexdigest(), llvmlite.__version__, ".".join(map(str, binding.llvm_version_info))
+    llvm = ".".join(map(str, binding.llvm_version_info))
+    return ours, sources.hexdigest(), numba.__version__, llvmlite.__version__, llvm
 
 
 def _digest(name: str, code: bytes) -> bytes:

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 import pyro.distributions as dist
 import torch
-from pyro.distributions import constraints
 from torch import Tensor
 
 from steady_ppl.utils.angles import wrap
@@ -14,7 +13,6 @@ from steady_ppl.utils.angles import wrap
 class _Wrapped:
     """A density of the difference of two angles, wrapped to [−π, π]."""
 
-    support = constraints.real
     loc: Tensor
 
     def residual(self, value: Tensor) -> Tensor:

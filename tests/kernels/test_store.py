@@ -126,7 +126,7 @@ def test_other_versions_and_processors_have_code_of_their_own(folder, monkeypatc
                 patch.setattr(store, part, lambda now=now, k=k: (*now[:k], "another", *now[k + 1 :]))
                 names.add(store._name("a"))
     monkeypatch.setattr(store, "MAGIC", b"another format\n")
-    assert len({*names, store._name("a")}) == 2 + 4 + 3 + 1
+    assert len({*names, store._name("a")}) == 2 + 5 + 3 + 1
 
 
 def test_a_text_that_cannot_be_written_leaves_nothing(folder):
