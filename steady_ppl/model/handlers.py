@@ -18,6 +18,7 @@ from torch import Tensor
 from steady_ppl.errors import ProgramError
 from steady_ppl.model.program import Program
 
+EVENT_HINT = "(is .to_event(1) missing?)"
 NEEDS_NORMAL = (  # ends the message of `normal_moments`
     ": looking ahead needs normal noise with independent components (a scalar or a vector); --recipe steady --guide "
     "bootstrap takes any"
@@ -52,11 +53,8 @@ class Observing(ByColumn):
     def __exit__(self, *exception: Any) -> None:
         super().__exit__(*exception)
         if exception[0] is None and self.column != self.measurements.shape[-1]:
-            raise ProgramError(
-                f"observe sampled {self.column} measurement components, the program declares "
-                f"{self.measurements.shape[-1]}",
-                site="observe",
-            )
+            declares = f"the program declares {self.measurements.shape[-1]}"
+            raise ProgramError(f"observe sampled {self.column} measurement components, {declares}", site="observe")
 
     def _pyro_sample(self, message: Any) -> None:
         fn, name = message["fn"], message["name"]
@@ -64,32 +62,26 @@ class Observing(ByColumn):
             raise ProgramError(f"site {name!r} of observe has obs=: leave it out, the engine conditions", site=name)
         columns = self.take(fn)
         if fn.event_dim > 1 or self.column > self.measurements.shape[-1]:
-            raise ProgramError(
-                f"site {name!r} of observe has event shape {tuple(fn.event_shape)}; expected a scalar or a vector, and "
-                f"{self.measurements.shape[-1]} declared measurement components in all",
-                site=name,
-            )
+            wanted = f"a scalar or a vector, and {self.measurements.shape[-1]} declared measurement components in all"
+            what = f"has event shape {tuple(fn.event_shape)}; expected {wanted}"
+            raise ProgramError(f"site {name!r} of observe {what}", site=name)
         value, observed = self.measurements[..., columns], self.observed[..., columns]
         if fn.event_dim == 0:
             value, observed = value[..., 0], observed[..., 0]
             try:
                 fn = fn.mask(observed)
             except ValueError:
-                raise ProgramError(
-                    f"site {name!r} of observe has batch shape {tuple(fn.batch_shape)}, which does not fit rows and "
-                    f"trajectories {tuple(observed.shape)} (is .to_event(1) missing?)",
-                    site=name,
-                ) from None
+                what = f"which does not fit rows and trajectories {tuple(observed.shape)} {EVENT_HINT}"
+                batch = f"site {name!r} of observe has batch shape {tuple(fn.batch_shape)}"
+                raise ProgramError(f"{batch}, {what}", site=name) from None
         elif isinstance(fn, dist.Independent) and fn.base_dist.event_dim == 0:
             fn = fn.base_dist.mask(observed).to_event(1)
         else:
             whole = observed.all(-1)
             if bool((observed.any(-1) & ~whole).any()):
-                raise ProgramError(
-                    f"site {name!r} has correlated components ({type(fn).__name__}), of which some are missing: "
-                    "independent components (to_event(1)) can be masked one by one, these cannot",
-                    site=name,
-                )
+                some = f"correlated components ({type(fn).__name__}), of which some are missing"
+                why = "independent components (to_event(1)) can be masked one by one, these cannot"
+                raise ProgramError(f"site {name!r} has {some}: {why}", site=name)
             fn = fn.mask(whole)
         message["fn"], message["value"], message["is_observed"] = fn, value, True
         message["scale"] = message["scale"] * self.weight
@@ -108,11 +100,9 @@ class Broadcasting(Messenger):
         try:
             message["fn"] = fn.expand(broadcast_shapes(fn.batch_shape, self.left))
         except RuntimeError:
-            raise ProgramError(
-                f"site {message['name']!r} has batch shape {tuple(fn.batch_shape)} and event shape "
-                f"{tuple(fn.event_shape)} on states of batch shape {self.left} (is .to_event(1) missing?)",
-                site=message["name"],
-            ) from None
+            name, batch = message["name"], f"batch shape {tuple(fn.batch_shape)}"
+            what = f"{batch} and event shape {tuple(fn.event_shape)} on states of batch shape {self.left} {EVENT_HINT}"
+            raise ProgramError(f"site {name!r} has {what}", site=name) from None
 
 
 @contextmanager
@@ -134,11 +124,9 @@ class KnownStart(Messenger):
         width = message["fn"].event_shape.numel()
         whole = message["fn"].event_dim == 1 and width <= self.state.shape[-1]
         if not whole or bool((self.state[..., width:] != 0).any()):
-            raise ProgramError(
-                f"a known start needs initial() to sample the whole state as one site of event shape "
-                f"({self.state.shape[-1]},); site {message['name']!r} has {tuple(message['fn'].event_shape)}",
-                site=message["name"],
-            )
+            name, has = message["name"], tuple(message["fn"].event_shape)
+            wanted = f"to sample the whole state as one site of event shape ({self.state.shape[-1]},)"
+            raise ProgramError(f"a known start needs initial() {wanted}; site {name!r} has {has}", site=name)
         message["fn"] = dist.Delta(self.state[..., :width], event_dim=1)  # what is left rests
 
 
@@ -239,10 +227,8 @@ def normal_moments(fn: Any, site: str) -> tuple[Tensor, Tensor]:
     ProgramError."""
     base = unwrapped(fn)
     if not isinstance(base, dist.Normal) or fn.event_dim > 1:
-        raise ProgramError(
-            f"site {site!r} is {type(base).__name__} with event shape {tuple(fn.event_shape)}{NEEDS_NORMAL}",
-            site=site,
-        )
+        what = f"{type(base).__name__} with event shape {tuple(fn.event_shape)}"
+        raise ProgramError(f"site {site!r} is {what}{NEEDS_NORMAL}", site=site)
     return base.loc, base.scale
 
 

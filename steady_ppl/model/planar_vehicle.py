@@ -219,11 +219,9 @@ class UnknownMap(PlanarVehicle):
         super().__init__()
         declared = super().landmarks
         if not len(declared):
-            raise ProgramError(
-                f"program {type(self).__name__}: UnknownMap stands before the vehicle that declares landmarks, as in "
-                "class Mine(UnknownMap, Hovercraft)",
-                site="__init__",
-            )
+            example = "class Mine(UnknownMap, Hovercraft)"
+            about = f"UnknownMap stands before the vehicle that declares landmarks, as in {example}"
+            raise ProgramError(f"program {type(self).__name__}: {about}", site="__init__")
         for index in self.surveyed:
             if not 0 <= index < len(declared):
                 about = f"surveyed names landmark {index}, there are 0 to {len(declared) - 1}"

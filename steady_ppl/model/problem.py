@@ -37,5 +37,4 @@ class Problem:
         return replace(self, data=self.data.without_truth(keep_start=self.known_start))
 
     def subset(self, index: Sequence[int] | Tensor) -> Problem:
-        """The problem of some of the drives."""
         return replace(self, data=self.data.subset(index))

@@ -178,10 +178,8 @@ class Program(PyroModule):
 
     def transition(self, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Tensor:
         """Sample the channel noise and move on by `step`; returns the next state, `(..., D)`."""
-        raise ProgramError(
-            f"program {type(self).__name__} lacks the method transition(self, state, control, time, step)",
-            site="transition",
-        )
+        method = "transition(self, state, control, time, step)"
+        raise ProgramError(f"program {type(self).__name__} lacks the method {method}", site="transition")
 
     def observe(self, state: Tensor) -> None:
         """Sample the measurement of `state`, without `obs=`: the engine conditions and masks."""

@@ -157,11 +157,9 @@ def require_convergence(program: Program, state: Tensor, control: Tensor, time: 
     """Raise ProgramError for a program whose actuators count rows, or whose rows, given as to `advance`, at K and 2 K
     substeps differ more for large K than for small ones."""
     if counts_rows(program):
-        raise ProgramError(
-            f"program {type(program).__name__}: actuators counts rows and not seconds, which is another delay in "
-            "substeps; shift commands by `time`, for example with steady_ppl.delayed",
-            site="actuators",
-        )
+        what = "actuators counts rows and not seconds, which is another delay in substeps"
+        how = "shift commands by `time`, for example with steady_ppl.delayed"
+        raise ProgramError(f"program {type(program).__name__}: {what}; {how}", site="actuators")
 
     def ends(count: int) -> Tensor:
         return _after(with_substeps(program, count), state, (control, time, step), 1.0)
@@ -171,11 +169,9 @@ def require_convergence(program: Program, state: Tensor, control: Tensor, time: 
     beyond = torch.where(fine.isfinite(), beyond, torch.inf)
     if bool((beyond > 0).any()):
         component = program.state_names[int(beyond.argmax())]
-        raise ProgramError(
-            f"program {type(program).__name__}: transition is no step in `step`: at K and 2 K substeps {component} "
-            "goes apart as K grows; move the state in proportion to `step`, with noise that does not depend on it",
-            site="transition",
-        )
+        what = f"transition is no step in `step`: at K and 2 K substeps {component} goes apart as K grows"
+        how = "move the state in proportion to `step`, with noise that does not depend on it"
+        raise ProgramError(f"program {type(program).__name__}: {what}; {how}", site="transition")
 
 
 def _probe_points(program: Program, data: Trajectories) -> tuple[Tensor, _Given]:

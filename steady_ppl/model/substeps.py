@@ -209,11 +209,9 @@ def location_and_scale(fn: Any, site: str) -> tuple[Tensor, Tensor]:
     """Return location and scale of a channel's distribution, each `(...)` or `(..., C)`; ProgramError without them."""
     base = unwrapped(fn)
     if not isinstance(base, dist.Normal | dist.StudentT | dist.Laplace | dist.Cauchy):
-        raise ProgramError(
-            f"site {site!r} is {type(base).__name__}: substeps need channel noise with a location and a scale "
-            "(Normal, StudentT, Laplace, Cauchy), which can be held over a row",
-            site=site,
-        )
+        kinds = "with a location and a scale (Normal, StudentT, Laplace, Cauchy), which can be held over a row"
+        what = f"site {site!r} is {type(base).__name__}: substeps need channel noise {kinds}"
+        raise ProgramError(what, site=site)
     return base.loc, base.scale
 
 

@@ -11,7 +11,7 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from steady_ppl.errors import ProgramError, SteadyError
-from steady_ppl.model.handlers import Broadcasting, Observing, Recording, Replaying, draw_starts, running
+from steady_ppl.model.handlers import EVENT_HINT, Broadcasting, Observing, Recording, Replaying, draw_starts, running
 from steady_ppl.model.program import Program, names
 from steady_ppl.model.stability import require_convergence
 from steady_ppl.model.substeps import MAX_SUBSTEPS, is_count
@@ -52,11 +52,8 @@ def probe(program: Program) -> None:
         _, seen = _call(name, "observe", lambda: program.observe(state), LEFT, observing)
         density = seen.total()
         if density.shape != LEFT:
-            raise ProgramError(
-                f"program {name}: the density of observe has shape {tuple(density.shape)}; expected {LEFT} "
-                "(is .to_event(1) missing?)",
-                site="observe",
-            )
+            what = f"the density of observe has shape {tuple(density.shape)}; expected {LEFT} {EVENT_HINT}"
+            raise ProgramError(f"program {name}: {what}", site="observe")
         _check_sites(name, started, noise, seen)
 
         # one element alone must come out as it did among the others
@@ -70,11 +67,9 @@ def probe(program: Program) -> None:
         pairs += [("transition", _density(noise, site).expand(LEFT), _density(moved, site)) for site in noise.values]
         for method, among, by_itself in (*pairs, ("observe", density, again.total())):
             if not torch.allclose(among[draw, row, drive], by_itself, rtol=1e-3, atol=1e-4, equal_nan=True):
-                raise ProgramError(
-                    f"program {name}: {method} mixes draws, rows or trajectories: one alone gives another result than "
-                    "among others; work on the last dimension only (no sum or mean over the others)",
-                    site=method,
-                )
+                what = "mixes draws, rows or trajectories: one alone gives another result than among others"
+                how = "work on the last dimension only (no sum or mean over the others)"
+                raise ProgramError(f"program {name}: {method} {what}; {how}", site=method)
 
 
 def _misdeclared(program: Program) -> Iterator[str]:
@@ -109,11 +104,9 @@ def _check_noise(name: str, noise: Recording) -> None:
     for site, value in noise.values.items():
         fn = noise.distributions[site]
         if fn.event_dim > 1 or tuple(value.shape[: value.dim() - fn.event_dim]) != LEFT:
-            raise ProgramError(
-                f"program {name}: site {site!r} of transition has shape {tuple(value.shape)} with event shape "
-                f"{tuple(fn.event_shape)}; expected {LEFT} and at most one event dimension (is .to_event(1) missing?)",
-                site=site,
-            )
+            has = f"shape {tuple(value.shape)} with event shape {tuple(fn.event_shape)}"
+            what = f"has {has}; expected {LEFT} and at most one event dimension {EVENT_HINT}"
+            raise ProgramError(f"program {name}: site {site!r} of transition {what}", site=site)
 
 
 def _check_sites(name: str, *recordings: Recording) -> None:
@@ -137,11 +130,9 @@ class _RecordingOnce(Recording):
         try:
             super()._pyro_post_sample(message)
         except (ValueError, RuntimeError) as error:
-            raise ProgramError(
-                f"site {name!r}, of batch shape {tuple(message['fn'].batch_shape)} and event shape "
-                f"{tuple(message['fn'].event_shape)}, cannot be scored: {one_line(error)} (is .to_event(1) missing?)",
-                site=name,
-            ) from error
+            batch, event = tuple(message["fn"].batch_shape), tuple(message["fn"].event_shape)
+            what = f"of batch shape {batch} and event shape {event}, cannot be scored: {one_line(error)} {EVENT_HINT}"
+            raise ProgramError(f"site {name!r}, {what}", site=name) from error
 
 
 def _call(
@@ -159,7 +150,7 @@ def _call(
             raise
         except Exception as error:
             on = "" if method == "initial" else f" on states of shape {LEFT} + (D,)"
-            hint = " (is .to_event(1) missing?)" if "broadcast" in str(error) else ""
+            hint = f" {EVENT_HINT}" if "broadcast" in str(error) else ""
             raise ProgramError(f"program {name}: {method} failed{on}: {one_line(error)}{hint}", site=method) from error
 
 
@@ -170,17 +161,12 @@ def _density(recording: Recording, site: str) -> Tensor:
 def _check_state(method: str, state: object, size: int) -> None:
     if not isinstance(state, Tensor) or state.shape[-1:] != (size,):
         came = f"shape {tuple(state.shape)}" if isinstance(state, Tensor) else type(state).__name__
-        raise ProgramError(
-            f"{method} must return a state whose last dimension holds the {size} declared components; "
-            f"it returned {came}",
-            site=method,
-        )
+        wanted = f"a state whose last dimension holds the {size} declared components"
+        raise ProgramError(f"{method} must return {wanted}; it returned {came}", site=method)
     if method == "transition" and state.shape[:-1] != LEFT:
-        raise ProgramError(
-            f"transition returned shape {tuple(state.shape)} for states of shape {(*LEFT, size)}: write it for any "
-            "shape on the left, with the component last",
-            site=method,
-        )
+        returned = f"shape {tuple(state.shape)} for states of shape {(*LEFT, size)}"
+        how = "write it for any shape on the left, with the component last"
+        raise ProgramError(f"transition returned {returned}: {how}", site=method)
 
 
 def start_size(program: Program) -> int:
