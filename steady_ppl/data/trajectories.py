@@ -106,12 +106,10 @@ class Trajectories(Displayed):
     @property
     def known_start(self) -> Tensor:
         """`(B, D)` the true first states; DataError where they are not all known."""
-        self.require_known_start()
-        assert self.states is not None
-        return self.states[0]
+        return self.require_known_start()
 
-    def require_known_start(self) -> None:
-        """Raise DataError where the true first states are not all known."""
+    def require_known_start(self) -> Tensor:
+        """The same, as a check."""
         if self.states is None:
             wanted = "the true states of every trajectory's first row"
             raise DataError(f"a known start needs {wanted}: the table has no x. columns")
@@ -119,14 +117,15 @@ class Trajectories(Displayed):
             column, label = f"x.{self.state_names[component]}", self.labels[trajectory]
             problem = f"a known start needs every trajectory's first state: {column} of trajectory {label} is empty"
             raise DataError(problem, column=column, trajectory=label, row=1)
+        return self.states[0]
 
     def subset(self, index: Sequence[int] | Tensor) -> Trajectories:
         """The trajectories at `index`, still padded to the same number of rows."""
         index = torch.as_tensor(index, dtype=torch.long, device=self.time.device)
-        chosen = self._each(lambda rows: rows[:, index])
+        chosen = self.with_rows(lambda rows: rows[:, index])
         return replace(chosen, lengths=self.lengths[index], labels=tuple(self.labels[int(i)] for i in index))
 
-    def _each(self, change: Callable[[Tensor], Tensor]) -> Trajectories:
+    def with_rows(self, change: Callable[[Tensor], Tensor]) -> Trajectories:
         """The same with every tensor of rows changed."""
         names = ("time", "controls", "measurements", "observed", "states")
         rows = {name: getattr(self, name) for name in names}
@@ -152,10 +151,9 @@ class Trajectories(Displayed):
         plan = torch.as_tensor(controls).to(self.controls)
         plan = plan.unsqueeze(1).expand(-1, len(self), -1) if plan.dim() == 2 else plan
         if plan.dim() != 3 or not len(plan) or plan.shape[1:] != self.controls.shape[1:]:
-            raise DataError(
-                f"planned controls of shape {tuple(controls.shape)}: expected (rows, {self.controls.shape[-1]}) or "
-                f"(rows, {len(self)}, {self.controls.shape[-1]}), for {', '.join(self.control_names) or 'no control'}"
-            )
+            width, names = self.controls.shape[-1], ", ".join(self.control_names) or "no control"
+            wanted = f"expected (rows, {width}) or (rows, {len(self)}, {width}), for {names}"
+            raise DataError(f"planned controls of shape {tuple(controls.shape)}: {wanted}")
         if not 0 < step < math.inf:
             raise DataError(f"step must be positive, got {step} s")
         later = step * torch.arange(1, len(plan) + 1, dtype=self.time.dtype, device=self.time.device)
@@ -193,7 +191,7 @@ class Trajectories(Displayed):
             return tensor.to(device=device, dtype=like if tensor.is_floating_point() else None)
 
         time = (self.time - self.time[0]).to(device=device)
-        return replace(self._each(cast), time=time, lengths=cast(self.lengths))
+        return replace(self.with_rows(cast), time=time, lengths=cast(self.lengths))
 
     def select(self, controls: Sequence[str], measurements: Sequence[str], states: Sequence[str]) -> Trajectories:
         """The named columns in order, unknown states NaN; DataError names missing controls or measurements."""

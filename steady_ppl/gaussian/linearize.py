@@ -126,9 +126,8 @@ def linearize(
     if angles is None:
         angles = angles_on_a_circle(program, data, states[0, :1])
     given = {"state": states[:-1], "noise": noise} | row_inputs(program, data)._asdict()
-    moved, (by_state, by_noise), in_plain_torch = on_all_rows(
-        program, "step", partial(noisy_step, program), given, ("state", "noise"), kernels
-    )
+    step, along = partial(noisy_step, program), ("state", "noise")
+    moved, (by_state, by_noise), in_plain_torch = on_all_rows(program, "step", step, given, along, kernels)
     offset = (moved - (by_noise @ noise.unsqueeze(-1)).squeeze(-1) - states[1:]).double()
     offset[..., angles] = wrap(offset[..., angles])  # a program may keep its angles on the circle, and so may a path
     start_offset, start_noise = (part.double() for part in _start(problem, states[0]))
@@ -184,9 +183,7 @@ def why_not_linear(program: Program, data: Trajectories, *, known_start: bool = 
     """What keeps a program from being linearised, None if nothing does; tried on the first two rows of the first
     trajectory of `data`, as returned by `for_program`, where its first state is certain if `known_start`."""
     rows, first = min(2, data.time.shape[0]), data.subset([0])
-    by_row = {name: getattr(first, name) for name in ("time", "controls", "measurements", "observed", "states")}
-    head = {name: values[:rows] for name, values in by_row.items() if values is not None}
-    data = replace(first, **head, lengths=first.lengths.clamp(max=rows))
+    data = replace(first.with_rows(lambda values: values[:rows]), lengths=first.lengths.clamp(max=rows))
     state = draw_starts(program, rows - 1, 1)
     path = ReferencePath(state[:1].expand(rows, -1, -1), state.new_zeros((rows - 1, 1, noise_size(program))))
     try:

@@ -51,25 +51,20 @@ def fixes(program: Program, data: Trajectories, *, places: int = 32, passes: int
     prior = drawn.mean(0), precision
     drives = max(1, MAX_ROWS_OF_BATCH // (places * len(data.time)))
     parts = torch.arange(len(data)).split(drives)
-    states = torch.cat(
-        [_found(program, data.subset(part), guesses[:, :, part], told, prior, passes) for part in parts], 1
-    )
-    return torch.where(enough[..., None] & told, states, torch.nan)
+    states = [_found(program, data.subset(part), guesses[:, :, part], told, prior, passes) for part in parts]
+    return torch.where(enough[..., None] & told, torch.cat(states, 1), torch.nan)
 
 
 def _require_enough(program: Program, data: Trajectories, told: Tensor, enough: Tensor) -> None:
     """Refuse drives without two rows of `enough` measurements, `(T + 1, B)`, for the components `told`, `(D,)`."""
-    poor = enough.sum(0) < 2
     if not bool(data.observed.any()):
         raise DataError("nothing is measured: every y. cell of the table is empty")
-    if bool(poor.any()):
-        label = data.labels[int(poor.nonzero()[0])]
+    for (drive,) in (enough.sum(0) < 2).nonzero()[:1].tolist():
+        label = data.labels[drive]
         dependent = ", ".join(name for name, tells in zip(program.state_names, told.tolist(), strict=True) if tells)
-        raise DataError(
-            f"trajectory {label}: in fewer than two rows there are measurements enough, {int(told.sum())}, to tell "
-            f"{dependent} from that row alone; leave such drives out",
-            trajectory=label,
-        )
+        few = f"in fewer than two rows there are measurements enough, {int(told.sum())}"
+        what = f"{few}, to tell {dependent} from that row alone; leave such drives out"
+        raise DataError(f"trajectory {label}: {what}", trajectory=label)
 
 
 def _found(

@@ -6,6 +6,7 @@ Roweis 1999).
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -54,21 +55,17 @@ def smooth(
     Returns:
         The lookahead along the last path that was accepted, so that its linearization and its means agree.
     """
-
-    def look(path: ReferencePath) -> Lookahead:
-        weight = observation_weight
-        return look_ahead(linearize(problem, path, observation_weight=weight, kernels=kernels, angles=angles))
-
     data = problem.data
     with unchanged(problem.program):
         angles = angles_on_a_circle(problem.program, data, path.states[0, :1])
+        along = partial(linearize, problem, observation_weight=observation_weight, kernels=kernels, angles=angles)
         if passes == 1:
-            return look(path)
+            return look_ahead(along(path))
         accepted = path = ReferencePath(path.states, torch.where(data.transitions[..., None], path.noise, 0.0))
         penalty = torch.zeros_like(path.states, dtype=torch.float64)
         most = torch.full((len(data),), torch.inf, dtype=torch.float64, device=path.states.device)
         for index in range(passes):
-            ahead = look(path)
+            ahead = look_ahead(along(path))
             density, defect = _merit(ahead)
             worse = torch.isfinite(most) & ~(_cost(density, defect, penalty) <= most)  # or not a number
             any_worse = bool(worse.any())
@@ -85,7 +82,7 @@ def smooth(
             penalty = torch.where(worse[:, None], penalty, _penalty(ahead, moved))
             most = torch.where(worse, most, _cost(density, defect, penalty) + MAX_INCREASE)
             path = moved
-        return look(accepted) if any_worse else ahead
+        return look_ahead(along(accepted)) if any_worse else ahead
 
 
 def _merit(ahead: Lookahead) -> tuple[Tensor, Tensor]:
@@ -146,9 +143,7 @@ def find_and_smooth(
 
 def require_found(ahead: Lookahead, problem: Problem) -> None:
     """Raise a `FilterError` where the linearised program's log p(y) is not finite."""
-    broken = ~torch.isfinite(ahead.log_likelihood)
-    if bool(broken.any()):
-        drive = int(broken.nonzero()[0])
+    for (drive,) in (~torch.isfinite(ahead.log_likelihood)).nonzero()[:1].tolist():
         label = problem.data.labels[drive]
         why = divergence(problem.program, problem.data.subset([drive])) or (
             "the linearised program's log p(y) is not finite: its parameters or states have blown up, or it cannot be "

@@ -56,14 +56,10 @@ class PathGuide:
         """Store paths of `data`, their padding filled; a state that is not finite is a `FilterError`."""
         self.paths = paths.within(data)
         broken = ~torch.isfinite(self.paths.states).all(-1).all(0) & data.rows
-        if bool(broken.any()):
-            row, trajectory = (int(i) for i in broken.nonzero()[0])
-            label, time = data.labels[trajectory], float(data.elapsed[row, trajectory])
-            raise FilterError(
-                f"trajectory {label} at {time:.3g} s: a state is not finite: the program has blown up",
-                trajectory=label,
-                time=time,
-            )
+        for row, drive in broken.nonzero()[:1].tolist():
+            label, time = data.labels[drive], float(data.elapsed[row, drive])
+            what = f"trajectory {label} at {time:.3g} s: a state is not finite: the program has blown up"
+            raise FilterError(what, trajectory=label, time=time)
 
     def __call__(self, data: Trajectories) -> None:
         """The guide of the model `Joint`; `data` are the trajectories of the last `refresh`."""
@@ -129,7 +125,6 @@ class SMCGuide(FilteringGuide):
         self.known_start, self.resample_below = known_start, resample_below
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
-        """Run the filter and keep `draws` paths."""
         weight = self.tempering(progress)
         return {"observation_weight": weight} | self._filter(data, weight)
 
@@ -203,11 +198,9 @@ def true_paths(program: Program, data: Trajectories) -> Paths:
         if not bool((change.abs() > NOISE_TOLERANCE * (1 + noise.abs())).any()):
             break
     else:
-        raise ProgramError(
-            f"program {type(program).__name__}: no channel noise was found that leads from one true state to the next "
-            "(transition bends too much in its noise): supervised learning cannot tell which it was",
-            site="transition",
-        )
+        what = "no channel noise was found that leads from one true state to the next"
+        why = "(transition bends too much in its noise): supervised learning cannot tell which it was"
+        raise ProgramError(f"program {type(program).__name__}: {what} {why}", site="transition")
     _, moving = run(noise)
     with running(1, before.shape[1]), Recording() as start:
         program.initial()

@@ -116,7 +116,6 @@ class GaussianGuide(LinearizedGuide):
     """
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
-        """Linearise, smooth and keep `draws` independent paths."""
         ahead, figures = self.look_ahead(data, progress)
         problem = Problem(self.program, data, self.known_start)
         require_found(ahead, problem)
@@ -157,7 +156,6 @@ class LookaheadGuide(LinearizedGuide, FilteringGuide):
         self.untwisted, self.tempered = untwisted, tempered
 
     def refresh(self, data: Trajectories, progress: float) -> dict[str, float]:
-        """Run the filter and keep `draws` paths."""
         ahead, figures = self.look_ahead(data, progress)
         twist = Twist(ahead, untwisted=self.untwisted, tempered=self.tempered)
         return figures | self._filter(data, self.tempering(progress), twist)

@@ -15,6 +15,7 @@ from pyro.infer.autoguide import AutoGuide, AutoNormal
 from pyro.infer.autoguide.initialization import init_to_value
 from pyro.poutine.messenger import Messenger
 from torch import Tensor, nn
+from torch.distributions.utils import vec_to_tril_matrix
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import UsageError, require
@@ -93,11 +94,14 @@ class VariationalGuide(nn.Module):
         weight = self.kl_weight
         density = weight * (at_start + later)
         if not self.known_start:
-            density = density + _prior_of_start(self.program, paths)
+            with running(self.draws, 1, len(data)), Recording() as seen, Replaying(paths.start):
+                self.program.initial()
+            logs = [fn.log_prob(paths.start[site]) for site, fn in seen.distributions.items()]
+            density = density + torch.stack(logs).sum((0, 2, 3))
         if not self.centred or weight != 1:
             channels = paths.channels(self.program, data)
-            logs = torch.stack([fn.log_prob(paths.noise[site]) for site, fn in channels.items()]).sum(0)
-            of_noise = torch.where(data.transitions, logs, 0.0).sum((1, 2))  # under the program, as `Joint` scores it
+            noises = torch.stack([fn.log_prob(paths.noise[site]) for site, fn in channels.items()]).sum(0)
+            of_noise = torch.where(data.transitions, noises, 0.0).sum((1, 2))  # under the program, as `Joint` scores it
             density = density + (1 - weight * self.centred) * of_noise
         pyro.factor("proposal", density.reshape(-1, 1, 1) if self.draws > 1 else density[0], has_rsample=True)
 
@@ -134,14 +138,6 @@ class VariationalGuide(nn.Module):
             event_dims=dims | {"states": 1},
         )
         return paths, at_start, later
-
-
-def _prior_of_start(program: Program, paths: Paths) -> Tensor:
-    draws, _, trajectories, _ = paths.states.shape
-    with running(draws, 1, trajectories), Recording() as seen, Replaying(paths.start):
-        program.initial()
-    logs = [fn.log_prob(paths.start[site]) for site, fn in seen.distributions.items()]
-    return torch.stack(logs).sum((0, 2, 3))
 
 
 def log_ratio(noise: Tensor, random: Tensor, log_scale: Tensor) -> Tensor:
@@ -184,9 +180,8 @@ class AutoRollout(VariationalGuide):
     def begin(self, data: Trajectories) -> Tensor:
         """Draw all noise at once; log q(ε) − log N(ε; 0, 1) of it, `(M,)`."""
         if data.labels != self.labels:
-            raise UsageError(
-                "an automatic guide has parameters for each of its drives: it takes no others and no batch"
-            )
+            why = "it takes no others and no batch"
+            raise UsageError(f"an automatic guide has parameters for each of its drives: {why}")
         names, normal = list(self._shapes(data)), dist.Normal(0.0, 1.0)
         with pyro.settings.context(module_local_params=True), poutine.block():
             traces = [poutine.trace(self.auto).get_trace(data) for _ in range(self.draws)]
@@ -336,11 +331,7 @@ def _below(size: int) -> int:
 
 def _factor(log_diagonal: Tensor, below: Tensor) -> Tensor:
     """A lower triangular matrix, `(..., C, C)`."""
-    factor = torch.diag_embed(log_diagonal.exp())
-    size = factor.shape[-1]
-    row, column = torch.tril_indices(size, size, -1)
-    factor[..., row, column] = below
-    return factor
+    return torch.diag_embed(log_diagonal.exp()) + vec_to_tril_matrix(below, -1)
 
 
 class _Standard(nn.Module):

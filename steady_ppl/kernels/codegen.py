@@ -177,8 +177,7 @@ class _Writer:
 
     def _base(self, vector: int) -> None:
         """Bias and whatever else of a product does not differ between particles, once a trajectory."""
-        product = self.graph.vectors[vector]
-        assert isinstance(product, Product)
+        product: Any = self.graph.vectors[vector]
         shared = [(i, self.scalar(n)) for i, n in enumerate(product.x) if self.graph.levels[n] < PARTICLE]
         with self._loop(LONG(product.length)) as k:
             value = self._bias(product, k)

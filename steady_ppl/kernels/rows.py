@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import partial
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -97,10 +98,8 @@ def _gradients(component: Tensor, leaves: list[Tensor]) -> Sequence[Tensor]:
     try:
         return torch.autograd.grad(component.sum(), leaves, retain_graph=True, materialize_grads=True)
     except (NotImplementedError, RuntimeError) as error:
-        why = str(error).splitlines()[0]
-        raise ProgramError(
-            f"the program cannot be linearised: {why} (--recipe steady --guide bootstrap takes any)"
-        ) from error
+        why = f"{str(error).splitlines()[0]} (--recipe steady --guide bootstrap takes any)"
+        raise ProgramError(f"the program cannot be linearised: {why}") from error
 
 
 class Slopes(NamedTuple):
@@ -156,9 +155,8 @@ def _computed(
         return f"{str(first.dtype).removeprefix('torch.')} on {first.device.type}"
     examples = {at: value[:1, :1].unsqueeze(0).clone() for at, value in arguments.items()}
     compiled_as = f"{name} by parameters" if "by_parameters" in derivatives else f"{name} on all rows"
-    method = compiled(
-        program, compiled_as, lambda: Method(program, lambda *given: (function(*given),), examples, {}, **derivatives)
-    )
+    build = partial(Method, program, lambda *given: (function(*given),), examples, {}, **derivatives)
+    method = compiled(program, compiled_as, build)
     if isinstance(method, str):
         return _noted(name, method)
     inputs = [value.float().reshape(cells, 1, -1).permute(2, 1, 0).contiguous().numpy() for value in arguments.values()]

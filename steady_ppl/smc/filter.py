@@ -40,17 +40,6 @@ class Step(NamedTuple):
     noise: dict[str, Tensor]  # value of each site of `transition` from this row, (N, B, ...); empty at the last row
 
 
-class _Weighed(NamedTuple):
-    """Particles with a row's measurements in their weights."""
-
-    log_weights: Tensor
-    weights: Tensor | None  # (N, B), sum to one and know of the `future`; None where nothing was measured
-    future: Tensor | None
-    evidence: Tensor
-    effective_sizes: Tensor
-    blown_up: Tensor
-
-
 @dataclass(eq=False)
 class ParticleFilter:
     """A particle filter that goes through a table row by row: `init`, then a `step` a row, under `torch.no_grad()`.
@@ -74,9 +63,8 @@ class ParticleFilter:
     def __post_init__(self) -> None:
         particles, data = self.particles, self.data
         if self.proposal.looks_ahead and self.on_frame is not None:
-            raise UsageError(
-                "on_frame sees what is predicted: a filter that looks ahead has seen the later measurements"
-            )
+            why = "a filter that looks ahead has seen the later measurements"
+            raise UsageError(f"on_frame sees what is predicted: {why}")
         self.bootstrap = type(self.proposal) is Proposal
         self.last, self.left = len(data.time) - 1, torch.Size((particles, 1, len(data)))
         self.inside, self.ended = data.rows, (~data.rows).any(1).tolist()  # rows past a trajectory's end
@@ -96,9 +84,8 @@ class ParticleFilter:
             states = program.initial()
         states = states.expand(*self.left, -1).squeeze(1)
         if self.known_start and not bool((states == data.known_start).all()):
-            raise ProgramError(
-                "a known start needs initial() to return the sampled state as it is; it returns another", site="initial"
-            )
+            what = "a known start needs initial() to return the sampled state as it is; it returns another"
+            raise ProgramError(what, site="initial")
         self.stepping = Stepping(program, data, self.observation_weight)
         size = (len(data), self.particles)
         even = states.new_full(size, -math.log(self.particles), dtype=torch.float64).t()
@@ -109,19 +96,16 @@ class ParticleFilter:
     def step(self, state: FilterState, row: int) -> tuple[FilterState, Step]:
         """Weigh the particles that have come to a row 0 … T, resample those trajectories that need it, and move on;
         returned are the particles at the next row, after the last one at itself, and what was done."""
-        weighed = self._weigh(state, row)
-        states, log_weights, roots = state.states, weighed.log_weights, state.roots
+        weighed, weights, future, done = self._weigh(state, row)
+        states, log_weights, roots = state.states, weighed, state.roots
         ancestors, noise = None, dict[str, Tensor]()
-        if row < self.last:
-            log_weights, roots, ancestors = self._resample(weighed, roots)
+        if row < self.last and weights is not None:
+            log_weights, roots, ancestors = self._resample(weighed, weights, future, done.effective_sizes, roots)
         if self.on_frame is not None:
-            self.on_frame(row, states, state.log_weights, weighed.log_weights)
+            self.on_frame(row, states, state.log_weights, weighed)
         if row < self.last:
             states, log_weights, noise = self._move(row, states, log_weights, ancestors)
-        return (
-            FilterState(states, log_weights, roots),
-            Step(weighed.evidence, weighed.effective_sizes, weighed.blown_up, ancestors, noise),
-        )
+        return FilterState(states, log_weights, roots), done._replace(ancestors=ancestors, noise=noise)
 
     def run(self, state: FilterState, keep_history: bool) -> Run:
         """Go from the state that `init` returns through all rows."""
@@ -135,16 +119,16 @@ class ParticleFilter:
                 sizes = {site: value.shape[-1] for site, value in noise.items()}
                 intervals.append(torch.cat([state.states, *noise.values()], -1).permute(2, 1, 0).contiguous())
                 parents.append(None if step.ancestors is None else step.ancestors.t())
-        evidence, effective_sizes, blown_up = (
-            torch.stack(part) for part in zip(*(one[:3] for one in steps), strict=True)
-        )
+        evidence, effective, blown_up = (torch.stack(part) for part in zip(*(one[:3] for one in steps), strict=True))
         history = History(start, intervals, parents, sizes, self.stepping.event_dims) if keep_history else None
-        return Run(state, evidence, effective_sizes, blown_up, history)
+        return Run(state, evidence, effective, blown_up, history)
 
-    def _weigh(self, state: FilterState, row: int) -> _Weighed:
+    def _weigh(self, state: FilterState, row: int) -> tuple[Tensor, Tensor | None, Tensor | None, Step]:
+        """Log-weights with a row's measurements in them; weights that sum to one and know of the `future`, None where
+        nothing was measured; the `future`; and figures of the row."""
         observed, future = self.observed[row], None
         if self.bootstrap and not observed:
-            return _Weighed(state.log_weights, None, None, self._none, self._all, self._none)
+            return state.log_weights, None, None, Step(self._none, self._all, self._none, None, {})
         log_weights = state.log_weights + (self.stepping.log_density(row, state.states) if observed else 0.0)
         if self.proposal.looks_ahead:
             future = self._within(row, self.proposal.log_future(row, state.states))
@@ -152,21 +136,19 @@ class ParticleFilter:
         broken = expected.isnan()  # a particle that blew up explains no measurement
         log_weights.masked_fill_(broken, -math.inf)
         weights, evidence = normalise(expected.masked_fill_(broken, -math.inf))
-        sizes = effective_sample_size(weights)
-        return _Weighed(log_weights - evidence, weights, future, evidence, sizes, broken.sum(0, dtype=torch.float64))
+        done = Step(evidence, effective_sample_size(weights), broken.sum(0, dtype=torch.float64), None, {})
+        return log_weights - evidence, weights, future, done
 
-    def _resample(self, weighed: _Weighed, roots: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    def _resample(
+        self, log_weights: Tensor, weights: Tensor, future: Tensor | None, sizes: Tensor, roots: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Log-weights, roots and ancestors of the particles that move on."""
-        log_weights = weighed.log_weights
-        exhausted = weighed.effective_sizes < self.resample_below * self.particles
-        if (
-            weighed.weights is None
-            or self.resample_below <= 0
-            or (log_weights.device.type == "cpu" and not bool(exhausted.any()))
-        ):
+        exhausted = sizes < self.resample_below * self.particles
+        none = log_weights.device.type == "cpu" and not bool(exhausted.any())  # a device would have to be waited for
+        if self.resample_below <= 0 or none:
             return log_weights, roots, None
-        ancestors = torch.where(exhausted, self.resampler(weighed.weights, self.particles), self._unmoved)
-        fresh = -math.log(self.particles) - (0.0 if weighed.future is None else take(weighed.future, ancestors))
+        ancestors = torch.where(exhausted, self.resampler(weights, self.particles), self._unmoved)
+        fresh = -math.log(self.particles) - (0.0 if future is None else take(future, ancestors))
         return torch.where(exhausted, fresh, log_weights), take(roots, ancestors), ancestors
 
     def _move(
@@ -251,15 +233,12 @@ def particle_filter(
 
 def _raise_if_broken(program: Program, log_likelihood: Tensor, blown_up: Tensor, data: Trajectories) -> None:
     """Find the first row whose evidence is not finite."""
-    broken = ~torch.isfinite(log_likelihood)
-    if not bool(broken.any()):
-        return
-    row, trajectory = (int(i) for i in broken.nonzero()[0])
-    label, time = data.labels[trajectory], float(data.elapsed[row, trajectory])
-    impossible = bool(log_likelihood[row, trajectory] == -math.inf) and not bool(blown_up[: row + 1, trajectory].any())
-    what = divergence(program, data.subset([trajectory]), row) or (
-        "every particle's weight is zero: the measurement is impossible under the program"
-        if impossible
-        else "no particle is left that is a number: the program's parameters or states have blown up"
-    )
-    raise FilterError(f"trajectory {label} at {time:.3g} s: {what}", trajectory=label, time=time)
+    for row, drive in (~torch.isfinite(log_likelihood)).nonzero()[:1].tolist():
+        label, time = data.labels[drive], float(data.elapsed[row, drive])
+        impossible = bool(log_likelihood[row, drive] == -math.inf) and not bool(blown_up[: row + 1, drive].any())
+        what = divergence(program, data.subset([drive]), row) or (
+            "every particle's weight is zero: the measurement is impossible under the program"
+            if impossible
+            else "no particle is left that is a number: the program's parameters or states have blown up"
+        )
+        raise FilterError(f"trajectory {label} at {time:.3g} s: {what}", trajectory=label, time=time)

@@ -195,6 +195,5 @@ class Filtered:
 
 def degeneracy_note(roots: float) -> str | None:
     """What is to be said where so many of the particles' starts survive a drive: all paths begin alike."""
-    return (
-        f"of the particles' starts {roots:.0f} survive a drive: raise particles" if roots < MIN_EFFECTIVE_SIZE else None
-    )
+    few = f"of the particles' starts {roots:.0f} survive a drive: raise particles"
+    return few if roots < MIN_EFFECTIVE_SIZE else None

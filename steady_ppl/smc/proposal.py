@@ -51,11 +51,9 @@ class Steered(Proposal):
     channels: int  # C
 
     def log_future(self, row: int, state: Tensor) -> Tensor:
-        """By `future`, see `Proposal`."""
         return self.future(state, *(given[row] for given in self.rows))
 
     def step(self, row: int, state: Tensor) -> tuple[Tensor | None, Tensor | float]:
-        """By `steered`, see `Proposal`."""
         kind: Any = {"device": state.device, "dtype": state.dtype}
         own = torch.randn(self.channels, *state.shape[1::-1], **kind).permute(2, 1, 0)
         chance = torch.rand(1, *state.shape[1::-1], **kind).permute(2, 1, 0)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError, SteadyError, require
-from steady_ppl.model.handlers import Recording, as_vector, draw_starts, running
+from steady_ppl.model.handlers import Recording, draw_starts, joined, running
 from steady_ppl.model.program import Program, for_program
 from steady_ppl.model.stability import counts_rows, is_step
 from steady_ppl.model.substeps import MAX_SUBSTEPS, advance, row_inputs, with_substeps
@@ -73,7 +73,10 @@ def simulate(
                 begin()
                 states.append(state)
         path = torch.cat(states)
-        _require_finite(program, path, run)
+        for row, drive in (~path.isfinite().all(-1) & run.rows).nonzero()[:1].tolist():
+            where = f"trajectory {run.labels[drive]}, row {row + 1}"
+            what = f"program {type(program).__name__} blows up: in {where}, its states are not finite"
+            raise ProgramError(what, site="transition")
         measurements = measure(program, path)
     return replace(
         run,
@@ -141,37 +144,22 @@ def measure(program: Program, states: Tensor) -> Tensor:
     """A draw of what the program measures in these states, `(..., K)` of `(..., D)`."""
     with running(*states.shape[:-1]), Recording() as seen:
         program.observe(states)
-    return torch.cat([as_vector(value, seen.distributions[site].event_dim) for site, value in seen.values.items()], -1)
-
-
-def _require_finite(program: Program, path: Tensor, data: Trajectories) -> None:
-    broken = (~path.isfinite().all(-1) & data.rows).nonzero()
-    if len(broken):
-        row, drive = broken[0].tolist()
-        raise ProgramError(
-            f"program {type(program).__name__} blows up: in trajectory {data.labels[drive]}, row {row + 1}, its states "
-            "are not finite",
-            site="transition",
-        )
+    return joined(seen.values, seen.distributions, states.shape[:-1])
 
 
 def _example_controls(program: Program, time: Tensor) -> Tensor:
     """What the program's own method gives, `(rows, trajectories, controls)`, checked."""
-    name, expected = type(program).__name__, (*time.shape, len(program.controls))
+    about, site = f"program {type(program).__name__}: example_controls", "example_controls"
+    expected = (*time.shape, len(program.controls))
     try:
         controls = program.example_controls(time)
     except SteadyError:
         raise
     except Exception as error:  # a user's own code
-        raise ProgramError(
-            f"program {name}: example_controls failed: {one_line(error)}", site="example_controls"
-        ) from error
+        raise ProgramError(f"{about} failed: {one_line(error)}", site=site) from error
     if not isinstance(controls, Tensor) or tuple(controls.shape) != expected:
         came = f"shape {tuple(controls.shape)}" if isinstance(controls, Tensor) else type(controls).__name__
-        raise ProgramError(
-            f"program {name}: example_controls gave {came}, expected a tensor of shape {expected}",
-            site="example_controls",
-        )
+        raise ProgramError(f"{about} gave {came}, expected a tensor of shape {expected}", site=site)
     if not controls.isfinite().all():
-        raise ProgramError(f"program {name}: example_controls gave a control that is not finite")
+        raise ProgramError(f"{about} gave a control that is not finite")
     return controls

@@ -1,4 +1,1 @@
-"""One training loop for every guide, its stopping rule and its checkpoints.
-
-Nothing here knows one guide from another.
-"""
+"""One training loop for every guide, whichever it is; its stopping rule and its checkpoints."""

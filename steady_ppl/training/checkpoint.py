@@ -57,10 +57,9 @@ def read_checkpoint(path: Path, state: Checkpoint, optimizer: torch.optim.Optimi
         groups[group][name] = value
     if _shapes(groups["parameters"]) != _shapes(state.parameters):
         raise RunError(f"{path.name} in {path.parent} was written by a program with other parameters")
-    if _shapes(groups["averaged"]) != _shapes(state.averaged):
-        raise damaged(path, "the averaged parameters are others than the program's")
-    if groups["kept"] and _shapes(groups["kept"]) != _shapes(state.averaged):
-        raise damaged(path, "the kept parameters are others than the program's")
+    for group in ("averaged", "kept") if groups["kept"] else ("averaged",):
+        if _shapes(groups[group]) != _shapes(state.averaged):
+            raise damaged(path, f"the {group} parameters are others than the program's")
     if broken := [name for name, value in groups["parameters"].items() if not value.isfinite().all()]:
         raise damaged(path, f"the parameters {', '.join(broken)} are not finite")
     numbers = _numbers(path, text)

@@ -174,10 +174,9 @@ def train(
         averaged={name: value.detach().clone() for name, value in parameters.items()},
         memory=getattr(guide, "memory", {}),
     )
-    if resume and checkpoint is not None:
-        read_checkpoint(checkpoint, state, optimizer)
-    elif checkpoint is not None:
-        write_checkpoint(checkpoint, state, optimizer)
+    if checkpoint is not None:
+        begin = read_checkpoint if resume else write_checkpoint
+        begin(checkpoint, state, optimizer)
     batch, interrupted = optimization.batch or len(data), False
     patience = optimization.patience * optimization.validate_every
     shows_bar = progress and sys.stderr.isatty()
@@ -208,10 +207,8 @@ def train(
                     state.averaged[name].lerp_(value.detach(), 1 - keep)
                 bar.update()
                 if state.step % optimization.validate_every == 0 or state.step == optimization.steps:
-                    held_out = []
-                    if validation.data is not None:
-                        with using(parameters, state.averaged):
-                            held_out = validation(program, seed)
+                    with using(parameters, state.averaged):
+                        held_out = validation(program, seed)
                     _judge(state, held_out, {"loss": loss.item(), **figures})
                     if progress and not shows_bar:
                         tell(_in_words(state.history[-1], optimization.steps), aside=True)
@@ -234,19 +231,15 @@ def _in_words(figures: Mapping[str, float], steps: int = 0) -> str:
 
 def _require_finite_gradient(name: str, value: Tensor, step: int) -> None:
     if value.grad is not None and not bool(torch.isfinite(value.grad).all()):
-        raise TrainingError(
-            f"the gradient of {parameter_name(name)} is not finite at step {step + 1}: look for a "
-            "square root, a division or a norm at zero in the program, or for roll-outs that blow up"
-        )
+        how = "look for a square root, a division or a norm at zero in the program, or for roll-outs that blow up"
+        raise TrainingError(f"the gradient of {parameter_name(name)} is not finite at step {step + 1}: {how}")
 
 
 def _judge(state: Checkpoint, held_out: list[float], figures: dict[str, float]) -> None:
     """Note a validation, and keep the averaged parameters if they are as good as the best."""
     if state.best_held_out and len(state.best_held_out) != len(held_out):
-        raise RunError(
-            f"the checkpoint is damaged: it knows {len(state.best_held_out)} held-out log p(y), and there are "
-            f"{len(held_out)}"
-        )
+        knows = f"it knows {len(state.best_held_out)} held-out log p(y), and there are {len(held_out)}"
+        raise RunError(f"the checkpoint is damaged: {knows}")
     entry = {"step": float(state.step), **figures}
     if held_out:
         entry["log_likelihood"] = sum(held_out) / len(held_out)
@@ -293,10 +286,8 @@ def _groups(program: Program, guide: Guide, own: Iterable[Tensor], optimization:
 
 def _require_finite(loss: Tensor, step: int) -> None:
     if not bool(torch.isfinite(loss)):
-        raise TrainingError(
-            f"the loss is {loss.item()} at step {step + 1}: lower the learning rate, or look at the program's "
-            "densities (a standard deviation of zero?)"
-        )
+        how = "lower the learning rate, or look at the program's densities (a standard deviation of zero?)"
+        raise TrainingError(f"the loss is {loss.item()} at step {step + 1}: {how}")
 
 
 @dataclass(frozen=True)
@@ -345,8 +336,9 @@ class Validation:
         return cls(data, count, known_start, every=1 if ahead else 10, look_ahead=ahead, reason=reason)
 
     def __call__(self, program: Program, seed: int) -> list[float]:
-        """Log p(y) of each held-out trajectory."""
-        assert self.data is not None
+        """Log p(y) of each held-out trajectory, if there are any."""
+        if self.data is None:
+            return []
         given: Any = {name: getattr(self, name) for name in ("particles", "known_start", "every", "look_ahead")}
         kernels = TYPICAL_VALIDATIONS * self.particles * self.data.time.numel() >= STEPS_WORTH_COMPILING
         with seeded(seed, "validate"):
