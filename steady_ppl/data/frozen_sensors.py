@@ -39,7 +39,12 @@ def frozen_stretches(data: Trajectories) -> list[Stretch]:
     """Stretches in which a measurement or a known state, which was logged too, is on a line over time though it
     scatters elsewhere."""
     runs, moving = list[RowRange](), set[RowRange]()
-    for column, values, there in _columns(data):
+    names, logged, known = [f"y.{name}" for name in data.measurement_names], data.measurements, data.observed
+    if data.states is not None:
+        names += [f"x.{name}" for name in data.state_names]
+        logged = torch.cat([logged, data.states.nan_to_num()], -1)
+        known = torch.cat([known, torch.isfinite(data.states) & data.rows.unsqueeze(-1)], -1)
+    for column, values, there in zip(names, logged.unbind(-1), known.unbind(-1), strict=True):
         of_column = _runs(data.time, values, there)
         if sum(last - first for _, first, last in of_column) < 0.5 * float(there.sum()):
             runs += [(*run, column) for run in of_column]
@@ -74,15 +79,6 @@ def without_stretches(data: Trajectories, stretches: list[Stretch]) -> Trajector
             observed[rows, stretch.drive] = False
             states[max(rows.start, 1) : rows.stop, stretch.drive] = torch.nan
     return replace(data, observed=observed, measurements=torch.where(observed, data.measurements, 0.0), states=states)
-
-
-def _columns(data: Trajectories) -> list[tuple[str, Tensor, Tensor]]:
-    names, values, there = [f"y.{name}" for name in data.measurement_names], data.measurements, data.observed
-    if data.states is not None:
-        names += [f"x.{name}" for name in data.state_names]
-        values = torch.cat([values, data.states.nan_to_num()], -1)
-        there = torch.cat([there, torch.isfinite(data.states) & data.rows.unsqueeze(-1)], -1)
-    return list(zip(names, values.unbind(-1), there.unbind(-1), strict=True))
 
 
 def _runs(time: Tensor, values: Tensor, there: Tensor) -> list[tuple[int, int, int]]:

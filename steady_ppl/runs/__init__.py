@@ -1,4 +1,1 @@
-"""A fit as a thing that is kept: its folder, its recipe, what it predicts and what is to be doubted of it.
-
-Nothing here judges one fit against another.
-"""
+"""A fit as a thing that is kept: its folder, its recipe, what it predicts and what is to be doubted of it."""

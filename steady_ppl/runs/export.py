@@ -83,10 +83,8 @@ class Dynamics(nn.Module):
         _require(state, "(..., {})", self.state_names)
         _require(controls, "(rows, ..., {})", self.control_names)
         if past is None and self.remembers:
-            raise UsageError(
-                f"in {type(self.program).__name__} commands act on after their step: give those before as `past`, an "
-                "empty tensor (0, ..., U) at the start of a drive"
-            )
+            how = "give those before as `past`, an empty tensor (0, ..., U) at the start of a drive"
+            raise UsageError(f"in {type(self.program).__name__} commands act on after their step: {how}")
         past = controls[:0] if past is None else past
         _require(past, "(rows, ..., {})", self.control_names)
         try:

@@ -61,9 +61,8 @@ class Fit(Displayed):
         """Posterior draws of states and channel noise as ArviZ `InferenceData`; see `steady_ppl.runs.posterior`."""
         from steady_ppl.runs.posterior import posterior  # here, for it loads xarray
 
-        return posterior(
-            self.program, data, draws=draws, particles=particles, every=every, known_start=self.known_start, seed=seed
-        )
+        settings: dict[str, Any] = {"draws": draws, "particles": particles, "every": every, "seed": seed}
+        return posterior(self.program, data, known_start=self.known_start, **settings)
 
     def forecast(
         self,
@@ -149,9 +148,8 @@ class Fit(Displayed):
         expected = {(name, value.shape) for name, value in program.state_dict().items()}
         found = {(name, value.shape) for name, value in tensors.items()}
         if differing := sorted({name for name, _ in expected ^ found}):
-            raise RunError(
-                f"{folder}: the parameters do not fit program {type(program).__name__}: {', '.join(differing)}"
-            )
+            name = type(program).__name__
+            raise RunError(f"{folder}: the parameters do not fit program {name}: {', '.join(differing)}")
         learned = {name for name, _ in program.named_parameters()}
         broken = sorted(name for name, value in tensors.items() if name in learned and not value.isfinite().all())
         if broken:
@@ -203,14 +201,11 @@ def _load_recorded(folder: Path, source: dict[str, str] | None, moved: str | Pat
     if not file.is_file():
         raise RunError(f"{folder}: its program {name} is gone: name it with --program PATH")
     if any((place / RUN_RECORD).exists() for place in file.parents):
-        raise RunError(
-            f"{folder}: its program {name} came with a run, and nothing that comes with one is executed: read it, and "
-            "name it with --program PATH"
-        )
+        why = "came with a run, and nothing that comes with one is executed"
+        raise RunError(f"{folder}: its program {name} {why}: read it, and name it with --program PATH")
     if sha256(file) != recorded:
-        raise RunError(
-            f"{folder}: its program {name} changed since the fit: fit again, or accept it with --program PATH"
-        )
+        how = "fit again, or accept it with --program PATH"
+        raise RunError(f"{folder}: its program {name} changed since the fit: {how}")
     return load_program(f"{file}:{class_name}")
 
 
@@ -231,5 +226,4 @@ def packages() -> dict[str, str]:
 
 
 def packages_text() -> str:
-    """Packages and their versions."""
     return ", ".join(f"{name} {number}" for name, number in packages().items())

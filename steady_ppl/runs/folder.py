@@ -173,10 +173,9 @@ def read_versioned(file: Path, form: Any, known: int, what: str) -> Any:
         raise RunError(f"{file.parent} is not {what}: it has no {file.name}") from None
     number = record.get("format") if isinstance(record, dict) else None
     if isinstance(number, int) and number > known:
-        raise RunError(
-            f"{file.parent} was written by a newer steady-ppl: its form is number {number}, this one reads up to "
-            f"{known}; install that version or a later one to read it"
-        )
+        numbers = f"its form is number {number}, this one reads up to {known}"
+        how = "install that version or a later one to read it"
+        raise RunError(f"{file.parent} was written by a newer steady-ppl: {numbers}; {how}")
     if problem := mismatch(record, form):
         raise RunError(f"{file} is damaged: {problem}")
     return record

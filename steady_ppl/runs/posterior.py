@@ -106,12 +106,23 @@ def drawn_states(
         variables[site if site not in variables else f"{site}_noise"] = ((*DIMENSIONS, dimension), values, attributes)
     measured = torch.where(run.observed, run.measurements, torch.nan)
     observed = _columns("measured_", program.measurement_names, program.measurement_units, measured)
+    effective = torch.where(run.rows, torch.cat(sizes, 1).double(), torch.nan).t().numpy(force=True)
+    survivors = torch.cat(roots).double().numpy(force=True)
+    stats = {
+        "effective_size": (("chain", *OF_ROW), effective[None], {"units": "particles"}),
+        "roots": (("chain", "trajectory"), survivors[None], {"units": "particles"}),
+    }
+    constants = _columns("", ("time",), ("s",), run.elapsed.unsqueeze(-1))
+    constants["log_likelihood"] = ("trajectory",), torch.cat(evidence).numpy(force=True), {"units": "nat"}
+    constants |= _columns("control_", program.control_names, program.control_units, run.controls)
+    if run.states is not None:
+        constants |= _columns("true_", program.state_names, program.state_units, run.states)
     about = {"program": type(program).__name__, "particles": choice.particles, "filter": choice.name}
     return {
         "posterior": xarray.Dataset(variables, coordinates, about),
-        "sample_stats": _dataset(_stats(run, torch.cat(sizes, 1), torch.cat(roots)), coordinates, ("chain", *OF_ROW)),
+        "sample_stats": _dataset(stats, coordinates, ("chain", *OF_ROW)),
         "observed_data": _dataset(observed, coordinates, OF_ROW),
-        "constant_data": _dataset(_constants(program, run, torch.cat(evidence)), coordinates, OF_ROW),
+        "constant_data": _dataset(constants, coordinates, OF_ROW),
     }
 
 
@@ -139,24 +150,6 @@ def _columns(prefix: str, names: Sequence[str], units: Sequence[str], values: Te
 
 def _dataset(variables: Mapping[str, tuple], coordinates: Mapping, names: Sequence[str]) -> xarray.Dataset:
     return xarray.Dataset(variables, {name: coordinates[name] for name in names})
-
-
-def _stats(data: Trajectories, sizes: Tensor, roots: Tensor) -> dict[str, tuple]:
-    """Of the filter, over the one chain."""
-    inside = torch.where(data.rows, sizes.to(torch.float64), torch.nan).t().numpy(force=True)
-    return {
-        "effective_size": (("chain", *OF_ROW), inside[None], {"units": "particles"}),
-        "roots": (("chain", "trajectory"), roots.double().numpy(force=True)[None], {"units": "particles"}),
-    }
-
-
-def _constants(program: Program, data: Trajectories, evidence: Tensor) -> dict[str, tuple]:
-    variables = _columns("", ("time",), ("s",), data.elapsed.unsqueeze(-1))
-    variables["log_likelihood"] = ("trajectory",), evidence.numpy(force=True), {"units": "nat"}
-    variables |= _columns("control_", program.control_names, program.control_units, data.controls)
-    if data.states is not None:
-        variables |= _columns("true_", program.state_names, program.state_units, data.states)
-    return variables
 
 
 def states_frame(posterior: Groups) -> pd.DataFrame:
@@ -243,11 +236,8 @@ def forecast(
     future = (run.elapsed > last + 0.01 * run.median_step) & run.rows  # decimal seconds are not binary ones
     for drive, label in enumerate(run.labels):
         if not bool(future[:, drive].any()):
-            raise DataError(
-                f"trajectory {label} has no row after {float(last[drive]):g} s: give planned `controls`, or an earlier "
-                "`after`, or add rows with controls and empty y. cells",
-                trajectory=label,
-            )
+            how = "give planned `controls`, or an earlier `after`, or add rows with controls and empty y. cells"
+            raise DataError(f"trajectory {label} has no row after {float(last[drive]):g} s: {how}", trajectory=label)
         if bool(future[0, drive]):
             raise DataError(f"trajectory {label} begins after {float(last[drive]):g} s", trajectory=label)
     known = replace(table, observed=table.observed & ~future[..., None].to(table.observed.device))

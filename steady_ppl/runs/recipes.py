@@ -27,18 +27,13 @@ Recipe = Callable[..., Fit]
 SETTING_TYPES = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a word", "None": "none"}
 
 
-def recipe_folder() -> Path:
-    """`inference/` of the checkout, else the copy that the wheel carries."""
-    return workbench() / "inference"
-
-
 def recipe_file(name: str) -> Path:
     """Where a recipe is: `fit-truth` is `inference/fit_truth.py`, others are paths. UsageError: there is none."""
     if name.endswith(".py"):
         if not Path(name).is_file():
             raise UsageError(f"no recipe file {name}")
         return Path(name)
-    folder = recipe_folder()
+    folder = workbench() / "inference"
     known = sorted(path.stem.replace("_", "-") for path in folder.glob("[!_]*.py"))
     if name not in known:
         raise UsageError(f"no recipe {name!r}; there are {', '.join(known)}, or a PATH.py of your own")
@@ -150,7 +145,9 @@ def run_recipe(
     declared = {key: value.clone() for key, value in program.state_dict().items()}
     said: dict[str, Any] = {"recipe": name, "status": "training", "known_start": known_start, "seed": seed}
     said["options"] = json.loads(json.dumps(dict(options)))  # as the record will say them
-    begun = begun_record(program, folder, table, valid, **said, option_files=_files(options))
+    named = {option: program_file(value) for option, value in options.items() if ".py" in str(value)}
+    said["option_files"] = {option: sha256(file) for option, file in named.items() if file.is_file()}
+    begun = begun_record(program, folder, table, valid, **said)
     arguments = {"known_start": known_start, "seed": seed, **options}
     if trains(recipe):
         arguments |= {"checkpoint": folder / CHECKPOINT, "resume": resume, "progress": progress}
@@ -196,9 +193,3 @@ def fingerprint(table: Trajectories) -> str:
     for values in (table.time, table.controls, table.measurements, table.observed, table.lengths, table.states):
         digest.update(b"-" if values is None else values.numpy(force=True).tobytes())
     return digest.hexdigest()
-
-
-def _files(options: Mapping[str, Any]) -> dict[str, str]:
-    """Hashes of the programs that options name."""
-    named = {name: program_file(value) for name, value in options.items() if ".py" in str(value)}
-    return {name: sha256(file) for name, file in named.items() if file.is_file()}

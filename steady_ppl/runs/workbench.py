@@ -22,9 +22,8 @@ def workbench() -> Path:
     for folder in (here.parent, here / "workbench"):
         if all((folder / room).is_dir() for room in FOLDERS) and (folder / "inference" / "steady.py").is_file():
             return folder
-    raise UsageError(
-        f"models, recipes, notebooks and studies are missing from this installation ({sysconfig.get_path('purelib')})"
-    )
+    where = sysconfig.get_path("purelib")
+    raise UsageError(f"models, recipes, notebooks and studies are missing from this installation ({where})")
 
 
 def make_workbench(folder: Path) -> list[Path]:

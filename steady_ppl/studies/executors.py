@@ -175,10 +175,9 @@ class Cluster(Executor):
 
     def _require_same_versions(self, address: str) -> None:
         if several := [name for name, worker in self._workers().items() if worker["nthreads"] > 1]:
-            raise UsageError(
-                f"workers with several threads, which would take turns: {shown(', '.join(several), 200)}; start them "
-                f"by `dask worker {address} --nthreads 1 --nworkers N`"
-            )
+            which = shown(", ".join(several), 200)
+            how = f"start them by `dask worker {address} --nthreads 1 --nworkers N`"
+            raise UsageError(f"workers with several threads, which would take turns: {which}; {how}")
         here = packages()
         for worker, there in self._ask(packages).items():
             if other := differing_versions(here, there):
@@ -288,11 +287,9 @@ class Attempts:
         self.before, self.lost_in_a_row = dict[str, int](), 0
 
     def sent(self, key: str) -> None:
-        """It is given to the scheduler."""
         self.before[key] = self.begun[key]
 
     def note_begun(self, key: str) -> None:
-        """It is begun."""
         self.begun[key] += 1
         self.lost_in_a_row = 0
 

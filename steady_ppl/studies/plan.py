@@ -127,10 +127,8 @@ def _plan(content: Mapping[str, Any], folder: Path, data: Path | None) -> Plan:
         with labelled(f"method {job.method}"):
             key = files.key(job)
         if key in different:
-            raise UsageError(
-                f"{job.method} with seed {job.seed} is there twice: methods need names of their own, and seeds and "
-                "other lists values that differ"
-            )
+            need = "methods need names of their own, and seeds and other lists values that differ"
+            raise UsageError(f"{job.method} with seed {job.seed} is there twice: {need}")
         different[key] = replace(job, key=key)
     jobs = _labelled(tuple(different.values()))
     picture = Picture(**content["picture"]) if "picture" in content else None

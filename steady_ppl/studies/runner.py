@@ -47,10 +47,9 @@ def run_study(plan: Plan, folder: Path, place: Executor, *, again: bool = False,
         table.keep(wanted)
         record_plan(plan, folder)
         rows = read_results(folder).to_dict("records")
-        tried_again = {
-            row["key"] for row in rows if row["outcome"] == "failed" and (again or row.get("reason") == OUTDATED)
-        }
-        kept = {row["key"]: row["outcome"] for row in rows if row["key"] not in tried_again}
+        failed = [row for row in rows if row["outcome"] == "failed"]
+        retried = {row["key"] for row in failed if again or row.get("reason") == OUTDATED}
+        kept = {row["key"]: row["outcome"] for row in rows if row["key"] not in retried}
         left = {key: job for key, job in wanted.items() if key not in kept}
         if kept:
             say(f"{len(kept)} of {len(wanted)} jobs are there already")
@@ -84,7 +83,6 @@ def run_study(plan: Plan, folder: Path, place: Executor, *, again: bool = False,
 
 
 def _time_left(began: float, done: int, left: int) -> str:
-    """How long it will take."""
     seconds = (time.monotonic() - began) / done * left
     for size, unit in ((86_400, "days"), (3600, "h"), (60, "min")):
         if seconds > 2 * size:

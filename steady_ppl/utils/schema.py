@@ -39,9 +39,8 @@ def mismatch(content: Any, form: Any, place: str = "") -> str | None:
         if not isinstance(content, list) or len(form) not in (1, len(content)):
             return _wrong(content, place, "a list" if len(form) == 1 else f"a list of {len(form)}")
         inner = form * len(content) if len(form) == 1 else form
-        return _first(
-            mismatch(one, of, f"{place}[{i}]") for i, (one, of) in enumerate(zip(content, inner, strict=True))
-        )
+        pairs = enumerate(zip(content, inner, strict=True))
+        return _first(mismatch(one, of, f"{place}[{i}]") for i, (one, of) in pairs)
     if isinstance(form, dict):
         if not isinstance(content, dict):
             return _wrong(content, place, "names and values")

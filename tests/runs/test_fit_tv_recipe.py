@@ -10,10 +10,10 @@ from examples import drives, example
 
 from steady_ppl import DataError, fixes, seeded
 from steady_ppl.model.loading import run_file
-from steady_ppl.runs.recipes import recipe_folder
+from steady_ppl.runs.recipes import recipe_file
 from steady_ppl.utils.angles import wrap
 
-FIT_TV = recipe_folder() / "fit_tv.py"
+FIT_TV = recipe_file("fit-tv")
 
 
 def test_fit_tv_differentiates_what_it_finds() -> None:

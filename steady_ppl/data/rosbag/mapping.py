@@ -80,7 +80,6 @@ class BagColumn:
 
     @property
     def steps(self) -> Steps:
-        """The names and indices that lead to the field."""
         return tuple(int(step) if step.isdigit() else step for step in re.findall(r"\w+", self.field))
 
     @property

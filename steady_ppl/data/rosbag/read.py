@@ -63,10 +63,9 @@ def read_bags(paths: Sequence[str | Path], mapping: BagMapping, say: Say = say_a
                     raise UsageError(f"two trajectories are named {name}: rename the bag {file.name}")
                 kept[name] = piece
     if not kept:
-        raise DataError(
-            f"no trajectory is left of {', '.join(labels)}: no two rows have known controls and a measurement; are the "
-            'clocks the same? clock = "bag" and "aligned" go by that of the recorder'
-        )
+        why = f"no trajectory is left of {', '.join(labels)}: no two rows have known controls and a measurement"
+        how = 'are the clocks the same? clock = "bag" and "aligned" go by that of the recorder'
+        raise DataError(f"{why}; {how}")
     columns = [column.name for column in sorted(mapping.columns, key=lambda column: "uyx".index(column.kind))]
     blocks = [
         pd.DataFrame(piece.cells, columns=columns).assign(trajectory=name, time=np.arange(piece.rows) * mapping.step)

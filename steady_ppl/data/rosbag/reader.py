@@ -32,8 +32,6 @@ TEXT_TYPES = ("string", "wstring", "wchar")
 
 @dataclass(frozen=True)
 class Bag:
-    """An open bag."""
-
     name: str  # of its file or folder, for error messages
     reader: AnyReader
     defined: frozenset[str]  # the message types that the bag itself defines
@@ -45,7 +43,6 @@ class Bag:
 
     @property
     def topics(self) -> list[str]:
-        """The names of the topics, sorted."""
         return sorted({connection.topic for connection in self.reader.connections})
 
     def types(self, topic: str) -> list[str]:
