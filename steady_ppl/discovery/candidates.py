@@ -91,8 +91,7 @@ class Candidate:
     @property
     def charge(self) -> int:
         """Nats for what the judging drives have told as well: each knee and place, and each number of common noise."""
-        common = self.refit.in_common(self.variant) if isinstance(self.refit, Refit) else 0
-        return len(self.variant.profiled) + common
+        return len(self.variant.profiled) + (self.refit.in_common(self.variant) if isinstance(self.refit, Refit) else 0)
 
     def significant(self, critical: float) -> bool:
         """Whether its own test reaches the family's level, or nearly does and its gain leaves no doubt.
@@ -125,7 +124,7 @@ def screen_program(now: Refit, declared: Program, *, sets: int, seed: int, withh
     away = departures(declared, now, parts)
     away = [one for one in away if one.variant.name not in there and one.variant.effect.name not in withheld]
     there |= {departure.variant.name for departure in away}
-    tailed = bool(torch.isfinite(measured(program, fold.path.states[:1, :1]).freedom).any())  # Student t as it stands
+    tailed = measured(program, fold.path.states[:1, :1]).heavy_tailed  # as it stands
     effects = [e for e in catalogue(program) if e.name not in withheld and not (tailed and e.form == "tails")]
     variants = [v for effect in effects for v in effect.variants(program, seen) if v.name not in there]
     spread, sharpness = typical_spreads(program, fold.drives, smoothed(ahead, fold.drives))
@@ -173,7 +172,7 @@ def attempts(
         one is not None and tested.column.probe is None and now.fitting == BY_LIKELIHOOD
         for tested, one in zip(chosen, known, strict=True)
     ]  # scoring steps go from there as far as the likelihood rises
-    starts = [_absent(tested) if zero else _start(tested) for tested, zero in zip(chosen, from_zero, strict=True)]
+    starts = [t.variant.absent(now.held_out) if zero else _start(t) for t, zero in zip(chosen, from_zero, strict=True)]
     made = [attempt_with(now, t.variant, start, one) for t, start, one in zip(chosen, starts, known, strict=True)]
     given = zip(chosen, begin(now, made, threshold), known, from_zero, strict=True)
     return [partial(_fitted, now, *one) for one in given]
@@ -187,18 +186,14 @@ def _fitted(
         return candidate
     if isinstance(candidate.refit, Refit) and gain_of_fits(now, candidate.refit, folds=1) >= 0:
         return candidate
-    again = refit_with(now, tested.variant, _absent(tested), information=known, threshold=threshold)
-    return judged(now, tested, again)
+    absent = tested.variant.absent(now.held_out)
+    return judged(now, tested, refit_with(now, tested.variant, absent, information=known, threshold=threshold))
 
 
 def _known(tested: Tested, screening: Screening) -> Tensor | None:
     """The information of the first fold's drives about a candidate whose effect is linear in its coefficient."""
     effect = tested.variant.effect
     return screening.information[_key(tested.column)] if effect.null == 0 and effect.form in LINEAR_FORMS else None
-
-
-def _absent(tested: Tested) -> list[float]:
-    return [0.0] * len(tested.coefficient)
 
 
 def judged(now: Refit, tested: Tested, refit: Refit | str) -> Candidate:
@@ -342,10 +337,6 @@ class _Axis(NamedTuple):
     middle: float
     half_width: float
 
-    def deviation(self, value: float) -> float:
-        """From the middle, in half widths: the prior's standard deviations."""
-        return (self.to(value) - self.middle) / self.half_width
-
 
 def _axis(at: Variant, grid: Sequence[Variant], name: str) -> _Axis:
     by_factor = name in at.effect.by_factor
@@ -358,7 +349,8 @@ def _axis(at: Variant, grid: Sequence[Variant], name: str) -> _Axis:
 
 def _log_prior(at: Variant, grid: Sequence[Variant]) -> float:
     """Of a knee, width or place: a normal as wide as its grid."""
-    return -0.5 * sum(_axis(at, grid, name).deviation(value) ** 2 for name, value in at.profiled.items())
+    axes = [(_axis(at, grid, name), value) for name, value in at.profiled.items()]
+    return -0.5 * sum(((axis.to(value) - axis.middle) / axis.half_width) ** 2 for axis, value in axes)
 
 
 def _neighbours(at: Variant, grid: Sequence[Variant], name: str, share: float) -> list[Variant]:

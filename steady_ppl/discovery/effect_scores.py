@@ -71,7 +71,7 @@ class Scoring:
         self.substep_spread = substep_spreads(program, data, at.channels.points[:1], self.acting)[0]
         self._around = cache(at.channels.around)
         self._means_around = cache(self._means_near)
-        self._values: dict[int, dict[str, Tensor]] = {}
+        self._variables_around = cache(self._variables_near)
 
     def __call__(self, column: Column) -> Tensor:
         """Scores of a column, `(B, size)`, in double precision."""
@@ -80,8 +80,7 @@ class Scoring:
         if column.variant.effect.function is over_reading:
             return self._curve_of_readings(column.variant)
         score = getattr(self, f"_{column.variant.effect.form}")
-        parts = [score(column.variant, c, width) for c, width in self._differences(column)]
-        return torch.stack(parts, -1).double()
+        return torch.stack([score(column.variant, c, width) for c, width in self._differences(column)], -1).double()
 
     def _differences(self, column: Column) -> Iterator[tuple[tuple[Tensor, Tensor], float]]:
         """For each number of the coefficient two coefficients and how far they are apart."""
@@ -115,11 +114,10 @@ class Scoring:
     def _curve_of_readings(self, variant: Variant) -> Tensor:
         """Scores of the heights at the knots of a curve that is added to some readings, `(B, K)`."""
         at, knots, circular = self.at.measurements, variant.options["knots"], variant.options["circular"]
-        count = self.reading.shape[-1]
         found = []
         for index, name in enumerate(self.program.measurement_names):
             if name in variant.options["chosen"]:
-                values = self.reading[[0, 1 + index, 1 + count + index], ..., index]
+                values = self.reading[at.places(index), ..., index]
                 found.append(by_height(values, at.weights(index) * self.at.sharpness[..., index], knots, circular))
         return torch.stack(found).sum(0)
 
@@ -129,20 +127,16 @@ class Scoring:
         variable, knots = variant.options["variable"], variant.options["knots"]
         times = multiplier(self._means_around(index), variant.options["channel"], variant.options["times"])
         weights = self.at.channels.weights(index) / self.substep_spread[..., index] * times
-        return by_height(self._variables(index)[variable], weights, knots, variable in self.program.angles)
+        return by_height(self._variables_around(index)[variable], weights, knots, variable in self.program.angles)
 
-    def _variables(self, index: int) -> dict[str, Tensor]:
+    def _variables_near(self, index: int) -> dict[str, Tensor]:
         """What curves may depend on, at the points of one channel, each `(3, T, B)`."""
-        if index not in self._values:
-            found = variables(self.program, self._around(index), *self.rows[:2], self._means_around(index))
-            shape = (3, *self.substep_spread.shape[:2])
-            self._values[index] = {name: value.expand(shape) for name, value in found.items()}
-        return self._values[index]
+        found = variables(self.program, self._around(index), *self.rows[:2], self._means_around(index))
+        return {name: value.expand(3, *self.substep_spread.shape[:2]) for name, value in found.items()}
 
     def _means_near(self, index: int) -> dict[str, Tensor]:
         """The channels' means at the points of one of them, each `(3, T, B)`."""
-        count = self.means.shape[-1]
-        at = [0, 1 + index, 1 + count + index]
+        at = self.at.channels.places(index)
         return {name: self.means[at, ..., k] for k, name in enumerate(self.program.channel_names)}
 
     def _pushed(self, variant: Variant, value: Tensor, index: int, few: bool = False) -> dict[str, Tensor]:
@@ -191,8 +185,7 @@ class Scoring:
         return self.at.measurements.of_mean((up - down) * self.at.sharpness / width)
 
     def _viewpoint(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
-        points = self.at.measurements.points
-        up, down = (measured(self.program, variant(self.program, points, c=value)) for value in c)
+        up, down = (measured(self.program, variant(self.program, self.at.measurements.points, c=value)) for value in c)
         return self.at.measurements.of_mean(down.shift(up) * self.at.sharpness / width)
 
     def _spread(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
@@ -209,8 +202,7 @@ class Scoring:
         at = self.at.measurements
         squares = at.mean.square()
         fourth = squares.square() + 6 * squares * at.variance + 3 * at.variance.square()
-        score = (fourth - 2 * (squares + at.variance) - 1) / 4
-        return torch.where(at.present, score, 0.0).sum((0, -1))
+        return torch.where(at.present, (fourth - 2 * (squares + at.variance) - 1) / 4, 0.0).sum((0, -1))
 
     def _colour(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         """Of the share of the last deviation that stays, at zero: E[ε(t) ε(t − 1)], in the spreads' ratio."""

@@ -64,15 +64,13 @@ def findings(search: Search) -> list[Finding]:
 
 
 def _finding(search: Search, found: Found) -> Finding:
-    refit = search.final
     variant, effect = found.candidate.variant, found.candidate.variant.effect
-    values = refit.coefficient(variant).flatten().double().numpy()
-    spread = _spread(search, variant, len(values))
+    values = search.final.coefficient(variant).flatten().double().numpy()
+    spread = _spread(search, variant)
     is_positive = effect.null != 0  # and learned as its logarithm
     places = np.zeros_like(spread)
     if variant.profiled:
-        variance = variance_of_places(found.without, found.candidate)
-        places = variance.sqrt().numpy() / (values if is_positive else 1.0)
+        places = variance_of_places(found.without, found.candidate).sqrt().numpy() / (values if is_positive else 1.0)
     by_factor = 0.0
     if effect.by_factor:  # one for the whole vector: a component near zero tells none
         by_factor = min(MAX_LOG_SD, float(np.linalg.norm(places)) / max(1e-12, float(np.linalg.norm(values))))
@@ -105,16 +103,14 @@ def _around(value: float, by: float) -> tuple[float, float]:
     return value * math.exp(-by), value * math.exp(by)
 
 
-def _spread(search: Search, variant: Variant, count: int) -> np.ndarray:
+def _spread(search: Search, variant: Variant) -> np.ndarray:
     """Standard deviations in the space in which the coefficient is learned, of a fit to all drives."""
     screening = search.rounds[-1].screening
     information = screening.information[""]
     ridge = 1e-10 * float(information.diagonal().max()) * torch.eye(len(information)).double()
     covariance = torch.linalg.inv(information + ridge)  # what the drives do not tell has a huge variance
-    learned = [part.owner for part in screening.parameters]
     (there,) = [known for known in attached(search.final.program) if known.name == variant.name]
-    index = [i for i, name in enumerate(learned) if name == there.parameter]
-    assert len(index) == count
+    index = [i for i, part in enumerate(screening.parameters) if part.owner == there.parameter]
     return (search.final.first_share * covariance.diagonal()[index]).clamp(min=0).sqrt().numpy()
 
 
@@ -160,8 +156,7 @@ def gain_interval(candidate: Candidate, seed: int) -> tuple[float, float] | None
     if not candidate.is_judged:
         return None
     gain = candidate.gain.double().numpy() - candidate.charge / len(candidate.gain)
-    random = np.random.default_rng(seed)
-    totals = random.choice(gain, (RESAMPLES, len(gain))).sum(1)
+    totals = np.random.default_rng(seed).choice(gain, (RESAMPLES, len(gain))).sum(1)
     low, high = np.quantile(totals, [0.025, 0.975])
     return float(low), float(high)
 

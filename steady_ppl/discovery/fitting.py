@@ -24,19 +24,11 @@ from steady_ppl.effects import attached
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
-from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
+from steady_ppl.gaussian.smoother import require_found, resting_path, smooth
 from steady_ppl.guides.base import Constant
 from steady_ppl.guides.linearized import LookaheadGuide
 from steady_ppl.likelihood.evidence import neglected
-from steady_ppl.likelihood.maximize import (
-    Maximum,
-    Term,
-    kept_maximum,
-    maximise,
-    maximise_each,
-    maximise_sum,
-    output_of,
-)
+from steady_ppl.likelihood.maximize import Maximum, Term, kept_maximum, maximise_each, maximise_sum, output_of
 from steady_ppl.likelihood.parameters import Element, elements, moved, set_values, values_of
 from steady_ppl.likelihood.scores import channel_moments, substep_spreads
 from steady_ppl.model.problem import Problem
@@ -66,13 +58,7 @@ class Judgement:
 class ByLikelihood:
     """Scoring steps of the linearised program's log p(y), which judges as well."""
 
-    def fit(self, problem: Problem, path: ReferencePath | None = None, **settings: Any) -> Maximum:
-        """Move a program's parameters, in place, from a path that is found when None; see `maximise`."""
-        return maximise(problem, path, **settings)
-
-    def fit_each(self, problems: Sequence[Problem], paths: Sequence[ReferencePath], *settings: Any) -> list[Fit]:
-        """Fits to be made one after another, see `maximise_each`."""
-        return maximise_each(problems, paths, *settings)
+    fit_each = staticmethod(maximise_each)
 
     def judge(self, problem: Problem, path: ReferencePath) -> Judgement:
         """Log p(y) of drives, linearised along a path that is improved from here."""
@@ -91,16 +77,12 @@ class ByDraws:
     steps: int = 60  # E steps, each with a gradient step
     learning_rate: float = 0.1  # Adam's at the first step
 
-    def fit(self, problem: Problem, path: ReferencePath | None = None, **_: Any) -> Maximum:
-        """See `ByLikelihood`."""
-
-        def find() -> Maximum:
-            return self._train(problem, path or find_path(problem))
-
-        return kept_maximum(problem.program, lambda: output_of(problem.program, find))
+    def fit(self, problem: Problem, path: ReferencePath) -> Maximum:
+        """Move a program's parameters, in place."""
+        return kept_maximum(problem.program, lambda: output_of(problem.program, lambda: self._train(problem, path)))
 
     def fit_each(self, problems: Sequence[Problem], paths: Sequence[ReferencePath], *_: Any) -> list[Fit]:
-        """See `ByLikelihood`; they draw random numbers, so that none begins before its turn."""
+        """See `maximise_each`; they draw random numbers, so that none begins before its turn."""
         return [partial(self.fit, *one) for one in zip(problems, paths, strict=True)]
 
     def _train(self, problem: Problem, path: ReferencePath) -> Maximum:

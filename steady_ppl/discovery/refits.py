@@ -134,8 +134,7 @@ class Refit(Fits):
 
     def in_common(self, variant: Variant) -> int:
         """How many numbers of an effect's coefficient all drives told, those that judge it as well."""
-        name = _as_attached(self.program, variant).parameter
-        return self.judges.common.count(name)
+        return self.judges.common.count(_as_attached(self.program, variant).parameter)
 
 
 def first_refit(problem: Problem, valid: Trajectories, *, seed: int, nearer: Program | None = None) -> Refit:
@@ -338,17 +337,14 @@ def _refit(
     fits: Sequence[Fit | None] = [first, *[None] * (len(folds) - 1)]
     if unwidened is None and threshold == NO_THRESHOLD and first is None and not any(maxima):  # all are made
         fits = _fits(fitting, programs, folds, information, least)
-    for program, fold, known, fit, floor in zip(programs, folds, maxima, fits, least, strict=True):
-        guess = fold.information(information, folds[0])
+    for program, fold, maximum, fit, floor in zip(programs, folds, maxima, fits, least, strict=True):
         anew = None if unwidened is None else _fit_anew(fold.fitting(as_declared(unwidened, program)), floor)
         if anew is not None:
             floor = max(floor, float(anew[1].log_likelihood.sum()))
-        if known is not None:
-            maximum = known
-        elif fit is not None:
-            maximum = fit()
-        else:
-            maximum = fitting.fit(fold.fitting(program), fold.path, information=guess, hopeless=floor)
+        if maximum is None:
+            guess = fold.information(information, folds[0])
+            (made,) = [fit] if fit else fitting.fit_each([fold.fitting(program)], [fold.path], [guess], [floor])
+            maximum = made()
         held_out_path = fold.held_out_path
         if anew is not None and anew[1].objective > maximum.objective:
             program, maximum = anew

@@ -14,7 +14,6 @@ from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.finding import Finding, NextRun, Shape, gain_interval
 from steady_ppl.discovery.screening import FAMILY_LEVEL, Tested
 from steady_ppl.discovery.search import Search
-from steady_ppl.effects import Variant
 from steady_ppl.errors import RunError
 from steady_ppl.runs.fit import Fit
 from steady_ppl.runs.folder import DISCOVERY
@@ -201,7 +200,7 @@ def _candidate(found: Discovery, tested: Tested) -> dict[str, Any]:
         "sd": _numbers(tested.sd) if scaled else None,
         "absent": null if scaled else None,
         "unit": variant.unit,
-        "options": _options(variant),
+        "options": variant.profiled,
         "detection_limit": _numbers(limit_of(found, tested)),
         "heldout_gain": fitted.total if fitted and math.isfinite(fitted.total) else None,
         "heldout_gain_ci": list(interval) if interval else None,
@@ -250,7 +249,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "sd": finding.sd,
         "interval_90": [list(pair) for pair in finding.interval],
         "unit": finding.variant.unit,
-        "options": _options(finding.variant),
+        "options": finding.variant.profiled,
         "equation": finding.variant.effect.equation,
         "text": finding.variant.effect.text,
         "heldout_gain": finding.gain,
@@ -340,9 +339,4 @@ def _short(value: float | list[float] | None) -> str:
 def _numbers(values: np.ndarray) -> float | list[float] | None:
     if not np.isfinite(values).all():
         return None
-    return float(values[0]) if len(values) == 1 else [float(value) for value in values]
-
-
-def _options(variant: Variant) -> dict[str, Any]:
-    """Its knees, widths and places."""
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in variant.profiled.items()}
+    return float(values[0]) if len(values) == 1 else values.tolist()

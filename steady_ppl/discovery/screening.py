@@ -119,7 +119,9 @@ def screen(
             tests.append(_best_of(alive))
         else:
             why = CONTAINED if any(bool((before[places[i]] > 0).any()) for i in members) else UNEXCITED
-            tests.append(_untestable(columns[members[0]], places[members[0]], why, len(scores)))
+            column, certain = columns[members[0]], np.ones(len(scores))
+            nothing, endless = np.zeros(column.size), np.full(column.size, math.inf)
+            tests.append(Tested(column, places[members[0]], 0.0, certain, nothing, endless, endless, untestable=why))
         curves += [_best_of([test]) for test in alive if test.is_curve]
     tests += [_departed(departure, information[own, own], scores[:, own]) for departure in departures]
     tests.sort(key=Tested.rank)
@@ -152,18 +154,12 @@ def _best_of(tests: list[Tested]) -> Tested:
     return replace(min(tests, key=Tested.rank), p_values=together, effective=effective)
 
 
-def _untestable(column: Column, place: slice, why: str, sets: int) -> Tested:
-    nothing, endless = np.zeros(column.size), np.full(column.size, math.inf)
-    return Tested(column, place, 0.0, np.ones(sets), nothing, endless, endless, untestable=why)
-
-
 def _limit(tested: Tested, critical: float) -> np.ndarray:
     """The size of each number, the others zero, at which a noncentral χ² passes the family's level with 95 %."""
     size = len(tested.coefficient)
     if tested.untestable or tested.is_curve or tested.alone is None or not math.isfinite(tested.variant.effect.null):
         return np.full(size, math.inf)
-    level = -math.expm1(math.log1p(-critical) / tested.effective)
-    threshold = special.chdtri(size, level)
+    threshold = special.chdtri(size, -math.expm1(math.log1p(-critical) / tested.effective))
     needed = optimize.brentq(lambda away: 1 - special.chndtr(threshold, size, away) - POWER, 1e-6, 1e4)
     return math.sqrt(needed) * tested.alone
 
@@ -189,10 +185,9 @@ def _test_of_curve(column: Column, place: slice, scores: Tensor, own: Tensor) ->
     root = torch.linalg.cholesky(covariance)
     values, turn = torch.linalg.eigh(root.T @ own @ root)
     values = values.clamp(min=0)
-    squares = (scores @ root @ turn).square() / (1 + values)
     weights = values / (1 + values)
     scale, freedom = float(weights.square().sum() / weights.sum()), float(weights.sum() ** 2 / weights.square().sum())
-    statistics = squares.sum(-1).numpy()
+    statistics = ((scores @ root @ turn).square() / (1 + values)).sum(-1).numpy()
     posterior = torch.linalg.inv(own + torch.linalg.inv(covariance))
     sd = posterior.diagonal().sqrt().numpy()
     return Tested(
@@ -266,13 +261,13 @@ def departures(declared: Program, now: Refit, parts: Sequence[Element]) -> list[
     own = torch.tensor([part.owner not in effects for part in parts])
     guessed = torch.tensor([any(part.name.startswith(guess) for guess in program.guesses) for part in parts])
     found = []
-    for name, log_spread in LOG_SPREADS.items():
-        sides = [on_both_sides(part, partial(log_spread, program, fold)) for part in parts]
+    for name in ("process_noise", "measurement_noise"):
+        sides = [on_both_sides(part, partial(_log_spreads, name, program, fold)) for part in parts]
         slope = torch.stack([(up - down) / (2 * part.step) for part, (up, down) in zip(parts, sides, strict=True)])
         slope = slope * own.unsqueeze(-1)
         is_tested = (slope != 0).any(0) & ~(slope[guessed] != 0).any(0)
         away, *judged = (
-            log_spread(one, drives) - log_spread(as_declared(declared, one), drives)
+            _log_spreads(name, one, drives) - _log_spreads(name, as_declared(declared, one), drives)
             for one, drives in zip((program, *now.judges.programs), (fold, *now.folds), strict=True)
         )
         mean = now.mean(judged)
@@ -284,15 +279,10 @@ def departures(declared: Program, now: Refit, parts: Sequence[Element]) -> list[
     return found
 
 
-def _log_spreads_of_channels(program: Program, fold: Fold) -> Tensor:
-    """Mean log standard deviations over the drives, `(C,)`."""
-    spread = substep_spreads(program, fold.drives, fold.path.states[:-1].unsqueeze(0))
-    return spread[0][fold.drives.transitions].log().mean(0).double()
-
-
-def _log_spreads_of_measurements(program: Program, fold: Fold) -> Tensor:
-    spread = measured(program, fold.path.states.unsqueeze(0)).spread
-    return spread[0][fold.drives.rows].log().mean(0).double()
-
-
-LOG_SPREADS = {"process_noise": _log_spreads_of_channels, "measurement_noise": _log_spreads_of_measurements}
+def _log_spreads(effect: str, program: Program, fold: Fold) -> Tensor:
+    """Mean log standard deviations over the drives, of the channels `(C,)` or the measurements `(K,)`."""
+    if effect == "process_noise":
+        spread, there = substep_spreads(program, fold.drives, fold.path.states[None, :-1]), fold.drives.transitions
+    else:
+        spread, there = measured(program, fold.path.states.unsqueeze(0)).spread, fold.drives.rows
+    return spread[0][there].log().mean(0).double()

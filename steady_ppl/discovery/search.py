@@ -98,8 +98,7 @@ class Found:
     @property
     def aliases(self) -> list[Candidate]:
         """Those that these drives cannot tell from the best, itself first."""
-        best = self.candidate.total
-        close = [c for c in self.candidates if c.total >= best - TIE_NATS]
+        close = [c for c in self.candidates if c.total >= self.candidate.total - TIE_NATS]
         return [self.candidate, *(c for c in close if c is not self.candidate and not c.against_its_sign)]
 
 

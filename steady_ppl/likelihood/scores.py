@@ -54,7 +54,7 @@ class Deviations:
     def by_row(self, slope: Tensor) -> Tensor:
         """`of_mean` row by row, `(rows, B)`."""
         count = self.mean.shape[-1]
-        return sum(self.of_component(i, slope[[0, 1 + i, 1 + count + i], ..., i]) for i in range(count))  # type: ignore[return-value]
+        return sum(self.of_component(i, slope[self.places(i), ..., i]) for i in range(count))  # type: ignore[return-value]
 
     def of_component(self, index: int, slope: Tensor) -> Tensor:
         """Row by row, of a change of one component's mean at x̂, x̂ + v and x̂ − v of that component, `(3, rows, B)`."""
@@ -68,8 +68,11 @@ class Deviations:
 
     def around(self, index: int) -> Tensor:
         """The points of one component, `(3, rows, B, D)`."""
-        count = self.mean.shape[-1]
-        return component_major(self.points[[0, 1 + index, 1 + count + index]])
+        return component_major(self.points[self.places(index)])
+
+    def places(self, index: int) -> list[int]:
+        """Which `points` are those of one component."""
+        return [0, 1 + index, 1 + self.mean.shape[-1] + index]
 
     def of_spread(self, slope: Tensor) -> Tensor:
         """Score of a change of the log standard deviations by `slope`, `(rows, B, C)`; `(B,)`."""

@@ -195,7 +195,7 @@ def test_not_knowing_a_knee_is_in_the_coefficients_interval():
     found = discovered("thrust_saturation:knee=0.6=0.8")
     (finding,) = found.findings
     assert finding.variant.name == "thrust_saturation" and abs(finding.coefficient[0] - 0.8) < 3 * finding.sd[0]
-    alone = _spread(found.search, finding.variant, 1)[0]
+    (alone,) = _spread(found.search, finding.variant)
     (one,) = found.search.found
     places = float(variance_of_places(one.without, one.candidate))
     assert places > 0.1 * alone**2 and finding.sd[0] ** 2 == pytest.approx(alone**2 + places, rel=1e-3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, is_doubtful
 from steady_ppl.discovery.refits import first_refit, refit_with
 from steady_ppl.effects import chosen_variant
 from steady_ppl.gaussian.smoother import find_path
+from steady_ppl.likelihood.maximize import maximise
 from steady_ppl.model.problem import Problem
 
 
@@ -24,7 +26,8 @@ def test_both_ways_agree_where_the_program_is_nearly_linear() -> None:
     fits = []
     for fitting in (ByLikelihood(), ByDraws(steps=200)):
         own = copy.deepcopy(program)
-        fits.append((own, fitting.fit(Problem(own, data, True), path)))
+        (fit,) = fitting.fit_each([Problem(own, data, True)], [path], [None], [-math.inf])
+        fits.append((own, fit()))
     (likely, first), (drawn, second) = fits
     assert not is_doubtful(Problem(likely, data, True), first.path)
     assert abs(float((first.log_likelihood - second.log_likelihood).sum())) < 1.0
@@ -35,9 +38,10 @@ def test_both_ways_agree_where_the_program_is_nearly_linear() -> None:
 def test_a_fit_never_ends_below_where_it_began() -> None:
     program = example("hovercraft", torch.float32)
     data = drives(program, 4, 41, seed=1)
-    ByLikelihood().fit(Problem(program, data, True))
+    problem = Problem(program, data, True)
+    maximise(problem)
     before = {name: value.clone() for name, value in program.named_parameters()}
-    fit = ByDraws(steps=3, learning_rate=2.0).fit(Problem(program, data, True))
+    fit = ByDraws(steps=3, learning_rate=2.0).fit(problem, find_path(problem))
     assert fit.gained == 0.0
     assert all(torch.equal(value, before[name]) for name, value in program.named_parameters())
 
@@ -56,7 +60,7 @@ def test_a_program_whose_linearised_likelihood_is_off_is_fitted_by_draws(monkeyp
     assert not isinstance(found, str) and found.fitting == base.fitting
     assert float((found.held_out - base.held_out).sum()) > TIE_NATS
     likely, path = copy.deepcopy(found.program), found.folds[0].path
-    ByLikelihood().fit(Problem(likely, train, True), path)
+    maximise(Problem(likely, train, True), path)
     there = found.fitting.judge(Problem(likely, train, True), path)
     assert float((found.maxima[0].log_likelihood - there.log_likelihood).sum()) > -TIE_NATS
 
