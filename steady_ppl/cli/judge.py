@@ -81,8 +81,7 @@ def prove(
         from steady_ppl.plotting.comparison import proof_picture
 
         write_picture(proof_picture(found), picture)
-    runs_by_label = {label: str(run) for label, run in labels.items()}
-    present(str(found), {"runs": runs_by_label, **found.figures}, json_file)
+    present(str(found), {"runs": {label: str(run) for label, run in labels.items()}, **found.figures}, json_file)
 
 
 def evaluate(
@@ -119,8 +118,7 @@ def evaluate(
     rows = [{"run": folder, **result} for folder, result in zip(folders, results, strict=True)]
     present("\n".join(lines), {"runs": rows}, json_file)
     doubts = {doubt: None for fit in fits for doubt in diagnose_units(fit.program, st.for_program(fit.program, drives))}
-    used = used_before(labels, fingerprint(drives))
-    say(*incomparable(results, folders), *used, *drives.uneven_steps, *doubts)
+    say(*incomparable(results, folders), *used_before(labels, fingerprint(drives)), *drives.uneven_steps, *doubts)
     for run, result in zip(runs, results, strict=True):
         if result["filter"] != "lookahead":
             say(f"{run}: judged by the filter {result['filter']}")

@@ -152,9 +152,8 @@ def main(arguments: list[str] | None = None) -> int:
     for option in command.params:
         if isinstance(option, typer.core.TyperOption) and option.name in COMPLETION_OPTIONS:
             option.hidden = True
-    words = ["steady", *(word for word in arguments if word not in ("--resume", "--force"))]
-    record = bound(COMMAND, shlex.join(words))
-    with bound(QUIET, "quiet" in asked), record, progress_line() as line, listening(line):
+    typed = shlex.join(["steady", *(word for word in arguments if word not in ("--resume", "--force"))])
+    with bound(QUIET, "quiet" in asked), bound(COMMAND, typed), progress_line() as line, listening(line):
         try:
             code = command.main(arguments, prog_name="steady", standalone_mode=False) or 0
             if code == INTERRUPTED_CODE:

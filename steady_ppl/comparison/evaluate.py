@@ -74,17 +74,16 @@ def evaluate(
     problem, of_map = _checked(fit, table, surveyed)
     program, data, known_start = problem.program, problem.data, problem.known_start
     choice = choose_filter(program, data, known_start=known_start, particles=particles, look_ahead=look_ahead)
-    settings: dict[str, Any] = {"look_ahead": choice.look_ahead, "known_start": known_start}
-    settings["particles"] = choice.particles
+    settings: Any = {"look_ahead": choice.look_ahead, "known_start": known_start, "particles": choice.particles}
     result: dict[str, Any] = {"recipe": fit.recipe, "known_start": known_start}
     result |= {"measured": list(data.measurement_names), "filter": choice.name}
     with stages(("log p(y)", 1), ("states", 2), ("measurements", 2)) as begin:
         begin()
         with seeded(seed, "log_likelihood"):
-            found = evidence(program, data, **settings)
-        worst = int(found.scarce.argmax())
-        scarce = {"trajectory": data.labels[worst], "share": float(found.scarce[worst]), "particles": choice.particles}
-        result |= {"log_likelihood": float(found.log_likelihood.mean()), "scarce": scarce}
+            likely, shares = evidence(program, data, **settings)
+        worst = int(shares.argmax())
+        scarce = {"trajectory": data.labels[worst], "share": float(shares[worst]), "particles": choice.particles}
+        result |= {"log_likelihood": float(likely.mean()), "scarce": scarce}
         result |= {"forward": {}, "forward_mean": {}, "state_estimation": {}}
         begin()
         if has_truth(data):
@@ -216,8 +215,7 @@ def state_estimation(
     for part in in_parts(data.observed_every(every), particles, look_ahead=look_ahead):
         assert part.states is not None
         filtered = run_filter(program, part, particles=particles, known_start=known_start, look_ahead=look_ahead)
-        paths = filtered.paths(lineages)
-        for group, squared in squared_errors(program, paths.states, part.states).items():
+        for group, squared in squared_errors(program, filtered.paths(lineages).states, part.states).items():
             mean = squared.mean(0)
             known = torch.isfinite(mean) & part.rows
             judged = known.any(0)

@@ -179,8 +179,7 @@ def judge_constant_velocity(before: Judged) -> Judged | str:
     if isinstance(found, str):
         return found
     path = before.tracked.path(unseen.data)
-    still = ReferencePath(path.states, torch.zeros_like(path.noise))
-    ahead = smooth(replace(unseen, program=found.program), still)
+    ahead = smooth(replace(unseen, program=found.program), replace(path, noise=torch.zeros_like(path.noise)))
     if not bool(torch.isfinite(ahead.log_likelihood).all()):
         return "it blows up on these drives"
     return compare_predictions(replace(before.problem, program=found.program), ahead)

@@ -92,8 +92,7 @@ def scored(real: Sequence[Direction], simulated: Sequence[Direction], sets: int)
     parts = [fit.split(each[0], free)]
     for values in each[1:]:  # compared with the others, as the real set is: what fits itself looks small
         away = values * sets / (sets - 1)
-        without = _Fitted((covariance * (sets - 1) - values.T @ away) / (sets - 2), own)
-        parts.append(without.split(away, free))
+        parts.append(_Fitted((covariance * (sets - 1) - values.T @ away) / (sets - 2), own).split(away, free))
     parameters, rest = (np.stack(part) for part in zip(*parts, strict=True))
     sd = fit.spread(free)
     left = fit.left[np.ix_(free, free)] / np.outer(sd, sd)

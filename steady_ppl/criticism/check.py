@@ -125,11 +125,9 @@ def _in_own_spreads(real: Residuals, simulated: Residuals) -> tuple[Residuals, R
     """Divide every residual by the root mean square, at its interval and drive, of all sets: a score is small where few
     measurements follow, however wrong the program is. The real set is one of them, or its tails would be heavier than
     those of the sets that its scale was taken from."""
-    squares = (real.values**2).sum(0) + (simulated.values**2).sum(0)
     count = real.there.sum(0) + simulated.there.sum(0)
-    scale = np.sqrt(squares / np.maximum(count, 1))
-    typical = np.sqrt((scale**2).mean((0, 1)))
-    told = (scale > 0.05 * typical) & (count > 1)
+    scale = np.sqrt(((real.values**2).sum(0) + (simulated.values**2).sum(0)) / np.maximum(count, 1))
+    told = (scale > 0.05 * np.sqrt((scale**2).mean((0, 1)))) & (count > 1)
     scale = np.where(told, scale, 1.0)
 
     def scaled(part: Residuals) -> Residuals:
@@ -155,7 +153,6 @@ def _scatter(both: Residuals) -> dict[str, np.ndarray]:
     """Mean squares of every residual, and the fourth power of the measurements' as a sign of tails; of every set."""
     squares, count = both.mean_squares, np.maximum(both.there.sum((1, 2)), 1)
     told = {i: name for i, name in enumerate(both.names) if both.there[0, ..., i].any()}
-    fourth = (both.values**4).sum((1, 2)) / count
-    tails = np.log(fourth / np.maximum(squares, 1e-12) ** 2 + 1e-12)
+    tails = np.log((both.values**4).sum((1, 2)) / count / np.maximum(squares, 1e-12) ** 2 + 1e-12)
     found = {f"{SCATTER}{name}": squares[:, i] for i, name in told.items()}
     return found | {f"tails of {name}": tails[:, i] for i, name in told.items()}

@@ -108,8 +108,7 @@ class _Scores:
         scores = []
         for part in parts:
             sides = on_both_sides(part, lambda: row_errors(program, states, data.measurements, data.observed).double())
-            shift = torch.where(data.observed, sides[1] - sides[0], 0.0)
-            scores.append(self.shift(shift / (2 * part.step)))
+            scores.append(self.shift(torch.where(data.observed, sides[1] - sides[0], 0.0) / (2 * part.step)))
         return torch.stack(scores, -1)
 
     def of_sensors(self) -> Named:

@@ -134,7 +134,6 @@ def _starts_elsewhere(tracked: Tracked, near: ReferencePath) -> Tensor:
 def residuals(program: Program, data: Trajectories, tracked: Tracked, ahead: Prediction, sets: int) -> Residuals:
     """The standardised one-step errors of the measurements and the scores of the channels, with what they are sorted
     by: state components, velocities in the channels' own frame and positions."""
-    values = torch.cat([ahead.standardised, tracked.noise], -1)
     there = torch.cat([ahead.observed, data.transitions.unsqueeze(-1).expand_as(tracked.noise)], -1)
     states = tracked.path(data).states[:-1]
     variables = {name: states[..., i] for i, name in enumerate(program.state_names)}
@@ -148,7 +147,7 @@ def residuals(program: Program, data: Trajectories, tracked: Tracked, ahead: Pre
         channels = tuple(f"channel {i + 1}" for i in range(count))
     return Residuals(
         names=[*program.measurement_names, *channels],
-        values=_by_set(torch.where(there, values, 0.0), sets),
+        values=_by_set(torch.where(there, torch.cat([ahead.standardised, tracked.noise], -1), 0.0), sets),
         there=_by_set(there, sets),
         variables={name: _by_set(value, sets) for name, value in variables.items()},
     )

@@ -129,9 +129,8 @@ def misfit_of(both: Residuals, time: Array, controls: dict[str, Array], pairs: S
     average = np.stack([average for _, average in found], -1)  # (1 + M, cells)
     squares, typical = both.mean_squares, both.mean_squares[1:].mean(0)
     dispersion = np.divide(squares, typical, out=np.full_like(squares, np.nan), where=typical > 0)
-    widened = np.sqrt(np.minimum(dispersion, unexplained[:, None]).clip(1.0))[:, [cell.residual for cell in cells]]
     z, freedom = standardise(average)
-    z /= widened
+    z /= np.sqrt(np.minimum(dispersion, unexplained[:, None]).clip(1.0))[:, [cell.residual for cell in cells]]
     p_values = 2 * special.stdtr(freedom, -np.abs(z))
     rates = np.stack([_adjusted(row) for row in p_values])
     simes = rates.min(1)

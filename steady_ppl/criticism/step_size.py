@@ -56,8 +56,7 @@ class StepTrial:
 
     def largest_difference(self, other: StepTrial) -> str:
         """The watched number that differs most from the other trial's, and by how much, in words."""
-        spread = self.covariance.diagonal().clamp(min=1e-300).sqrt()
-        apart = ((other.values - self.values) / spread).abs()
+        apart = ((other.values - self.values) / self.covariance.diagonal().clamp(min=1e-300).sqrt()).abs()
         return f"{self.names[int(apart.argmax())]} by {float(apart.max()):.1f} standard deviations"
 
 
@@ -187,8 +186,7 @@ def check_step(
     if not is_step(program, data):  # in substeps it is another model, whose parameters are others
         watched = ()
     elif parts is not None and watched is None:
-        wider = widens(program, parts, data)
-        watched = [part.owner for part, noise in zip(parts, wider, strict=True) if not noise]
+        watched = [part.owner for part, noise in zip(parts, widens(program, parts, data), strict=True) if not noise]
     names = watched or ()
 
     def trial(substeps: int, like: Program, path: ReferencePath, steps: int) -> StepTrial:
@@ -201,8 +199,7 @@ def check_step(
         if steps:
             with seeded(substeps, "wider noise"):
                 path = widen_noise(problem, path)
-        maximum = maximise(problem, path, steps=steps, precision=REFIT_PRECISION)
-        return _trial(changed, data, maximum, names)
+        return _trial(changed, data, maximise(problem, path, steps=steps, precision=REFIT_PRECISION), names)
 
     def again(coarse: StepTrial, fine: StepTrial) -> StepTrial:
         try:

@@ -95,8 +95,7 @@ def _named(program: Program, variant: Variant) -> str:
             f"effect {variant.name} is registered in {home}, which the new file would not load: register it in the "
             "program's own file"
         )
-    numbers = _numbers(coefficient(program, variant).detach())
-    return f"{variant.written}={','.join(numbers if isinstance(numbers, list) else [numbers])}"
+    return f"{variant.written}={','.join(_numbers(coefficient(program, variant).detach().flatten()))}"
 
 
 def _numbers(value: Tensor) -> Any:

@@ -233,8 +233,7 @@ class Variant:
 
     def absent(self, like: Tensor) -> Tensor:
         """The coefficient without the effect."""
-        shape = (self.effect.size,) if self.effect.components else ()
-        return like.new_full(shape, self.effect.null)
+        return like.new_full((self.effect.size,) if self.effect.components else (), self.effect.null)
 
     def __call__(self, program: Program, *arguments: Any, c: Tensor, mean: Means | None = None) -> Any:
         """Call the effect's function with its options and, where it asks, the channels' means without the effect."""

@@ -92,14 +92,6 @@ def neglected(
     return filtered.log_likelihood - ahead.log_likelihood
 
 
-@dataclass(frozen=True)
-class Evidence:
-    """What a filter says of given drives, without their states."""
-
-    log_likelihood: Tensor  # (B,), estimated
-    scarce: Tensor  # (B,) as `Filtered.scarce`; where it is large the estimate scatters, and is mostly too low
-
-
 def evidence(
     program: Program,
     data: Trajectories,
@@ -109,7 +101,7 @@ def evidence(
     every: int = 10,
     look_ahead: bool = False,
     kernels: bool | None = None,
-) -> Evidence:
+) -> tuple[Tensor, Tensor]:
     """Estimate log p(y) of each trajectory, untempered.
 
     Args:
@@ -120,6 +112,9 @@ def evidence(
         every: use the measurements of every n-th row only, the first included (10 turns 10 Hz into 1 Hz).
         look_ahead: propose with a view to the later measurements instead of blindly.
         kernels: see `particle_filter`.
+
+    Returns:
+        The estimates, `(B,)`, and `Filtered.scarce`: where it is large they scatter, and are mostly too low.
 
     Raises:
         DataError: a trajectory has measurements, but none at these rows.
@@ -139,13 +134,13 @@ def evidence(
         filtered = run_filter(program, part, particles=particles, keep_history=False, **settings)
         values.append(filtered.log_likelihood)
         scarce.append(filtered.scarce(part))
-    return Evidence(torch.cat(values), torch.cat(scarce))
+    return torch.cat(values), torch.cat(scarce)
 
 
 @one_thread()
 def log_likelihood(program: Program, data: Trajectories, **settings: Any) -> Tensor:
     """The estimate of `evidence`, `(B,)`; settings and errors are its."""
-    return evidence(program, data, **settings).log_likelihood
+    return evidence(program, data, **settings)[0]
 
 
 @one_thread()
@@ -170,6 +165,4 @@ def in_parts(
     """Split into groups of trajectories such that no filter carries more than about `at_once` particles; the search
     for a path to look ahead along uses a thousand itself."""
     particles = max(particles, 1000) if look_ahead else particles
-    size = max(1, at_once // particles)
-    for first in range(0, len(data), size):
-        yield data.subset(range(first, min(first + size, len(data))))
+    return map(data.subset, torch.arange(len(data)).split(max(1, at_once // particles)))

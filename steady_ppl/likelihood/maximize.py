@@ -88,7 +88,6 @@ def maximise(
     Raises:
         FilterError: the program cannot be smoothed at its initial parameters.
     """
-
     given = {"information": information, "steps": steps, "precision": precision, "hopeless": hopeless}
     return kept_maximum(problem.program, lambda: _maximum_of_copy(problem, path or find_path(problem), **given))
 
@@ -101,10 +100,9 @@ def maximise_each(
 ) -> list[Callable[[], Maximum]]:
     """Calls of `maximise` for several programs, to be made in this order; where cores are free the next ones begin. A
     program moves when its call is made."""
-    each = zip(problems, paths, informations, hopeless, strict=True)
     computations = [
         partial(_maximum_of_copy, problem, path, information=information, hopeless=least)
-        for problem, path, information, least in each
+        for problem, path, information, least in zip(problems, paths, informations, hopeless, strict=True)
     ]
     outputs = zip(problems, in_batches(computations), strict=True)
     return [partial(kept_maximum, problem.program, output) for problem, output in outputs]

@@ -124,9 +124,8 @@ class NormalShape:
 
     def draws(self, count: int) -> Tensor:
         """Values `(K, P)`."""
-        size = len(self.centre)
         student = torch.distributions.Chi2(torch.tensor(DEGREES_OF_FREEDOM, dtype=torch.float64)).sample((count, 1))
-        white = torch.randn(count, size, dtype=torch.float64) * (DEGREES_OF_FREEDOM / student).sqrt()
+        white = torch.randn(count, len(self.centre), dtype=torch.float64) * (DEGREES_OF_FREEDOM / student).sqrt()
         return self.centre + white @ self.root.T
 
     def density(self, values: Tensor) -> Tensor:
@@ -177,11 +176,8 @@ def _shaped(shape: NormalShape, values: Tensor, log_weights: Tensor) -> NormalSh
 
 def observed_information(problem: Problem, path: ReferencePath, parts: list[Element]) -> Tensor:
     """Minus the second derivatives of log p(y) and the log prior, `(P, P)`, by differences of exact scores."""
-    columns = []
-    for part in parts:
-        up, down = on_both_sides(part, lambda: posterior_score(problem, path))
-        columns.append((down - up) / (2 * part.step))
-    found = torch.stack(columns)
+    sides = [on_both_sides(part, lambda: posterior_score(problem, path)) for part in parts]
+    found = torch.stack([(down - up) / (2 * part.step) for part, (up, down) in zip(parts, sides, strict=True)])
     return (found + found.T) / 2
 
 

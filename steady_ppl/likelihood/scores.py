@@ -58,8 +58,7 @@ class Deviations:
 
     def of_component(self, index: int, slope: Tensor) -> Tensor:
         """Row by row, of a change of one component's mean at x̂, x̂ + v and x̂ − v of that component, `(3, rows, B)`."""
-        change = self.mean[..., index] * slope[0] + (slope[1] - slope[2]) / 2
-        return torch.where(self.present[..., index], change, 0.0)
+        return torch.where(self.present[..., index], self.mean[..., index] * slope[0] + (slope[1] - slope[2]) / 2, 0.0)
 
     def weights(self, index: int) -> Tensor:
         """What `of_component` multiplies the slopes with, `(3, rows, B)`."""
@@ -136,8 +135,7 @@ class Arrivals:
         count = self.mean.shape[-1]
         change = wrap_angles(change, self.angles)
         apart = (change[1 : 1 + count] - change[1 + count :]).diagonal(dim1=0, dim2=-1) / 2
-        by_row = (self.scale * (self.mean * change[0] + apart)).sum(-1)
-        return torch.where(self.present, by_row, 0.0).sum(0)
+        return torch.where(self.present, (self.scale * (self.mean * change[0] + apart)).sum(-1), 0.0).sum(0)
 
     def of_slopes(self, slopes: Slopes) -> Tensor:
         """Scores of learnable numbers from the slopes of where rows end, row by row; `(B, P)`."""

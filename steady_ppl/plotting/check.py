@@ -50,14 +50,12 @@ def representative(found: Check) -> int:
         if "drive" in finding.cell.where:
             return int(finding.cell.where["drive"])
     far = found.predictions[max(found.predictions)]
-    total = far.standardised.square().sum((0, 2)) / far.observed.sum((0, 2)).clamp(min=1)
-    return int(total.argmax())
+    return int((far.standardised.square().sum((0, 2)) / far.observed.sum((0, 2)).clamp(min=1)).argmax())
 
 
 def predictions(found: Check, drive: int, component: int, axes: Axes) -> None:
     """Measured against the nearest and the farthest prediction, with 90 % bands."""
-    data = found.data
-    time = data.elapsed[:, drive].numpy(force=True)
+    time = found.data.elapsed[:, drive].numpy(force=True)
     last = list(found.horizons)[-1]
     for name, color in zip(dict.fromkeys(("one step", last)), (NEAR_COLOR, FAR_COLOR), strict=False):
         at, middle, half = _with_breaks(time, *(values[:, drive, component] for values in band(found, name)))

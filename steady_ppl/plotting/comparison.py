@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from steady_ppl.comparison.result import NOISE_FLOOR, Proof, units_of_states
 from steady_ppl.errors import UsageError
+from steady_ppl.utils.text import with_unit
 
 COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "black")  # Okabe and Ito
 MARKERS = "os^Dvx+"
@@ -38,8 +39,7 @@ def open_loop_picture(found: Proof, *, of: str | None = None, axes: Axes | None 
     for index, (name, curve) in enumerate(curves.items()):
         mark, color = MARKERS[index % len(MARKERS)], COLORS[index % len(COLORS)]
         axes.plot(*zip(*curve, strict=True), f"{mark}-", color=color, ms=4, lw=1.4, label=name)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log", xlabel="predicted ahead [s]")
     for axis in (axes.xaxis, axes.yaxis):  # 0.1 and 20 rather than powers of ten
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")  # twos and fives
@@ -49,9 +49,8 @@ def open_loop_picture(found: Proof, *, of: str | None = None, axes: Axes | None 
         lowest = 0.8 * min(error for curve in (floor, *curves.values()) for _, error in curve)
         axes.fill_between(seconds, lowest, errors, color="0.85", lw=0, label=NOISE_FLOOR, zorder=0)
         axes.set_ylim(bottom=lowest)
-    axes.set_xlabel("predicted ahead [s]")
     unit, what = (states[of], of) if of in states else (of, "measured")
-    axes.set_ylabel(f"{what}, root mean square error{f' [{unit}]' if unit else ''}")
+    axes.set_ylabel(with_unit(f"{what}, root mean square error", unit))
     axes.legend(fontsize=8)
     return axes
 

@@ -3,7 +3,7 @@ its body frame unless said otherwise."""
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -48,12 +48,8 @@ def _springs(program: Program, data: Trajectories | None) -> Choices:
     return _each({channel: (channel,) for channel, (position, _) in program.motion.items() if position})
 
 
-def _drags(program: Program, data: Trajectories | None) -> Choices:
-    return [{"drag": drag} for drag in (0.06, 0.02, 0.2)]
-
-
-def _leads(program: Program, data: Trajectories | None) -> Choices:
-    return [{"lead": lead} for lead in (0.2, 0.0, 0.5)]
+def _one_of(option: str, *numbers: float) -> Callable[[Program, Trajectories | None], Choices]:
+    return lambda program, data: [{option: number} for number in numbers]
 
 
 def _limits(program: Program, data: Trajectories | None) -> Choices:
@@ -234,7 +230,7 @@ def slope(self: Program, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     components=("x", "y"),
     profiled=("drag",),
     by_factor=("drag",),
-    choices=_drags,
+    choices=_one_of("drag", 0.06, 0.02, 0.2),
 )
 def wind(self: Program, state: Tensor, *_: Tensor, c: Tensor, drag: Any) -> Pushes:
     r"""a = -k (v-w)|v-w| + k v|v| per axis, w the world-frame wind (c₁, c₂) in the body frame
@@ -298,11 +294,10 @@ def lever_arm(self: Program, state: Tensor, *_: Tensor, c: Tensor, mean: Means) 
     feels: the tracked point swings around another one when turning
     occurs: a camera, a tag or a GPS antenna that is mounted away from the centre of mass
     """
-    yaw_rate = state[..., 5]
-    return {"forward": c * yaw_rate**2, "lateral": -c * mean["yaw"]}
+    return {"forward": c * state[..., 5] ** 2, "lateral": -c * mean["yaw"]}
 
 
-@_where_it_slips("1/s", typical=0.2, limit=5.0, sign=1, profiled=("lead",), choices=_leads)
+@_where_it_slips("1/s", typical=0.2, limit=5.0, sign=1, profiled=("lead",), choices=_one_of("lead", 0.2, 0.0, 0.5))
 def side_slip(self: Program, state: Tensor, *_: Tensor, c: Tensor, lead: Any) -> Pushes:
     r"""a_lateral = -c (v_y - k ω)
 
