@@ -123,7 +123,9 @@ def demonstrate(
         demo.result("report.html: open it in a browser, it needs no network.")
         hidden = f"What had been hidden: {st.load_program(TRUE_PROGRAM)}."
         say(textwrap.fill(hidden, TEXT_WIDTH, initial_indent="\n   ", subsequent_indent="   "))
-        _write_record({"status": "finished", "seconds": round(time.perf_counter() - began, 1), "steps": demo.steps})
+        _write_record(
+            Path(), {"status": "finished", "seconds": round(time.perf_counter() - began, 1), "steps": demo.steps}
+        )
     say(f"\n{out}: report.html; check, discovery and proof as .png, .txt and .json; drives; runs; {grown}")
     say(f"{time.perf_counter() - began:.0f} s in all")
 
@@ -164,8 +166,7 @@ def add(demo: Demo, effects: Sequence[str]) -> str:
     demo.step("Add: write the program with it")
     names = dict.fromkeys(effect.split(":")[0].split("=")[0] for effect in effects)
     grown = f"models/hovercraft_with_{'_and_'.join(names)}.py"
-    said = demo.steady(f"add runs/found --out {grown}").splitlines()
-    equations = [line for line in said[1:] if "$" not in line]
+    equations = [line for line in demo.steady(f"add runs/found --out {grown}").splitlines()[1:] if "$" not in line]
     demo.result(f"{'; '.join(equations)}. It is a Pyro program like any other.")
     return grown
 
@@ -217,12 +218,11 @@ def _open(out: Path, force: bool) -> None:
     with cleared_on_failure(out):
         (out / "models").mkdir(exist_ok=True)
         shutil.copyfile(source, out / OWNER_PROGRAM)
-        with chdir(out):
-            _write_record({"status": "running"})
+        _write_record(out, {"status": "running"})
 
 
-def _write_record(content: Mapping[str, Any]) -> None:
-    Path(DEMO_RECORD).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+def _write_record(out: Path, content: Mapping[str, Any]) -> None:
+    (out / DEMO_RECORD).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def demo(

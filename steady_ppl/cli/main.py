@@ -39,8 +39,7 @@ app = typer.Typer(
 def add_command(function: Callable[..., None], about: str, *examples: str, hidden: bool = False) -> None:
     """Add a command, what `steady --help` says of it, examples for its own help, and whether another one's help names
     it: one screen is full."""
-    title = "Example:" if len(examples) == 1 else "Examples:"
-    epilog = "\n".join(["\b", title, *(f"  {line}" for line in examples)])
+    epilog = "\n".join(["\b", "Example:" if len(examples) == 1 else "Examples:", *(f"  {line}" for line in examples)])
     app.command(function.__name__.replace("_", "-"), short_help=about, epilog=epilog, hidden=hidden)(function)
 
 

@@ -44,7 +44,6 @@ class _Line:
                     self.drawn = True
 
     def clear(self) -> None:
-        """Leave an empty line."""
         if self.drawn:
             print(CLEAR_LINE, end="", file=sys.stderr, flush=True)
             self.drawn = False

@@ -8,15 +8,13 @@ others, and the kind of direction that leaves least is the one to blame, if the 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 
 from steady_ppl.criticism.perturbations import Direction
-from steady_ppl.criticism.residual_maps import CHECK_LEVEL, standardise, tail_p_value
+from steady_ppl.criticism.residual_maps import CHECK_LEVEL, Array, standardise, tail_p_value
 
-Array = np.ndarray[Any, Any]
 FAULT_KINDS = ("sensor", "actuator", "dynamics")  # of directions
 LEVEL_OF_TEST = CHECK_LEVEL / 4  # of mean, parameters, noise and maps, which together keep the level (Bonferroni)
 MIN_GAIN_OF_KIND = 3.0  # nats of log p(y) between the best kind and the next
@@ -148,8 +146,7 @@ def _dispersion(each: Array, correlation: Array) -> Array:
         return np.full((sets, each.shape[-1]), np.inf)
     variance = np.maximum(each[1:].var(0), 1e-300)
     size = each.sum(1, keepdims=True) / variance.sum(0)
-    apart = ((each - size * variance) / np.sqrt(variance)).clip(-MAX_SCORE_SD, MAX_SCORE_SD)
-    squares = (apart**2).mean(1)
+    squares = (((each - size * variance) / np.sqrt(variance)).clip(-MAX_SCORE_SD, MAX_SCORE_SD) ** 2).mean(1)
     weight = correlation**2
     return (squares / np.maximum(squares[1:].mean(0), 1e-300)) @ weight / np.maximum(weight.sum(0), 1e-300)
 

@@ -280,8 +280,7 @@ def sentence(found: Check, finding: SignificantCell) -> str:
         return f"the misfit of {name} goes {'with' if more else 'against'} {where}"
     if cell.residual >= len(found.program.measurements):
         return f"{name} {'above' if more else 'below'} the program's{where}"
-    unit = found.program.measurement_units[cell.residual]
-    size = f"{abs(cell.mean or 0.0):.2g} {unit} ".replace("  ", " ")
+    size = f"{abs(cell.mean or 0.0):.2g} {found.program.measurement_units[cell.residual]} ".replace("  ", " ")
     return f"{name} measured {size}{'above' if (cell.mean or 0.0) > 0 else 'below'} its prediction{where}"
 
 

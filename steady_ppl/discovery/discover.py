@@ -118,7 +118,7 @@ def discover(
         begin()
         shape = shape_of(found, program)
         effects = [] if shape else findings(found)
-        final = found.base if shape or found.rounds[0].nothing_found else found.final
+        final = found.base if shape else found.final
         settings = {"simulations": simulations, "seed": seed}
         fits = [Fit(refit.mean_program(), "discover", settings, seed, known_start) for refit in (found.base, final)]
         better = found.curve.refit if found.curve else found.final

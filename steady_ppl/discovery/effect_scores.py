@@ -216,8 +216,7 @@ class Scoring:
 def scores_along(problem: Problem, ahead: Lookahead, parts: Sequence[Element], columns: Sequence[Column]) -> Tensor:
     """Scores of parameters and columns, `(B, N)`."""
     along = (problem.program, problem.data, smoothed(ahead, problem.data))
-    scoring = Scoring(*along)
-    return torch.cat([parameter_scores(*along, list(parts)), *(scoring(column) for column in columns)], -1)
+    return torch.cat([parameter_scores(*along, list(parts)), *map(Scoring(*along), columns)], -1)
 
 
 @torch.no_grad()

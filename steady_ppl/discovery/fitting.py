@@ -47,23 +47,15 @@ Fit = Callable[[], Maximum]
 
 
 @dataclass(frozen=True)
-class Judgement:
-    """Drives under a program: log p(y), `(B,)`, and the posterior means along which it was linearised."""
-
-    log_likelihood: Tensor
-    path: ReferencePath
-
-
-@dataclass(frozen=True)
 class ByLikelihood:
     """Scoring steps of the linearised program's log p(y), which judges as well."""
 
     fit_each = staticmethod(maximise_each)
 
-    def judge(self, problem: Problem, path: ReferencePath) -> Judgement:
-        """Log p(y) of drives, linearised along a path that is improved from here."""
+    def judge(self, problem: Problem, path: ReferencePath) -> tuple[Tensor, ReferencePath]:
+        """Log p(y) of drives, `(B,)`, linearised along a path that is improved from here; and that path."""
         ahead = _smooth(problem, path)
-        return Judgement(ahead.log_likelihood, resting_path(ahead, problem.data))
+        return ahead.log_likelihood, resting_path(ahead, problem.data)
 
 
 @dataclass(frozen=True)
@@ -87,35 +79,35 @@ class ByDraws:
 
     def _train(self, problem: Problem, path: ReferencePath) -> Maximum:
         program, data, known_start = problem.program, problem.data, problem.known_start
-        before = self.judge(problem, path)
+        before, path = self.judge(problem, path)
         guide = LookaheadGuide(
             program, particles=GUIDE_PARTICLES, tempering=Constant(), known_start=known_start, search_again=math.inf
         )
-        guide.remember(before.path, data)
+        guide.remember(path, data)
         optimization = Optimization(self.steps, learning_rate=self.learning_rate, averaging=0.95)
         began = copy.deepcopy(program.state_dict())
         with torch.enable_grad():
             train(program, guide, data, Validation(), optimization, known_start=known_start, progress=False)
-        after = self.judge(problem, before.path)
-        if not float(after.log_likelihood.sum()) > float(before.log_likelihood.sum()):
+        after, ended = self.judge(problem, path)
+        if not float(after.sum()) > float(before.sum()):
             program.load_state_dict(began)
-            after = before
+            after, ended = before, path
         return Maximum(
-            log_likelihood=after.log_likelihood,
-            objective=float(after.log_likelihood.sum()),
-            path=after.path,
+            log_likelihood=after,
+            objective=float(after.sum()),
+            path=ended,
             names=(),
             information=torch.zeros(0, 0),
             steps=self.steps,
             decrement=None,
-            gained=float((after.log_likelihood - before.log_likelihood).sum()),
+            gained=float((after - before).sum()),
         )
 
-    def judge(self, problem: Problem, path: ReferencePath) -> Judgement:
+    def judge(self, problem: Problem, path: ReferencePath) -> tuple[Tensor, ReferencePath]:
         """See `ByLikelihood`."""
         ahead = _smooth(problem, path)
         more = _neglected(problem, ahead, particles=JUDGE_PARTICLES)
-        return Judgement(ahead.log_likelihood + more, resting_path(ahead, problem.data))
+        return ahead.log_likelihood + more, resting_path(ahead, problem.data)
 
 
 Fitting = ByLikelihood | ByDraws

@@ -175,8 +175,8 @@ def starts_by_draws(given: Program, fitted: Program, fold: Fold) -> list[Start]:
     for program, near in ((given, None), (fitted, fold.path)):
         problem = fold.fitting(program)
         try:
-            judged = FIRST_BY_DRAWS.judge(problem, near or find_path(problem))
-            found.append(Start(program, judged.path, float(judged.log_likelihood.sum())))
+            likely, path = FIRST_BY_DRAWS.judge(problem, near or find_path(problem))
+            found.append(Start(program, path, float(likely.sum())))
         except FilterError as error:
             failures.append(error)
     if not found:
@@ -194,8 +194,7 @@ def first_by_draws(given: Program, fitted: list[Program], folds: list[Fold], see
     def fit_from(begun: list[Start]) -> Refit:
         one, other = (start.path for start in begun)
         along = [replace(folds[0], path=one, held_out_path=other), replace(folds[1], path=other, held_out_path=one)]
-        programs = [copy.deepcopy(start.program) for start in begun]
-        return _refit(programs, along, fitting=FIRST_BY_DRAWS)
+        return _refit([copy.deepcopy(start.program) for start in begun], along, fitting=FIRST_BY_DRAWS)
 
     try:
         refit = fit_from(likelier)
@@ -349,12 +348,12 @@ def _refit(
         if anew is not None and anew[1].objective > maximum.objective:
             program, maximum = anew
             held_out_path = find_path(fold.judging(program))
-        judged = fitting.judge(fold.judging(program), held_out_path)
+        judged, held_out_path = fitting.judge(fold.judging(program), held_out_path)
         fitted.append(program)
         found.append(maximum)
-        held_out.append(judged.log_likelihood)
-        judged_folds.append(replace(fold, path=maximum.path, held_out_path=judged.path))
-        own, others = float(maximum.log_likelihood.sum()), float(judged.log_likelihood.sum())
+        held_out.append(judged)
+        judged_folds.append(replace(fold, path=maximum.path, held_out_path=held_out_path))
+        own, others = float(maximum.log_likelihood.sum()), float(judged.sum())
         if own < threshold.drives and (threshold.stops_early or others < threshold.held_out):
             break
     judges, alone = Judges(fitted, found), torch.cat(held_out)
@@ -363,7 +362,7 @@ def _refit(
         judges = with_common_noise(problems, found)
     if judges.common:
         held_out = [
-            fitting.judge(fold.judging(program), fold.held_out_path).log_likelihood
+            fitting.judge(fold.judging(program), fold.held_out_path)[0]
             for program, fold in zip(judges.programs, judged_folds, strict=True)
         ]
     return Refit(fitted, found, judged_folds, fitting, judges, torch.cat(held_out), alone, unwidened)

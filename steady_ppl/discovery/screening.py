@@ -57,7 +57,6 @@ class Tested:
 
     @property
     def variant(self) -> Variant:
-        """The effect."""
         return self.column.variant
 
     @property
@@ -133,7 +132,7 @@ def screen(
         p_value=(1 + float((family[1:] <= family[0]).sum())) / len(family),
         critical=critical,
         fitted=(float(scores[0, own] @ (inverse @ scores[0, own])), fitted),
-        correlations=_canonical_correlations(left, [test.place for test in tests]),
+        correlations=_largest_canonical_correlations(left, [test.place for test in tests]),
         information=information,
     )
 
@@ -215,9 +214,7 @@ def _departed(departure: Departure, information: Tensor, scores: Tensor) -> Test
     return Tested(column, nowhere, float(z[0] ** 2), p_values, change, sds, sds, alone=sds, departure=True)
 
 
-def _canonical_correlations(left: Tensor, places: Sequence[slice]) -> Tensor:
-    """Largest canonical correlations between the candidates' columns."""
-
+def _largest_canonical_correlations(left: Tensor, places: Sequence[slice]) -> Tensor:
     def whitening(own: Tensor) -> Tensor:
         if not bool((own.diagonal() > 0).all()):
             return torch.zeros_like(own)

@@ -83,7 +83,6 @@ class Round:
 
     @property
     def nothing_found(self) -> bool:
-        """Whether the tests found nothing."""
         return self.screening.tests.p_value > FAMILY_LEVEL
 
 
@@ -280,7 +279,6 @@ def _curves(search: Search) -> list[Candidate]:
 
 
 def labels(refit: Refit) -> list[str]:
-    """The effects of a program."""
     return [variant.label for variant in attached(refit.program)]
 
 

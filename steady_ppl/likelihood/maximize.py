@@ -70,7 +70,6 @@ def maximise(
     problem: Problem,
     path: ReferencePath | None = None,
     *,
-    information: Tensor | None = None,
     steps: int = 25,
     precision: float = 0.02,
     hopeless: float = -math.inf,
@@ -80,7 +79,6 @@ def maximise(
     Args:
         problem: its program with normal noise; see `linearize`.
         path: of the drives, near their posterior means; found from the measurements when None.
-        information: of the learnable numbers, `(P, P)`, where it is known.
         steps: scoring steps at most.
         precision: stop when another step would gain less, nats.
         hopeless: give up after six steps where log p(y) would not reach this were it to rise on as it has lately.
@@ -88,7 +86,7 @@ def maximise(
     Raises:
         FilterError: the program cannot be smoothed at its initial parameters.
     """
-    given = {"information": information, "steps": steps, "precision": precision, "hopeless": hopeless}
+    given = {"steps": steps, "precision": precision, "hopeless": hopeless}
     return kept_maximum(problem.program, lambda: _maximum_of_copy(problem, path or find_path(problem), **given))
 
 
@@ -151,7 +149,6 @@ class Term:
 
     @classmethod
     def alone(cls, problem: Problem, path: ReferencePath) -> Term:
-        """The only term of an objective."""
         parts = elements(problem.program)
         return cls(problem, path, parts, list(range(len(parts))))
 

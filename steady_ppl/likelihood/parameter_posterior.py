@@ -155,8 +155,7 @@ def adapt(program: Program, shape: NormalShape, judge: LogLikelihood, count: int
             new = shapes[-1].draws(round(share * count))
             values, judged = torch.cat([values, new]), torch.cat([judged, log_posterior(program, new, judge)])
             drawn = torch.tensor(ROUND_SHARES[: len(shapes)], dtype=values.dtype).log()
-            mixture = torch.stack([one.density(values) for one in shapes]) + drawn[:, None]
-            log_weights = judged - mixture.logsumexp(0)
+            log_weights = judged - (torch.stack([one.density(values) for one in shapes]) + drawn[:, None]).logsumexp(0)
     return values, log_weights
 
 

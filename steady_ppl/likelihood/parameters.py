@@ -30,7 +30,6 @@ class Element(Number):
         return f"{self.owner}[{self.index}]" if self.parameter.numel() > 1 else self.owner
 
     def move(self, by: float) -> None:
-        """Change it."""
         self.parameter.data.view(-1)[self.index] += by
 
 

@@ -76,13 +76,12 @@ def gains(rows: Sequence[GainRow], axes: Axes) -> None:
             axes.annotate(f"◂ {row.value:.0f}", (left, place), color=row.color, fontsize=LETTER_POINTS, va="center")
         elif row.label:
             _point(axes, row, place, hollow=row.interval is None)
-    axes.set_yticks(range(len(rows)), [row.label or row.beside for row in rows], fontsize=LETTER_POINTS)
+    about = "held-out log p(y) gained [nats], 95 % interval"
+    titled(axes, "what each candidate brings", about, [row.label or row.beside for row in rows])
     for text, row in zip(axes.get_yticklabels(), rows, strict=True):
         text.set_fontweight("normal" if row.label else "bold")
-    axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlim(left - 0.05 * (most - left), None)
     axes.axvline(0, color="black", lw=0.6)
-    titled(axes, "what each candidate brings", "held-out log p(y) gained [nats], 95 % interval")
     kinds = {CHOSEN_COLOR: "chosen", ALIAS_COLOR: "cannot be told from it", OTHER_COLOR: "other candidates"}
     for color in [color for color in kinds if any(row.label and row.color == color for row in rows)]:
         axes.plot([], [], "o", color=color, ms=5, label=kinds[color])
@@ -100,15 +99,14 @@ def coefficients(found: Discovery, axes: Axes, rest: int = MAX_OTHERS) -> None:
         axes.text(1.01, place, row.beside, transform=axes.get_yaxis_transform(), fontsize=7, va="center")
     axes.axvspan(-1, 1, color=LIMIT_COLOR, alpha=0.15, lw=0)
     axes.axvline(0, color="black", lw=0.6)
-    axes.set_yticks(range(len(rows)), [row.label for row in rows], fontsize=LETTER_POINTS)
-    axes.set_ylim(len(rows) - 0.4, -0.6)
     if max((abs(row.value) for row in rows), default=0.0) > 8:
         axes.set_xscale("symlog", linthresh=1)
         axes.xaxis.set_major_formatter("{x:g}")
         axes.margins(x=0.06)
     axes.text(1.01, 1.01, "limit", transform=axes.transAxes, fontsize=7, va="bottom")
     what = "what was found and what is left" if found.findings else "what could have been seen"
-    titled(axes, what, "coefficient / detection limit, 90 % interval (green: can be missed)")
+    about = "coefficient / detection limit, 90 % interval (green: can be missed)"
+    titled(axes, what, about, [row.label for row in rows])
 
 
 def tests(found: Discovery, axes: Axes) -> None:
@@ -121,11 +119,10 @@ def tests(found: Discovery, axes: Axes) -> None:
     axes.axvline(screened.critical, color=CHOSEN_COLOR, lw=1, ls="--", label="5 % level of the whole catalogue")
     axes.set_xscale("log")
     axes.invert_xaxis()
-    axes.set_yticks(range(len(shown)), [_label(tested.variant) for tested in shown], fontsize=LETTER_POINTS)
-    axes.set_ylim(len(shown) - 0.4, -0.6)
     axes.legend(fontsize=7, loc="lower right")
     about = "p-value of each candidate alone; beyond the line something is missing"
-    titled(axes, f"score tests: family-wise p = {found.p_value:.2g}", about)
+    names = [_label(tested.variant) for tested in shown]
+    titled(axes, f"score tests: family-wise p = {found.p_value:.2g}", about, names)
 
 
 def _groups(found: Discovery) -> list[list[GainRow]]:
@@ -247,8 +244,11 @@ def unknown_effect(found: Discovery, *, axes: Axes | None = None) -> Axes:
     return titled(axes, "the curve that is missing, in no catalogue", f"{variable}; ticks: where the drives were")
 
 
-def titled(axes: Axes, title: str, about: str) -> Axes:
-    """Title and axis in small letters."""
+def titled(axes: Axes, title: str, about: str, lines: Sequence[str] | None = None) -> Axes:
+    """Title, axis and what its lines are of, from above, in small letters."""
+    if lines is not None:
+        axes.set_yticks(range(len(lines)), lines)
+        axes.set_ylim(len(lines) - 0.4, -0.6)
     axes.set_title(title, fontsize=9)
     axes.set_xlabel(about, fontsize=LETTER_POINTS)
     axes.yaxis.label.set_fontsize(LETTER_POINTS)

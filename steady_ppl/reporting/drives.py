@@ -20,7 +20,6 @@ MARGIN_SECONDS = 0.5  # shown before and after a stretch
 MAX_CODE, MISSING_CODE = 65534, -32768  # codes of sixteen bits, which are finer than a screen
 MAX_PACKED_NUMBERS = 300_000  # of all drives and runs: .8 MB of text
 PATHS_SHOWN = 8  # draws in the plane
-DriveInterval = tuple[int, float, float]  # drive, and from when to when
 
 
 def _strips(found: Check) -> dict[str, Any] | None:
@@ -57,8 +56,8 @@ def _regimes(found: Check) -> dict[str, Any]:
     }
 
 
-def where_to_look(found: Check, cell: Cell) -> DriveInterval | None:
-    """The drive and the seconds that add most to a cell; None where it is of no place."""
+def where_to_look(found: Check, cell: Cell) -> tuple[int, float, float] | None:
+    """The drive, and from when to when, s, that adds most to a cell; None where it is of no place."""
     if cell.map in ("lag", "memory"):
         return None
     there, values = _rows(found, cell)
@@ -141,8 +140,7 @@ def chosen_drives(checks: list[Check], numbers: int = MAX_PACKED_NUMBERS) -> Sho
     every = max(1, -(-rows * columns // numbers))
     room = max(1, numbers // (-(-rows // every) * columns))
     worst = np.max([np.abs(np.nan_to_num(strips(one)[1])).max((0, 2), initial=0.0) for one in checks], 0)
-    order = np.argsort(-worst, kind="stable")[:room]
-    return Shown(sorted(int(i) for i in order), every, count)
+    return Shown(sorted(np.argsort(-worst, kind="stable")[:room].tolist()), every, count)
 
 
 def _columns(found: Check) -> int:

@@ -140,9 +140,9 @@ def rounded(value: Any, digits: int = 3) -> str:
     return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}g}".replace("-", "−")
 
 
-def signed(value: float | None, digits: int = 1) -> str:
+def signed(value: float | None) -> str:
     """A difference with its sign, or nothing."""
-    return "" if value is None else f"{value:+.{digits}f}".replace("-", "−")
+    return "" if value is None else f"{value:+.1f}".replace("-", "−")
 
 
 def spread(candidate: Mapping[str, Any]) -> str:
@@ -154,14 +154,13 @@ def spread(candidate: Mapping[str, Any]) -> str:
 
 def said(sentence: str) -> Markup:
     """A sentence of a verdict: commands in it as code, signs as minus, no line broken before a per cent sign."""
-    text = re.sub(r"(?<![\w.])-(?=[\d.])", "−", sentence).replace(" %", "\u00a0%")
-    parts = enumerate(text.split("`"))
+    parts = enumerate(re.sub(r"(?<![\w.])-(?=[\d.])", "−", sentence).replace(" %", "\u00a0%").split("`"))
     return Markup("").join(Markup("<code>{}</code>").format(part) if i % 2 else escape(part) for i, part in parts)
 
 
-def interval(pair: Any, digits: int = 3) -> str:
+def interval(pair: Any) -> str:
     """Both ends, or nothing."""
-    return "" if pair is None else f"[{rounded(pair[0], digits)}, {rounded(pair[1], digits)}]"
+    return "" if pair is None else f"[{rounded(pair)}]"
 
 
 def _program(label: str, fit: Fit) -> dict[str, Any]:

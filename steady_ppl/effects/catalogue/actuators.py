@@ -30,8 +30,7 @@ def _each(program: Program, data: Trajectories | None = None) -> Choices:
 
 def _everywhere(program: Program, data: Trajectories | None = None) -> Choices:
     """All controls together and, where their units differ, each alone."""
-    alone = _each(program) if len(set(program.control_units)) > 1 else []
-    return [{"controls": program.control_names}, *alone]
+    return [{"controls": program.control_names}, *(_each(program) if len(set(program.control_units)) > 1 else [])]
 
 
 def _per_unit(program: Program, data: Trajectories | None) -> Choices:
@@ -45,8 +44,7 @@ def _per_unit(program: Program, data: Trajectories | None) -> Choices:
 
 
 def _magnitudes(data: Trajectories, controls: Names) -> Tensor:
-    columns = [data.control_names.index(name) for name in controls]
-    return data.controls[..., columns][data.rows].abs()
+    return data.controls[..., [data.control_names.index(name) for name in controls]][data.rows].abs()
 
 
 def _knees(program: Program, data: Trajectories | None) -> Choices:
@@ -98,8 +96,7 @@ def speed_dependent_gain(self: Program, state: Tensor, control: Tensor, time: Te
     occurs: propellers, whose thrust falls with the speed of advance; motors near the speed of no load
     """
     forward, lateral, _ = self.body_velocity(state)
-    speed = (forward**2 + lateral**2 + 1e-12).sqrt()
-    return control * (1 - c * speed).unsqueeze(-1)
+    return control * (1 - c * (forward**2 + lateral**2 + 1e-12).sqrt()).unsqueeze(-1)
 
 
 @_on_controls("1", typical=0.45, limit=1.0, sign=1, profiled=("knee",), choices=_knees)
