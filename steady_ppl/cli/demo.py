@@ -35,7 +35,6 @@ class Demo:
     steps: list[dict[str, Any]] = field(default_factory=list)  # title, commands, result and seconds of each
 
     def step(self, title: str) -> None:
-        """Begin a step."""
         self.steps.append({"title": title, "commands": [], "began": time.perf_counter()})
         self.say(f"\n{len(self.steps)}. {title}")
 
@@ -123,9 +122,7 @@ def demonstrate(
         demo.result("report.html: open it in a browser, it needs no network.")
         hidden = f"What had been hidden: {st.load_program(TRUE_PROGRAM)}."
         say(textwrap.fill(hidden, TEXT_WIDTH, initial_indent="\n   ", subsequent_indent="   "))
-        _write_record(
-            Path(), {"status": "finished", "seconds": round(time.perf_counter() - began, 1), "steps": demo.steps}
-        )
+    _write_record(out, {"status": "finished", "seconds": round(time.perf_counter() - began, 1), "steps": demo.steps})
     say(f"\n{out}: report.html; check, discovery and proof as .png, .txt and .json; drives; runs; {grown}")
     say(f"{time.perf_counter() - began:.0f} s in all")
 

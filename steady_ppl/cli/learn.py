@@ -16,7 +16,6 @@ from steady_ppl.utils.text import say, shown, tell
 
 LITERALS = {"true": True, "false": False, "none": None}
 RECIPES = ("steady", "likelihood", "steady-minus", "svi", "hand", "fit-hand", "fit-tv", "fit-truth")
-Device = Literal["cpu", "cuda"]
 GuideName = Literal["lookahead", "gaussian", "bootstrap", "network", "mean-field", "smoother"]
 
 
@@ -48,7 +47,7 @@ def fit(
         typer.Option("--set", metavar="NAME=VALUE", help="Any other setting of the recipe, for example ramp=0.7."),
     ] = None,
     seed: options.Seed = 0,
-    device: Annotated[Device, typer.Option(help="Where to compute.")] = "cpu",
+    device: Annotated[Literal["cpu", "cuda"], typer.Option(help="Where to compute.")] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
     force: options.Overwrite = False,
 ) -> None:
@@ -154,16 +153,13 @@ def discover(
         write_picture(discovery_picture(found), picture)
 
 
-Effects = Annotated[
-    list[str] | None,
-    typer.Argument(metavar="EFFECT...", help="NAME[:AT][:OPTION=NUMBER][=NUMBER[,NUMBER]], see `steady effects`."),
-]
-
-
 def add(
     source: Annotated[str, typer.Argument(metavar="RUN|MODEL", help="A run folder, or a program's file.")],
     out: Annotated[Path, typer.Option("--out", metavar="MODEL.py", help="Program to write, beside the old one.")],
-    effects: Effects = None,
+    effects: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="EFFECT...", help="NAME[:AT][:OPTION=NUMBER][=NUMBER[,NUMBER]], see `steady effects`."),
+    ] = None,
     program: options.MovedOfRun = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing file.")] = False,
 ) -> None:

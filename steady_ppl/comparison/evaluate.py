@@ -210,8 +210,7 @@ def state_estimation(
     The squared error is averaged over lineages and rows; its root is averaged over trajectories. See `run_filter` for
     the filter's settings; `every` is n, `lineages` are the paths of each trajectory.
     """
-    assert data.states is not None
-    roots: dict[str, list[Tensor]] = {}
+    roots = defaultdict[str, list[Tensor]](list)
     for part in in_parts(data.observed_every(every), particles, look_ahead=look_ahead):
         assert part.states is not None
         filtered = run_filter(program, part, particles=particles, known_start=known_start, look_ahead=look_ahead)
@@ -219,8 +218,7 @@ def state_estimation(
             mean = squared.mean(0)
             known = torch.isfinite(mean) & part.rows
             judged = known.any(0)
-            total = torch.where(known, mean, 0.0).sum(0)[judged]
-            roots.setdefault(group, []).append((total / known.sum(0)[judged]).sqrt())
+            roots[group].append((torch.where(known, mean, 0.0).sum(0)[judged] / known.sum(0)[judged]).sqrt())
     return {group: float(torch.cat(values).mean()) for group, values in roots.items() if any(map(len, values))}
 
 
@@ -259,9 +257,8 @@ def _ends_of_roll_outs(
     program: Program, data: Trajectories, states: Tensor, horizon: int, handler: Messenger | None
 ) -> Tensor:
     """Where roll-outs end that begin at given states of all rows but the last `horizon`, with the recorded controls."""
-    starts = data.time.shape[0] - horizon
     given = (
-        torch.stack([values[k : k + starts] for k in range(horizon)])
+        torch.stack([values[k : len(data.time) - horizon + k] for k in range(horizon)])
         for values in (acting_controls(program, data), data.elapsed, data.steps)
     )
     for end in roll_out(program, states, *given, handler=handler):

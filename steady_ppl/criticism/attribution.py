@@ -58,8 +58,7 @@ class Scored:
         """Some directions of a kind, picked one after the other, and the nats that they explain, less their price."""
         z, correlation = self.z[0] / widened, self.correlation
         members = np.array([own == kind for own in self.kinds])
-        picked: list[int] = []
-        nats: list[float] = []
+        picked, nats = list[int](), list[float]()
         for step in range(min(MAX_DIRECTIONS, len(z))):
             spread = correlation.diagonal()
             left = np.where(members & (spread > 0.02), z**2 / np.maximum(spread, 0.02), 0.0)

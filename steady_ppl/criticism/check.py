@@ -96,8 +96,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         both = Residuals.concatenated([ours, theirs])
         misfit = misfit_of(both, time, controls, _pairs(program, ours), dispersion)
     notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
-    notes += fallback_notes(uncompiled)
-    notes += run.uneven_steps + diagnose_units(program, run)
+    notes += fallback_notes(uncompiled) + run.uneven_steps + diagnose_units(program, run)
     notes += [f"refitted to these drives, {step.note}"] if step.note else []
     notes += [step.uncompared] if step.uncompared else []
     if not parameters.names:

@@ -171,9 +171,7 @@ def _adjusted(p_values: Array) -> Array:
     """The false-discovery rates at which each is just found; those of `scipy.stats` take half a second to load."""
     order, count = np.argsort(p_values), len(p_values)
     rates = p_values[order] * count / np.arange(1, count + 1)
-    found = np.empty(count)
-    found[order] = np.minimum.accumulate(rates[::-1])[::-1].clip(max=1.0)
-    return found
+    return np.minimum.accumulate(rates[::-1])[::-1].clip(max=1.0)[np.argsort(order)]
 
 
 def _all_cells(data: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence) -> Averaged:

@@ -168,8 +168,7 @@ def over_floor(error: Tensor, there: Tensor, floor: np.ndarray) -> float:
 
 def measured_values(found: Check) -> np.ndarray:
     """What was measured, `(T + 1, B, K)`, NaN where it was not."""
-    data = found.data
-    return np.where(data.observed.numpy(force=True), data.measurements.double().numpy(force=True), np.nan)
+    return np.where(found.data.observed.numpy(force=True), found.data.measurements.double().numpy(force=True), np.nan)
 
 
 def band(found: Check, horizon: str) -> tuple[np.ndarray, np.ndarray]:

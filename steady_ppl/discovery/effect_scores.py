@@ -37,7 +37,7 @@ MIN_SHARE_OF_FINITE_SETS = 0.8  # share of the simulated sets that must not blow
 
 @dataclass(frozen=True)
 class Column:
-    """A candidate's scores."""
+    """A candidate at one coefficient, whose scores are looked at."""
 
     variant: Variant  # the effect
     probe: float | None = None  # the finite coefficient that was tried, None for the derivative where it is absent

@@ -59,7 +59,7 @@ class Shape:
 def findings(search: Search) -> list[Finding]:
     """The effects that were found, the one that brings most first."""
     found = [_finding(search, one) for one in search.found]
-    found += [_departure(search, tested) for tested in search.departed]
+    found += [_departure(tested) for tested in search.departed]
     return sorted(found, key=lambda finding: -(finding.gain or 0.0))
 
 
@@ -92,8 +92,7 @@ def _interval(effect: Effect, value: float, sd: float, of_places: float, by_fact
     """With 90 % probability, lopsided by what is uncertain by a factor: `by_factor` is the sd of its logarithm."""
     if effect.null != 0:
         return _around(value, HALF_WIDTH * math.hypot(sd, of_places))
-    rest = math.sqrt(max(0.0, of_places**2 - (by_factor * value) ** 2))
-    by = HALF_WIDTH * math.hypot(sd, rest)
+    by = HALF_WIDTH * math.hypot(sd, math.sqrt(max(0.0, of_places**2 - (by_factor * value) ** 2)))
     low, high = sorted(_around(value, HALF_WIDTH * by_factor))
     return value - math.hypot(by, value - low), value + math.hypot(by, high - value)
 
@@ -123,7 +122,7 @@ def _confidence(search: Search, found: Found) -> float:
     return float(np.exp(np.logaddexp.reduce([totals[id(c)] for c in found.aliases]) - whole))
 
 
-def _departure(search: Search, tested: Tested) -> Finding:
+def _departure(tested: Tested) -> Finding:
     factor, sd = 1 + float(tested.coefficient[0]), float(tested.sd[0])
     interval, name = _around(factor, HALF_WIDTH * sd / factor), tested.variant.name
     return Finding(tested.variant, "noise", [name], None, [factor], [sd], [interval], None)

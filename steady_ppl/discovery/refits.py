@@ -27,6 +27,7 @@ from steady_ppl.utils.random import seeded
 
 MAX_LOG_NOISE_RATIO = math.log(20.0)  # of noise after a fit and before, beyond which a program explains nothing
 AlongStates = TypeVar("AlongStates", bound=Trajectories | ReferencePath)
+Start = tuple[Program, ReferencePath, float]  # of a fit by draws: the path of its drives, and their log p(y)
 MAX_LOSS = 2.0  # nats below the program without, after which a fit is given up
 
 
@@ -105,13 +106,9 @@ class Refit(Fits):
     held_out_alone: Tensor  # the same under the programs that were fitted to one fold alone
     unwidened: Program | None = None  # before its fit made its noise many times wider: fits begin there as well
 
-    def coefficients(self, variant: Variant) -> list[Tensor]:
-        """An effect's coefficient on each fold."""
-        return _coefficients(self.judges.programs, variant)
-
     def coefficient(self, variant: Variant) -> Tensor:
-        """Its mean over the folds: nearly that of a fit to all drives together."""
-        return self.mean(self.coefficients(variant))
+        """An effect's, its mean over the folds: nearly that of a fit to all drives together."""
+        return self.mean(_coefficients(self.judges.programs, variant))
 
     def mean_program(self) -> Program:
         """The folds' parameters averaged where they are learned: nearly what a fit to all drives together gives."""
@@ -160,15 +157,6 @@ def first_refit(problem: Problem, valid: Trajectories, *, seed: int, nearer: Pro
     return replace(_refit(programs, folds, [one, second]), unwidened=unwidened)
 
 
-@dataclass(frozen=True)
-class Start:
-    """Where a fit by draws may begin: a program, a path of its drives and what log p(y) a filter finds for them all."""
-
-    program: Program
-    path: ReferencePath
-    log_likelihood: float
-
-
 def starts_by_draws(given: Program, fitted: Program, fold: Fold) -> list[Start]:
     """The given program and its linearised fit as starts, the likelier first, as far as they follow the drives."""
     found, failures = list[Start](), list[FilterError]()
@@ -176,12 +164,12 @@ def starts_by_draws(given: Program, fitted: Program, fold: Fold) -> list[Start]:
         problem = fold.fitting(program)
         try:
             likely, path = FIRST_BY_DRAWS.judge(problem, near or find_path(problem))
-            found.append(Start(program, path, float(likely.sum())))
+            found.append((program, path, float(likely.sum())))
         except FilterError as error:
             failures.append(error)
     if not found:
         raise failures[0]
-    return sorted(found, key=lambda start: start.log_likelihood, reverse=True)
+    return sorted(found, key=lambda start: start[2], reverse=True)
 
 
 def first_by_draws(given: Program, fitted: list[Program], folds: list[Fold], seed: int) -> Refit:
@@ -189,17 +177,17 @@ def first_by_draws(given: Program, fitted: list[Program], folds: list[Fold], see
     with seeded(seed, "paths by draws"):
         starts = [starts_by_draws(given, *pair) for pair in zip(fitted, folds, strict=True)]
     likelier = [ranked[0] for ranked in starts]
-    as_given = [start for ranked in starts for start in ranked if start.program is given]
+    as_given = [start for ranked in starts for start in ranked if start[0] is given]
 
     def fit_from(begun: list[Start]) -> Refit:
-        one, other = (start.path for start in begun)
+        one, other = (path for _, path, _ in begun)
         along = [replace(folds[0], path=one, held_out_path=other), replace(folds[1], path=other, held_out_path=one)]
-        return _refit([copy.deepcopy(start.program) for start in begun], along, fitting=FIRST_BY_DRAWS)
+        return _refit([copy.deepcopy(program) for program, _, _ in begun], along, fitting=FIRST_BY_DRAWS)
 
     try:
         refit = fit_from(likelier)
     except FilterError:
-        if len(as_given) < len(folds) or all(start.program is given for start in likelier):
+        if len(as_given) < len(folds) or all(program is given for program, _, _ in likelier):
             raise
         refit = fit_from(as_given)
     return replace(refit, fitting=BY_DRAWS)

@@ -61,7 +61,6 @@ class Tested:
 
     @property
     def is_curve(self) -> bool:
-        """Whether it is no named effect."""
         return self.column.is_curve
 
     def rank(self) -> tuple[float, float]:
@@ -104,10 +103,8 @@ def screen(
     left = (left + left.T) / 2
     projected = scores[:, rest] - scores[:, own] @ solved
     before = information[rest, rest].diagonal()
-
     ends = [*itertools.accumulate(column.size for column in columns)]
     places = [slice(end - column.size, end) for column, end in zip(columns, ends, strict=True)]
-
     groups = defaultdict[str, list[int]](list)
     for index, column in enumerate(columns):
         groups[CURVE if column.is_curve else column.variant.name].append(index)
@@ -209,8 +206,9 @@ def _departed(departure: Departure, information: Tensor, scores: Tensor) -> Test
     sd = float((departure.slope @ step).sqrt())
     z = torch.cat([torch.tensor([departure.away]).double(), scores[1:] @ step]).numpy() / sd
     p_values = 2 * special.ndtr(-np.abs(z))
-    sds = np.array([sd * (math.sqrt(departure.share) * departure.factor)])
-    column, nowhere, change = Column(departure.variant), slice(0, 0), np.array([departure.factor - 1])
+    factor = math.exp(departure.on_all)
+    sds = np.array([sd * (math.sqrt(departure.share) * factor)])
+    column, nowhere, change = Column(departure.variant), slice(0, 0), np.array([factor - 1])
     return Tested(column, nowhere, float(z[0] ** 2), p_values, change, sds, sds, alone=sds, departure=True)
 
 
@@ -237,11 +235,6 @@ class Departure:
     on_all: float  # the same of the judges, on the drives of all folds
     share: float  # of the drives that are tested among all
     slope: Tensor  # derivative of `away` in the fitted parameters, (P,)
-
-    @property
-    def factor(self) -> float:
-        """By what the noise differs."""
-        return math.exp(self.on_all)
 
 
 @torch.no_grad()

@@ -7,7 +7,7 @@ is held-out log p(y), each drive judged by a program that was fitted without it,
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -67,10 +67,6 @@ class Settings:
         """Test every candidate that a fitted program does not have, in a round counted from 0."""
         sets = self.later_sets if index else self.sets
         return screen_program(now, self.declared, sets=sets, seed=self.seed + index, withheld=self.withheld)
-
-    def with_substeps(self, substeps: int) -> Settings:
-        """The same of a program at another step."""
-        return replace(self, declared=with_substeps(self.declared, substeps))
 
 
 @dataclass(frozen=True)
@@ -158,7 +154,7 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
         step = _step_of(base)
         if step.too_coarse:  # the step is no effect: what follows is about the program at the step that suits
             program = with_substeps(program, step.suited.substeps)
-            settings = settings.with_substeps(step.suited.substeps)
+            settings = replace(settings, declared=with_substeps(settings.declared, step.suited.substeps))
             base = first(program, step.suited.program)
         begin()
         found = _rounds(Search(base, base, step, gained), settings)
@@ -169,7 +165,8 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
         if with_found.too_coarse:  # what was found asks for a finer step: sizes are those of that step
             finer = with_found.suited.substeps
             base = first(with_substeps(program, finer), with_substeps(found.base.program, finer))
-            found = _rounds(Search(base, base, step, gained, with_found), settings.with_substeps(finer))
+            settings = replace(settings, declared=with_substeps(settings.declared, finer))
+            found = _rounds(Search(base, base, step, gained, with_found), settings)
     return found
 
 
@@ -244,11 +241,8 @@ def _refits(now: Refit, screening: Screening, first: bool) -> list[Candidate]:
     best = max((c for c in candidates if c.is_judged), key=lambda c: c.total, default=None)
     candidates = [c if c.is_judged else replace(c, behind=best) for c in candidates]
     least = max((c.total for c in candidates), default=0.0) - MAX_NATS_OF_RIVAL
-    return _ranked(at_its_best_place(now, c) if c.total > least else c for c in candidates)
-
-
-def _ranked(candidates: Iterable[Candidate]) -> list[Candidate]:
-    return sorted(candidates, key=lambda candidate: -candidate.total)
+    placed = [at_its_best_place(now, c) if c.total > least else c for c in candidates]
+    return sorted(placed, key=lambda c: -c.total)
 
 
 def _threshold(candidates: Sequence[Candidate]) -> Threshold:
@@ -289,10 +283,9 @@ def prune(search: Search) -> None:
         if isinstance(without, str) or without is found.without:  # beside which it was chosen among the same rivals
             continue
         chosen, least = found.candidate, found.candidate.total - MAX_NATS_OF_RIVAL
-        rivals = [chosen, *(c for c in found.candidates if c is not chosen and c.total > least)]
         there = {variant.name for variant in attached(without.program)}
         again = []
-        for rival in rivals:
+        for rival in [chosen, *(c for c in found.candidates if c is not chosen and c.total > least)]:
             if rival.variant.name not in there and isinstance(rival.refit, Refit):
                 begin = rival.refit.coefficient(rival.variant)
                 refit = refit_with(without, rival.variant, begin, information=search.final.maxima[0])
@@ -301,7 +294,7 @@ def prune(search: Search) -> None:
         lead = CLEAR_GAIN if chosen.variant.profiled else 0.0  # a place is another one if these drives clearly say so
         if all(c.total + lead < as_it_stands.total for c in again if c.variant.name == chosen.variant.name):
             again = [as_it_stands, *(c for c in again if c.variant.name != chosen.variant.name)]
-        again = _ranked(again)
+        again = sorted(again, key=lambda c: -c.total)
         best = next((c for c in again if not c.against_its_sign), None)
         place = search.found.index(found)
         if best is None or best.total <= TIE_NATS or isinstance(best.refit, str):

@@ -63,10 +63,9 @@ def choose_filter(
     The arguments are those of `evidence`; fewer than one particle are a UsageError."""
     reason = why_not_linear(program, data, known_start=known_start) if look_ahead is None else "as asked"
     ahead = reason is None if look_ahead is None else look_ahead
-    name = "lookahead" if ahead else f"bootstrap ({reason})"
     count = (200 if ahead else 5000) if particles is None else particles
     require(count >= 1, "particles", count, "at least 1")
-    return FilterChoice(count, ahead, name)
+    return FilterChoice(count, ahead, "lookahead" if ahead else f"bootstrap ({reason})")
 
 
 def neglected(

@@ -408,9 +408,8 @@ def refit_outliers(problem: Problem, maximum: Maximum) -> Maximum:
         states, noise = maximum.path.states.clone(), maximum.path.noise.clone()
         found = resting_path(there, part.data)
         states[:, outliers[better]], noise[:, outliers[better]] = found.states[:, better], found.noise[:, better]
-        before = maximum.gained - maximum.objective
-        maximum = maximise(problem, ReferencePath(states, noise))
-        maximum = replace(maximum, gained=maximum.objective + before)
+        again = maximise(problem, ReferencePath(states, noise))
+        maximum = replace(again, gained=again.objective + (maximum.gained - maximum.objective))
     return maximum
 
 

@@ -39,11 +39,7 @@ def elements(program: Program, *, frozen: bool = False) -> list[Element]:
     Raises:
         UsageError: there are more than can be screened one by one.
     """
-    steps = {
-        variant.parameter: 0.02 * float(variant.typical.abs().max())
-        for variant in attached(program)
-        if variant.effect.null == 0
-    }
+    steps = {v.parameter: 0.02 * float(v.typical.abs().max()) for v in attached(program) if v.effect.null == 0}
     found = []
     for name, parameter in program.named_parameters():
         if not (parameter.requires_grad or frozen):

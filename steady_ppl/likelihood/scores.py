@@ -126,10 +126,6 @@ class Arrivals:
     angles: tuple[int, ...]  # components of the state that are angles
     present: Tensor  # (T, B) bool
 
-    def ends(self, program: Program, data: Trajectories) -> Tensor:
-        """Where rows end from these states with this noise, `(1 + 2 D, T, B, D)`."""
-        return noisy_step(program, self.states, self.noise, *row_inputs(program, data)).double()
-
     def score(self, change: Tensor) -> Tensor:
         """Of a change of where rows end, `(1 + 2 D, T, B, D)`; `(B,)`."""
         count = self.mean.shape[-1]
@@ -284,11 +280,6 @@ class Measured:
         """Whether some site is a Student t."""
         return any(isinstance(unwrapped(fn), dist.StudentT) for fn in self.distributions.values())
 
-    def same(self, other: Measured) -> bool:
-        """Whether `other` measures the same, with the same scales and tails."""
-        alike = (self.spread == other.spread) & (self.freedom == other.freedom)
-        return bool((self.shift(other) == 0).all()) and bool(alike.all())
-
 
 @torch.no_grad()
 def measured(program: Program, states: Tensor) -> Measured:
@@ -346,8 +337,9 @@ def _of_ends(program: Program, data: Trajectories, at: Smoothed, parts: list[Ele
     scores, left = at.states.new_zeros((len(data), len(parts))).double(), list(range(len(parts)))
     if isinstance(slopes, Slopes):
         scores, left = arriving.of_slopes(slopes), of_actuators(program, data, parts)
+    along = (program, arriving.states, arriving.noise)
     for index in left:
-        up, down = on_both_sides(parts[index], lambda: arriving.ends(program, data))
+        up, down = on_both_sides(parts[index], lambda: noisy_step(*along, *row_inputs(program, data)).double())
         scores[:, index] = arriving.score(up - down) / (2 * parts[index].step)
     return scores
 
@@ -376,7 +368,8 @@ def _of_measurements(program: Program, at: Smoothed, parts: list[Element]) -> Te
     scores = at.states.new_zeros((points.shape[2], len(parts))).double()
     for index, part in enumerate(parts):
         up, down = on_both_sides(part, lambda: measured(program, points[:1]))
-        if up.same(down):
+        alike = (up.spread == down.spread) & (up.freedom == down.freedom)
+        if bool((up.shift(down) == 0).all()) and bool(alike.all()):
             continue
         width, here = 2 * part.step, measured(program, points)
         up, down = on_both_sides(part, lambda: measured(program, points))

@@ -104,9 +104,9 @@ def coefficients(found: Discovery, axes: Axes, rest: int = MAX_OTHERS) -> None:
         axes.xaxis.set_major_formatter("{x:g}")
         axes.margins(x=0.06)
     axes.text(1.01, 1.01, "limit", transform=axes.transAxes, fontsize=7, va="bottom")
-    what = "what was found and what is left" if found.findings else "what could have been seen"
+    title = "what was found and what is left" if found.findings else "what could have been seen"
     about = "coefficient / detection limit, 90 % interval (green: can be missed)"
-    titled(axes, what, about, [row.label for row in rows])
+    titled(axes, title, about, [row.label for row in rows])
 
 
 def tests(found: Discovery, axes: Axes) -> None:
@@ -120,9 +120,8 @@ def tests(found: Discovery, axes: Axes) -> None:
     axes.set_xscale("log")
     axes.invert_xaxis()
     axes.legend(fontsize=7, loc="lower right")
-    about = "p-value of each candidate alone; beyond the line something is missing"
-    names = [_label(tested.variant) for tested in shown]
-    titled(axes, f"score tests: family-wise p = {found.p_value:.2g}", about, names)
+    title, names = f"score tests: family-wise p = {found.p_value:.2g}", [_label(tested.variant) for tested in shown]
+    titled(axes, title, "p-value of each candidate alone; beyond the line something is missing", names)
 
 
 def _groups(found: Discovery) -> list[list[GainRow]]:

@@ -51,10 +51,9 @@ def _(data: Trajectories) -> str:
 @html.register
 def _(fit: Fit) -> str:
     """Program, recipe, parameters, how it was judged, and what must be known of it."""
-    name, trained = type(fit.program).__name__, fit.trained
-    said = SENTENCE.format(
-        f"{name}, fitted by {fit.recipe}" if trained else f"{name}, recipe {fit.recipe}, nothing learned"
-    )
+    trained = fit.trained
+    how = f"fitted by {fit.recipe}" if trained else f"recipe {fit.recipe}, nothing learned"
+    said = SENTENCE.format(f"{type(fit.program).__name__}, {how}")
     if trained and trained.rise:
         first, kept = trained.rise
         said += PARAGRAPH.format(

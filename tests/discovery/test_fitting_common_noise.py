@@ -19,7 +19,7 @@ from steady_ppl.discovery import fitting
 from steady_ppl.discovery.candidates import judged
 from steady_ppl.discovery.fitting import noise_numbers, with_common_noise
 from steady_ppl.discovery.refits import Threshold, first_refit, refit_with
-from steady_ppl.effects import chosen_variant
+from steady_ppl.effects import chosen_variant, coefficient
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path, smooth
 from steady_ppl.likelihood.maximize import Term, maximise, maximise_sum
@@ -140,7 +140,7 @@ def test_effects_that_are_noise_are_in_common_too(effect):
     found = refit_with(base, variant, 1.2 if variant.effect.null == 1 else 0.1)
     assert not isinstance(found, str)
     assert set(found.judges.common) == {"noise", found.judges.common[-1]} and found.in_common(variant) == 1
-    one, other = found.coefficients(variant)
+    one, other = (coefficient(judge, variant).detach() for judge in found.judges.programs)
     assert torch.equal(one, other)
     assert abs(float((found.held_out - base.held_out).sum())) < 1.5
 

@@ -19,7 +19,7 @@ from steady_ppl.discovery.refits import (
     refit_with,
     starts_by_draws,
 )
-from steady_ppl.effects import chosen_variant
+from steady_ppl.effects import chosen_variant, coefficient
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path, smooth
 from steady_ppl.likelihood.maximize import maximise
@@ -34,12 +34,12 @@ def test_fits_by_draws_begin_at_the_likelier_program() -> None:
     fold = Fold(data, path, data, path, True)
     for given, fitted in ((good, far), (far, good)):
         first, second = starts_by_draws(given, fitted, fold)
-        assert first.program is good and second.program is far
-        assert first.log_likelihood > second.log_likelihood
-        assert first.path.states.shape == path.states.shape
+        assert first[0] is good and second[0] is far
+        assert first[2] > second[2]
+        assert first[1].states.shape == path.states.shape
     stiff, still = good.with_effect("linear_drag", 1e3), good.with_effect("linear_drag", 0.0)
     for given, fitted in ((still, stiff), (stiff, still)):
-        assert [start.program is still for start in starts_by_draws(given, fitted, fold)] == [True]
+        assert [program is still for program, _, _ in starts_by_draws(given, fitted, fold)] == [True]
     with pytest.raises(FilterError):
         starts_by_draws(stiff, stiff, fold)
 
@@ -77,7 +77,7 @@ def test_drives_are_judged_by_fits_that_have_seen_them_for_the_noise_alone():
     assert not isinstance(found, str)
     assert found.held_out.shape == (14,)
     variant = chosen_variant(program, "yaw_bias", "")
-    first, second = (float(value) for value in found.coefficients(variant))
+    first, second = (float(coefficient(judge, variant).detach()) for judge in found.judges.programs)
     assert float(found.coefficient(variant)) == pytest.approx((6 * first + 8 * second) / 14)
     judged = smooth(Problem(found.judges.programs[0], valid, True), found.folds[0].held_out_path, passes=4)
     torch.testing.assert_close(found.held_out[:8], judged.log_likelihood, atol=0.05, rtol=0)

@@ -44,5 +44,5 @@ def test_a_departure_is_the_mean_of_all_folds_and_its_test_is_of_the_first():
     found = {d.variant.name: d for d in departures(declared, fitted(one, other), elements(one))}
     translation = found["process_noise:translation"]
     assert translation.away == pytest.approx(math.log(2)) and translation.share == pytest.approx(4 / 6)
-    assert translation.factor == pytest.approx(math.exp((4 * math.log(2) + 2 * math.log(4)) / 6))
-    assert found["process_noise:yaw"].factor == pytest.approx(1.0)
+    assert translation.on_all == pytest.approx((4 * math.log(2) + 2 * math.log(4)) / 6)
+    assert found["process_noise:yaw"].on_all == pytest.approx(0.0, abs=1e-6)

@@ -8,16 +8,13 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.effects.catalogue.forces import PLANAR
+from steady_ppl.effects.catalogue.forces import PLANAR, THRUSTS
 from steady_ppl.effects.declaration import Choices, Effect, Names, Need, declare, needs, power_of_two_below
 from steady_ppl.model.actuation import delayed, lagged
 from steady_ppl.model.program import Program
 
 CONTROLS: Need = (lambda program: program.controls, "the program has no controls")
-THRUSTERS: Need = (
-    lambda program: {"left", "right"} <= set(program.control_names),
-    "there are no controls left and right",
-)
+THRUSTERS: Need = (THRUSTS[0], "there are no controls left and right")
 NO_TWO_THRUSTS: Need = (
     lambda program: {"left", "right"} != set(program.control_names),
     "of two thrusts it is the asymmetry, up to mass and inertia",

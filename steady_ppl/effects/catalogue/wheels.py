@@ -91,8 +91,7 @@ def reverse_steering(self: Program, state: Tensor, control: Tensor, time: Tensor
     occurs: tyres, suspensions and differentials that are not alike in both directions
     """
     forward, _, _ = self.body_velocity(state)
-    lost = c * torch.tanh(forward / 0.1)
-    return control * (1 - lost.unsqueeze(-1) * self.chosen_controls(("turn",), control))
+    return control * (1 - (c * torch.tanh(forward / 0.1)).unsqueeze(-1) * self.chosen_controls(("turn",), control))
 
 
 @_on_lateral_velocity("m", typical=0.1, limit=1.0)
@@ -119,8 +118,7 @@ def crab_angle(
     occurs: axles that are not square to the frame, a tag that is turned against the vehicle, a farm machine on a slope
     """
     forward, lateral, yaw_rate = self.body_velocity(state)
-    change = mean["forward"] + lateral * yaw_rate
-    return {"lateral": c * (forward / self.settles_in(step) + change)}
+    return {"lateral": c * (forward / self.settles_in(step) + (mean["forward"] + lateral * yaw_rate))}
 
 
 @_on_lateral_velocity("s", typical=0.05, limit=0.5)
