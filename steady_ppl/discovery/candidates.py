@@ -282,9 +282,7 @@ def variance_of_places(now: Refit, candidate: Candidate) -> Tensor:
             return None
         return fits.mean_coefficient(variant).flatten().double() - here, best - gain_of_fits(now, fits)
 
-    variance, slopes = torch.zeros_like(here), list[Tensor]()  # of the coefficient, by a step up
-    steps = list[tuple[str, int, Variant, float]]()  # name, sign, where it leads, nats by which the likelihood falls
-    bends, priors = list[float](), list[float]()  # curvature of the likelihood, of a normal as wide as the grid
+    variance, steps = torch.zeros_like(here), list[_GridStep]()
     for name in at.profiled:
         beside = zip((1, -1), _neighbours(at, grid, name, NEIGHBOUR_SHARE), strict=True)
         sides = [(sign, variant, *found) for sign, variant in beside if (found := moved_to(variant))]
@@ -292,21 +290,33 @@ def variance_of_places(now: Refit, candidate: Candidate) -> Tensor:
             variance = variance + here.square()
             continue
         sign, variant, _, fall = sides[0]
-        steps.append((name, sign, variant, fall))
-        slopes.append(torch.stack([sign * change for sign, _, change, _ in sides]).mean(0))
-        bends.append(sum(2 * fall for *_, fall in sides) / len(sides))
+        slope = torch.stack([sign * change for sign, _, change, _ in sides]).mean(0)
+        bend = sum(2 * fall for *_, fall in sides) / len(sides)
         axis = _axis(at, grid, name)
-        priors.append((NEIGHBOUR_SHARE * axis.spacing / axis.half_width) ** 2)
+        prior = (NEIGHBOUR_SHARE * axis.spacing / axis.half_width) ** 2
+        steps.append(_GridStep(name, sign, variant, fall, slope, bend, prior))
     if not steps:
         return variance
-    curvature = torch.diag(torch.tensor(bends, dtype=torch.float64))
-    for (i, (_, sign, one, fall)), (j, (name, way, other, loss)) in combinations(enumerate(steps), 2):
-        both = moved_to(replace(one, options={**one.options, name: other.options[name]}))
-        if both is not None:
-            curvature[i, j] = curvature[j, i] = sign * way * (both[1] - fall - loss)
+    curvature = torch.diag(torch.tensor([step.bend for step in steps], dtype=torch.float64))
+    for (i, one), (j, other) in combinations(enumerate(steps), 2):
+        options = {**one.beside.options, other.name: other.beside.options[other.name]}
+        if (both := moved_to(replace(one.beside, options=options))) is not None:
+            curvature[i, j] = curvature[j, i] = one.sign * other.sign * (both[1] - one.fall - other.fall)
     values, turn = torch.linalg.eigh(curvature)
-    along = torch.stack(slopes, -1) @ turn
-    return variance + (along.square() / (values.clamp(min=0) + min(priors))).sum(-1)
+    along = torch.stack([step.slope for step in steps], -1) @ turn
+    return variance + (along.square() / (values.clamp(min=0) + min(step.prior for step in steps))).sum(-1)
+
+
+class _GridStep(NamedTuple):
+    """A step beside a place, in one of its numbers."""
+
+    name: str  # of the number
+    sign: int  # which way it goes
+    beside: Variant  # where that leads
+    fall: float  # of the likelihood there, nats
+    slope: Tensor  # change of the coefficient by a step up, (k,)
+    bend: float  # curvature of the likelihood in steps
+    prior: float  # precision of a normal as wide as the grid, in steps
 
 
 def _grid(now: Refit, candidate: Candidate) -> list[Variant]:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -27,7 +27,6 @@ from steady_ppl.utils.random import seeded
 
 MAX_LOG_NOISE_RATIO = math.log(20.0)  # of noise after a fit and before, beyond which a program explains nothing
 AlongStates = TypeVar("AlongStates", bound=Trajectories | ReferencePath)
-Start = tuple[Program, ReferencePath, float]  # of a fit by draws: the path of its drives, and their log p(y)
 MAX_LOSS = 2.0  # nats below the program without, after which a fit is given up
 
 
@@ -157,6 +156,12 @@ def first_refit(problem: Problem, valid: Trajectories, *, seed: int, nearer: Pro
     return replace(_refit(programs, folds, [one, second]), unwidened=unwidened)
 
 
+class Start(NamedTuple):
+    program: Program
+    path: ReferencePath  # of its drives
+    log_likelihood: float  # that a filter finds for them all
+
+
 def starts_by_draws(given: Program, fitted: Program, fold: Fold) -> list[Start]:
     """The given program and its linearised fit as starts, the likelier first, as far as they follow the drives."""
     found, failures = list[Start](), list[FilterError]()
@@ -164,12 +169,12 @@ def starts_by_draws(given: Program, fitted: Program, fold: Fold) -> list[Start]:
         problem = fold.fitting(program)
         try:
             likely, path = FIRST_BY_DRAWS.judge(problem, near or find_path(problem))
-            found.append((program, path, float(likely.sum())))
+            found.append(Start(program, path, float(likely.sum())))
         except FilterError as error:
             failures.append(error)
     if not found:
         raise failures[0]
-    return sorted(found, key=lambda start: start[2], reverse=True)
+    return sorted(found, key=lambda start: start.log_likelihood, reverse=True)
 
 
 def first_by_draws(given: Program, fitted: list[Program], folds: list[Fold], seed: int) -> Refit:
@@ -177,17 +182,17 @@ def first_by_draws(given: Program, fitted: list[Program], folds: list[Fold], see
     with seeded(seed, "paths by draws"):
         starts = [starts_by_draws(given, *pair) for pair in zip(fitted, folds, strict=True)]
     likelier = [ranked[0] for ranked in starts]
-    as_given = [start for ranked in starts for start in ranked if start[0] is given]
+    as_given = [start for ranked in starts for start in ranked if start.program is given]
 
     def fit_from(begun: list[Start]) -> Refit:
-        one, other = (path for _, path, _ in begun)
+        one, other = (start.path for start in begun)
         along = [replace(folds[0], path=one, held_out_path=other), replace(folds[1], path=other, held_out_path=one)]
-        return _refit([copy.deepcopy(program) for program, _, _ in begun], along, fitting=FIRST_BY_DRAWS)
+        return _refit([copy.deepcopy(start.program) for start in begun], along, fitting=FIRST_BY_DRAWS)
 
     try:
         refit = fit_from(likelier)
     except FilterError:
-        if len(as_given) < len(folds) or all(program is given for program, _, _ in likelier):
+        if len(as_given) < len(folds) or all(start.program is given for start in likelier):
             raise
         refit = fit_from(as_given)
     return replace(refit, fitting=BY_DRAWS)
