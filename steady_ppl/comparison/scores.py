@@ -105,7 +105,9 @@ def paired(ours: Sums, theirs: Sums, *, seed: int) -> Change | None:
 def _weights(drives: int, seed: int) -> np.ndarray:
     """How often each drive counts, `(1 + R, B)`: once, and in each resample."""
     drawn = np.random.default_rng([seed, drives]).multinomial(drives, np.full(drives, 1 / drives), RESAMPLES)
-    return np.concatenate([np.ones((1, drives)), drawn])
+    weights = np.concatenate([np.ones((1, drives)), drawn])
+    weights.flags.writeable = False
+    return weights
 
 
 @dataclass(frozen=True)

@@ -105,11 +105,11 @@ class Trajectories(Displayed):
 
     @property
     def known_start(self) -> Tensor:
-        """`(B, D)` the true first states; DataError where they are not all known."""
+        """See `require_known_start`."""
         return self.require_known_start()
 
     def require_known_start(self) -> Tensor:
-        """The same, as a check."""
+        """The true first states, `(B, D)`; DataError where they are not all known."""
         if self.states is None:
             wanted = "the true states of every trajectory's first row"
             raise DataError(f"a known start needs {wanted}: the table has no x. columns")

@@ -331,16 +331,17 @@ class _Axis(NamedTuple):
 
     to: Callable[[float], float]
     back: Callable[[float], float]
-    spacing: float  # the least; of one point: a share of its value
-    middle: float
+    spacing: float  # the least; of one point: a share of where it is now
+    middle: float  # of one point: where it is now, so that its prior is flat
     half_width: float
 
 
 def _axis(at: Variant, grid: Sequence[Variant], name: str) -> _Axis:
     by_factor = name in at.effect.by_factor
     to, back = (math.log, math.exp) if by_factor else (float, float)
-    values = sorted({to(variant.profiled[name]) for variant in grid})
-    alone = math.log(1.8) if by_factor else 0.8 * abs(values[0]) or 1.0
+    values, now = sorted({to(variant.profiled[name]) for variant in grid}), at.profiled[name]
+    alone = math.log(1.8) if by_factor else 0.8 * abs(now) or 1.0
+    values = values if len(values) > 1 else [to(now)]
     spacing = min((b - a for a, b in pairwise(values)), default=alone)
     return _Axis(to, back, spacing, 0.5 * (values[0] + values[-1]), 0.5 * max(values[-1] - values[0], spacing))
 

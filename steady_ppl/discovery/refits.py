@@ -335,8 +335,8 @@ def _refit(
             floor = max(floor, float(anew[1].log_likelihood.sum()))
         if maximum is None:
             guess = fold.information(information, folds[0])
-            (made,) = [fit] if fit else fitting.fit_each([fold.fitting(program)], [fold.path], [guess], [floor])
-            maximum = made()
+            fit = fit or fitting.fit_each([fold.fitting(program)], [fold.path], [guess], [floor])[0]
+            maximum = fit()
         held_out_path = fold.held_out_path
         if anew is not None and anew[1].objective > maximum.objective:
             program, maximum = anew

@@ -291,8 +291,7 @@ def prune(search: Search) -> None:
                 refit = refit_with(without, rival.variant, begin, information=search.final.maxima[0])
                 again.append(at_its_best_place(without, judged(without, rival.tested, refit)))
         as_it_stands = judged(without, chosen.tested, search.final)
-        lead = CLEAR_GAIN if chosen.variant.profiled else 0.0  # a place is another one if these drives clearly say so
-        if all(c.total + lead < as_it_stands.total for c in again if c.variant.name == chosen.variant.name):
+        if all(c.total < as_it_stands.total for c in again if c.variant.name == chosen.variant.name):
             again = [as_it_stands, *(c for c in again if c.variant.name != chosen.variant.name)]
         again = sorted(again, key=lambda c: -c.total)
         best = next((c for c in again if not c.against_its_sign), None)

@@ -144,8 +144,10 @@ class ParticleFilter:
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Log-weights, roots and ancestors of the particles that move on."""
         exhausted = sizes < self.resample_below * self.particles
-        none = log_weights.device.type == "cpu" and not bool(exhausted.any())  # a device would have to be waited for
-        if self.resample_below <= 0 or none:
+        all_stay = log_weights.device.type == "cpu" and not bool(
+            exhausted.any()
+        )  # a device would have to be waited for
+        if self.resample_below <= 0 or all_stay:
             return log_weights, roots, None
         ancestors = torch.where(exhausted, self.resampler(weights, self.particles), self._unmoved)
         fresh = -math.log(self.particles) - (0.0 if future is None else take(future, ancestors))

@@ -96,7 +96,8 @@ class _Process:
 
     def end(self) -> None:
         """Kill it. loky's thread fails where it has not yet taken what was submitted: KeyError."""
-        while not (self.last.running() or self.last.done()):
+        deadline = time.monotonic() + WORKER_WAIT_SECONDS
+        while not (self.last.running() or self.last.done()) and time.monotonic() < deadline:
             time.sleep(0.001)
         self.executor.shutdown(kill_workers=True)
 

@@ -242,9 +242,16 @@ def test_the_prior_of_a_place_and_its_variance_are_one():
     assert -2 * sum(falls) / 2 == pytest.approx((0.25 * axis.spacing / axis.half_width) ** 2) == pytest.approx(0.04)
 
 
-def test_a_grid_of_one_point_at_zero_has_neighbours():
-    flat = chosen_variant(example("hovercraft"), "thrust_saturation", knee=0.0)
-    assert [one.profiled["knee"] for one in _neighbours(flat, [flat], "knee", 0.25)] == [0.25, -0.25]
+def test_a_grid_of_one_point_goes_by_shares_of_where_it_is():
+    """A radius stays above zero, and may be anywhere."""
+    knee = chosen_variant(example("hovercraft"), "thrust_saturation", knee=1.0)
+    here, places = knee, list[float]()
+    for _ in range(3):
+        here = _neighbours(here, [knee], "knee", 0.5)[1]
+        places.append(here.profiled["knee"])
+        assert _log_prior(here, [knee]) == 0.0
+    assert places == pytest.approx([0.6, 0.36, 0.216])
+    assert _axis(replace(knee, options={**knee.options, "knee": 0.0}), [knee], "knee").half_width > 0
 
 
 def test_the_prior_of_a_place_is_as_wide_as_its_grid():
