@@ -157,6 +157,8 @@ def first_refit(problem: Problem, valid: Trajectories, *, seed: int, nearer: Pro
 
 
 class Start(NamedTuple):
+    """Where a fit by draws may begin."""
+
     program: Program
     path: ReferencePath  # of its drives
     log_likelihood: float  # that a filter finds for them all

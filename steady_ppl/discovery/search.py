@@ -273,6 +273,7 @@ def _curves(search: Search) -> list[Candidate]:
 
 
 def labels(refit: Refit) -> list[str]:
+    """The effects of a program."""
     return [variant.label for variant in attached(refit.program)]
 
 

@@ -86,7 +86,9 @@ def _compiling() -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Number:
-    parameter: Tensor  # learnable
+    """One learnable number."""
+
+    parameter: Tensor
     index: int  # in its flat form
     step: float  # by which finite differences move it
 

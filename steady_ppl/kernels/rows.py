@@ -40,6 +40,8 @@ def fallback_notes(why: Mapping[str, str]) -> list[str]:
 
 
 class Computed(NamedTuple):
+    """A function on all rows."""
+
     values: Tensor  # (rows, B, V)
     jacobians: list[Tensor]  # in each argument that was asked for, (rows, B, V, ·)
     in_plain_torch: str | None  # why no kernel served; None where one did or was not worth it

@@ -226,4 +226,5 @@ def packages() -> dict[str, str]:
 
 
 def packages_text() -> str:
+    """Packages and their versions."""
     return ", ".join(f"{name} {number}" for name, number in packages().items())

@@ -32,6 +32,8 @@ TEXT_TYPES = ("string", "wstring", "wchar")
 
 @dataclass(frozen=True)
 class Bag:
+    """An open bag."""
+
     name: str  # of its file or folder, for error messages
     reader: AnyReader
     defined: frozenset[str]  # the message types that the bag itself defines
