@@ -61,7 +61,7 @@ lint: $(INSTALLED)
 	$(BIN)/lint-imports --no-cache
 
 # Benchmarks run by hand and seldom: of their types only names and signatures that are gone are looked for.
-LOOSE = arg-type assignment call-overload index misc no-untyped-def operator union-attr unused-ignore var-annotated
+LOOSE = arg-type assignment attr-defined call-overload index misc no-untyped-def operator type-arg union-attr unused-ignore var-annotated
 types: $(INSTALLED)
 	$(BIN)/mypy
 	$(BIN)/mypy benchmarks $(LOOSE:%=--disable-error-code=%)

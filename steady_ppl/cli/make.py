@@ -44,8 +44,7 @@ def import_bag(
     step: Annotated[float | None, typer.Option(help="Seconds between rows; before that of MAPPING.toml.")] = None,
 ) -> None:
     """Turn ROS bags into a table; without a mapping, list what is in them and print one to start from."""
-    from steady_ppl.data.rosbag.read import open_bag
-    from steady_ppl.data.rosbag.reader import listing
+    from steady_ppl.data.rosbag.reader import listing, open_bag
     from steady_ppl.data.table import require_table_file
 
     bags = [path for path in arguments if path.suffix != ".toml"]

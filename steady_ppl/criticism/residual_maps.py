@@ -108,7 +108,9 @@ class Misfit:
         return [(cell, float(z)) for cell, z in zip(self.cells, self.z, strict=True) if cell.map == name]
 
 
-def misfit_of(both: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence, unexplained: Array) -> Misfit:
+def misfit_of(
+    both: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence[tuple[str, str]], unexplained: Array
+) -> Misfit:
     """Compare every cell of one real set with those of many simulated ones.
 
     Args:
@@ -174,7 +176,7 @@ def _adjusted(p_values: Array) -> Array:
     return np.minimum.accumulate(rates[::-1])[::-1].clip(max=1.0)[np.argsort(order)]
 
 
-def _all_cells(data: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence) -> Averaged:
+def _all_cells(data: Residuals, time: Array, controls: dict[str, Array], pairs: Sequence[tuple[str, str]]) -> Averaged:
     """Every cell; its statistic is the sum over the root of the count."""
     inside = data.there[0].any(-1)
     drives = np.broadcast_to(np.arange(time.shape[1]), time.shape)

@@ -37,7 +37,7 @@ class WrappedNormal(_Wrapped, dist.Normal):
         return -0.5 * (self.residual(value) / self.scale) ** 2 - self.scale.log() - 0.5 * math.log(2 * math.pi)
 
 
-class WrappedStudentT(_Wrapped, dist.StudentT):
+class WrappedStudentT(_Wrapped, dist.StudentT):  # type: ignore[misc]
     """Student t on the difference of two angles, wrapped to [−π, π]; its mass beyond half a turn is neglected."""
 
     def log_prob(self, value: Tensor) -> Tensor:

@@ -27,7 +27,7 @@ def check_picture(found: Check) -> Figure:
     """One figure of everything; made without pyplot's list of figures, so that nothing needs to be closed."""
     with plt.rc_context({"axes.titlesize": 9, "axes.labelsize": 8}):
         shown = min(MAX_COMPONENTS_SHOWN, len(found.program.measurement_names))
-        figure = plt.Figure(figsize=(13, 2.2 * max(shown, 3) + 1.3), layout="constrained")
+        figure = Figure(figsize=(13, 2.2 * max(shown, 3) + 1.3), layout="constrained")
         left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1.25, 1), squeeze=False))
         drive = representative(found)
         panels = left.subplots(shown, 1, sharex=True, squeeze=False)[:, 0]

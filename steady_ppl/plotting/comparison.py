@@ -57,6 +57,6 @@ def open_loop_picture(found: Proof, *, of: str | None = None, axes: Axes | None 
 
 def proof_picture(found: Proof) -> Figure:
     """The same as a figure of its own; made without pyplot's list of figures, so that nothing needs to be closed."""
-    figure = plt.Figure(figsize=(6, 4), layout="constrained")
+    figure = Figure(figsize=(6, 4), layout="constrained")
     open_loop_picture(found, axes=figure.subplots())
     return figure

@@ -48,7 +48,7 @@ def discovery_picture(found: Discovery) -> Figure:
     groups = _groups(found)
     lines = sum(2 + sum(bool(row.label) for row in group) for group in groups)
     height = max(7.5, 4.5 + 0.24 * lines) if groups else 2.2 + 0.19 * len(_remaining(found))
-    figure = plt.Figure(figsize=(12, height), layout="constrained")
+    figure = Figure(figsize=(12, height), layout="constrained")
     if groups:
         left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1, 1.05), squeeze=False))
         above, below = left.subplots(2, 1, height_ratios=(height - 3.5, 3))

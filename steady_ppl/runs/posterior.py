@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 OF_ROW = ("trajectory", "row")
 DIMENSIONS = ("chain", "draw", *OF_ROW)
+Variable = tuple[tuple[str, ...], np.ndarray, dict[str, Any]]
+"""Dimensions, values and attributes."""
 Groups = Mapping[str, xarray.Dataset]
 """Those of ArviZ's InferenceData, which is such a mapping itself."""
 INTERVAL_QUANTILES = (0.05, 0.5, 0.95)
@@ -87,10 +89,10 @@ def drawn_states(
                 for site, value in paths.noise.items():
                     noise.setdefault(site, []).append(as_vector(value, paths.event_dims[site]))
     states, evidence, sizes, roots = zip(*found, strict=True)
-    coordinates: dict[str, list | np.ndarray] = {"chain": [0], "draw": np.arange(draws)}
+    coordinates: dict[str, Any] = {"chain": [0], "draw": np.arange(draws)}
     coordinates |= {"trajectory": list(run.labels), "row": np.arange(run.time.shape[0])}
     inside = run.rows.t().numpy(force=True)
-    variables: dict[str, tuple] = {}
+    variables: dict[str, Variable] = {}
     path = _draws(torch.cat(states, 2))
     for index in () if known_start else program.angle_indices:
         path[0, ..., index] = paths_on_one_turn(path[0, ..., index], inside)
@@ -139,7 +141,7 @@ def _draws(values: Tensor) -> np.ndarray:
     return values.transpose(1, 2).unsqueeze(0).numpy(force=True).copy()
 
 
-def _columns(prefix: str, names: Sequence[str], units: Sequence[str], values: Tensor) -> dict[str, tuple]:
+def _columns(prefix: str, names: Sequence[str], units: Sequence[str], values: Tensor) -> dict[str, Variable]:
     """Variables over trajectories and rows of the components of `(rows, B, ·)`."""
     columns = values.transpose(0, 1).double().numpy(force=True).copy()
     return {
@@ -148,7 +150,7 @@ def _columns(prefix: str, names: Sequence[str], units: Sequence[str], values: Te
     }
 
 
-def _dataset(variables: Mapping[str, tuple], coordinates: Mapping, names: Sequence[str]) -> xarray.Dataset:
+def _dataset(variables: Mapping[str, Variable], coordinates: Mapping[Any, Any], names: Sequence[str]) -> xarray.Dataset:
     return xarray.Dataset(variables, {name: coordinates[name] for name in names})
 
 
@@ -250,7 +252,7 @@ def forecast(
     later = torch.where(run.observed & future[..., None], run.measurements, torch.nan)
     constants = _columns("", ("time",), ("s",), torch.where(future, run.elapsed, torch.nan).unsqueeze(-1))
     constants |= _columns("measured_", program.measurement_names, program.measurement_units, later)
-    variables: dict[str, tuple] = {}
+    variables: dict[str, Variable] = {}
     for index, (name, unit) in enumerate(zip(program.state_names, program.state_units, strict=True)):
         variables[name] = (DIMENSIONS, np.where(there, states[None, ..., index], np.nan), {"units": unit})
     circular = on_a_circle(program, run, path[0]).tolist()

@@ -37,7 +37,7 @@ MIN_REFUSED_JOBS = 4  # jobs whose files are others, at which a worker has been 
 MAX_LOST_JOBS = 10  # jobs that Dask gives up while nothing is begun
 
 
-class Executor(AbstractContextManager):
+class Executor(AbstractContextManager[Any]):
     """Where jobs are computed."""
 
     lost: tuple[type[BaseException], ...] = ()
@@ -85,7 +85,7 @@ class _Process:
         self.last = self.loaded = self.executor.submit(packages)
         self.died_idle = False
 
-    def submit(self, job: Job) -> Future:
+    def submit(self, job: Job) -> Future[ResultRow]:
         """The job's row, or that the process has died."""
         try:
             self.last = self.executor.submit(run, job)
@@ -104,7 +104,8 @@ class _Process:
 
 def _rows(jobs: Sequence[Job], workers: int, died: list[Job], say: Say) -> Generator[ResultRow]:
     """The rows of jobs, but of those whose processes have `died`."""
-    waiting, running, idle, unloaded = list(reversed(jobs)), dict[Future, tuple[Job, _Process]](), list[_Process](), 0
+    waiting, running = list(reversed(jobs)), dict[Future[ResultRow], tuple[Job, _Process]]()
+    idle, unloaded = list[_Process](), 0
     try:
         while waiting or running:
             while waiting and len(running) < workers:
@@ -148,7 +149,7 @@ class Cluster(Executor):
     def __init__(self, address: str) -> None:
         try:
             import distributed  # an extra, which --cluster alone needs
-            from distributed.comm import CommClosedError
+            from distributed.comm.core import CommClosedError
             from distributed.scheduler import KilledWorker
         except ImportError as error:
             raise UsageError("--cluster needs dask.distributed: pip install 'steady-ppl[cluster]'") from error

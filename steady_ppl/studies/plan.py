@@ -144,7 +144,7 @@ def _unknown(content: Mapping[str, Any]) -> str | None:
     return next(filter(None, problems), None)
 
 
-def _jobs(content: Mapping[str, Any], task: str, source: Axes, methods: list[dict]) -> Iterator[Job]:
+def _jobs(content: Mapping[str, Any], task: str, source: Axes, methods: list[dict[str, Any]]) -> Iterator[Job]:
     start = content.get("known_start", False)
     for seed, data, method in itertools.product(content["seeds"], _grid(source), methods):
         for settings in _grid(method["settings"]):
