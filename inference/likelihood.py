@@ -18,6 +18,8 @@ from steady_ppl import (
     why_not_linear,
 )
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
+from steady_ppl.likelihood.identifiability import undetermined
+from steady_ppl.model.problem import Problem
 from steady_ppl.utils.progress import stages
 
 from .steady import doubts
@@ -29,6 +31,7 @@ def fit(
     valid: Trajectories | None = None,
     *,
     known_start: bool = False,
+    steps: int = 25,
     validation_particles: int | None = None,
     seed: int = 0,
 ) -> Fit:
@@ -39,6 +42,7 @@ def fit(
         table: the training drives; true states, where there are any, are used for a known start only.
         valid: held-out drives.
         known_start: the first row's true state is given.
+        steps: scoring steps at most.
         validation_particles: N of the filter that judges the held-out drives, see `Validation.suited`.
         seed: of the search for paths.
 
@@ -46,7 +50,7 @@ def fit(
         UsageError: a program that cannot be linearised, or a network.
         FilterError: the drives cannot be smoothed.
     """
-    settings = {"known_start": known_start, "validation_particles": validation_particles, "seed": seed}
+    settings = {"known_start": known_start, "steps": steps, "validation_particles": validation_particles, "seed": seed}
     data = for_program(program, table).without_truth(keep_start=known_start)
     reason = why_not_linear(program, data, known_start=known_start)
     if reason:
@@ -71,7 +75,7 @@ def fit(
             notes.append(f"as declared, the program cannot follow the held-out drives: {error}")
         begin()
         with seeded(seed, "paths"), kernel_failures() as why:
-            maximum = fit_by_likelihood(program, data, known_start=known_start)
+            maximum = fit_by_likelihood(program, data, known_start=known_start, steps=steps)
         notes += fallback_notes(why)
         begin()
         judge(maximum.steps)
@@ -79,9 +83,10 @@ def fit(
         doubtful = doubts(program, data, known_start, seed, "recipe steady with guide=lookahead")
     if not maximum.converged:
         notes.append(
-            f"not converged after {maximum.steps} steps, another would gain {maximum.decrement:.2g} nats: some "
-            "parameter may be at its bound, or told by nothing"
+            f"not converged after {maximum.steps} steps, another would gain {maximum.decrement:.2g} nats: take more "
+            f"(--steps {4 * steps})"
         )
+    notes += undetermined(Problem(program, data, known_start), maximum.path)
     notes += validation.notes + doubtful
     trained = Trained(history, kept=maximum.steps)
     return Fit(program, "likelihood", settings, seed=seed, known_start=known_start, trained=trained, notes=notes)

@@ -28,6 +28,7 @@ from steady_ppl.gaussian.linearize import require_linear
 from steady_ppl.gaussian.predict import named_horizons, predict
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
+from steady_ppl.likelihood.identifiability import undetermined
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.runs.diagnostics import diagnose_units
@@ -99,7 +100,9 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
     notes += fallback_notes(uncompiled) + run.uneven_steps + diagnose_units(program, run)
     notes += [f"refitted to these drives, {step.note}"] if step.note else []
     notes += [step.uncompared] if step.uncompared else []
-    if not parameters.names:
+    if parameters.names:
+        notes += undetermined(problem, path)
+    else:
         notes.append("the program's own parameters were not looked at one by one: it has none, or a network's")
     return Check(
         program=program,

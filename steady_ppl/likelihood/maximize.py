@@ -36,7 +36,10 @@ from steady_ppl.utils.progress import stages
 
 PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
 STALLED_PASSES = 30  # linearisations a step once no share of a step was accepted: some path swings about its mode
+MAX_STEPS = 25  # scoring steps of a fit, where nothing else is said
 MAX_MOVE = 150  # steps of differences, 1.5 of a logarithm: the most that a number moves at once
+MAX_MOVE_SD = 50.0  # standard deviations, of a number with a unit: it moves as far at once, if that is more
+RIDGE = 1e-3  # added to the information of a number, in that of one with a unit if that is smaller
 SHARE_AGAINST_SCORE = 1 / 3
 """Of that, for a number whose own score points the other way: noise or a friction that is driven to nothing early has
 no score there, and a fit cannot return."""
@@ -70,7 +73,7 @@ def maximise(
     problem: Problem,
     path: ReferencePath | None = None,
     *,
-    steps: int = 25,
+    steps: int = MAX_STEPS,
     precision: float = 0.02,
     hopeless: float = -math.inf,
 ) -> Maximum:
@@ -158,7 +161,7 @@ def maximise_sum(
     terms: Sequence[Term],
     *,
     information: Tensor | None = None,
-    steps: int = 25,
+    steps: int = MAX_STEPS,
     precision: float = 0.02,
     hopeless: float = -math.inf,
 ) -> list[Maximum]:
@@ -172,15 +175,16 @@ def maximise_sum(
     Raises:
         FilterError: the programs cannot be smoothed where they begin, or the drives do not tell their numbers apart.
     """
-    here = _linearised(terms)
+    here = linearised(terms)
     for at in here.terms:
         require_found(at.ahead, at.term.problem)
     began = [at.objective for at in here.terms]
+    is_given = information is not None
+    information = _by_cross_products(here) if information is None else _regularised(information, here.has_unit)
     reach = torch.zeros_like(here.gradient)
     for term in terms:
         reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
-    is_given = information is not None
-    information = _by_cross_products(here) if information is None else _regularised(information)
+    reach = torch.where(here.has_unit, torch.maximum(reach, MAX_MOVE_SD * information.diagonal().rsqrt()), reach)
     taken, decrement, passes = 0, 0.0, PASSES
     rises = deque[float](maxlen=3)  # of log p(y) by the last steps
     with stages(*(("", SHARE_THAT_GOES_ON**step) for step in range(steps + 1))) as begin:
@@ -217,7 +221,7 @@ def maximise_sum(
                 break
             else:
                 passes = STALLED_PASSES
-                here = _linearised([at.term for at in here.terms], passes)
+                here = linearised([at.term for at in here.terms], passes)
                 information = _by_cross_products(here)
                 rises.append(math.inf)  # along other paths
     return [
@@ -235,7 +239,7 @@ def maximise_sum(
     ]
 
 
-def _line_search(here: _LinearizedObjective, move: Tensor, passes: int) -> tuple[float, _LinearizedObjective | None]:
+def _line_search(here: LinearizedObjective, move: Tensor, passes: int) -> tuple[float, LinearizedObjective | None]:
     """The share of a move that does not fall, and where it leads; None where none does and nothing is moved."""
     share, terms = 1.0 if bool(torch.isfinite(move).all()) else 0.0, [at.term for at in here.terms]
     before = [values_of(term.parts) for term in terms]
@@ -250,19 +254,23 @@ def _line_search(here: _LinearizedObjective, move: Tensor, passes: int) -> tuple
     return 0.0, None
 
 
-def _by_cross_products(here: _LinearizedObjective) -> Tensor:
+def _by_cross_products(here: LinearizedObjective) -> Tensor:
     """The information by the cross products of the drives' scores."""
     by_drive = here.scores - here.scores.mean(0)
     information = by_drive.T @ by_drive
-    return _regularised(information + 0.1 * torch.diag(information.diagonal()))
+    return _regularised(information + 0.1 * torch.diag(information.diagonal()), here.has_unit)
 
 
-def _regularised(information: Tensor) -> Tensor:
-    return information + 1e-6 * torch.diag(information.diagonal()) + 1e-3 * torch.eye(len(information)).double()
+def _regularised(information: Tensor, has_unit: Tensor) -> Tensor:
+    own = information.diagonal()
+    of_unit = torch.where(own > 0, own.clamp(max=1.0), 1.0)  # nothing is known of a number that tells nothing
+    return information + torch.diag(1e-6 * own + RIDGE * torch.where(has_unit, of_unit, 1.0))
 
 
 @dataclass(frozen=True)
-class _LinearizedTerm:
+class LinearizedTerm:
+    """A term's objective where its program is."""
+
     term: Term  # along the path that its drives have here
     shares: dict[str, float]  # in the log prior of parameters, which other terms may have in common with it
     ahead: Lookahead
@@ -270,10 +278,13 @@ class _LinearizedTerm:
 
 
 @dataclass(frozen=True)
-class _LinearizedObjective:
-    terms: list[_LinearizedTerm]
+class LinearizedObjective:
+    """A sum of terms where their programs are."""
+
+    terms: list[LinearizedTerm]
     scores: Tensor  # (B, P), of the drives of all terms
     gradient: Tensor  # (P,)
+    has_unit: Tensor  # (P,) bool, see `Element`
 
     @property
     def objective(self) -> float:
@@ -284,11 +295,12 @@ class _LinearizedObjective:
         return sum(float(term.ahead.log_likelihood.sum()) for term in self.terms)
 
 
-def _linearised(terms: Sequence[Term], passes: int = PASSES) -> _LinearizedObjective:
+def linearised(terms: Sequence[Term], passes: int = PASSES) -> LinearizedObjective:
+    """The objective of programs where they are, with its scores; not finite where one diverges."""
     return _scored(_valued(terms, passes))
 
 
-def _tried(terms: Sequence[Term], passes: int, least: float) -> _LinearizedObjective | None:
+def _tried(terms: Sequence[Term], passes: int, least: float) -> LinearizedObjective | None:
     """None where the step went too far: the objective falls below `least`, or a program diverges there."""
     try:
         found = _valued(terms, passes)
@@ -301,7 +313,7 @@ def _tried(terms: Sequence[Term], passes: int, least: float) -> _LinearizedObjec
     return here if bool(torch.isfinite(here.gradient).all()) else None
 
 
-def _valued(terms: Sequence[Term], passes: int) -> list[_LinearizedTerm]:
+def _valued(terms: Sequence[Term], passes: int) -> list[LinearizedTerm]:
     found, owners = [], Counter(column for term in terms for column in term.columns)
     for term in terms:
         names = [part.owner for part in term.parts]
@@ -309,21 +321,22 @@ def _valued(terms: Sequence[Term], passes: int) -> list[_LinearizedTerm]:
         ahead = smooth(term.problem, term.path, passes=passes, tolerance=TOLERANCE)
         objective = float(ahead.log_likelihood.sum()) + log_prior(term.problem.program, shares)
         there = replace(term, path=resting_path(ahead, term.problem.data))
-        found.append(_LinearizedTerm(there, shares, ahead, objective))
+        found.append(LinearizedTerm(there, shares, ahead, objective))
     return found
 
 
-def _scored(found: list[_LinearizedTerm]) -> _LinearizedObjective:
+def _scored(found: list[LinearizedTerm]) -> LinearizedObjective:
     columns, by_drive = {column for at in found for column in at.term.columns}, []
-    gradient = torch.zeros(len(columns), dtype=torch.float64)
+    gradient, has_unit = torch.zeros(len(columns), dtype=torch.float64), torch.zeros(len(columns), dtype=torch.bool)
     for at in found:
+        has_unit[at.term.columns] = torch.tensor([part.has_unit for part in at.term.parts], dtype=torch.bool)
         program, data = at.term.problem.program, at.term.problem.data
         own = parameter_scores(program, data, smoothed(at.ahead, data), at.term.parts)
         gradient[at.term.columns] += own.sum(0) + _slope_of_prior(program, at.term.parts, at.shares)
         wide = own.new_zeros((len(own), len(gradient)))
         wide[:, at.term.columns] = own
         by_drive.append(wide)
-    return _LinearizedObjective(found, torch.cat(by_drive), gradient)
+    return LinearizedObjective(found, torch.cat(by_drive), gradient, has_unit)
 
 
 def posterior_score(problem: Problem, path: ReferencePath) -> Tensor:
@@ -332,7 +345,7 @@ def posterior_score(problem: Problem, path: ReferencePath) -> Tensor:
     Raises:
         FilterError: the program diverges there.
     """
-    return _linearised([Term.alone(problem, path)], STALLED_PASSES).gradient
+    return linearised([Term.alone(problem, path)], STALLED_PASSES).gradient
 
 
 def _slope_of_prior(program: Program, parts: list[Element], shares: dict[str, float]) -> Tensor:
@@ -366,7 +379,9 @@ def _bfgs_update(information: Tensor, step: Tensor, fall: Tensor) -> Tensor:
 
 
 @one_thread()
-def fit_by_likelihood(program: Program, data: Trajectories, *, known_start: bool = False) -> Maximum:
+def fit_by_likelihood(
+    program: Program, data: Trajectories, *, known_start: bool = False, steps: int = MAX_STEPS
+) -> Maximum:
     """Move a program's parameters, in place, to where log p(y) of the linearised program plus the log prior is largest.
 
     Paths are found by random starts: run it in a `seeded` block.
@@ -375,6 +390,7 @@ def fit_by_likelihood(program: Program, data: Trajectories, *, known_start: bool
         program: with normal noise, its parameters as declared or as another fit left them.
         data: as returned by `for_program`.
         known_start: the first state is certain.
+        steps: scoring steps at most.
 
     Raises:
         UsageError: more learnable numbers than can be looked at one by one.
@@ -385,12 +401,12 @@ def fit_by_likelihood(program: Program, data: Trajectories, *, known_start: bool
         begin()
         path = widen_noise(problem)
         begin()
-        found = maximise(problem, path)
+        found = maximise(problem, path, steps=steps)
         begin()
-        return refit_outliers(problem, found)
+        return refit_outliers(problem, found, steps)
 
 
-def refit_outliers(problem: Problem, maximum: Maximum) -> Maximum:
+def refit_outliers(problem: Problem, maximum: Maximum, steps: int = MAX_STEPS) -> Maximum:
     """Search again for the paths of drives far less likely than the others, which were found before the program was
     fitted, and refit where they are better."""
     for _ in range(SEARCHES):
@@ -408,7 +424,7 @@ def refit_outliers(problem: Problem, maximum: Maximum) -> Maximum:
         states, noise = maximum.path.states.clone(), maximum.path.noise.clone()
         found = resting_path(there, part.data)
         states[:, outliers[better]], noise[:, outliers[better]] = found.states[:, better], found.noise[:, better]
-        again = maximise(problem, ReferencePath(states, noise))
+        again = maximise(problem, ReferencePath(states, noise), steps=steps)
         maximum = replace(again, gained=again.objective + (maximum.gained - maximum.objective))
     return maximum
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import TypeVar
 
 import torch
@@ -23,6 +24,7 @@ class Element(Number):
     """One number among a program's parameters, in the unconstrained space in which it is learned."""
 
     owner: str  # the parameter's name
+    has_unit: bool = False  # whether it may be any number, of a size that only the data tell; else it is a logarithm
 
     @property
     def name(self) -> str:
@@ -45,8 +47,10 @@ def elements(program: Program, *, frozen: bool = False) -> list[Element]:
         if not (parameter.requires_grad or frozen):
             continue
         owner = parameter_name(name)
+        has_unit = torch.equal(attrgetter(owner)(program), parameter)
         for index, value in enumerate(parameter.detach().flatten().tolist()):
-            found.append(Element(parameter, index, max(steps.get(owner, 0.01), MIN_RELATIVE_MOVE * abs(value)), owner))
+            step = max(steps.get(owner, 0.01), MIN_RELATIVE_MOVE * abs(value))
+            found.append(Element(parameter, index, step, owner, has_unit))
     if len(found) > MAX_LEARNABLE_NUMBERS:
         raise UsageError(
             f"program {type(program).__name__} has {len(found)} learnable numbers: a network cannot be looked at "

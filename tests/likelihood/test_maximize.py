@@ -11,6 +11,8 @@ import pyro.distributions as dist
 import pytest
 import torch
 from examples import drives, example
+from pyro.distributions import constraints
+from pyro.nn import PyroParam
 
 from steady_ppl import for_program, simulate
 from steady_ppl.errors import FilterError
@@ -173,3 +175,27 @@ def test_a_drive_whose_path_is_lost_is_fitted_again():
     found = refit_outliers(problem, replace(right, log_likelihood=lost, path=replace(right.path, states=states)))
     assert torch.allclose(found.log_likelihood, right.log_likelihood, atol=0.3)
     assert refit_outliers(problem, right) is right
+
+
+class Biased(type(example("linear_gaussian"))):
+    """A bias of any size, in whatever unit."""
+
+    unit = 1.0
+
+    def __init__(self):
+        super().__init__()
+        self.bias = PyroParam(torch.tensor(0.0), constraints.real)
+
+    def transition(self, state, control, time, step):
+        return super().transition(state, control + self.bias * self.unit, time, step)
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1.0, 1e4])
+def test_a_number_with_a_unit_is_found_in_any_unit(unit):
+    program = Biased().double()
+    program.unit, program.bias = unit, torch.tensor(0.7 / unit).double()
+    data = drives(program, 10, 80)
+    program.bias = torch.tensor(0.0).double()
+    maximum = maximise(Problem(program, data, True))
+    assert maximum.converged
+    assert unit * float(program.bias.detach()) == pytest.approx(0.7, abs=0.15)
