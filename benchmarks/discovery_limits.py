@@ -25,7 +25,7 @@ from steady_ppl.discovery.candidates import Screening, screen_program
 from steady_ppl.discovery.effect_scores import columns_of
 from steady_ppl.discovery.refits import Refit, first_refit
 from steady_ppl.discovery.screening import MIN_SHARE_OF_INFORMATION, Screened
-from steady_ppl.effects import Variant, attached, catalogue, chosen_variant, parsed
+from steady_ppl.effects import Sizes, Variant, attached, catalogue, chosen_variant, parsed
 from steady_ppl.model.problem import Problem
 
 Array = np.ndarray
@@ -142,7 +142,8 @@ def _plantings(screened: tuple[Refit, Screening]) -> list[Planting]:
         if tested.departure
         for planting in [_planting(tested.variant, fewer * tested.detection_limit)]
     }
-    every = [v for effect in catalogue(base.program) for v in effect.variants(base.program, seen)]
+    sizes = Sizes(base.program, seen)
+    every = [sizes.of(v) for effect in catalogue(base.program) for v in effect.variants(base.program, seen)]
     for column in columns_of([variant for variant in every if variant.name not in have]):
         information = screening.information.get(f"{column.variant.label} {column.probe}")
         sd = None if information is None else _deviation(information, len(screening.parameters))

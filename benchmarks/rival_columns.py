@@ -13,7 +13,7 @@ from torch import Tensor
 
 from steady_ppl import Program, Trajectories
 from steady_ppl.discovery.effect_scores import Column, columns_of
-from steady_ppl.effects import Variant, attached, catalogue
+from steady_ppl.effects import Sizes, Variant, attached, catalogue
 from steady_ppl.gaussian.linearize import ReferencePath, linearize
 from steady_ppl.likelihood.parameters import elements, moved
 from steady_ppl.likelihood.scores import channel_moments
@@ -50,8 +50,8 @@ class Evidence:
 def candidates(program: Program, data: Trajectories, withheld: Sequence[str] = ()) -> list[Variant]:
     """The variants that a program does not have."""
     have = {variant.name for variant in attached(program)}
-    left = [effect for effect in catalogue(program) if effect.name not in withheld]
-    return [variant for effect in left for variant in effect.variants(program, data) if variant.name not in have]
+    left, sizes = [effect for effect in catalogue(program) if effect.name not in withheld], Sizes(program, data)
+    return [sizes.of(one) for effect in left for one in effect.variants(program, data) if one.name not in have]
 
 
 def evidence(program: Program, data: Trajectories, states: Tensor, variants: Sequence[Variant]) -> Evidence:

@@ -118,6 +118,13 @@ def discover(
     json_file: options.Json = None,
     picture: Annotated[Path | None, typer.Option(help="Draw what was found into this file, for example .png.")] = None,
     simulations: Annotated[int, options.count("Simulated sets for the calibration.", least=50)] = 200,
+    withhold: Annotated[
+        list[str] | None, typer.Option(metavar="EFFECT", help="Leave an effect out of the search; as often as needed.")
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KIND", help="Look for one kind alone: dynamics, actuator, sensor or noise; or for some."),
+    ] = None,
     program: options.MovedOfRun = None,
     seed: options.Seed = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a search that was stopped.")] = False,
@@ -137,6 +144,7 @@ def discover(
     given = fit_or_program(source, program, seed, substeps)
     drives, judges = st.read_table(table), st.read_table(valid) if valid else None
     settings: dict[str, Any] = {"known_start": known_start, "mix": mix, "simulations": simulations, "seed": seed}
+    settings |= {"withheld": withhold or [], "only": only or []}
     with kept_search(out, given, drives, judges, settings, force=force, resume=resume):
         found = st.discover(given, drives, judges, **settings)
         figures = {"source": source, **found.figures}

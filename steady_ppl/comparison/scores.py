@@ -182,7 +182,7 @@ def judge_constant_velocity(before: Judged) -> Judged | str:
         return found
     path = before.tracked.path(unseen.data)
     ahead = smooth(replace(unseen, program=found.program), replace(path, noise=torch.zeros_like(path.noise)))
-    if not bool(torch.isfinite(ahead.log_likelihood).all()):
+    if bool(ahead.is_broken.any()):
         return "it blows up on these drives"
     return compare_predictions(replace(before.problem, program=found.program), ahead)
 
@@ -198,7 +198,7 @@ def noise_floor(true: Judged, seed: int) -> Judged | str:
         again, path = simulate_again(program, data, starts, true.tracked.noise.shape[-1])
     own = replace(unseen, data=again)
     ahead = smooth(own, path)
-    if not bool(torch.isfinite(ahead.log_likelihood).all()):
+    if bool(ahead.is_broken.any()):
         return "the true program does not explain drives of its own"
     if true.states:
         own = replace(own, data=replace(again, states=torch.where(again.rows.unsqueeze(-1), path.states, torch.nan)))

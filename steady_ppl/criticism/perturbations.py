@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.effects.sizes import time_of_change
 from steady_ppl.gaussian.kalman import Tracked
 from steady_ppl.gaussian.predict import mean_steps, on_a_circle, row_errors
 from steady_ppl.kernels.rows import Slopes, slopes_on_all_rows
@@ -24,7 +25,7 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import RowInputs, acting_controls, mean_step, row_controls
 from steady_ppl.utils.angles import wrap, wrap_angles
 
-LAG_SECONDS = 0.3
+SHARE_OF_LAG = 0.4  # of the time in which commands change
 DEAD_ZONE, SATURATION_KNEE = 0.2, 0.6  # of the largest command
 NOT_SUMMED = ("offset of", "curvature in")  # in the controls' own units
 MAX_SCORED_PARAMETERS = 40  # parameters; a network's are not looked at one by one
@@ -65,6 +66,7 @@ class _Scores:
         self.controls = acting_controls(program, data)
         self.inputs = RowInputs(self.controls[:-1], data.elapsed[:-1], data.steps)
         self.commands = row_controls(program, self.controls).double()
+        self.lag = torch.tensor(SHARE_OF_LAG * time_of_change(program, data))
         count = self.noise.shape[-1]
         self.channels = program.channel_names if len(program.channels) == count else [f"{i + 1}" for i in range(count)]
 
@@ -157,7 +159,7 @@ class _Scores:
             "dead zone of": -command.clamp(-DEAD_ZONE * most, DEAD_ZONE * most),
             "saturation of": command.clamp(-SATURATION_KNEE * most, SATURATION_KNEE * most) - command,
             "delay of": -change,
-            "lag of": lagged(command.unsqueeze(-1), time, torch.tensor(LAG_SECONDS)).squeeze(-1) - command,
+            "lag of": lagged(command.unsqueeze(-1), time, self.lag).squeeze(-1) - command,
         }
         if (speed := next(iter(self.program.velocities(self.states).values()), None)) is not None:
             shapes["speed-dependent gain of"] = command * speed.abs().double()
@@ -215,7 +217,7 @@ class _Scores:
             more, less = (self._moved(self.controls + sign * change) for sign in (1, -1))
             response = wrap_angles(more - less, self.linear.angles) / (2 * size)
             response = torch.where(self.data.transitions[..., None], response, 0.0)
-            found.append(response if bool((response.abs() > 1e-9).any()) else None)
+            found.append(response if bool((response != 0).any()) else None)
         return found
 
     def _moved(self, controls: Tensor) -> Tensor:

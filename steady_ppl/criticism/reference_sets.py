@@ -128,7 +128,7 @@ def _starts_elsewhere(tracked: Tracked, near: ReferencePath) -> Tensor:
     begin = near.states[0].double()
     away = wrap_angles(tracked.smoothed[0] - begin, tracked.linearization.angles).abs()
     sd = tracked.covariances[0].diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-    return ~(away <= REST_TOLERANCE * sd + ROUNDING * (1 + begin.abs())).all(-1)
+    return ~(away <= REST_TOLERANCE * sd + ROUNDING * begin.abs().amax(0)).all(-1)
 
 
 def residuals(program: Program, data: Trajectories, tracked: Tracked, ahead: Prediction, sets: int) -> Residuals:

@@ -239,7 +239,8 @@ def _sums(data: Residuals, kind: str, labels: Array, where: list[dict[str, Any]]
 def _correlations(data: Residuals, inside: Array, controls: dict[str, Array]) -> Averaged:
     """With the controls, with their changes and with the residual itself, some rows before."""
     regressors = {}
-    for name, values in controls.items():
+    for name, told in controls.items():
+        values = told / (np.abs(told[inside]).max() or 1.0)
         regressors[name] = np.where(inside, values - values[inside].mean(), 0.0)
         regressors[f"change of {name}"] = np.where(inside, np.diff(values, axis=0, prepend=values[:1]), 0.0)
     given = np.array([*regressors.values()])

@@ -24,6 +24,7 @@ from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import can_be_cut, counts_rows, is_step
 from steady_ppl.model.substeps import MAX_SUBSTEPS, with_substeps
+from steady_ppl.utils.matrices import pseudo_inverse
 from steady_ppl.utils.random import seeded
 
 MIN_GAIN = 3.0  # nats, of all drives together, from which a finer step counts
@@ -32,7 +33,7 @@ MAX_DECREMENT = 1.0  # nats that a scoring step may promise; beyond it more step
 REFIT_PRECISION = 0.005  # nats
 MAX_SUBSTEPS_TRIED = 32  # of a trial, unless more are asked for; a program may always be tried at twice its own
 MAX_REFIT_STEPS = 25  # scoring steps of a fit
-MAX_NATS_A_NUMBER = 50.0  # log-density of a measured number; of what is known to sixteen digits it is 37 at most
+MAX_NATS_A_NUMBER = 50.0  # log-density of a measured number in its own spread; of sixteen digits it is 37 at most
 UNKNOWN = "whether the time step suits is not known"
 
 
@@ -52,7 +53,7 @@ class StepTrial:
     def shift(self, other: StepTrial) -> float:
         """Nats that the other trial's watched parameters lie below this one's maximum, to second order."""
         change = other.values - self.values
-        return 0.5 * float(change @ torch.linalg.pinv(self.covariance) @ change)
+        return 0.5 * float(change @ pseudo_inverse(self.covariance) @ change)
 
     def largest_difference(self, other: StepTrial) -> str:
         """The watched number that differs most from the other trial's, and by how much, in words."""
@@ -272,11 +273,20 @@ def _uncompared(found: StepCheck, failure: str | None) -> str | None:
 
 def _trial(program: Program, data: Trajectories, maximum: Maximum, watched: Sequence[str]) -> StepTrial:
     likely, decrement = float(maximum.log_likelihood.sum()), maximum.decrement or 0.0
-    if not bool(maximum.information.isfinite().all()) or likely > MAX_NATS_A_NUMBER * int(data.observed.sum()):
+    in_own_spread = likely + sum(
+        len(seen) * math.log(float(seen.std()) or 1.0) for seen in _seen(data) if len(seen) > 1
+    )
+    most = MAX_NATS_A_NUMBER * int(data.observed.sum())
+    if not bool(maximum.information.isfinite().all()) or in_own_spread > most:
         raise FilterError("its likelihood has no maximum on these drives: a standard deviation goes to zero")
     found = StepTrial(program.substeps, likely, decrement, program, maximum.path)
     if not (chosen := {i: part for i, part in enumerate(elements(program)) if part.owner in watched}):
         return found
     at, parts = list(chosen), list(chosen.values())
-    covariance = torch.linalg.pinv(maximum.information)[at][:, at]
+    covariance = pseudo_inverse(maximum.information)[at][:, at]
     return replace(found, names=tuple(part.name for part in parts), values=values_of(parts), covariance=covariance)
+
+
+def _seen(data: Trajectories) -> list[Tensor]:
+    """What each sensor said, `(M,)` each."""
+    return [data.measurements[..., k][data.observed[..., k]].double() for k in range(data.measurements.shape[-1])]

@@ -29,7 +29,7 @@ from steady_ppl.discovery.refits import (
     refit_with,
 )
 from steady_ppl.discovery.screening import FAMILY_LEVEL, Screened, Tested, departures, screen
-from steady_ppl.effects import Variant, attached, catalogue
+from steady_ppl.effects import Effect, Sizes, Variant, attached, catalogue
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood.parameters import Element, elements
@@ -44,6 +44,7 @@ CLEAR_GAIN = 10.0  # nats of held-out log p(y) for which a test need only be nea
 NEAR_FAMILY_LEVEL = FAMILY_LEVEL / 5  # p-value of a single test that is near it
 MIN_STATISTIC_TO_RETRY = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
 LINEAR_FORMS = ("push", "command", "history", "measured", "viewpoint")  # of effects in proportion to the coefficient
+UNEXPLAINED = "colour"  # the form of effects that imitate whatever is missing, and may enter when nothing else does
 MIN_GAIN_OF_PLACE = 0.3  # nats by which another knee or place has to be likelier
 MAX_COORDINATE_SWEEPS = 4  # along all knees and places in turns, with steps of one size
 NEIGHBOUR_SHARE = 0.25  # of the grid's spacing, at which a place's likelihood is compared with its neighbours'
@@ -67,6 +68,7 @@ class Candidate:
     gain: Tensor  # held-out log p(y) above that of the program without, nats, (B,)
     alone: Tensor  # the same of the programs fitted to one fold alone, which is all there is of those given up
     behind: Candidate | None = None  # what one fold was enough to show that this one is behind, if so
+    is_confirmed: bool = False  # whether a particle filter was asked, see `confirmed`
 
     @property
     def variant(self) -> Variant:
@@ -102,6 +104,11 @@ class Candidate:
         return self.total > TIE_NATS and self.tested.p_value <= critical
 
     @property
+    def is_explanation(self) -> bool:
+        """Whether it says what makes the error: that it lasts is no reason."""
+        return self.variant.effect.form != UNEXPLAINED
+
+    @property
     def against_its_sign(self) -> bool:
         """Whether physics gives the coefficient the other sign: then it is a symptom, not an effect."""
         sign = self.variant.effect.sign
@@ -109,25 +116,33 @@ class Candidate:
 
 
 @torch.no_grad()
-def screen_program(now: Refit, declared: Program, *, sets: int, seed: int, withheld: Sequence[str] = ()) -> Screening:
+def screen_program(
+    now: Refit, declared: Program, *, sets: int, seed: int, withheld: Sequence[str] = (), only: Sequence[str] = ()
+) -> Screening:
     """Test every candidate that a fitted program does not have, on the drives of its first fold.
 
     `declared` is the program before it was fitted, `sets` counts the simulated ones, `withheld` names effects to leave
-    out.
+    out, `only` the kinds that are looked for, all of them where it names none.
     """
+
+    def is_wanted(effect: Effect) -> bool:
+        return effect.name not in withheld and (not only or effect.verdict in only)
+
     program, fold = now.program, now.folds[0]
     problem, parts = fold.fitting(program), elements(program)
     there = {variant.name for variant in attached(program)}
     seen = replace(fold.drives, states=fold.path.states)
     ahead = smooth(problem, fold.path, passes=3, tolerance=0.01)
     away = departures(declared, now, parts)
-    away = [one for one in away if one.variant.name not in there and one.variant.effect.name not in withheld]
+    away = [one for one in away if one.variant.name not in there and is_wanted(one.variant.effect)]
     there |= {departure.variant.name for departure in away}
     tailed = measured(program, fold.path.states[:1, :1]).heavy_tailed  # as it stands
-    effects = [e for e in catalogue(program) if e.name not in withheld and not (tailed and e.form == "tails")]
-    variants = [v for effect in effects for v in effect.variants(program, seen) if v.name not in there]
+    effects = [e for e in catalogue(program) if is_wanted(e) and not (tailed and e.form == "tails")]
+    sizes = Sizes(program, seen)
+    variants = [sizes.of(v) for effect in effects for v in effect.variants(program, seen) if v.name not in there]
     spread, sharpness = typical_spreads(program, fold.drives, smoothed(ahead, fold.drives))
-    columns = columns_of([*variants, *curves(program, seen, spread, sharpness)])
+    variants += [curve for curve in curves(program, seen, spread, sharpness) if is_wanted(curve.effect)]
+    columns = columns_of(variants)
     observed = scores_along(problem, ahead, parts, columns)
     if broken := (~torch.isfinite(observed).all(-1)).nonzero().flatten().tolist():
         raise FilterError(f"trajectory {fold.drives.labels[broken[0]]}: the fitted program blows up on it")
@@ -197,6 +212,11 @@ def _known(tested: Tested, screening: Screening) -> Tensor | None:
 
 def judged(now: Refit, tested: Tested, refit: Refit | str) -> Candidate:
     """A fit and what it gains over the program without."""
+    if isinstance(refit, Refit) and tested.variant.effect.form == UNEXPLAINED:
+        least, most = tested.variant.effect.between
+        coefficient = refit.coefficient(tested.variant)
+        if bool(((coefficient <= least) | (coefficient >= most)).any()):
+            refit = f"its coefficient goes to {float(coefficient.abs().max()):.3g}, its bound is {most:g}"
     if isinstance(refit, str):
         none = torch.full_like(now.held_out, -math.inf)
         return Candidate(tested, refit, none, none)
@@ -233,22 +253,36 @@ def at_its_best_place(now: Refit, candidate: Candidate) -> Candidate:
     held-out drives do not clearly deny that."""
     if isinstance(candidate.refit, str) or not candidate.variant.profiled:
         return candidate
-    grid, at, tested = _grid(now, candidate), candidate.variant, candidate.tested
+    at = candidate.variant
     begun = candidate.refit if candidate.is_judged else refit_with(now, at, candidate.refit.coefficient(at))
     if isinstance(begun, str):
         return candidate
-    fits: list[tuple[Variant, Fits]] = [(at, begun)]  # each likelier than the one before
+    for variant, best in reversed(likelier_places(now, begun, at)):
+        refit = begun if best is begun else judged_fits(best)
+        if isinstance(refit, Refit):
+            there = judged(now, candidate.tested.at(variant), refit)
+            if not candidate.is_judged or there.total >= candidate.total - CLEAR_GAIN:
+                return there
+    return candidate
+
+
+def likelier_places(base: Refit, begun: Fits, at: Variant) -> list[tuple[Variant, Fits]]:
+    """Knees, widths or places of an effect, on its grid and then between its points, and the fits there, each likelier
+    than the one before: `begun` first, which has the effect there and perhaps others that `base` lacks."""
+    grid, fits = _grid(base, at), [(at, begun)]
 
     def score(variant: Variant, fitted: Fits) -> float:
-        return gain_of_fits(now, fitted) + _log_prior(variant, grid)
+        return gain_of_fits(base, fitted) + _log_prior(variant, grid)
 
     def try_all(variants: Iterable[Variant]) -> None:
         for variant in variants:
-            other = fit_near(now, fits[-1][1], [variant])
+            beside = {known.name for known in attached(base.program)}
+            every = [variant if one.name == at.name else one for one in attached(begun.program)]
+            other = fit_near(base, fits[-1][1], [one for one in every if one.name not in beside])
             if isinstance(other, Fits) and score(variant, other) > score(*fits[-1]) + MIN_GAIN_OF_PLACE:
                 fits.append((variant, other))
 
-    try_all(variant for variant in grid if variant.label != candidate.variant.label)
+    try_all(variant for variant in grid if variant.label != at.label)
     for share in (0.5, 0.25):
         for _ in range(MAX_COORDINATE_SWEEPS):
             before = len(fits)
@@ -256,13 +290,7 @@ def at_its_best_place(now: Refit, candidate: Candidate) -> Candidate:
                 try_all(_neighbours(fits[-1][0], grid, name, share))
             if len(fits) == before:
                 break
-    for variant, best in reversed(fits):
-        refit = begun if best is begun else judged_fits(best)
-        if isinstance(refit, Refit):
-            there = judged(now, replace(tested, column=replace(tested.column, variant=variant)), refit)
-            if not candidate.is_judged or there.total >= candidate.total - CLEAR_GAIN:
-                return there
-    return candidate
+    return fits
 
 
 def variance_of_places(now: Refit, candidate: Candidate) -> Tensor:
@@ -272,7 +300,7 @@ def variance_of_places(now: Refit, candidate: Candidate) -> Tensor:
     fitted on either side of one, its coefficient is as uncertain as it is large. `now` lacks the effect.
     """
     assert isinstance(candidate.refit, Refit)
-    at, grid, near = candidate.variant, _grid(now, candidate), candidate.refit
+    at, grid, near = candidate.variant, _grid(now, candidate.variant), candidate.refit
     here, best = near.mean_coefficient(at).flatten().double(), gain_of_fits(now, near)
 
     def moved_to(variant: Variant) -> tuple[Tensor, float] | None:
@@ -319,11 +347,11 @@ class _GridStep(NamedTuple):
     prior: float  # precision of a normal as wide as the grid, in steps
 
 
-def _grid(now: Refit, candidate: Candidate) -> list[Variant]:
-    """The effect at all places that were screened."""
+def _grid(now: Refit, at: Variant) -> list[Variant]:
+    """The effect at all places that were screened, with the same prior everywhere."""
     fold = now.folds[0]
-    every = candidate.variant.effect.variants(now.program, replace(fold.drives, states=fold.path.states))
-    return [variant for variant in every if variant.name == candidate.variant.name]
+    every = at.effect.variants(now.program, replace(fold.drives, states=fold.path.states))
+    return [replace(variant, scale=at.scale) for variant in every if variant.name == at.name]
 
 
 class _Axis(NamedTuple):

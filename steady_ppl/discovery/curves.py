@@ -98,7 +98,7 @@ def knots_of(values: Tensor, circular: bool) -> tuple[float, ...] | None:
         return None
     every = values[:: max(1, len(values) // 100_000)]
     low, high = (float(q) for q in torch.quantile(every, torch.tensor([0.01, 0.99]).to(every)))
-    if not math.isfinite(high - low) or high - low < 1e-6 * max(1.0, abs(high)):
+    if not math.isfinite(high - low) or high - low <= 1e-6 * max(abs(low), abs(high)):
         return None
     return tuple(low + (high - low) * k / (KNOTS - 1) for k in range(KNOTS))
 

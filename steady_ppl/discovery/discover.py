@@ -20,6 +20,7 @@ from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.result import Discovery
 from steady_ppl.discovery.search import MAX_EFFECTS, Found, Search, Settings, search
 from steady_ppl.effects import of_name, record, restore, written_class
+from steady_ppl.effects.declaration import VERDICT_OF_FORM
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.linearize import require_linear
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
@@ -51,6 +52,7 @@ def discover(
     declared: Program | None = None,
     simulations: int = 200,
     withheld: Sequence[str] = (),
+    only: Sequence[str] = (),
     seed: int = 0,
 ) -> Discovery:
     """Find the physical effects that a program lacks.
@@ -70,11 +72,12 @@ def discover(
             given, else `program`.
         simulations: sets of drives for the calibration, at least 50.
         withheld: names of effects to leave out of the catalogue.
+        only: the kinds of effects to look for (dynamics, actuator, sensor, noise); all of them where none is named.
         seed: of the simulated sets.
 
     Raises:
-        UsageError: a network, a program that cannot be linearised, too few simulations, no such effect to leave out, or
-            one table to mix.
+        UsageError: a network, a program that cannot be linearised, too few simulations, no such effect to leave out, no
+            such kind, or one table to mix.
         DataError: too few drives, no known start, or controls that identify nothing.
         FilterError: the program cannot be fitted.
 
@@ -82,10 +85,15 @@ def discover(
         >>> import steady_ppl as st  # doctest: +SKIP
         >>> print(st.discover(st.load_program("mine.py"), st.read_table("drives.csv")))  # doctest: +SKIP
     """
-    if isinstance(withheld, str):
-        raise UsageError(f"withheld is a list of effects, got {withheld!r}")
+    for what, names, kind in (("withheld", withheld, "effects"), ("only", only, "kinds")):
+        if isinstance(names, str):
+            raise UsageError(f"{what} is a list of {kind}, got {names!r}")
     for name in withheld:
         of_name(name)
+    kinds = dict.fromkeys(VERDICT_OF_FORM.values())
+    for name in only:
+        if name not in kinds:
+            raise UsageError(f"no kind of effects {name!r}; there are {', '.join(kinds)}")
     is_fitted = isinstance(program, Fit) and program.recipe != "hand"
     if isinstance(program, Fit):
         known_start = program.known_start if known_start is None else known_start
@@ -113,14 +121,15 @@ def discover(
     require_searchable(problem, choosing.data, simulations)
     with stages(("", 8), ("comparing before and after", 1), ("looking for a better next drive", 1)) as begin:
         begin()
+        settings = Settings(declared, simulations, seed=seed, withheld=withheld, only=only)
         with seeded(seed, "search"), kernel_failures() as why:
-            found = search(problem, choosing.data, Settings(declared, simulations, seed=seed, withheld=withheld))
+            found = search(problem, choosing.data, settings)
         begin()
         shape = shape_of(found, program)
         effects = [] if shape else findings(found)
         final = found.base if shape else found.final
-        settings = {"simulations": simulations, "seed": seed}
-        fits = [Fit(refit.mean_program(), "discover", settings, seed, known_start) for refit in (found.base, final)]
+        said = {"simulations": simulations, "seed": seed}
+        fits = [Fit(refit.mean_program(), "discover", said, seed, known_start) for refit in (found.base, final)]
         better = found.curve.refit if found.curve else found.final
         assert isinstance(better, Refit)
         rows = {"before": found.base.judges.programs[0], "after": better.judges.programs[0]}
@@ -180,8 +189,7 @@ def _notes(found: Search) -> list[str]:
         )
     if not found.final.converged and found.found:
         notes.append("the fit with what was found has not converged")
-    if found.diverged:
-        notes.append(f"{' and '.join(found.diverged)}: taken back, with it the program blows up on drives of its own")
+    notes += [f"{label}: taken back, for with it the program fails: {why}" for label, why in found.taken_back.items()]
     if len(found.found) == MAX_EFFECTS:
         notes.append(f"the search stops at {MAX_EFFECTS} effects: add them, fit, and discover again from there")
     if not found.is_complete:

@@ -20,9 +20,11 @@ from steady_ppl.gaussian.predict import HALF_WIDTH, simulate_again
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, unit_of
+from steady_ppl.utils.matrices import ridged_inverse
 from steady_ppl.utils.random import seeded
 
 MAX_LOG_SD = 2.0  # of a factor: beyond it nothing is known but the sign
+MAX_LOG_RATIO = 100.0  # of an interval's ends: nothing is known beyond it, and it is a number
 BAND_COVERAGE = 0.9  # of the whole band of a curve
 MAX_SIMULATED_DRIVES = 24  # of each proposed excitation
 EXCITATIONS_OF_KIND = 3  # that are held, pushed, stepped and swung
@@ -99,15 +101,14 @@ def _interval(effect: Effect, value: float, sd: float, of_places: float, by_fact
 
 def _around(value: float, by: float) -> tuple[float, float]:
     """An interval that is symmetric in the logarithm."""
+    by = min(by, MAX_LOG_RATIO)
     return value * math.exp(-by), value * math.exp(by)
 
 
 def _spread(search: Search, variant: Variant) -> np.ndarray:
     """Standard deviations in the space in which the coefficient is learned, of a fit to all drives."""
     screening = search.rounds[-1].screening
-    information = screening.information[""]
-    ridge = 1e-10 * float(information.diagonal().max()) * torch.eye(len(information)).double()
-    covariance = torch.linalg.inv(information + ridge)  # what the drives do not tell has a huge variance
+    covariance = ridged_inverse(screening.information[""])
     (there,) = [known for known in attached(search.final.program) if known.name == variant.name]
     index = [i for i, part in enumerate(screening.parameters) if part.owner == there.parameter]
     return (search.final.first_share * covariance.diagonal()[index]).clamp(min=0).sqrt().numpy()

@@ -128,9 +128,18 @@ def _smooth(problem: Problem, path: ReferencePath) -> Lookahead:
     return ahead
 
 
-def _neglected(problem: Problem, ahead: Lookahead, particles: int = 200) -> Tensor:
+def neglected_along(problem: Problem, path: ReferencePath, seed: int = 0) -> Tensor:
+    """What the program's linearised log p(y) neglects, nats, `(B,)`, along a path that is improved from here.
+
+    Raises:
+        FilterError: no filter follows the drives.
+    """
+    return _neglected(problem, _smooth(problem, path), seed=seed)
+
+
+def _neglected(problem: Problem, ahead: Lookahead, particles: int = 200, seed: int = 0) -> Tensor:
     known = problem.known_start
-    with seeded(0, "judge"):
+    with seeded(seed, "judge"):
         return neglected(problem.program, problem.data, known_start=known, particles=particles, ahead=ahead)
 
 

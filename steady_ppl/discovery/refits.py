@@ -15,7 +15,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, Fit, Fitting, Judges, is_doubtful, with_common_noise
 from steady_ppl.effects import Variant, attach, attached, coefficient
-from steady_ppl.errors import FilterError, SteadyError
+from steady_ppl.errors import FilterError, reason_of
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path
 from steady_ppl.likelihood.maximize import Maximum, fit_by_likelihood, maximise, refit_outliers
@@ -224,8 +224,8 @@ def attempt_with(
         if isinstance(information, Maximum):
             information = _information(information, elements(programs[0]))
         return Attempt(programs, information)
-    except SteadyError as error:
-        return str(error)
+    except Exception as error:  # also of the program's own code, on parameters that nobody tried before
+        return reason_of(error)
 
 
 def begin(base: Refit, attempts: Sequence[Attempt | str], threshold: Threshold = NO_THRESHOLD) -> list[Attempt | str]:
@@ -252,8 +252,8 @@ def finish(base: Refit, attempt: Attempt | str, threshold: Threshold = NO_THRESH
     given = (attempt.programs, base.folds, [None] * len(attempt.programs), attempt.information)
     try:
         return _refit(*given, least, threshold, base.unwidened, base.fitting, attempt.first)
-    except SteadyError as error:
-        return str(error)
+    except Exception as error:  # also of the program's own code, on parameters that nobody tried before
+        return reason_of(error)
 
 
 def _floor(without: Maximum, threshold: Threshold = NO_THRESHOLD) -> float:
@@ -293,16 +293,16 @@ def fit_near(base: Fits, near: Fits, variants: Sequence[Variant]) -> Fits | str:
         maxima = [fit() for fit in _fits(near.fitting, programs, folds, known, [-math.inf] * len(folds))]
         folds = [replace(fold, path=maximum.path) for fold, maximum in zip(folds, maxima, strict=True)]
         return Fits(programs, maxima, folds, near.fitting)
-    except SteadyError as error:
-        return str(error)
+    except Exception as error:  # also of the program's own code, on parameters that nobody tried before
+        return reason_of(error)
 
 
 def judged_fits(fits: Fits) -> Refit | str:
     """How a program explains the drives that were kept from its fits, or why it cannot follow them."""
     try:
         return _refit(fits.programs, fits.folds, fits.maxima, fitting=fits.fitting)
-    except SteadyError as error:
-        return str(error)
+    except Exception as error:  # also of the program's own code, on parameters that nobody tried before
+        return reason_of(error)
 
 
 def as_declared(declared: Program, fitted: Program) -> Program:

@@ -26,6 +26,7 @@ from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.likelihood.parameters import Element, on_both_sides
 from steady_ppl.likelihood.scores import measured, substep_spreads
 from steady_ppl.model.program import Program
+from steady_ppl.utils.matrices import pseudo_inverse, ridged_inverse
 
 FAMILY_LEVEL, POWER = 0.05, 0.95  # of the tests of all candidates together, and at a detection limit
 MIN_SHARE_OF_INFORMATION = 1e-4  # of a column, that the fitted parameters must leave for it to be tested
@@ -58,6 +59,10 @@ class Tested:
     @property
     def variant(self) -> Variant:
         return self.column.variant
+
+    def at(self, variant: Variant) -> Tested:
+        """The same test, of the effect at another knee or place."""
+        return replace(self, column=replace(self.column, variant=variant))
 
     @property
     def is_curve(self) -> bool:
@@ -97,7 +102,7 @@ def screen(
     information = torch.einsum("sbi,sbj->ij", apart, apart) / (len(apart) - 1)
     scores = torch.cat([(observed.sum(0) - bias).unsqueeze(0), sums - bias])
     own, rest = slice(0, fitted), slice(fitted, None)
-    inverse = torch.linalg.pinv(information[own, own], hermitian=True)  # `lstsq` rounds differently from run to run
+    inverse = pseudo_inverse(information[own, own])
     solved = inverse @ information[own, rest]
     left = information[rest, rest] - information[rest, own] @ solved
     left = (left + left.T) / 2
@@ -201,8 +206,7 @@ def _test_of_curve(column: Column, place: slice, scores: Tensor, own: Tensor) ->
 
 def _departed(departure: Departure, information: Tensor, scores: Tensor) -> Tested:
     """A Wald test of the fitted noise against the declared."""
-    ridge = 1e-10 * float(information.diagonal().max()) * torch.eye(len(information)).double()
-    step = torch.linalg.solve(information + ridge, departure.slope)  # a vanished noise has no information
+    step = ridged_inverse(information) @ departure.slope  # a vanished noise has no information
     sd = float((departure.slope @ step).sqrt())
     z = torch.cat([torch.tensor([departure.away]).double(), scores[1:] @ step]).numpy() / sd
     p_values = 2 * special.ndtr(-np.abs(z))

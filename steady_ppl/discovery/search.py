@@ -23,8 +23,10 @@ from steady_ppl.discovery.candidates import (
     attempts,
     judged,
     leaders,
+    likelier_places,
     screen_program,
 )
+from steady_ppl.discovery.particles import confirmed
 from steady_ppl.discovery.refits import (
     NO_THRESHOLD,
     Fits,
@@ -37,7 +39,7 @@ from steady_ppl.discovery.refits import (
 )
 from steady_ppl.discovery.screening import FAMILY_LEVEL, Tested
 from steady_ppl.effects import attached
-from steady_ppl.errors import FilterError
+from steady_ppl.errors import reason_of
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import with_substeps
@@ -62,11 +64,13 @@ class Settings:
     later_sets: int = 60  # of each further one
     seed: int = 0  # of the simulated sets
     withheld: Sequence[str] = ()  # names of effects that are left out of the catalogue
+    only: Sequence[str] = ()  # the kinds of effects that are looked for; all of them where none is named
 
     def screen(self, now: Refit, index: int) -> Screening:
         """Test every candidate that a fitted program does not have, in a round counted from 0."""
         sets = self.later_sets if index else self.sets
-        return screen_program(now, self.declared, sets=sets, seed=self.seed + index, withheld=self.withheld)
+        left_out = {"withheld": self.withheld, "only": self.only}
+        return screen_program(now, self.declared, sets=sets, seed=self.seed + index, **left_out)
 
 
 @dataclass(frozen=True)
@@ -109,7 +113,7 @@ class Search:
     rounds: list[Round] = field(default_factory=list)  # the last tests the final program unless the search ended early
     found: list[Found] = field(default_factory=list)  # the effects that were added
     curves: list[Candidate] = field(default_factory=list)  # fitted in place of the first effect, best first
-    diverged: list[str] = field(default_factory=list)  # effects taken back: the program blew up with them
+    taken_back: dict[str, str] = field(default_factory=dict)  # effects with which the program failed, and how
 
     @property
     def is_complete(self) -> bool:
@@ -186,11 +190,12 @@ def _rounds(found: Search, settings: Settings) -> Search:
                 begin_part()
                 try:
                     screening = settings.screen(found.final, index)
-                except FilterError:
+                except Exception as error:
                     if index == 0:
                         raise
                     taken_back = found.found.pop()
-                    found.final, found.diverged = taken_back.without, [taken_back.candidate.variant.label]
+                    found.final, label = taken_back.without, taken_back.candidate.variant.label
+                    found.taken_back = {label: reason_of(error)}
                     break
                 begin_part()
                 if not _add_best(found, screening, index):
@@ -202,8 +207,9 @@ def _rounds(found: Search, settings: Settings) -> Search:
             if set(labels(found.final)) != set(labels(final)):  # the same in another order has been tested
                 try:
                     found.rounds.append(Round(settings.screen(found.final, MAX_EFFECTS + 1), [], None))
-                except FilterError:
-                    found.diverged = [label for label in labels(found.final) if label not in labels(final)]
+                except Exception as error:
+                    new = [label for label in labels(found.final) if label not in labels(final)]
+                    found.taken_back = dict.fromkeys(new, reason_of(error))
                     found.found, found.final = before, final
         begin()
         if len(found.rounds) > 1 and not found.rounds[1].nothing_found and not found.curves:
@@ -218,7 +224,8 @@ def _add_best(found: Search, screening: Screening, index: int) -> bool:
         return False
     candidates = _refits(found.final, screening, index == 0)
     able = [c for c in candidates if c.is_judged and not c.against_its_sign]
-    best = next((c for c in able if c.significant(screening.tests.critical)), None)
+    significant = [c for c in able if c.significant(screening.tests.critical)]
+    best = next(iter(sorted(significant, key=lambda c: not c.is_explanation)), None)  # the first that is one, if any is
     if index == 0 and best is None:
         found.curves = _curves(found)
         if found.curve is None and not found.departed:  # neither can be what the tests found
@@ -229,7 +236,22 @@ def _add_best(found: Search, screening: Screening, index: int) -> bool:
     assert isinstance(best.refit, Refit)
     found.found.append(Found(best, candidates, found.final))
     found.final = best.refit
+    for one in found.found[:-1]:
+        _place_again(found, one)
     return True
+
+
+def _place_again(search: Search, found: Found) -> None:
+    """Move the knee or place of an effect to where it is likeliest beside those that were added after it."""
+    candidate = found.candidate
+    if not candidate.variant.profiled:
+        return
+    *_, (variant, fits) = likelier_places(search.base, search.final, candidate.variant)
+    if fits is search.final or isinstance(refit := judged_fits(fits), str):
+        return
+    search.final = refit
+    moved = replace(candidate, tested=candidate.tested.at(variant))
+    search.found[search.found.index(found)] = replace(found, candidate=moved)
 
 
 def _refits(now: Refit, screening: Screening, first: bool) -> list[Candidate]:
@@ -241,8 +263,7 @@ def _refits(now: Refit, screening: Screening, first: bool) -> list[Candidate]:
     best = max((c for c in candidates if c.is_judged), key=lambda c: c.total, default=None)
     candidates = [c if c.is_judged else replace(c, behind=best) for c in candidates]
     least = max((c.total for c in candidates), default=0.0) - MAX_NATS_OF_RIVAL
-    placed = [at_its_best_place(now, c) if c.total > least else c for c in candidates]
-    return sorted(placed, key=lambda c: -c.total)
+    return confirmed(now, [at_its_best_place(now, c) if c.total > least else c for c in candidates])
 
 
 def _threshold(candidates: Sequence[Candidate]) -> Threshold:
@@ -287,14 +308,15 @@ def prune(search: Search) -> None:
         there = {variant.name for variant in attached(without.program)}
         again = []
         for rival in [chosen, *(c for c in found.candidates if c is not chosen and c.total > least)]:
-            if rival.variant.name not in there and isinstance(rival.refit, Refit):
+            imitates = chosen.is_explanation and not rival.is_explanation
+            if rival.variant.name not in there and isinstance(rival.refit, Refit) and not imitates:
                 begin = rival.refit.coefficient(rival.variant)
                 refit = refit_with(without, rival.variant, begin, information=search.final.maxima[0])
                 again.append(at_its_best_place(without, judged(without, rival.tested, refit)))
         as_it_stands = judged(without, chosen.tested, search.final)
         if all(c.total < as_it_stands.total for c in again if c.variant.name == chosen.variant.name):
             again = [as_it_stands, *(c for c in again if c.variant.name != chosen.variant.name)]
-        again = sorted(again, key=lambda c: -c.total)
+        again = confirmed(without, again)
         best = next((c for c in again if not c.against_its_sign), None)
         place = search.found.index(found)
         if best is None or best.total <= TIE_NATS or isinstance(best.refit, str):

@@ -1,6 +1,7 @@
 """A program with an effect: the same three methods, around which the effect acts."""
 
 import copy
+import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -53,7 +54,7 @@ def attach(program: Program, variant: Variant, value: Value | None = None, *, cl
     program.__class__ = _class_with(type(program), variant, class_name)
     with pyro.settings.context(module_local_params=True):
         setattr(program, name, PyroParam(start, _constraint(effect)))
-    wide = dist.Cauchy(1.0 if effect.null == 1 else 0.0, effect.limit)  # as wide as is physical
+    wide = dist.Cauchy(1.0 if effect.null == 1 else 0.0, _width_of_prior(variant, value))
     program.priors = {**program.priors, name: wide if effect.prior is None else effect.prior}
     rate = float(variant.typical.abs().max()) if effect.null == 0 else 1.0  # Adam's steps are of this size in any unit
     program.rates = {name: rate, **program.rates}
@@ -78,6 +79,12 @@ def _frozen(value: object) -> Hashable:
     if isinstance(value, tuple | list):
         return tuple(map(_frozen, value))
     return value if isinstance(value, Hashable) else id(value)
+
+
+def _width_of_prior(variant: Variant, value: Value | None) -> float:
+    """As wide as is physical; a number that is given says in what unit."""
+    largest = 0.0 if value is None else float(torch.as_tensor(value).abs().max())
+    return max(variant.limit, largest) if variant.effect.null == 0 and math.isfinite(largest) else variant.limit
 
 
 def attach_listed(program: Program) -> Program:

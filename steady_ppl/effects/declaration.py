@@ -46,11 +46,6 @@ Value = float | Sequence[float] | Tensor  # of a coefficient, before it is a ten
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def power_of_two_below(size: float) -> float:
-    """For a coefficient to be learned in units of; one where nothing has a size."""
-    return 2.0 ** math.floor(math.log2(size)) if size > 0 else 1.0
-
-
 def needs(*conditions: Need) -> Callable[[Program], str | None]:
     """Return what an effect `lacks`: the reason of the first condition that does not hold for a program."""
     return lambda program: next((reason for holds, reason in conditions if not holds(program)), None)
@@ -131,7 +126,8 @@ class Effect:
         return max(1, len(self.components))
 
     def variants(self, program: Program, data: Trajectories | None = None) -> list[Variant]:
-        """All ways in which it could act on a program; knees, places and scales are chosen for `data` where given."""
+        """All ways in which it could act on a program; knees and places are chosen for `data` where given, and the
+        scale is left to `Sizes`."""
         if self.lacks(program):
             return []
         found = [self.variant(**choice) for choice in self.choices(program, data)]
@@ -142,9 +138,9 @@ class Effect:
                 )
         return [replace(variant, unit=_unit(program, variant)) for variant in found]
 
-    def variant(self, at: str = "", scale: float = 1.0, **options: Any) -> Variant:
+    def variant(self, at: str = "", **options: Any) -> Variant:
         """The effect with everything settled but its coefficient."""
-        return Variant(self, at, options, scale=scale, unit=self.unit)
+        return Variant(self, at, options, unit=self.unit)
 
 
 def declare(effects: list[Effect], form: str, unit: str, **more: Any) -> Callable[[Function], Function]:
@@ -172,7 +168,7 @@ class Variant:
     at: str  # where it acts, if there is a choice
     options: Mapping[str, Any]  # the further arguments of its function
     called: str = ""  # another name for the coefficient, where a program has a parameter of the effect's name
-    scale: float = 1.0  # of the effect's probes and typical value for the drives that were looked at
+    scale: float = 1.0  # of the effect's probes, limit and typical value for the drives that were looked at
     unit: str = ""  # of the coefficient in this program
 
     @property
@@ -184,6 +180,11 @@ class Variant:
     def typical(self) -> Tensor:
         """A coefficient that is clearly felt, `(k,)`."""
         return self.scale * torch.as_tensor(self.effect.typical).flatten()
+
+    @property
+    def limit(self) -> float:
+        """A magnitude beyond which it is hardly physical."""
+        return self.scale * self.effect.limit
 
     @property
     def profiled(self) -> dict[str, Any]:

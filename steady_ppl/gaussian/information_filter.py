@@ -38,6 +38,8 @@ from steady_ppl.gaussian.lanes import (
 )
 from steady_ppl.gaussian.linearize import LinearArrays, Linearization, ReferencePath
 
+ROUNDING = 1e-6  # of log p(y), by which it may be larger than can be
+
 
 class Potential(NamedTuple):
     """exp(c − ½ δᵀ Λ δ + λᵀ δ) of a state in lanes."""
@@ -82,6 +84,13 @@ class Lookahead:
     given: LinearArrays = field(repr=False)  # the linearization in lanes
     futures: Potential = field(repr=False)  # after every row, in lanes
     steering: Steering = field(repr=False)  # of every interval's noise, in lanes
+
+    @property
+    def is_broken(self) -> Tensor:
+        """Where log p(y) is no number, or above the measurements' density at residuals of zero, `(B,)`: no Gaussian
+        reaches that, and the recursions have lost their digits."""
+        most = self.linearization.log_scale.sum(0)
+        return ~torch.isfinite(self.log_likelihood) | (self.log_likelihood > most + ROUNDING * (1 + most.abs()))
 
     @cached_property
     def precision(self) -> Tensor:

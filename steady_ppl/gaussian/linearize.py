@@ -227,21 +227,26 @@ def _start(problem: Problem, first: Tensor) -> tuple[Tensor, Tensor]:
 
 def angles_on_a_circle(program: Program, data: Trajectories, state: Tensor) -> tuple[int, ...]:
     """The declared angles of which a whole turn changes neither what is measured nor where the program goes; an angle
-    that a plain normal measures counts its turns. Looked at from one state, `(1, D)`."""
+    that a plain normal measures counts its turns. Looked at from one state, `(1, D)`, beside what a
+    sixth of a turn changes."""
     angles = list(program.angle_indices)
-    turns = state.new_zeros((len(angles) + 1, state.shape[-1]))
-    turns[range(1, len(turns)), angles] = 2 * math.pi
+    count = len(angles)
+    turns = state.new_zeros((2 * count + 1, state.shape[-1]))
+    turns[range(1, count + 1), angles] = 2 * math.pi
+    turns[range(count + 1, len(turns)), angles] = math.pi / 3
     states = (state + turns).unsqueeze(1)
     first = slice(0, 1)
     measurement = data.measurements[first, first].new_zeros((len(turns), 1, data.measurements.shape[-1]))
     everywhere = torch.ones_like(measurement, dtype=torch.bool)
     residuals, log_sd, _ = _residuals(program, states, measurement, everywhere).chunk(3, -1)
     squares = (residuals / log_sd.exp()).square()  # of no sign: a bearing straight behind is on both ends of its scale
-    same = ((squares - squares[first]).abs() <= 0.01 * (1 + squares)).flatten(1).all(1)
+    same = ((squares - squares[first]).abs() <= 0.01 * (1 + squares)).flatten(1).all(1)[: count + 1]
     if len(data.steps):
         given = (part[first, first] for part in (data.controls, data.elapsed, data.steps))
         change = mean_step(program, states, *given) - states
         apart = change - change[first]
         apart[..., angles] = wrap(apart[..., angles])
-        same &= (apart.abs() <= 0.01 * change.abs() + 1e-5 * (1 + states.abs())).flatten(1).all(1)
+        by_part = torch.cat([apart[first], apart[count + 1 :]]).abs()
+        apart, change, states = (part[: count + 1] for part in (apart, change, states))
+        same &= (apart.abs() <= 0.01 * (change.abs() + by_part) + 1e-6 * states.abs()).flatten(1).all(1)
     return tuple(angle for angle, periodic in zip(angles, same[1:].tolist(), strict=True) if periodic)

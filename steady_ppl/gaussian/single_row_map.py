@@ -17,6 +17,8 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.validate import noise_size
 from steady_ppl.utils.cores import one_thread
 
+MIN_SHARE_OF_VARIANCE = 1e-12  # of the largest square, where the prior knows a component
+MIN_CURVATURE = 1e-9  # of the cost, in the prior's own
 DAMPING = 1e-2  # of the first step, relative to the curvature
 MAX_ROWS_OF_BATCH = 50_000  # rows of all places and drives
 
@@ -46,9 +48,11 @@ def fixes(program: Program, data: Trajectories, *, places: int = 32, passes: int
     enough = (data.observed.sum(-1) >= told.sum()) & data.rows
     _require_enough(program, data, told, enough)
     drawn = guesses[data.rows[:, None].expand(guesses.shape[:3])].double()
-    precision = 1 / drawn.var(0).clamp(min=1e-12)
+    variance = torch.maximum(drawn.var(0), MIN_SHARE_OF_VARIANCE * drawn.square().amax(0))
+    usual = torch.where(variance > 0, 1 / variance, 1 / MIN_SHARE_OF_VARIANCE)
+    precision = usual.clone()
     precision[list(program.angle_indices)] = 0.0  # normal, flat over angles
-    prior = drawn.mean(0), precision
+    prior = drawn.mean(0), precision, MIN_CURVATURE * usual
     drives = max(1, MAX_ROWS_OF_BATCH // (places * len(data.time)))
     parts = torch.arange(len(data)).split(drives)
     states = [_found(program, data.subset(part), guesses[:, :, part], told, prior, passes) for part in parts]
@@ -68,11 +72,11 @@ def _require_enough(program: Program, data: Trajectories, told: Tensor, enough: 
 
 
 def _found(
-    program: Program, data: Trajectories, guesses: Tensor, told: Tensor, prior: tuple[Tensor, Tensor], passes: int
+    program: Program, data: Trajectories, guesses: Tensor, told: Tensor, prior: tuple[Tensor, ...], passes: int
 ) -> Tensor:
     """The most probable states `(T + 1, B, D)` of some drives, from guesses `(T + 1, S, B, D)` under a prior's mean and
-    precision, each `(D,)`."""
-    mean, precision = prior
+    precision, with the least curvature that a component is taken to have, each `(D,)`."""
+    mean, precision, least = prior
     left = guesses.shape[1:3]
     copies = data.subset(torch.arange(len(data)).repeat(left[0]))
 
@@ -90,7 +94,8 @@ def _found(
     damping = torch.full_like(best[1], DAMPING)
     for _ in range(passes):
         states, cost, downhill, curvature = best
-        damped = curvature + torch.diag_embed(damping.unsqueeze(-1) * curvature.diagonal(dim1=-2, dim2=-1) + 1e-9)
+        own = curvature.diagonal(dim1=-2, dim2=-1)
+        damped = curvature + torch.diag_embed(damping.unsqueeze(-1) * own + least)
         tried = judged(states + torch.where(told, torch.linalg.solve(damped, downhill), 0.0).to(states))
         better = tried[1] < cost
         damping = torch.where(better, damping / 5, damping * 5).clamp(1e-9, 1e9)

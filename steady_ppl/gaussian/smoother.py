@@ -5,6 +5,7 @@ which the lookahead filter is steered; its draws are an E step of their own (Bri
 Roweis 1999).
 """
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -142,12 +143,16 @@ def find_and_smooth(
 
 
 def require_found(ahead: Lookahead, problem: Problem) -> None:
-    """Raise a `FilterError` where the linearised program's log p(y) is not finite."""
-    for (drive,) in (~torch.isfinite(ahead.log_likelihood)).nonzero()[:1].tolist():
+    """Raise a `FilterError` where the linearised program's log p(y) is not finite, or larger than it can be."""
+    for (drive,) in ahead.is_broken.nonzero()[:1].tolist():
         label = problem.data.labels[drive]
+        likely = float(ahead.log_likelihood[drive])
         why = divergence(problem.program, problem.data.subset([drive])) or (
-            "the linearised program's log p(y) is not finite: its parameters or states have blown up, or it cannot be "
-            "linearised there (--recipe steady --guide bootstrap does not)"
+            f"the linearised program's log p(y), {likely:.4g} nats, is larger than its sensors allow: the filter has "
+            "broken down numerically"
+            if math.isfinite(likely)
+            else "the linearised program's log p(y) is not finite: its parameters or states have blown up, or it "
+            "cannot be linearised there (--recipe steady --guide bootstrap does not)"
         )
         raise FilterError(f"trajectory {label}: {why}", trajectory=label)
 

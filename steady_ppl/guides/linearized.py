@@ -56,7 +56,7 @@ class LinearizedGuide(PathGuide):
         """
         self._search(data, [i for i, label in enumerate(data.labels) if f"states/{label}" not in self.memory], progress)
         ahead = self._smooth(data, progress)
-        lost = (~torch.isfinite(ahead.log_likelihood)).nonzero().flatten().tolist()
+        lost = ahead.is_broken.nonzero().flatten().tolist()
         searched = [float(self.memory[f"searched/{label}"]) for label in data.labels]
         due = [i for i, then in enumerate(searched) if progress - then >= self.search_again and i not in lost]
         counts = {"paths_lost": float(len(lost)), "searches_failed": 0.0}

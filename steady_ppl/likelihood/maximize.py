@@ -186,6 +186,8 @@ def maximise_sum(
         reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
     reach = torch.where(here.has_unit, torch.maximum(reach, MAX_MOVE_SD * information.diagonal().rsqrt()), reach)
     taken, decrement, passes = 0, 0.0, PASSES
+    few_drives = len(here.scores) < 2 * len(information)  # they know too little: what they say is seen twice
+    is_small = False
     rises = deque[float](maxlen=3)  # of log p(y) by the last steps
     with stages(*(("", SHARE_THAT_GOES_ON**step) for step in range(steps + 1))) as begin:
         for taken in range(steps + 1):
@@ -203,11 +205,11 @@ def maximise_sum(
                 is_given, own = False, _by_cross_products(here)
                 seen, _ = torch.linalg.solve_ex(own, here.gradient)
                 more = 0.5 * float(here.gradient @ seen)
-                few_drives = len(here.scores) < 2 * len(own)  # they know too little
                 if taken == 0 or (more > CONVERGED_DECREMENT and not few_drives):
                     information, move, decrement = own, seen, more
             behind = taken >= 6 and here.log_likelihood + (steps - taken) * max(0.0, *rises) < hopeless
-            if decrement < precision or taken == steps or behind:
+            was_small, is_small = is_small, decrement < precision
+            if (is_small and (was_small or not few_drives or taken == 0)) or taken == steps or behind:
                 break
             move = move * min(1.0, 1 / max(1e-9, float((move.abs() / reach).max())))
             against = move * here.gradient < 0
@@ -304,8 +306,8 @@ def _tried(terms: Sequence[Term], passes: int, least: float) -> LinearizedObject
     """None where the step went too far: the objective falls below `least`, or a program diverges there."""
     try:
         found = _valued(terms, passes)
-        finite = all(bool(torch.isfinite(term.ahead.log_likelihood).all()) for term in found)
-        if not finite or not sum(term.objective for term in found) >= least:
+        broken = any(bool(term.ahead.is_broken.any()) for term in found)
+        if broken or not sum(term.objective for term in found) >= least:
             return None
         here = _scored(found)
     except FilterError:

@@ -16,7 +16,7 @@ def lagged(control: Tensor, time: Tensor, constant: Tensor) -> Tensor:
         return control
     constant = torch.as_tensor(constant, dtype=control.dtype, device=control.device).clamp(min=0.0)
     steps = row_spans(time).unsqueeze(-1)
-    stays = (-steps / constant.clamp(min=1e-6)).exp()
+    stays = (-steps / torch.maximum(constant, 1e-5 * steps)).exp()
     share = constant / steps * (1 - stays)
     at, means = control[0], []
     for row in range(len(control)):

@@ -140,20 +140,23 @@ def dense(layer: nn.Linear, inputs: Tensor) -> Tensor:
     return outputs.view(-1, *inputs.shape[:-1]).movedim(0, -1)
 
 
-def bearings_to(landmarks: Sequence[Sequence[float]] | Tensor, state: Tensor, sd: float | Tensor) -> dist.Independent:
+def bearings_to(
+    landmarks: Sequence[Sequence[float]] | Tensor, state: Tensor, sd: float | Tensor, near: float = 0.1
+) -> dist.Independent:
     """Return the distribution of bearings to landmarks relative to the heading, `(..., K)` rad, with independent noise.
 
-    Nearer than 0.1 m the noise grows as 0.1/distance, at most tenfold.
+    Nearer than `near` the noise grows as `near` over the distance, at most tenfold.
 
     Args:
         landmarks: `(K, 2)` m.
         state: `(..., 6)`, x, y and heading first.
         sd: rad.
+        near: m.
     """
     places = _on_device(landmarks, state)
     x, y, heading = state[..., 0], state[..., 1], state[..., 2]
     to_x, to_y = places[:, 0] - x.unsqueeze(-1), places[:, 1] - y.unsqueeze(-1)
-    nearness = (to_x * to_x + to_y * to_y).clamp(1e-4, 1e-2).rsqrt() * 0.1
+    nearness = (to_x * to_x + to_y * to_y).clamp(0.01 * near**2, near**2).rsqrt() * near
     bearing = torch.atan2(to_y, to_x) - heading.unsqueeze(-1)
     return WrappedNormal(bearing, sd * nearness).to_event(1)
 

@@ -62,10 +62,10 @@ def divergence(program: Program, data: Trajectories, rows: int | None = None) ->
 
 def _eigenvalues(program: Program, state: Tensor, given: _Given) -> Tensor | None:
     """Of the row's derivative in the state, `(..., D)` at states `(..., D)`; None where one is no number."""
-    size = state.shape[-1]
-    columns = []
-    for unit in torch.eye(size).to(state):
-        by = 1e-3 * (1 + state.abs()) * unit
+    columns, usual = [], state.abs().flatten(0, -2).amax(0)
+    usual = torch.where(usual > 0, usual, 1.0)
+    for unit in torch.eye(len(usual)).to(state):
+        by = 1e-3 * (usual + state.abs()) * unit
         ends = [_after(program, state + moved, given, 0.0).expand(*state.shape) for moved in (by, -by)]
         columns.append((ends[0] - ends[1]) / (2 * by.sum(-1, keepdim=True)))
     derivative = torch.stack(columns, -1).double()
@@ -109,8 +109,8 @@ def is_step(program: Program, data: Trajectories) -> bool:
             still, pushed = (_after(own, state, (control, time, short), noise) for noise in (0.0, 1.0))
         changes.append((_largest(still - state), _largest(pushed - still)))
     (far, pushed_far), (near, pushed_near) = changes
-    moves = near <= 0.5 * far + 1e-6 * (1 + _largest(state))
-    noise = pushed_near <= 0.1 * pushed_far + 1e-6
+    moves = near <= 0.5 * far + 1e-6 * _largest(state)
+    noise = pushed_near <= 0.1 * pushed_far + 1e-6 * _largest(state)
     return bool(moves.all() and noise.all())
 
 
@@ -165,7 +165,7 @@ def require_convergence(program: Program, state: Tensor, control: Tensor, time: 
         return _after(with_substeps(program, count), state, (control, time, step), 1.0)
 
     coarse, fine = (_largest(ends(count) - ends(2 * count)) for count in (8, STEP_DIVISOR))
-    beyond = fine - 0.7 * coarse - 1e-4 * (1 + _largest(ends(8)))
+    beyond = fine - 0.7 * coarse - 1e-4 * _largest(ends(8))
     beyond = torch.where(fine.isfinite(), beyond, torch.inf)
     if bool((beyond > 0).any()):
         component = program.state_names[int(beyond.argmax())]

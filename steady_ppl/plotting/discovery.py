@@ -191,7 +191,7 @@ def _in_limits(variant: Variant, values: np.ndarray, ends: np.ndarray, limits: n
 
 
 def _with_unit(limit: float, variant: Variant) -> str:
-    if limit > variant.effect.limit:
+    if limit > variant.limit:
         return "beyond the physical"
     return f"{limit:.2g}" + ("" if variant.unit in ("", "1") else f" {variant.unit}")
 

@@ -109,3 +109,21 @@ def test_a_run_whose_program_changed_is_refused(table, tmp_path, capsys):
     model.write_text(MODEL.read_text() + "\n# changed\n")
     capsys.readouterr()
     assert "changed" in refused(capsys, "discover", tmp_path / "run", table)
+
+
+def test_one_kind_is_looked_for_and_an_effect_left_out(table, capsys):
+    given = (
+        "--known-start",
+        "--simulations",
+        50,
+        "--only",
+        "dynamics",
+        "--withhold",
+        "yaw_bias",
+        "--withhold",
+        "slope",
+    )
+    assert steady("discover", MODEL, table, *given, "--json", "-") == 0
+    candidates = json.loads(capsys.readouterr().out)["candidates"]
+    names = {one["effect"].partition(":")[0] for one in candidates}
+    assert "linear_drag" in names and not names & {"yaw_bias", "slope", "actuator_lag", "bearing_bias", "heavy_tails"}

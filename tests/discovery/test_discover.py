@@ -418,6 +418,15 @@ def test_what_is_withheld_is_an_effect(withheld, says):
         st.discover(program, st.simulate(program, 10), withheld=withheld)
 
 
+@pytest.mark.parametrize(
+    ("only", "says"), [(["physics"], "there are dynamics, actuator, sensor, noise"), ("noise", "list")]
+)
+def test_what_is_looked_for_is_a_kind(only, says):
+    program = example("hovercraft")
+    with pytest.raises(st.UsageError, match=says):
+        st.discover(program, st.simulate(program, 10), only=only)
+
+
 def test_mixed_tables_are_one_and_every_second_drive_chooses() -> None:
     program = example("hovercraft", torch.float32)
     train, valid = drives(program, 6, 21, seed=1), drives(program, 5, 21, seed=2)

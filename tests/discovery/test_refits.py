@@ -19,7 +19,7 @@ from steady_ppl.discovery.refits import (
     refit_with,
     starts_by_draws,
 )
-from steady_ppl.effects import chosen_variant, coefficient
+from steady_ppl.effects import attached, chosen_variant, coefficient
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path, smooth
 from steady_ppl.likelihood.maximize import maximise
@@ -113,3 +113,20 @@ def test_a_fit_at_another_knee_is_the_one_from_nothing():
     assert gain_of_fits(base, near) == pytest.approx(gain_of_fits(base, direct[1]), abs=0.2)
     # fits rest within .02 nats of their maxima, .2 standard deviations: of two fits on two folds .4 nats, three of them
     assert float((near.held_out - direct[1].held_out).sum()) == pytest.approx(0.0, abs=1.2)
+
+
+class Stumbling(type(example("hovercraft"))):
+    """A program whose code fails as soon as it is given an effect."""
+
+    def integrate(self, state, acceleration, step):
+        if len(attached(self)) > 0:
+            raise ZeroDivisionError("of the program's own")
+        return super().integrate(state, acceleration, step)
+
+
+def test_a_failure_of_a_programs_own_fails_the_candidate_with_its_reason():
+    program = Stumbling().double()
+    train, valid = drives(program, 6, 21, seed=1), drives(program, 6, 21, seed=2)
+    base = first_refit(Problem(program, train, True), valid, seed=0)
+    found = refit_with(base, chosen_variant(program, "yaw_bias", ""), 0.01)
+    assert found == "ZeroDivisionError: of the program's own"

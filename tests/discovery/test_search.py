@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import pytest
+
+from steady_ppl.discovery import search
+from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.search import Found
 
 
@@ -17,3 +23,45 @@ def test_a_class_begins_with_what_was_chosen():
     more, chosen, near, far = Stub(10.5), Stub(10.0), Stub(8.5), Stub(7.0)
     found = Found(chosen, [more, chosen, near, far], None)
     assert found.aliases == [chosen, more, near]
+
+
+class Chosen:
+    """A candidate of so many nats, significant and judged."""
+
+    is_judged, against_its_sign = True, False
+
+    def __init__(self, name, total, explains=True, profiled=()):
+        self.name, self.total, self.is_explanation = name, total, explains
+        self.refit, self.variant = object.__new__(Refit), SimpleNamespace(profiled=profiled)
+
+    def significant(self, critical):
+        return self.total > 2
+
+
+@pytest.mark.parametrize(
+    ("totals", "expected"),
+    [
+        ({"coloured": (100.0, False), "drag": (30.0, True), "bias": (5.0, True)}, "drag"),
+        ({"coloured": (100.0, False), "drag": (1.0, True)}, "coloured"),
+        ({"coloured": (1.0, False), "drag": (1.0, True)}, None),
+    ],
+)
+def test_coloured_noise_enters_where_nothing_else_is_significant(monkeypatch, totals, expected):
+    candidates = [Chosen(name, *told) for name, told in totals.items()]
+    monkeypatch.setattr(search, "_refits", lambda *_: candidates)
+    screening = SimpleNamespace(tests=SimpleNamespace(p_value=0.0, critical=0.01))
+    found = search.Search(base=None, final=None, step=None, gained=0.0)
+    assert search._add_best(found, screening, 1) == (expected is not None)
+    assert [one.candidate.name for one in found.found] == ([expected] if expected else [])
+
+
+def test_a_knee_is_moved_beside_what_is_added_after_it(monkeypatch):
+    knee, moved, later = (Chosen(name, 10.0, profiled=(name,)) for name in ("knee", "moved", "later"))
+    knee.tested = SimpleNamespace(at=lambda variant: variant)
+    monkeypatch.setattr(search, "replace", lambda one, **to: SimpleNamespace(**{**vars(one), **to}))
+    monkeypatch.setattr(search, "likelier_places", lambda base, begun, at: [(at, begun), (moved.variant, "fits")])
+    monkeypatch.setattr(search, "judged_fits", lambda fits: moved.refit)
+    first = search.Found(knee, [knee], None)
+    found = search.Search(base=None, final=later.refit, step=None, gained=0.0, found=[first])
+    search._place_again(found, first)
+    assert found.final is moved.refit and found.found[0].candidate.tested is moved.variant

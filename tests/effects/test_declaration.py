@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
-from examples import drives, short
+from examples import short
 
 from steady_ppl import UsageError
-from steady_ppl.effects import Effect, chosen_variant, find
+from steady_ppl.effects import Effect, chosen_variant
 
 
 def test_coefficients_have_the_units_of_what_they_act_on() -> None:
@@ -26,17 +24,6 @@ def test_coefficients_have_the_units_of_what_they_act_on() -> None:
     }
     for (program, effect), unit in units.items():
         assert chosen_variant(short(program), effect).unit == unit, (program, effect)
-
-
-def test_probes_go_with_the_size_of_the_commands() -> None:
-    """Pulse widths of a thousand and more, not newtons."""
-    program = short("hovercraft")
-    data = drives(program, 2, 6)
-    large = replace(data, controls=1000 * data.controls)
-    (small,), (great,) = (find("dead_zone", program).variants(program, table) for table in (data, large))
-    assert small.probes == [small.scale * probe for probe in (0.05, 0.15, 0.3)]
-    assert 500 <= great.scale / small.scale <= 2000
-    assert great.scale <= float(large.controls.abs().max()) < 2 * great.scale
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.catalogue.forces import PLANAR, THRUSTS
-from steady_ppl.effects.declaration import Choices, Effect, Names, Need, declare, needs, power_of_two_below
+from steady_ppl.effects.declaration import Choices, Effect, Names, Need, declare, needs
 from steady_ppl.model.actuation import delayed, lagged
 from steady_ppl.model.program import Program
 
@@ -33,11 +33,7 @@ def _everywhere(program: Program, data: Trajectories | None = None) -> Choices:
 def _per_unit(program: Program, data: Trajectories | None) -> Choices:
     """The coefficient has a control's unit: together where they share one, else each alone."""
     together, *alone = _everywhere(program)
-    choices = []
-    for group in alone or [together]:
-        scale = 1.0 if data is None else power_of_two_below(float(_magnitudes(data, group["controls"]).amax()))
-        choices.append({**group, "scale": scale})
-    return choices
+    return alone or [together]
 
 
 def _magnitudes(data: Trajectories, controls: Names) -> Tensor:
@@ -93,7 +89,8 @@ def speed_dependent_gain(self: Program, state: Tensor, control: Tensor, time: Te
     occurs: propellers, whose thrust falls with the speed of advance; motors near the speed of no load
     """
     forward, lateral, _ = self.body_velocity(state)
-    return control * (1 - c * (forward**2 + lateral**2 + 1e-12).sqrt()).unsqueeze(-1)
+    speed = (forward**2 + lateral**2).clamp(min=1e-30).sqrt()  # which has a slope at rest
+    return control * (1 - c * speed).unsqueeze(-1)
 
 
 @_on_controls("1", typical=0.45, limit=1.0, sign=1, profiled=("knee",), choices=_knees)

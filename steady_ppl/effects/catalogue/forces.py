@@ -3,7 +3,7 @@ its body frame unless said otherwise."""
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -12,11 +12,14 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.declaration import Choices, Effect, Means, Names, Need, Pushes, declare, needs
+from steady_ppl.effects.sizes import sizes_of_channels, speed_of
 from steady_ppl.model.handlers import draw_starts
 from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.model.program import Program
 from steady_ppl.utils.random import seeded
 
+KNEE_SPEED = 0.05  # m/s; a friction's knee where nothing is known of speeds
+SHARES_OF_SPEED = (0.1, 0.02)  # of the root mean square speed, that a friction's knee can be
 STARTS = 500  # drawn, where nothing else says where a vehicle goes
 
 AXES: Need = (lambda program: program.axes, "the program does not say which channels move what (`motion`)")
@@ -48,8 +51,35 @@ def _springs(program: Program, data: Trajectories | None) -> Choices:
     return _each({channel: (channel,) for channel, (position, _) in program.motion.items() if position})
 
 
-def _one_of(option: str, *numbers: float) -> Callable[[Program, Trajectories | None], Choices]:
-    return lambda program, data: [{option: number} for number in numbers]
+def three_digits(value: float) -> float:
+    """As it is written."""
+    return float(f"{value:.3g}")
+
+
+def _axes_and_knees(program: Program, data: Trajectories | None) -> Choices:
+    """A friction's knee is somewhere below the speeds that were driven."""
+    choices = []
+    for group in _axes(program, data):
+        speed = speed_of(program, data, group["channels"])
+        knees = [three_digits(share * speed) for share in SHARES_OF_SPEED] if speed > 0 else [KNEE_SPEED]
+        choices += [{**group, "knee": knee} for knee in knees]
+    return choices
+
+
+def _drags(program: Program, data: Trajectories | None) -> Choices:
+    """Drags of which wind could be felt: they brake the usual speed by a share of what it is told."""
+    speed, told = speed_of(program, data, program.axes["translation"]), 0.0
+    if data is not None and speed > 0:
+        told = max(sizes_of_channels(program, data)[channel] for channel in program.axes["translation"])
+    unit = told / speed**2 if told > 0 else 0.2
+    return [{"drag": three_digits(share * unit)} for share in (0.3, 0.1, 1.0)]
+
+
+def _leads(program: Program, data: Trajectories | None) -> Choices:
+    """How far ahead of the tracked point the one is that does not slide, in shares of a usual radius of turning."""
+    speed, turn = (speed_of(program, data, program.axes[axis]) for axis in ("translation", "yaw"))
+    unit = speed / turn if speed > 0 and turn > 0 else 2.0
+    return [{"lead": three_digits(share * unit)} for share in (0.1, 0.0, 0.25)]
 
 
 def _limits(program: Program, data: Trajectories | None) -> Choices:
@@ -111,16 +141,25 @@ def quadratic_drag(self: Program, state: Tensor, *_: Tensor, c: Tensor, channels
     return {channel: -c * velocity[channel] * velocity[channel].abs() for channel in channels}
 
 
-@_on_axes("m/s²", typical=0.1, limit=1.0, sign=1)
-def coulomb_friction(self: Program, state: Tensor, *_: Tensor, c: Tensor, channels: Names) -> Pushes:
-    r"""a = -c v / sqrt(v² + 0.05²)
+@_force(
+    "m/s²",
+    typical=0.1,
+    limit=1.0,
+    sign=1,
+    profiled=("knee",),
+    by_factor=("knee",),
+    choices=_axes_and_knees,
+    lacks=needs(AXES),
+)
+def coulomb_friction(self: Program, state: Tensor, *_: Tensor, c: Tensor, channels: Names, knee: Any) -> Pushes:
+    r"""a = -c v / sqrt(v² + knee²)
 
-    equation: a = -c\,v / \sqrt{v^2 + 0.05^2}
+    equation: a = -c\,v / \sqrt{v^2 + v_0^2}
     feels: brakes the same at any speed, then stops dead
     occurs: sledges, tracked robots, wheels with the brake dragging, linear guides and ball screws
     """
     velocity = self.velocities(state)
-    return {channel: -c * velocity[channel] * (velocity[channel] ** 2 + 0.05**2).rsqrt() for channel in channels}
+    return {channel: -c * velocity[channel] * (velocity[channel] ** 2 + knee**2).rsqrt() for channel in channels}
 
 
 @_on_yaw("1/s", typical=0.15, limit=2.0, sign=1)
@@ -230,7 +269,7 @@ def slope(self: Program, state: Tensor, *_: Tensor, c: Tensor) -> Pushes:
     components=("x", "y"),
     profiled=("drag",),
     by_factor=("drag",),
-    choices=_one_of("drag", 0.06, 0.02, 0.2),
+    choices=_drags,
 )
 def wind(self: Program, state: Tensor, *_: Tensor, c: Tensor, drag: Any) -> Pushes:
     r"""a = -k (v-w)|v-w| + k v|v| per axis, w the world-frame wind (c₁, c₂) in the body frame
@@ -297,7 +336,7 @@ def lever_arm(self: Program, state: Tensor, *_: Tensor, c: Tensor, mean: Means) 
     return {"forward": c * state[..., 5] ** 2, "lateral": -c * mean["yaw"]}
 
 
-@_where_it_slips("1/s", typical=0.2, limit=5.0, sign=1, profiled=("lead",), choices=_one_of("lead", 0.2, 0.0, 0.5))
+@_where_it_slips("1/s", typical=0.2, limit=5.0, sign=1, profiled=("lead",), choices=_leads)
 def side_slip(self: Program, state: Tensor, *_: Tensor, c: Tensor, lead: Any) -> Pushes:
     r"""a_lateral = -c (v_y - k ω)
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.effects.catalogue.forces import PLANAR
-from steady_ppl.effects.declaration import Choices, Effect, Need, declare, needs, power_of_two_below
+from steady_ppl.effects.declaration import Choices, Effect, Need, declare, needs
 from steady_ppl.model.planar_vehicle import PlanarVehicle
 from steady_ppl.model.program import Program
 
@@ -30,14 +30,6 @@ RATES: Need = (
 
 def _each(program: Program, data: Trajectories | None) -> Choices:
     return [{"component": index, "at": name} for index, name in enumerate(program.measurement_names)]
-
-
-def _each_of_its_size(program: Program, data: Trajectories | None) -> Choices:
-    choices = []
-    for index, choice in enumerate(_each(program, data)):
-        seen = torch.empty(0) if data is None else data.measurements[..., index][data.observed[..., index]].double()
-        choices.append({**choice, "scale": power_of_two_below(float(seen.std()) if len(seen) > 1 else 0.0)})
-    return choices
 
 
 SENSORS: list[Effect] = []
@@ -63,12 +55,10 @@ def landmark_bias(self: Program, state: Tensor, measured: Tensor, c: Tensor, com
     feels: one landmark is not where the map has it
     occurs: a landmark that was surveyed badly or moved, one receiver of an array that is off
     """
-    bias = measured.new_zeros(measured.shape[-1])
-    bias[component] = 1.0
-    return measured + c * bias
+    return measured + c * torch.tensor([float(index == component) for index in range(measured.shape[-1])]).to(measured)
 
 
-@_on_readings("of the measurement", typical=0.05, limit=1.0, choices=_each_of_its_size, lacks=needs(OTHER_SENSORS))
+@_on_readings("of the measurement", typical=0.05, limit=1.0, choices=_each, lacks=needs(OTHER_SENSORS))
 def sensor_bias(self: Program, state: Tensor, measured: Tensor, c: Tensor, component: Any) -> Tensor:
     r"""y_i → y_i + c, one measurement
 

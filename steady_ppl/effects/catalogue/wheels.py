@@ -1,14 +1,17 @@
 """Vehicles on wheels that are told a speed and a turn rate, as programs without slip have them."""
 
 import math
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.effects.catalogue.forces import PLANAR
+from steady_ppl.effects.catalogue.forces import PLANAR, three_digits
 from steady_ppl.effects.declaration import Choices, Effect, Means, Names, Need, Pushes, declare, needs
+from steady_ppl.effects.sizes import speed_of
 from steady_ppl.model.program import Program
 
 SPEED_AND_TURN: Need = (
@@ -20,6 +23,16 @@ GRIP: Need = (lambda program: not program.slips, "the lateral velocity is free")
 
 def _each_channel(program: Program, data: Trajectories | None) -> Choices:
     return [{"channels": (name,), "at": name} for name in program.channel_names]
+
+
+def _slow(speed: float) -> Callable[[Program, Trajectories | None], Choices]:
+    """A speed, m/s where nothing is known of a vehicle's, and else such a share of it."""
+
+    def choices(program: Program, data: Trajectories | None) -> Choices:
+        usual = speed_of(program, data, ("forward",)) or 1.0
+        return [{"knee": three_digits(speed * usual)}]
+
+    return choices
 
 
 WHEELS: list[Effect] = []
@@ -44,9 +57,9 @@ def response_time(
     return {channel: (carried[channel] - mean[channel]) * slower for channel in channels}
 
 
-@_on_command("1", typical=0.5, limit=2.0)
-def curvature_steering(self: Program, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
-    r"""turn → (1 - c) turn + c (turn / speed) v
+@_on_command("1", typical=0.5, limit=2.0, profiled=("knee",), by_factor=("knee",), choices=_slow(0.05))
+def curvature_steering(self: Program, state: Tensor, control: Tensor, time: Tensor, c: Tensor, knee: Any) -> Tensor:
+    r"""turn → (1 - c) turn + c (turn / speed) v, none below a speed of knee
 
     equation: u_\mathrm{turn} \to (1 - c)\,u_\mathrm{turn} + c\,u_\mathrm{turn}\,v / u_\mathrm{speed}
     feels: steers a curve, not a turn rate: turns slower while it is slower than it is told
@@ -54,7 +67,7 @@ def curvature_steering(self: Program, state: Tensor, control: Tensor, time: Tens
     """
     speed, turn = control[..., self.control_index("speed")], control[..., self.control_index("turn")]
     forward, _, _ = self.body_velocity(state)
-    asked = turn * speed * forward / (speed**2 + 0.05**2)
+    asked = turn * speed * forward / (speed**2 + knee**2)
     return control + c * (asked - turn).unsqueeze(-1) * self.chosen_controls(("turn",), control)
 
 
@@ -82,16 +95,16 @@ def understeer(self: Program, state: Tensor, control: Tensor, time: Tensor, c: T
     return control * (1 - (c * forward**2).unsqueeze(-1) * self.chosen_controls(("turn",), control))
 
 
-@_on_command("1", typical=0.1, limit=1.0)
-def reverse_steering(self: Program, state: Tensor, control: Tensor, time: Tensor, c: Tensor) -> Tensor:
-    r"""turn → (1 - c tanh(v/0.1)) turn
+@_on_command("1", typical=0.1, limit=1.0, profiled=("knee",), by_factor=("knee",), choices=_slow(0.1))
+def reverse_steering(self: Program, state: Tensor, control: Tensor, time: Tensor, c: Tensor, knee: Any) -> Tensor:
+    r"""turn → (1 - c tanh(v/knee)) turn
 
-    equation: u_\mathrm{turn} \to (1 - c\,\tanh(v / 0.1))\,u_\mathrm{turn}
+    equation: u_\mathrm{turn} \to (1 - c\,\tanh(v / v_0))\,u_\mathrm{turn}
     feels: turns tighter backwards than forwards
     occurs: tyres, suspensions and differentials that are not alike in both directions
     """
     forward, _, _ = self.body_velocity(state)
-    return control * (1 - (c * torch.tanh(forward / 0.1)).unsqueeze(-1) * self.chosen_controls(("turn",), control))
+    return control * (1 - (c * torch.tanh(forward / knee)).unsqueeze(-1) * self.chosen_controls(("turn",), control))
 
 
 @_on_lateral_velocity("m", typical=0.1, limit=1.0)

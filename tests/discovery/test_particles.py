@@ -1,0 +1,100 @@
+"""A particle filter has the last word about the best candidate."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from examples import drives, example
+
+from steady_ppl.discovery import particles
+from steady_ppl.discovery.particles import confirmed
+from steady_ppl.discovery.refits import BY_DRAWS, BY_LIKELIHOOD
+from steady_ppl.errors import FilterError
+from steady_ppl.gaussian.smoother import find_path, require_found, smooth
+from steady_ppl.model.problem import Problem
+
+
+@dataclass(frozen=True)
+class Fake:
+    """A candidate that was fitted, as far as a ranking looks at it."""
+
+    name: str
+    gain: torch.Tensor
+    refit: object
+    alone: torch.Tensor | None = None
+    is_confirmed: bool = False
+
+    @property
+    def is_judged(self) -> bool:
+        return not isinstance(self.refit, str)
+
+    @property
+    def total(self) -> float:
+        return float(self.gain.sum())
+
+
+def refit(name: str, fitting=BY_LIKELIHOOD) -> SimpleNamespace:
+    fold = SimpleNamespace(judging=lambda program: program, held_out_path=None)
+    return SimpleNamespace(judges=SimpleNamespace(programs=[name]), folds=[fold], fitting=fitting)
+
+
+def ranking(monkeypatch, neglected: dict[str, float], now=BY_LIKELIHOOD) -> list[Fake]:
+    """Of a first that gains 9 nats, a second that gains 6 and a third that loses 3, when so much is neglected."""
+    asked: list[tuple[str, int]] = []
+
+    def along(program: str, path: object, seed: int) -> torch.Tensor:
+        asked.append((program, seed))
+        if math.isnan(neglected.get(program, 0.0)):
+            raise FilterError("every weight is zero")
+        return torch.full((2,), neglected.get(program, 0.0) / 2)
+
+    monkeypatch.setattr(particles, "neglected_along", along)
+    monkeypatch.setattr(particles, "Refit", SimpleNamespace)
+    each = [Fake(name, torch.full((2,), gain / 2), refit(name)) for name, gain in (("b", 6.0), ("a", 9.0), ("c", -3.0))]
+    found = confirmed(refit("now", now), each)
+    assert len(asked) == len(set(asked))
+    return found
+
+
+def test_what_agrees_keeps_its_rank_and_its_gain(monkeypatch):
+    first, second, third = ranking(monkeypatch, {"a": 0.4, "now": 0.1})
+    assert (first.name, first.total, first.is_confirmed) == ("a", 9.0, True)
+    assert not second.is_confirmed and third.name == "c"
+
+
+def test_what_particles_deny_falls_back(monkeypatch):
+    first, second, third = ranking(monkeypatch, {"a": -9000.0})
+    assert (first.name, first.is_confirmed) == ("b", True)
+    assert second.name == "c" and third.total == pytest.approx(9 - 9000)
+
+
+def test_what_the_program_without_neglects_too_is_no_matter(monkeypatch):
+    first, *_ = ranking(monkeypatch, {"a": -50.0, "b": -50.0, "now": -50.0})
+    assert (first.name, first.total) == ("a", 9.0)
+
+
+def test_a_candidate_that_no_filter_follows_is_none(monkeypatch):
+    first, *_, last = ranking(monkeypatch, {"a": math.nan})
+    assert first.name == "b" and last.name == "a"
+    assert isinstance(last.refit, str) and "every weight is zero" in last.refit and last.total == -math.inf
+
+
+def test_fits_by_draws_are_judged_by_particles_already(monkeypatch):
+    first, *_ = ranking(monkeypatch, {"a": -9000.0}, now=BY_DRAWS)
+    assert (first.name, first.is_confirmed) == ("a", False)
+
+
+def test_a_likelihood_that_no_gaussian_could_reach_is_refused():
+    program = example("linear_gaussian", torch.float32)
+    problem = Problem(program, drives(program, 3, 40), True)
+    ahead = smooth(problem, find_path(problem))
+    assert not bool(ahead.is_broken.any())
+    most = ahead.linearization.log_scale.sum(0)
+    beyond = replace(ahead, log_likelihood=torch.where(torch.arange(3) == 1, most + 1, ahead.log_likelihood))
+    assert beyond.is_broken.tolist() == [False, True, False]
+    with pytest.raises(FilterError, match="trajectory 2: .* is larger than its sensors allow"):
+        require_found(beyond, problem)
