@@ -204,16 +204,18 @@ NEED_FILES = ("emps", "silverbox")
 
 def unit_of(variant: Variant, units: Units) -> float:
     """By what a coefficient is multiplied."""
-    unit = variant.effect.unit
-    if unit in ("of the control", "of the measurement"):
-        return units.command if unit == "of the control" else units.length * units.measured
-    if unit == "1/kg":
+    declared = variant.effect.unit
+    if variant.unit == "rad":
+        return 1.0
+    if declared in ("of the control", "of the measurement"):
+        return units.command if declared == "of the control" else units.length * units.measured
+    if declared == "1/kg":
         return units.acceleration / units.command
-    above, _, below = unit.partition("/")
+    above, _, below = variant.unit.partition("/")
 
     def size(text: str) -> float:
-        powers = re.findall(r"(?<![a-z])(m|s)(?![a-z])(²|³)?", text)
-        of = {"m": units.length, "s": units.time}
+        powers = re.findall(r"(?<![a-z])(m|V|s)(?![a-z])(²|³)?", text)
+        of = {"m": units.length, "V": units.length, "s": units.time}
         return math.prod(of[name] ** {"": 1, "²": 2, "³": 3}[power] for name, power in powers)
 
     return size(above) / size(below)

@@ -68,7 +68,7 @@ class Candidate:
     gain: Tensor  # held-out log p(y) above that of the program without, nats, (B,)
     alone: Tensor  # the same of the programs fitted to one fold alone, which is all there is of those given up
     behind: Candidate | None = None  # what one fold was enough to show that this one is behind, if so
-    is_confirmed: bool = False  # whether a particle filter was asked, see `confirmed`
+    is_confirmed: bool = False  # whether a particle filter was asked, see `ParticleJudge`
 
     @property
     def variant(self) -> Variant:

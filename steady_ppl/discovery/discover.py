@@ -19,7 +19,7 @@ from steady_ppl.discovery.fitting import ByDraws
 from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.result import Discovery
 from steady_ppl.discovery.search import MAX_EFFECTS, Found, Search, Settings, search
-from steady_ppl.effects import of_name, record, restore, written_class
+from steady_ppl.effects import catalogue, of_name, record, restore, written_class
 from steady_ppl.effects.declaration import VERDICT_OF_FORM
 from steady_ppl.errors import DataError, UsageError
 from steady_ppl.gaussian.linearize import require_linear
@@ -101,6 +101,9 @@ def discover(
         program = program.program
     known_start = bool(known_start)
     program = copy.deepcopy(program).cpu()
+    if not any(effect.name not in withheld and (not only or effect.verdict in only) for effect in catalogue(program)):
+        kind = f"of {' and '.join(only)} that" if only else "that"
+        raise UsageError(f"nothing to look for: no effect {kind} is not withheld applies to the program")
     declared = copy.deepcopy(declared or program).cpu()
     notes: list[str] = []
     if mix:

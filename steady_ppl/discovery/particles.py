@@ -1,8 +1,8 @@
 """What a particle filter says of candidates that the linearised programs' log p(y) ranks: it has the last word."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -10,41 +10,60 @@ from torch import Tensor
 from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.fitting import neglected_along
 from steady_ppl.discovery.refits import BY_LIKELIHOOD, Refit
-from steady_ppl.errors import FilterError
+from steady_ppl.errors import FilterError, reason_of
 
 NEGLIGIBLE_NATS = 1.0  # by which a filter may rank otherwise before it is asked once more, and from then on believed
 
+Choice = Callable[[Sequence[Candidate]], Candidate | None]  # of candidates, best first
 
-def confirmed(now: Refit, candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Candidates for a program `now`, best first, the best by the particle filter's log p(y).
+
+@dataclass
+class ParticleJudge:
+    """Log p(y) of held-out drives by a filter that looks ahead, for candidates of a program `now`.
 
     The linearised log p(y) is off where a program is far from linear. What it neglects of a candidate and not of the
-    program without is no gain.
+    program without is no gain. Where no filter follows the program without, the linearised log p(y) stands.
     """
-    ranked = sorted(candidates, key=lambda candidate: -candidate.total)
-    if now.fitting != BY_LIKELIHOOD or not ranked:
-        return ranked
-    without: dict[int, Tensor] = {}
 
-    def neglected(refit: Refit, seed: int) -> Tensor:
-        judges = zip(refit.judges.programs, refit.folds, strict=True)
-        return torch.cat([neglected_along(fold.judging(p), fold.held_out_path, seed=seed) for p, fold in judges])
+    now: Refit
+    without: dict[int, Tensor | None] = field(default_factory=dict)  # what is neglected of `now`, by the seed
 
-    def more(refit: Refit, seed: int) -> Tensor:
-        if seed not in without:
-            without[seed] = neglected(now, seed)
-        return neglected(refit, seed) - without[seed]
+    def chosen(self, candidates: Sequence[Candidate], choose: Choice) -> tuple[Candidate | None, list[Candidate]]:
+        """The candidate that is chosen when it has been confirmed, and all of them, best first."""
+        ranked = sorted(candidates, key=lambda candidate: -candidate.total)
+        while (best := choose(ranked)) is not None and not best.is_confirmed:
+            confirmed = self.confirm(best)
+            ranked = [confirmed if candidate is best else candidate for candidate in ranked]
+            ranked.sort(key=lambda candidate: -candidate.total)
+        return best, ranked
 
-    while (best := ranked[0]).is_judged and not best.is_confirmed and best.total > 0:
-        assert isinstance(best.refit, Refit)
+    def confirm(self, candidate: Candidate) -> Candidate:
+        """The candidate with its gain by particles, or why no filter follows the drives."""
+        if self.now.fitting != BY_LIKELIHOOD or not isinstance(candidate.refit, Refit) or not candidate.is_judged:
+            return replace(candidate, is_confirmed=True)
         try:
-            found = more(best.refit, 0)
-            if not abs(float(found.sum())) <= NEGLIGIBLE_NATS:
-                found = (found + more(best.refit, 1)) / 2
-            believed = abs(float(found.sum())) > NEGLIGIBLE_NATS
-            best = replace(best, gain=best.gain + found if believed else best.gain, is_confirmed=True)
-        except FilterError as error:
-            gain = torch.full_like(best.gain, -math.inf)
-            best = replace(best, refit=f"no particle filter follows the drives: {error}", gain=gain, alone=gain)
-        ranked = sorted([best, *ranked[1:]], key=lambda candidate: -candidate.total)
-    return ranked
+            more = self._more(candidate.refit, 0)
+            if more is not None and not abs(float(more.sum())) <= NEGLIGIBLE_NATS:
+                again = self._more(candidate.refit, 1)
+                more = more if again is None else (more + again) / 2
+        except Exception as error:  # also of the program's own code
+            nothing = torch.full_like(candidate.gain, -math.inf)
+            reason = f"no particle filter follows the drives: {reason_of(error)}"
+            return replace(candidate, refit=reason, gain=nothing, alone=nothing, is_confirmed=True)
+        if more is None or abs(float(more.sum())) <= NEGLIGIBLE_NATS:
+            return replace(candidate, is_confirmed=True)
+        return replace(candidate, gain=candidate.gain + more, is_confirmed=True)
+
+    def _more(self, refit: Refit, seed: int) -> Tensor | None:
+        if seed not in self.without:
+            try:
+                self.without[seed] = _neglected(self.now, seed)
+            except FilterError:
+                self.without[seed] = None
+        without = self.without[seed]
+        return None if without is None else _neglected(refit, seed) - without
+
+
+def _neglected(refit: Refit, seed: int) -> Tensor:
+    judges = zip(refit.judges.programs, refit.folds, strict=True)
+    return torch.cat([neglected_along(fold.judging(p), fold.held_out_path, seed=seed) for p, fold in judges])

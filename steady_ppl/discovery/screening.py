@@ -126,7 +126,7 @@ def screen(
         curves += [_best_of([test]) for test in alive if test.is_curve]
     tests += [_departed(departure, information[own, own], scores[:, own]) for departure in departures]
     tests.sort(key=Tested.rank)
-    family = np.stack([test.p_values for test in tests]).min(0)
+    family = np.stack([np.ones(len(scores)), *(test.p_values for test in tests)]).min(0)
     critical = _critical(family[1:])
     return Screened(
         tested=[replace(test, detection_limit=_limit(test, critical)) for test in tests],

@@ -7,8 +7,9 @@ is held-out log p(y), each drive judged by a program that was fitted without it,
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from steady_ppl.criticism.step_size import StepCheck, check_step
@@ -26,7 +27,7 @@ from steady_ppl.discovery.candidates import (
     likelier_places,
     screen_program,
 )
-from steady_ppl.discovery.particles import confirmed
+from steady_ppl.discovery.particles import ParticleJudge
 from steady_ppl.discovery.refits import (
     NO_THRESHOLD,
     Fits,
@@ -186,6 +187,7 @@ def _rounds(found: Search, settings: Settings) -> Search:
         begin()
         shares = [(said, 0.5**index) for index in range(MAX_EFFECTS + 1) for said in ("testing every effect", "")]
         with stages(*shares) as begin_part:
+            earlier = list(found.found)
             for index in range(MAX_EFFECTS + 1):
                 begin_part()
                 try:
@@ -193,11 +195,12 @@ def _rounds(found: Search, settings: Settings) -> Search:
                 except Exception as error:
                     if index == 0:
                         raise
-                    taken_back = found.found.pop()
-                    found.final, label = taken_back.without, taken_back.candidate.variant.label
-                    found.taken_back = {label: reason_of(error)}
+                    taken_back = found.found[-1]
+                    found.found, found.final = earlier, taken_back.without
+                    found.taken_back = {taken_back.candidate.variant.label: reason_of(error)}
                     break
                 begin_part()
+                earlier = list(found.found)
                 if not _add_best(found, screening, index):
                     break
         begin()
@@ -222,14 +225,15 @@ def _add_best(found: Search, screening: Screening, index: int) -> bool:
     found.rounds.append(Round(screening, [], None))
     if found.rounds[-1].nothing_found or index == MAX_EFFECTS:
         return False
-    candidates = _refits(found.final, screening, index == 0)
-    able = [c for c in candidates if c.is_judged and not c.against_its_sign]
-    significant = [c for c in able if c.significant(screening.tests.critical)]
-    best = next(iter(sorted(significant, key=lambda c: not c.is_explanation)), None)  # the first that is one, if any is
+    judge, critical = ParticleJudge(found.final), screening.tests.critical
+    best, candidates = judge.chosen(
+        _refits(found.final, screening, index == 0), partial(_first, lambda c: c.significant(critical))
+    )
     if index == 0 and best is None:
         found.curves = _curves(found)
         if found.curve is None and not found.departed:  # neither can be what the tests found
-            best = next((c for c in able if c.total > TIE_NATS and c.tested.p_value <= NEAR_FAMILY_LEVEL), None)
+            near = partial(_first, lambda c: c.total > TIE_NATS and c.tested.p_value <= NEAR_FAMILY_LEVEL)
+            best, candidates = judge.chosen(candidates, near)
     found.rounds[-1] = Round(screening, candidates, best)
     if best is None:
         return False
@@ -239,6 +243,12 @@ def _add_best(found: Search, screening: Screening, index: int) -> bool:
     for one in found.found[:-1]:
         _place_again(found, one)
     return True
+
+
+def _first(is_enough: Callable[[Candidate], bool], ranked: Sequence[Candidate]) -> Candidate | None:
+    """The best candidate that brings enough, one that explains something before one that does not."""
+    able = [c for c in ranked if c.is_judged and not c.against_its_sign and is_enough(c)]
+    return min(able, key=lambda c: not c.is_explanation, default=None)
 
 
 def _place_again(search: Search, found: Found) -> None:
@@ -263,7 +273,7 @@ def _refits(now: Refit, screening: Screening, first: bool) -> list[Candidate]:
     best = max((c for c in candidates if c.is_judged), key=lambda c: c.total, default=None)
     candidates = [c if c.is_judged else replace(c, behind=best) for c in candidates]
     least = max((c.total for c in candidates), default=0.0) - MAX_NATS_OF_RIVAL
-    return confirmed(now, [at_its_best_place(now, c) if c.total > least else c for c in candidates])
+    return [at_its_best_place(now, c) if c.total > least else c for c in candidates]
 
 
 def _threshold(candidates: Sequence[Candidate]) -> Threshold:
@@ -316,10 +326,10 @@ def prune(search: Search) -> None:
         as_it_stands = judged(without, chosen.tested, search.final)
         if all(c.total < as_it_stands.total for c in again if c.variant.name == chosen.variant.name):
             again = [as_it_stands, *(c for c in again if c.variant.name != chosen.variant.name)]
-        again = confirmed(without, again)
-        best = next((c for c in again if not c.against_its_sign), None)
+        needed = partial(_first, lambda c: c.total > TIE_NATS)
+        best, again = ParticleJudge(without).chosen(again, needed)
         place = search.found.index(found)
-        if best is None or best.total <= TIE_NATS or isinstance(best.refit, str):
+        if best is None or isinstance(best.refit, str):
             search.found.pop(place)
             search.final = without
         else:

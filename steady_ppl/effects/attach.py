@@ -1,7 +1,6 @@
 """A program with an effect: the same three methods, around which the effect acts."""
 
 import copy
-import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -54,7 +53,7 @@ def attach(program: Program, variant: Variant, value: Value | None = None, *, cl
     program.__class__ = _class_with(type(program), variant, class_name)
     with pyro.settings.context(module_local_params=True):
         setattr(program, name, PyroParam(start, _constraint(effect)))
-    wide = dist.Cauchy(1.0 if effect.null == 1 else 0.0, _width_of_prior(variant, value))
+    wide = _wide_prior(variant, variant.limit)
     program.priors = {**program.priors, name: wide if effect.prior is None else effect.prior}
     rate = float(variant.typical.abs().max()) if effect.null == 0 else 1.0  # Adam's steps are of this size in any unit
     program.rates = {name: rate, **program.rates}
@@ -81,10 +80,9 @@ def _frozen(value: object) -> Hashable:
     return value if isinstance(value, Hashable) else id(value)
 
 
-def _width_of_prior(variant: Variant, value: Value | None) -> float:
-    """As wide as is physical; a number that is given says in what unit."""
-    largest = 0.0 if value is None else float(torch.as_tensor(value).abs().max())
-    return max(variant.limit, largest) if variant.effect.null == 0 and math.isfinite(largest) else variant.limit
+def _wide_prior(variant: Variant, width: float) -> dist.Cauchy:
+    """As wide as is physical."""
+    return dist.Cauchy(1.0 if variant.effect.null == 1 else 0.0, width)
 
 
 def attach_listed(program: Program) -> Program:
@@ -92,6 +90,10 @@ def attach_listed(program: Program) -> Program:
     for text in program.effects:
         name, at, options, value = parsed(text)
         attach(program, chosen_variant(program, name, at, **options), value, class_name=type(program).__name__)
+        variant = attached(program)[-1]
+        if value is not None and variant.effect.null != 1 and variant.effect.prior is None:
+            width = max(variant.limit, *map(abs, value))  # the number that is given says in what unit
+            program.priors = {**program.priors, variant.parameter: _wide_prior(variant, width)}
     return program
 
 
@@ -131,10 +133,11 @@ def record(program: Program) -> list[str]:
 
 def restore(program: Program, effects: Sequence[str]) -> Program:
     """Add the effects of a record that the program does not have yet to this very program."""
-    have = record(program)
+    have = [(variant.name, dict(variant.options)) for variant in attached(program)]
     for text in effects:
-        if text not in have:
-            attach(program, chosen_variant(program, text))
+        variant = chosen_variant(program, text)
+        if (variant.name, dict(variant.options)) not in have:
+            attach(program, variant)
     return program
 
 

@@ -52,16 +52,21 @@ def _correlation(values: Tensor, inside: Tensor) -> Tensor:
     """Of rows `(T, B, U)` with those some rows later, by the lag from 0; empty where nothing changes."""
     count = inside.sum().clamp(min=1)
     there = inside.unsqueeze(-1)
-    apart = torch.where(there, values - torch.where(there, values, 0.0).sum((0, 1)) / count, 0.0).double()
+    values = torch.where(there, values, 0.0).double()
+    apart = torch.where(there, values - values.sum((0, 1)) / count, 0.0)
     scale = apart.square().sum((0, 1)).sqrt()
     apart = apart[..., scale > 1e-6 * values.abs().amax((0, 1)) * count.sqrt()]
     if not apart.shape[-1]:
         return torch.empty(0)
     apart = apart / apart.square().sum((0, 1)).sqrt()
-    padded = torch.fft.rfft(apart, n=2 * len(apart), dim=0)
-    lags = torch.fft.irfft(padded * padded.conj(), n=2 * len(apart), dim=0)[: len(apart)].sum(1)  # (T, U)
-    pairs = torch.stack([(inside[lag:] & inside[: len(inside) - lag]).sum() for lag in range(len(inside))])
-    return (lags.mean(-1) * count / pairs.clamp(min=1))[pairs > 0]
+    lags, pairs = _autocorrelation(apart).mean(-1), _autocorrelation(inside.double()).round()
+    return (lags * count / pairs.clamp(min=1))[pairs > 0]
+
+
+def _autocorrelation(values: Tensor) -> Tensor:
+    """Sums of products of rows `(T, B, ...)` with those so many rows later, `(T, ...)`."""
+    spectrum = torch.fft.rfft(values, n=2 * len(values), dim=0)
+    return torch.fft.irfft(spectrum.abs().square().sum(1), n=2 * len(values), dim=0)[: len(values)]
 
 
 def rms(values: Tensor) -> float:
@@ -164,20 +169,16 @@ class Sizes:
     def _size_of_push(self, variant: Variant) -> float:
         mean = self._means if variant.needs_mean else None
         found = variant(self.program, *self._rows, c=variant.coefficient(variant.typical, self._rows[0]), mean=mean)
-        return max(
-            rms(push) / self._channels[channel] for channel, push in found.items() if self._channels[channel] > 0
-        )
+        sizes = self._channels
+        return max((rms(push) / sizes[channel] for channel, push in found.items() if sizes[channel] > 0), default=0.0)
 
     def _command(self, variant: Variant) -> float:
         state, control, time, _ = self._rows
 
         def size(variant: Variant) -> float:
             acting = variant(self.program, state, control, time, c=variant.coefficient(variant.typical, state))
-            moved = [
-                (rms(change), rms(told))
-                for change, told in zip((acting - control).unbind(-1), control.unbind(-1), strict=True)
-            ]
-            return max(change / told for change, told in moved if told > 0)
+            pairs = zip((acting - control).unbind(-1), control.unbind(-1), strict=True)
+            return max((rms(change) / rms(told) for change, told in pairs if rms(told) > 0), default=0.0)
 
         return self._until(variant, FELT_OF_COMMAND, size)
 

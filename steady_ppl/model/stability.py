@@ -1,5 +1,6 @@
 """Check that `transition` is a consistent and a stable time step."""
 
+import copy
 import math
 from collections.abc import Callable
 
@@ -62,6 +63,8 @@ def divergence(program: Program, data: Trajectories, rows: int | None = None) ->
 
 def _eigenvalues(program: Program, state: Tensor, given: _Given) -> Tensor | None:
     """Of the row's derivative in the state, `(..., D)` at states `(..., D)`; None where one is no number."""
+    program, state = copy.deepcopy(program).double(), state.double()  # of which small differences have digits
+    given = (given[0].double(), given[1].double(), given[2].double())
     columns, usual = [], state.abs().flatten(0, -2).amax(0)
     usual = torch.where(usual > 0, usual, 1.0)
     for unit in torch.eye(len(usual)).to(state):

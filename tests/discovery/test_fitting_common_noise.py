@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from types import SimpleNamespace
 
 import pyro
 import pyro.distributions as dist
@@ -172,7 +173,8 @@ def test_a_candidate_that_is_given_up_is_compared_with_fits_to_the_same_half(car
     whole = refit_with(carts, variant, [0.0])
     half = refit_with(carts, variant, [0.0], threshold=Threshold(drives=1e9, held_out=1e9))
     assert not isinstance(whole, str) and not isinstance(half, str) and len(half.programs) == 1
-    given_up, through = judged(carts, None, half), judged(carts, None, whole)
+    tested = SimpleNamespace(variant=variant)
+    given_up, through = judged(carts, tested, half), judged(carts, tested, whole)
     torch.testing.assert_close(given_up.gain, through.alone[: len(given_up.gain)])
 
 

@@ -11,7 +11,7 @@ import torch
 from examples import drives, example
 
 from steady_ppl.discovery import particles
-from steady_ppl.discovery.particles import confirmed
+from steady_ppl.discovery.particles import ParticleJudge
 from steady_ppl.discovery.refits import BY_DRAWS, BY_LIKELIHOOD
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path, require_found, smooth
@@ -42,7 +42,12 @@ def refit(name: str, fitting=BY_LIKELIHOOD) -> SimpleNamespace:
     return SimpleNamespace(judges=SimpleNamespace(programs=[name]), folds=[fold], fitting=fitting)
 
 
-def ranking(monkeypatch, neglected: dict[str, float], now=BY_LIKELIHOOD) -> list[Fake]:
+def first(ranked):
+    """The best."""
+    return ranked[0]
+
+
+def ranking(monkeypatch, neglected: dict[str, float], now=BY_LIKELIHOOD, choose=first) -> list[Fake]:
     """Of a first that gains 9 nats, a second that gains 6 and a third that loses 3, when so much is neglected."""
     asked: list[tuple[str, int]] = []
 
@@ -55,8 +60,9 @@ def ranking(monkeypatch, neglected: dict[str, float], now=BY_LIKELIHOOD) -> list
     monkeypatch.setattr(particles, "neglected_along", along)
     monkeypatch.setattr(particles, "Refit", SimpleNamespace)
     each = [Fake(name, torch.full((2,), gain / 2), refit(name)) for name, gain in (("b", 6.0), ("a", 9.0), ("c", -3.0))]
-    found = confirmed(refit("now", now), each)
+    best, found = ParticleJudge(refit("now", now)).chosen(each, choose)
     assert len(asked) == len(set(asked))
+    assert best is choose(found) and best.is_confirmed
     return found
 
 
@@ -83,9 +89,20 @@ def test_a_candidate_that_no_filter_follows_is_none(monkeypatch):
     assert isinstance(last.refit, str) and "every weight is zero" in last.refit and last.total == -math.inf
 
 
+def test_whatever_is_chosen_has_been_confirmed(monkeypatch):
+    """Also one that is not the first of all."""
+    found = ranking(monkeypatch, {"b": -9000.0}, choose=lambda ranked: next(c for c in ranked if c.name != "a"))
+    assert [one.name for one in found] == ["a", "c", "b"] and not found[0].is_confirmed
+
+
+def test_where_no_filter_follows_the_program_without_the_linearised_ranking_stands(monkeypatch):
+    first, second, _ = ranking(monkeypatch, {"now": math.nan, "a": -9000.0})
+    assert (first.name, first.total, second.is_confirmed) == ("a", 9.0, False)
+
+
 def test_fits_by_draws_are_judged_by_particles_already(monkeypatch):
     first, *_ = ranking(monkeypatch, {"a": -9000.0}, now=BY_DRAWS)
-    assert (first.name, first.is_confirmed) == ("a", False)
+    assert (first.name, first.total) == ("a", 9.0)
 
 
 def test_a_likelihood_that_no_gaussian_could_reach_is_refused():

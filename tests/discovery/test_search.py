@@ -28,7 +28,7 @@ def test_a_class_begins_with_what_was_chosen():
 class Chosen:
     """A candidate of so many nats, significant and judged."""
 
-    is_judged, against_its_sign = True, False
+    is_judged, is_confirmed, against_its_sign = True, True, False
 
     def __init__(self, name, total, explains=True, profiled=()):
         self.name, self.total, self.is_explanation = name, total, explains

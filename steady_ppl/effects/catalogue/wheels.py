@@ -29,8 +29,8 @@ def _slow(speed: float) -> Callable[[Program, Trajectories | None], Choices]:
     """A speed, m/s where nothing is known of a vehicle's, and else such a share of it."""
 
     def choices(program: Program, data: Trajectories | None) -> Choices:
-        usual = speed_of(program, data, ("forward",)) or 1.0
-        return [{"knee": three_digits(speed * usual)}]
+        usual = speed_of(program, data, ("forward",))
+        return [{"knee": three_digits(speed * (usual if usual > 0 else 1.0))}]
 
     return choices
 
