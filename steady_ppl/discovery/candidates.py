@@ -212,11 +212,6 @@ def _known(tested: Tested, screening: Screening) -> Tensor | None:
 
 def judged(now: Refit, tested: Tested, refit: Refit | str) -> Candidate:
     """A fit and what it gains over the program without."""
-    if isinstance(refit, Refit) and tested.variant.effect.form == UNEXPLAINED:
-        least, most = tested.variant.effect.between
-        coefficient = refit.coefficient(tested.variant)
-        if bool(((coefficient <= least) | (coefficient >= most)).any()):
-            refit = f"its coefficient goes to {float(coefficient.abs().max()):.3g}, its bound is {most:g}"
     if isinstance(refit, str):
         none = torch.full_like(now.held_out, -math.inf)
         return Candidate(tested, refit, none, none)

@@ -184,7 +184,10 @@ def maximise_sum(
     reach = torch.zeros_like(here.gradient)
     for term in terms:
         reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
-    reach = torch.where(here.has_unit, torch.maximum(reach, MAX_MOVE_SD * information.diagonal().rsqrt()), reach)
+    is_open = torch.zeros_like(here.has_unit)
+    for term in terms:
+        is_open[term.columns] = torch.tensor([part.has_unit and not part.is_effect for part in term.parts]).bool()
+    reach = torch.where(is_open, torch.maximum(reach, MAX_MOVE_SD * information.diagonal().rsqrt()), reach)
     taken, decrement, passes = 0, 0.0, PASSES
     few_drives = len(here.scores) < 2 * len(information)  # they know too little: what they say is seen twice
     is_small = False

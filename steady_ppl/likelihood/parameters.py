@@ -25,6 +25,7 @@ class Element(Number):
 
     owner: str  # the parameter's name
     has_unit: bool = False  # whether it may be any number, of a size that only the data tell; else it is a logarithm
+    is_effect: bool = False  # whether it is an effect's, whose typical size is known
 
     @property
     def name(self) -> str:
@@ -50,7 +51,7 @@ def elements(program: Program, *, frozen: bool = False) -> list[Element]:
         has_unit = torch.equal(attrgetter(owner)(program), parameter)
         for index, value in enumerate(parameter.detach().flatten().tolist()):
             step = max(steps.get(owner, 0.01), MIN_RELATIVE_MOVE * abs(value))
-            found.append(Element(parameter, index, step, owner, has_unit))
+            found.append(Element(parameter, index, step, owner, has_unit, owner in steps))
     if len(found) > MAX_LEARNABLE_NUMBERS:
         raise UsageError(
             f"program {type(program).__name__} has {len(found)} learnable numbers: a network cannot be looked at "
