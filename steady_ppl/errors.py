@@ -76,12 +76,6 @@ class TrainingError(ComputationError):
     """Training failed, for example on a loss that is not finite."""
 
 
-def reason_of(error: Exception) -> str:
-    """What went wrong, in one line: a fault of a program or of its numbers that nobody foresaw, with its kind."""
-    text = " ".join(str(error).split())
-    return text if isinstance(error, SteadyError) else f"{type(error).__name__}: {text}"
-
-
 def require(holds: bool, setting: str, value: object, wanted: str) -> None:
     """Refuse a setting's value unless it is what is wanted, such as "at least 1".
 

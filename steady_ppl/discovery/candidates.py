@@ -117,31 +117,27 @@ class Candidate:
 
 @torch.no_grad()
 def screen_program(
-    now: Refit, declared: Program, *, sets: int, seed: int, withheld: Sequence[str] = (), only: Sequence[str] = ()
+    now: Refit, declared: Program, *, sets: int, seed: int, wanted: Callable[[Effect], bool] = lambda effect: True
 ) -> Screening:
     """Test every candidate that a fitted program does not have, on the drives of its first fold.
 
-    `declared` is the program before it was fitted, `sets` counts the simulated ones, `withheld` names effects to leave
-    out, `only` the kinds that are looked for, all of them where it names none.
+    `declared` is the program before it was fitted, `sets` counts the simulated ones, `wanted` says of
+    an effect whether it is looked for.
     """
-
-    def is_wanted(effect: Effect) -> bool:
-        return effect.name not in withheld and (not only or effect.verdict in only)
-
     program, fold = now.program, now.folds[0]
     problem, parts = fold.fitting(program), elements(program)
     there = {variant.name for variant in attached(program)}
     seen = replace(fold.drives, states=fold.path.states)
     ahead = smooth(problem, fold.path, passes=3, tolerance=0.01)
     away = departures(declared, now, parts)
-    away = [one for one in away if one.variant.name not in there and is_wanted(one.variant.effect)]
+    away = [one for one in away if one.variant.name not in there and wanted(one.variant.effect)]
     there |= {departure.variant.name for departure in away}
     tailed = measured(program, fold.path.states[:1, :1]).heavy_tailed  # as it stands
-    effects = [e for e in catalogue(program) if is_wanted(e) and not (tailed and e.form == "tails")]
+    effects = [e for e in catalogue(program) if wanted(e) and not (tailed and e.form == "tails")]
     sizes = Sizes(program, seen)
     variants = [sizes.of(v) for effect in effects for v in effect.variants(program, seen) if v.name not in there]
     spread, sharpness = typical_spreads(program, fold.drives, smoothed(ahead, fold.drives))
-    variants += [curve for curve in curves(program, seen, spread, sharpness) if is_wanted(curve.effect)]
+    variants += [curve for curve in curves(program, seen, spread, sharpness) if wanted(curve.effect)]
     columns = columns_of(variants)
     observed = scores_along(problem, ahead, parts, columns)
     if broken := (~torch.isfinite(observed).all(-1)).nonzero().flatten().tolist():

@@ -101,10 +101,11 @@ def discover(
         program = program.program
     known_start = bool(known_start)
     program = copy.deepcopy(program).cpu()
-    if not any(effect.name not in withheld and (not only or effect.verdict in only) for effect in catalogue(program)):
+    declared = copy.deepcopy(declared or program).cpu()
+    settings = Settings(declared, simulations, seed=seed, withheld=withheld, only=only)
+    if not any(map(settings.wants, catalogue(program))):
         kind = f"of {' and '.join(only)} that" if only else "that"
         raise UsageError(f"nothing to look for: no effect {kind} is not withheld applies to the program")
-    declared = copy.deepcopy(declared or program).cpu()
     notes: list[str] = []
     if mix:
         if valid is None:
@@ -124,7 +125,6 @@ def discover(
     require_searchable(problem, choosing.data, simulations)
     with stages(("", 8), ("comparing before and after", 1), ("looking for a better next drive", 1)) as begin:
         begin()
-        settings = Settings(declared, simulations, seed=seed, withheld=withheld, only=only)
         with seeded(seed, "search"), kernel_failures() as why:
             found = search(problem, choosing.data, settings)
         begin()

@@ -10,7 +10,8 @@ from torch import Tensor
 from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.fitting import neglected_along
 from steady_ppl.discovery.refits import BY_LIKELIHOOD, Refit
-from steady_ppl.errors import FilterError, reason_of
+from steady_ppl.errors import FilterError
+from steady_ppl.utils.text import reason_of
 
 NEGLIGIBLE_NATS = 1.0  # by which a filter may rank otherwise before it is asked once more, and from then on believed
 

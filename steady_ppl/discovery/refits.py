@@ -15,7 +15,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, Fit, Fitting, Judges, is_doubtful, with_common_noise
 from steady_ppl.effects import Variant, attach, attached, coefficient
-from steady_ppl.errors import FilterError, reason_of
+from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path
 from steady_ppl.likelihood.maximize import Maximum, fit_by_likelihood, maximise, refit_outliers
@@ -24,6 +24,7 @@ from steady_ppl.likelihood.scores import widens
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, parameter_name
 from steady_ppl.utils.random import seeded
+from steady_ppl.utils.text import reason_of
 
 MAX_LOG_NOISE_RATIO = math.log(20.0)  # of noise after a fit and before, beyond which a program explains nothing
 AlongStates = TypeVar("AlongStates", bound=Trajectories | ReferencePath)

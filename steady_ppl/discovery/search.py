@@ -39,12 +39,12 @@ from steady_ppl.discovery.refits import (
     refit_with,
 )
 from steady_ppl.discovery.screening import FAMILY_LEVEL, Tested
-from steady_ppl.effects import attached
-from steady_ppl.errors import reason_of
+from steady_ppl.effects import Effect, attached
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import with_substeps
 from steady_ppl.utils.progress import stages
+from steady_ppl.utils.text import reason_of
 
 MIN_GAIN_OF_CURVE = 3.0  # nats by which a curve must be better than named effects
 MAX_NATS_BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
@@ -67,11 +67,14 @@ class Settings:
     withheld: Sequence[str] = ()  # names of effects that are left out of the catalogue
     only: Sequence[str] = ()  # the kinds of effects that are looked for; all of them where none is named
 
+    def wants(self, effect: Effect) -> bool:
+        """Whether an effect is looked for."""
+        return effect.name not in self.withheld and (not self.only or effect.verdict in self.only)
+
     def screen(self, now: Refit, index: int) -> Screening:
         """Test every candidate that a fitted program does not have, in a round counted from 0."""
         sets = self.later_sets if index else self.sets
-        left_out = {"withheld": self.withheld, "only": self.only}
-        return screen_program(now, self.declared, sets=sets, seed=self.seed + index, **left_out)
+        return screen_program(now, self.declared, sets=sets, seed=self.seed + index, wanted=self.wants)
 
 
 @dataclass(frozen=True)

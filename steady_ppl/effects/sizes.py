@@ -1,6 +1,6 @@
 """How large effects are on a vehicle, in any unit.
 
-The catalogue's numbers are for vehicles that are told something else every second and gain some decimetres a second in
+The catalogue's numbers are for vehicles whose commands change every second and gain some decimetres a second in
 a second. On others, or in other units, what they do to these drives says by what to multiply them.
 """
 
@@ -22,16 +22,16 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, row_controls
 
 FELT, FELT_OF_COMMAND = 1.5, 0.15  # a typical push, in a channel's size, and change of a command, in the command's
-SHARE_TOLD = 0.1  # of what a channel is told, that counts as much as its noise
-QUANTILE_OF_LARGEST = 0.99  # of what a channel is told, that a limit must be below to be felt
+SHARE_COMMANDED = 0.1  # of what is commanded of a channel, that counts as much as its noise
+QUANTILE_OF_LARGEST = 0.99  # of what is commanded of a channel, that a limit must be below to be felt
 STEPS_OF_SCALE = 4
-CORRELATION = 0.5  # of what is told with what was told before, after the time in which it changes
+CORRELATION = 0.5  # of commands with those before, after the time in which they change
 MAX_SHARE_OF_DURATION = 0.25  # of a drive, that this time can be
 
 
 @torch.no_grad()
 def time_of_change(program: Program, data: Trajectories) -> float:
-    """In how many seconds what is told has become something else, or how it moves where nothing changes.
+    """In how many seconds commands have become others, or states where no command changes.
 
     The lag at which the correlation with what was before falls to a half, the mean of all controls that change.
     """
@@ -83,10 +83,10 @@ def speed_of(program: Program, data: Trajectories | None, channels: Names) -> fl
 
 
 @torch.no_grad()
-def sizes_of_channels(program: Program, data: Trajectories, share_told: float = 1.0) -> dict[str, float]:
-    """Root mean squares of what is told of each channel, or a share of it, and of its noise; along `data.states`.
+def sizes_of_channels(program: Program, data: Trajectories, share_commanded: float = 1.0) -> dict[str, float]:
+    """Root mean squares of what is commanded of each channel, or a share of it, and of its noise; along `data.states`.
 
-    It is at most what brings a resting vehicle to its usual speed while what is told changes: a program that holds a
+    It is at most what brings a resting vehicle to its usual speed while commands change: a program that holds a
     velocity has noise that it takes back within a row.
     """
     assert data.states is not None
@@ -97,9 +97,9 @@ def sizes_of_channels(program: Program, data: Trajectories, share_told: float = 
     found = list[float]()
     for site, fn in seen.distributions.items():
         mean, spread = (as_vector(part, fn.event_dim).expand(*inside.shape, -1) for part in normal_moments(fn, site))
-        told = [rms(part[inside]) for part in mean.unbind(-1)]
+        commanded = [rms(part[inside]) for part in mean.unbind(-1)]
         noise = [rms(part[inside]) for part in spread.unbind(-1)]
-        found += [math.hypot(share_told * one, other) for one, other in zip(told, noise, strict=True)]
+        found += [math.hypot(share_commanded * one, other) for one, other in zip(commanded, noise, strict=True)]
     sizes, time = dict(zip(program.channel_names, found, strict=True)), time_of_change(program, data)
     for channels in program.axes.values():
         if (speed := speed_of(program, data, channels)) > 0:
@@ -156,10 +156,10 @@ class Sizes:
 
     @cached_property
     def _channels(self) -> dict[str, float]:
-        return sizes_of_channels(self.program, self.data, share_told=SHARE_TOLD)
+        return sizes_of_channels(self.program, self.data, share_commanded=SHARE_COMMANDED)
 
     def _push(self, variant: Variant) -> float:
-        """By which its typical push is as large as the noise and some of what is told."""
+        """By which its typical push is as large as the noise and some of what is commanded."""
         if variant.effect.null != 0:
             reach = max(variant.effect.probes)
             sizes = [self._means[name].abs().double().flatten() for name in variant.options["channels"]]
@@ -178,7 +178,8 @@ class Sizes:
         def size(variant: Variant) -> float:
             acting = variant(self.program, state, control, time, c=variant.coefficient(variant.typical, state))
             pairs = zip((acting - control).unbind(-1), control.unbind(-1), strict=True)
-            return max((rms(change) / rms(told) for change, told in pairs if rms(told) > 0), default=0.0)
+            sizes = [(rms(change), rms(command)) for change, command in pairs]
+            return max((change / command for change, command in sizes if command > 0), default=0.0)
 
         return self._until(variant, FELT_OF_COMMAND, size)
 

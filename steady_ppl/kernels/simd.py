@@ -147,6 +147,7 @@ def _turned(x: Lanes, quarters: int) -> Lanes:
 
 
 def exp(x: Lanes) -> Lanes:
+    """The exponential."""
     low, high = x < -87.33654, x > 88.72283
     clipped = low.where(-87.33654, high.where(88.72283, x))
     n = (clipped * (1 / math.log(2)) + 0.5).call("floor")
@@ -199,6 +200,7 @@ def sigmoid(x: Lanes) -> Lanes:
 
 
 def tanh(x: Lanes) -> Lanes:
+    """The hyperbolic tangent."""
     size, s = abs(x), x * x
     small = polynomial(s, -5.70498872745e-3, 2.06390887954e-2, -5.37397155531e-2, 1.33314422036e-1, -3.33332819422e-1)
     large = 1.0 - 2.0 / (exp(size + size) + 1.0)

@@ -181,11 +181,9 @@ def maximise_sum(
     began = [at.objective for at in here.terms]
     is_given = information is not None
     information = _by_cross_products(here) if information is None else _regularised(information, here.has_unit)
-    reach = torch.zeros_like(here.gradient)
+    reach, is_open = torch.zeros_like(here.gradient), torch.zeros_like(here.has_unit)
     for term in terms:
         reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
-    is_open = torch.zeros_like(here.has_unit)
-    for term in terms:
         is_open[term.columns] = torch.tensor([part.has_unit and not part.is_effect for part in term.parts]).bool()
     reach = torch.where(is_open, torch.maximum(reach, MAX_MOVE_SD * information.diagonal().rsqrt()), reach)
     taken, decrement, passes = 0, 0.0, PASSES

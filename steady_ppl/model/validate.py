@@ -65,11 +65,10 @@ def probe(program: Program) -> None:
         one, moved = _call(name, "transition", lambda: program.transition(*single), (1, 1, 1), Replaying(alone))
         observing = Observing(measurements[row, drive], observing.observed[row, drive])
         _, again = _call(name, "observe", lambda: program.observe(single[0]), (1, 1, 1), observing)
-        pairs = [("transition", after, one)]
+        pairs = [("transition", after / usual, one / usual)]
         pairs += [("transition", _density(noise, site).expand(LEFT), _density(moved, site)) for site in noise.values]
         for method, among, by_itself in (*pairs, ("observe", density, again.total())):
-            atol = 1e-4 * float(usual.amin()) if method == "transition" and by_itself is one else 1e-4
-            if not torch.allclose(among[draw, row, drive], by_itself, rtol=1e-3, atol=atol, equal_nan=True):
+            if not torch.allclose(among[draw, row, drive], by_itself, rtol=1e-3, atol=1e-4, equal_nan=True):
                 what = "mixes draws, rows or trajectories: one alone gives another result than among others"
                 how = "work on the last dimension only (no sum or mean over the others)"
                 raise ProgramError(f"program {name}: {method} {what}; {how}", site=method)

@@ -4,6 +4,7 @@ import sys
 import unicodedata
 from collections.abc import Callable, Collection, Sequence
 
+from steady_ppl.errors import SteadyError
 from steady_ppl.utils.context import QUIET
 
 # what moves the cursor, colours, renames the window, turns lines round, is not seen, or cannot be written at all
@@ -47,6 +48,11 @@ def one_line(error: BaseException) -> str:
     """An error's type and the first line of its message."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
+def reason_of(error: Exception) -> str:
+    """What went wrong: our own message, or the kind and first line of a fault that nobody foresaw."""
+    return str(error) if isinstance(error, SteadyError) else one_line(error)
 
 
 def say(*remarks: str, always: bool = False) -> None:

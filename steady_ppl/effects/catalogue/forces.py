@@ -67,19 +67,20 @@ def _axes_and_knees(program: Program, data: Trajectories | None) -> Choices:
 
 
 def _drags(program: Program, data: Trajectories | None) -> Choices:
-    """Drags of which wind could be felt: they brake the usual speed by a share of what it is told."""
-    speed, told = speed_of(program, data, program.axes["translation"]), 0.0
+    """Drags of which wind could be felt: they brake the usual speed by a share of what is commanded."""
+    speed, commanded = speed_of(program, data, program.axes["translation"]), 0.0
     if data is not None and speed > 0:
-        told = max(sizes_of_channels(program, data)[channel] for channel in program.axes["translation"])
-    unit = told / speed**2 if told > 0 else 0.2
+        commanded = max(sizes_of_channels(program, data)[channel] for channel in program.axes["translation"])
+    unit = commanded / speed**2 if commanded > 0 else 0.2
     return [{"drag": three_digits(share * unit)} for share in (0.3, 0.1, 1.0)]
 
 
 def _leads(program: Program, data: Trajectories | None) -> Choices:
     """How far ahead of the tracked point the one is that does not slide, in shares of a usual radius of turning."""
     speed, turn = (speed_of(program, data, program.axes[axis]) for axis in ("translation", "yaw"))
-    unit = speed / turn if speed > 0 and turn > 0 else 2.0
-    return [{"lead": three_digits(share * unit)} for share in (0.1, 0.0, 0.25)]
+    if not (speed > 0 and turn > 0):
+        return [{"lead": lead} for lead in (0.2, 0.0, 0.5)]
+    return [{"lead": three_digits(share * speed / turn)} for share in (0.1, 0.0, 0.3)]
 
 
 def _limits(program: Program, data: Trajectories | None) -> Choices:
