@@ -187,7 +187,7 @@ def _known(effect: str) -> tuple[Planted, ...]:
 def said(found: Discovery) -> Record:
     """Return what is kept of a discovery."""
     figures = found.figures
-    keys = ("effect", "kind", "class", "confidence", "coefficient", "sd", "interval_90", "options")
+    keys = ("effect", "kind", "class", "confidence", "coefficient", "sd", "interval_90", "options", "correction")
     effects = [{key: one[key] for key in keys} for one in figures["effects"]]
     first = effects[0] if effects else {}
     return {

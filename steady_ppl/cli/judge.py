@@ -25,7 +25,9 @@ def check(
     picture: Annotated[Path | None, typer.Option(help="Draw the picture into this file, for example .png.")] = None,
     mask: Annotated[
         Path | None,
-        typer.Option(help="Write the table without the stretches that nobody measured, for fits and checks, here."),
+        typer.Option(
+            help="Write the table without outliers and stretches that nobody measured, for fits and checks, here."
+        ),
     ] = None,
     simulations: Annotated[int, options.count("Simulated sets for the bands.", least=20)] = 100,
     program: options.Moved = None,
@@ -50,9 +52,10 @@ def check(
         write_picture(check_picture(found), picture)
     present(str(found), {"run": str(run), **found.figures}, json_file)
     if mask is not None:
-        st.write_table(without_stretches(drives, found.stuck), mask)
-        count = len(found.stuck)
-        say(f"{mask}: {table.name} without {count} stretch{'' if count == 1 else 'es'} that nobody measured")
+        st.write_table(found.outliers.without(without_stretches(drives, found.stuck)), mask)
+        count, cells = len(found.stuck), found.outliers.cells
+        stretches = f"{count} stretch{'' if count == 1 else 'es'} that nobody measured"
+        say(f"{mask}: {table.name} without {stretches} and {cells} reading{'' if cells == 1 else 's'} that are wrong")
 
 
 def prove(

@@ -29,6 +29,7 @@ from steady_ppl.gaussian.predict import named_horizons, predict
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
 from steady_ppl.likelihood.identifiability import undetermined
+from steady_ppl.likelihood.outliers import find_outliers
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.runs.diagnostics import diagnose_units
@@ -77,6 +78,11 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         begin()
         with seeded(seed, "check"), kernel_failures() as uncompiled:
             ahead = find_and_smooth(problem)
+            outliers = find_outliers(problem, ahead.linearization.path)
+            if outliers.found:
+                run = outliers.left
+                problem = replace(problem, data=run)
+                ahead = find_and_smooth(problem)
             path = ahead.linearization.path
             real = track(problem, path, passes=1)
             _, drawn, _ = ahead.draws(simulations)
@@ -98,6 +104,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         misfit = misfit_of(both, time, controls, _pairs(program, ours), dispersion)
     notes = [] if made.sets == simulations else [f"{simulations - made.sets} of {simulations} simulated sets blew up"]
     notes += fallback_notes(uncompiled) + run.uneven_steps + diagnose_units(program, run)
+    notes += [outliers.note] if outliers.note else []
     notes += [f"refitted to these drives, {step.note}"] if step.note else []
     notes += [step.uncompared] if step.uncompared else []
     if parameters.names:
@@ -119,6 +126,7 @@ def check(fit: Fit, data: Trajectories, *, simulations: int = 100, seed: int = 0
         residuals=list(ours.names),
         standardised=ours,
         stuck=frozen_stretches(data),
+        outliers=outliers,
         notes=notes,
     )
 

@@ -16,6 +16,7 @@ from steady_ppl.data.frozen_sensors import Stretch
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import HALF_WIDTH, Prediction
+from steady_ppl.likelihood.outliers import Outliers
 from steady_ppl.model.program import Program, unit_of
 from steady_ppl.utils.hooks import Displayed
 from steady_ppl.utils.text import aligned, figure, with_unit
@@ -37,7 +38,7 @@ class Check(Displayed):
 
     Attributes:
         program: that was judged.
-        data: the drives, as the program reads them.
+        data: the drives, as the program reads them, without outliers.
         path: near their posterior means.
         horizons: name → how many rows ahead, "one step" first.
         predictions: horizon → measured less predicted.
@@ -50,6 +51,7 @@ class Check(Displayed):
         residuals: names of the measurement components and, after them, of the channels.
         standardised: the residuals themselves, one set, with the variables that the regimes are ranges of.
         stuck: stretches of the table in which nothing was measured though something is written.
+        outliers: readings that no noise of the sensors explains; nothing else is about them.
         notes: what was left out.
     """
 
@@ -67,6 +69,7 @@ class Check(Displayed):
     residuals: list[str]
     standardised: Residuals
     stuck: list[Stretch]
+    outliers: Outliers
     notes: list[str]
 
     @property
@@ -106,6 +109,7 @@ class Check(Displayed):
                 {"trajectory": one.label, "seconds": list(one.seconds), "columns": list(one.columns), "text": str(one)}
                 for one in self.stuck
             ],
+            "outliers": self.outliers.figures,
             "notes": self.notes,
         }
 
@@ -124,6 +128,7 @@ class Check(Displayed):
         lines += ["", f"{total} of {cells} cells are outside their simulated bands (false discoveries held at 5 %)"]
         lines += [f"  {finding['z']:+6.1f} sd  {finding['text']}" for finding in strongest(content["findings"])]
         lines += [f"the table: {one['text']}" for one in content["stuck"]]
+        lines += self.outliers.lines()
         return "\n".join(lines + [f"note: {note}" for note in content["notes"]])
 
     def __repr__(self) -> str:

@@ -137,6 +137,11 @@ class Trajectories(Displayed):
         keep = (torch.arange(self.time.shape[0], device=self.time.device) % stride == 0)[:, None, None]
         return replace(self, observed=self.observed & keep)
 
+    def without(self, cells: Tensor) -> Trajectories:
+        """The same without some measured cells, `(T + 1, B, K)` bool."""
+        observed = self.observed & ~cells
+        return replace(self, observed=observed, measurements=torch.where(observed, self.measurements, 0.0))
+
     def continued(self, controls: Tensor, step: float | None = None) -> Trajectories:
         """The drives with rows after their ends in which nothing is measured: what is planned, to be forecast.
 

@@ -36,6 +36,7 @@ from steady_ppl.likelihood.parameters import Element, elements
 from steady_ppl.likelihood.scores import measured, smoothed, typical_spreads
 from steady_ppl.model.program import Program
 from steady_ppl.utils.journal import journaled
+from steady_ppl.utils.matrices import ridged_inverse
 from steady_ppl.utils.random import seeded
 
 MIN_LEADERS, MIN_ALIAS_CORRELATION = 6, 0.85  # how many are refitted, and those whose columns are so like the first's
@@ -57,6 +58,13 @@ class Screening:
     tests: Screened  # of all candidates
     parameters: list[Element]  # the program's learnable numbers, in the order of `information`
     information: Mapping[str, Tensor]  # of parameters and one candidate, by the candidate; the parameters' alone by ""
+
+    def spread_of(self, fitted: Refit, variant: Variant) -> Tensor:
+        """Standard deviations `(k,)` of an effect of the fitted program that was tested, of a fit to all drives: of the
+        coefficient as it is learned, of a factor its logarithm."""
+        (there,) = [known for known in attached(fitted.program) if known.name == variant.name]
+        index = [i for i, part in enumerate(self.parameters) if part.owner == there.parameter]
+        return (fitted.first_share * ridged_inverse(self.information[""]).diagonal()[index]).clamp(min=0).sqrt()
 
 
 @dataclass(frozen=True)

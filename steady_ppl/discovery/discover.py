@@ -14,7 +14,7 @@ from steady_ppl.comparison.scores import MIN_DRIVES
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories, concatenated
 from steady_ppl.discovery.candidates import TIE_NATS
-from steady_ppl.discovery.finding import findings, next_run, shape_of
+from steady_ppl.discovery.finding import corrections, findings, next_run, shape_of
 from steady_ppl.discovery.fitting import ByDraws
 from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.result import Discovery
@@ -129,14 +129,15 @@ def discover(
             found = search(problem, choosing.data, settings)
         begin()
         shape = shape_of(found, program)
-        effects = [] if shape else findings(found)
+        effects = corrections(found) if shape else findings(found)
         final = found.base if shape else found.final
         said = {"simulations": simulations, "seed": seed}
-        fits = [Fit(refit.mean_program(), "discover", said, seed, known_start) for refit in (found.base, final)]
+        fits = [Fit(refit.mean_program(), "discover", said, seed, known_start) for refit in (found.as_it_stands, final)]
         better = found.curve.refit if found.curve else found.final
         assert isinstance(better, Refit)
-        rows = {"before": found.base.judges.programs[0], "after": better.judges.programs[0]}
-        proof = prove(rows, choosing.data, known_start=known_start, with_constant_velocity=False, seed=seed)
+        rows = {"before": found.as_it_stands.judges.programs[0], "after": better.judges.programs[0]}
+        judges = found.base.folds[0].held_out  # the validation drives without outliers
+        proof = prove(rows, judges, known_start=known_start, with_constant_velocity=False, seed=seed)
         begin()
         unclear = [] if shape else [one for one in found.found if len(one.aliases) > 1]
         largest = max(unclear, key=lambda one: one.candidate.total, default=None)
@@ -145,7 +146,7 @@ def discover(
     if largest and proposed is None:
         both = " from ".join(candidate.variant.name for candidate in largest.aliases[:2])
         notes.append(f"no way of driving that was tried tells {both} better than these drives do")
-    notes += diagnose_units(program, problem.data) + _notes(found) + doubtful(proof.rows, choosing.data)
+    notes += diagnose_units(program, problem.data) + _notes(found) + doubtful(proof.rows, judges)
     return Discovery(found, effects, shape, proposed, proof, fits[0], fits[1], _doubts(found, is_fitted), notes)
 
 
@@ -190,10 +191,11 @@ def _notes(found: Search) -> list[str]:
             "a curve has no name and is not kept: 'after' is what it would bring, --out has the program as it stood, "
             "fitted"
         )
+    notes += [one.note for one in found.outliers if one.note]
     if not found.final.converged and found.found:
         notes.append("the fit with what was found has not converged")
     notes += [f"{label}: taken back, for with it the program fails: {why}" for label, why in found.taken_back.items()]
-    if len(found.found) == MAX_EFFECTS:
+    if found.is_full:
         notes.append(f"the search stops at {MAX_EFFECTS} effects: add them, fit, and discover again from there")
     if not found.is_complete:
         notes.append("something is left that no effect of the catalogue brings: the tests were not quiet at the end")

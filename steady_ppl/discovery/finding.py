@@ -13,14 +13,13 @@ from steady_ppl.comparison.scores import RESAMPLES
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.discovery.candidates import Candidate, variance_of_places
 from steady_ppl.discovery.refits import Refit, with_states_of
-from steady_ppl.discovery.screening import Tested
+from steady_ppl.discovery.screening import NOISE_SIZES, Tested
 from steady_ppl.discovery.search import MIN_GAIN_OF_CURVE, Found, Search
-from steady_ppl.effects import Effect, Variant, attached
+from steady_ppl.effects import Effect, Variant
 from steady_ppl.gaussian.predict import HALF_WIDTH, simulate_again
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, unit_of
-from steady_ppl.utils.matrices import ridged_inverse
 from steady_ppl.utils.random import seeded
 
 MAX_LOG_SD = 2.0  # of a factor: beyond it nothing is known but the sign
@@ -43,6 +42,11 @@ class Finding:
     interval: list[tuple[float, float]]  # 90 %
     gain: float | None  # nats of held-out log p(y) that it brings
 
+    @property
+    def is_correction(self) -> bool:
+        """Whether it is how large a declared noise is, and says nothing of what is missing."""
+        return self.variant.effect.name in NOISE_SIZES
+
 
 @dataclass(frozen=True)
 class Shape:
@@ -59,16 +63,27 @@ class Shape:
 
 
 def findings(search: Search) -> list[Finding]:
-    """The effects that were found, the one that brings most first."""
-    found = [_finding(search, one) for one in search.found]
+    """The effects that were found, the one that brings most first, and then how large the noise is."""
+    found = [_finding(search, one) for one in search.found] + corrections(search)
     found += [_departure(tested) for tested in search.departed]
-    return sorted(found, key=lambda finding: -(finding.gain or 0.0))
+    return sorted(found, key=lambda finding: (finding.is_correction, -(finding.gain or 0.0)))
+
+
+def corrections(search: Search) -> list[Finding]:
+    """The factors on declared noise with which the search began."""
+    screening, found = search.rounds[-1].screening, list[Finding]()
+    for one in search.corrections:
+        factor = float(search.final.coefficient(one.variant))
+        sd = float(screening.spread_of(search.final, one.variant))
+        interval, name = _around(factor, HALF_WIDTH * sd), one.variant.name
+        found.append(Finding(one.variant, "noise", [name], None, [factor], [factor * sd], [interval], one.gain))
+    return found
 
 
 def _finding(search: Search, found: Found) -> Finding:
     variant, effect = found.candidate.variant, found.candidate.variant.effect
     values = search.final.coefficient(variant).flatten().double().numpy()
-    spread = _spread(search, variant)
+    spread = search.rounds[-1].screening.spread_of(search.final, variant).numpy()
     is_positive = effect.null != 0  # and learned as its logarithm
     places = np.zeros_like(spread)
     if variant.profiled:
@@ -103,15 +118,6 @@ def _around(value: float, by: float) -> tuple[float, float]:
     """An interval that is symmetric in the logarithm."""
     by = min(by, MAX_LOG_RATIO)
     return value * math.exp(-by), value * math.exp(by)
-
-
-def _spread(search: Search, variant: Variant) -> np.ndarray:
-    """Standard deviations in the space in which the coefficient is learned, of a fit to all drives."""
-    screening = search.rounds[-1].screening
-    covariance = ridged_inverse(screening.information[""])
-    (there,) = [known for known in attached(search.final.program) if known.name == variant.name]
-    index = [i for i, part in enumerate(screening.parameters) if part.owner == there.parameter]
-    return (search.final.first_share * covariance.diagonal()[index]).clamp(min=0).sqrt().numpy()
 
 
 def _confidence(search: Search, found: Found) -> float:

@@ -31,6 +31,7 @@ VERDICT_PHRASES = {
     "noise": "The noise is not as declared:",
     "other": "Something is missing that is in no catalogue",
 }
+WRONG_NOISE = "These drives contradict the declared noise:"
 PAIR_FORM, NUMBERS_FORM = [NUMBER, NUMBER], (NUMBER, [(NUMBER, None)], None)
 CANDIDATE_FORM = {
     **dict.fromkeys(("effect", "kind", "unit"), TEXT),
@@ -45,6 +46,7 @@ EFFECT_FORM = {
     "class": LINES,
     "coefficient": [NUMBER],
     "interval_90": [PAIR_FORM],
+    "correction?": BOOL,
 }
 SHAPE_FORM = {"channel": TEXT, "variable": TEXT, "points": [NUMBER], "curve": [NUMBER], "band": [NUMBER]}
 DISCOVERY_FORM = {
@@ -88,10 +90,11 @@ class Discovery(Displayed):
 
     @property
     def verdict(self) -> str:
-        """none, dynamics, actuator, sensor, noise or other."""
-        if self.findings:
-            return self.findings[0].kind
-        return "none" if self.search.rounds[0].nothing_found else "other"
+        """none, dynamics, actuator, sensor, noise or other: of what is missing, if only noise is wrong noise."""
+        search = self.search
+        if self.shape or (not search.rounds[0].nothing_found and not search.found and not search.departed):
+            return "other"
+        return self.findings[0].kind if self.findings else "none"
 
     @property
     def p_value(self) -> float:
@@ -106,7 +109,7 @@ class Discovery(Displayed):
         sides = {row["row"]: {key: row[key] for key in kept} for row in self.proof.figures["rows"]}
         return {
             "verdict": self.verdict,
-            "sentence": sentence(self),
+            "sentence": " ".join(sentences(self)),
             "p_value": self.p_value,
             "level": FAMILY_LEVEL,
             "effect": first.variant.name if first else None,
@@ -123,6 +126,11 @@ class Discovery(Displayed):
                 {"p_value": one.screening.tests.p_value, "added": one.chosen.variant.name if one.chosen else None}
                 for one in self.search.rounds
             ],
+            "outliers": [
+                {"drives": name, **one}
+                for name, found in zip(("training", "validation"), self.search.outliers, strict=False)
+                for one in found.figures
+            ],
             "known_start": self.before.known_start,
             "step": self.search.step.figures,
             "step_with_found": self.search.with_found.figures if self.search.with_found else None,
@@ -131,7 +139,7 @@ class Discovery(Displayed):
         }
 
     def __str__(self) -> str:
-        said = [*(f"warning: {doubt}" for doubt in self.doubts), sentence(self)]
+        said = [*(f"warning: {doubt}" for doubt in self.doubts), *sentences(self)]
         lines = [line for paragraph in said for line in textwrap.wrap(paragraph, TEXT_WIDTH)]
         for finding in self.findings:
             lines += ["", f"{finding.variant.name}: {finding.variant.effect.text}", f"  {finding.variant.effect.feels}"]
@@ -139,6 +147,8 @@ class Discovery(Displayed):
             lines += ["", f"{shape.variable} [{shape.variable_unit}]  {shape.channel} [{shape.unit}]"]
             rows = zip(shape.points, shape.curve, shape.band, strict=True)
             lines += [f"{point:10.3g}  {height:10.3g} ± {band:.2g}" for point, height, band in rows]
+        wrong = zip(("training", "validation"), self.search.outliers, strict=False)
+        lines += [line for name, found in wrong if found.found for line in ("", *found.lines(name))]
         lines += ["", *_table(self)]
         if run := self.next_run:
             asked = f"To tell {' from '.join(run.between[:2])}, drive {run.way}: {run.separation:.1f} nats a drive, "
@@ -150,7 +160,7 @@ class Discovery(Displayed):
         return "\n".join(lines + [line for note in notes for line in textwrap.wrap(f"note: {note}", TEXT_WIDTH)])
 
     def __repr__(self) -> str:
-        return f"Discovery({sentence(self)!r})"
+        return f"Discovery({' '.join(sentences(self))!r})"
 
 
 def read_discovery(source: Path) -> dict[str, Any] | None:
@@ -253,30 +263,41 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "equation": finding.variant.effect.equation,
         "text": finding.variant.effect.text,
         "heldout_gain": finding.gain,
+        "correction": finding.is_correction,
     }
 
 
-def sentence(found: Discovery) -> str:
-    """The verdict in one sentence, after a first one on the time step where that is too coarse."""
+def sentences(found: Discovery) -> list[str]:
+    """The verdict in a sentence, after one on the time step where that is too coarse and one on noise that is wrong."""
     step, with_found = found.search.step.sentence, found.search.with_found
     later = f"with what was found below, {with_found.sentence}" if with_found and with_found.sentence else ""
     first = "; ".join(filter(None, (step, later)))
-    said = f"{first[0].upper()}{first[1:]}. All that follows is at that step. " if first else ""
-    return said + _verdict(found)
+    said = [f"{first[0].upper()}{first[1:]}. All that follows is at that step."] if first else []
+    effects = [finding for finding in found.findings if not finding.is_correction]
+    if sizes := [_said(finding, True) for finding in found.findings if finding.is_correction]:
+        noise = f"{VERDICT_PHRASES['noise']} {' and '.join(sizes)}"
+        if not effects and found.verdict == "noise" and not found.search.rounds[0].nothing_found:
+            return [*said, f"{noise} {_p_value(found)}."]
+        said.append(f"{WRONG_NOISE} {' and '.join(sizes)}. All that follows is with the noise that they show.")
+    return [*said, _verdict(found, effects)]
 
 
-def _verdict(found: Discovery) -> str:
-    start, p_value, shape = VERDICT_PHRASES[found.verdict], f"(p = {found.p_value:.2g})", found.shape
-    if found.verdict == "none":
-        return f"{start} {p_value}; the limits below say what could not have been seen."
+def _p_value(found: Discovery) -> str:
+    return f"(p = {found.p_value:.2g})"
+
+
+def _verdict(found: Discovery, effects: Sequence[Finding]) -> str:
+    missing, p_value, shape = VERDICT_PHRASES["other"], _p_value(found), found.shape
+    if found.search.rounds[0].nothing_found:
+        return f"{VERDICT_PHRASES['none']} {p_value}; the limits below say what could not have been seen."
     if shape is not None:
         times = f" times {shape.times}" if shape.times else ""
-        return f"{start} {p_value}: {shape.channel} lacks a curve of {shape.variable}{times}."
-    if not found.findings:
-        return f"{start} {p_value}, and neither an effect nor a curve brings anything on held-out drives."
+        return f"{missing} {p_value}: {shape.channel} lacks a curve of {shape.variable}{times}."
+    if not effects:
+        return f"{missing} {p_value}, and neither an effect nor a curve brings anything on held-out drives."
     clauses: list[str] = []
-    for kind in dict.fromkeys(finding.kind for finding in found.findings):
-        said = [_said(finding, found.search.is_complete) for finding in found.findings if finding.kind == kind]
+    for kind in dict.fromkeys(finding.kind for finding in effects):
+        said = [_said(finding, found.search.is_complete) for finding in effects if finding.kind == kind]
         words = VERDICT_PHRASES[kind] if not clauses else VERDICT_PHRASES[kind][0].lower() + VERDICT_PHRASES[kind][1:]
         clauses.append(f"{words} {' and '.join(said)}")
     if not found.search.is_complete:

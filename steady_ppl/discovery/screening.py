@@ -23,7 +23,7 @@ from steady_ppl.discovery.curves import CURVE, prior_covariance
 from steady_ppl.discovery.effect_scores import Column
 from steady_ppl.discovery.refits import Fold, Refit, as_declared
 from steady_ppl.effects import Variant, attached, catalogue
-from steady_ppl.likelihood.parameters import Element, on_both_sides
+from steady_ppl.likelihood.parameters import Element, elements, on_both_sides
 from steady_ppl.likelihood.scores import measured, substep_spreads
 from steady_ppl.model.program import Program
 from steady_ppl.utils.matrices import pseudo_inverse, ridged_inverse
@@ -31,6 +31,7 @@ from steady_ppl.utils.matrices import pseudo_inverse, ridged_inverse
 FAMILY_LEVEL, POWER = 0.05, 0.95  # of the tests of all candidates together, and at a detection limit
 MIN_SHARE_OF_INFORMATION = 1e-4  # of a column, that the fitted parameters must leave for it to be tested
 CONTAINED = "the fitted parameters already explain it"
+NOISE_SIZES = ("process_noise", "measurement_noise")  # the effects that multiply a standard deviation
 UNEXCITED = "these drives never excite it"
 
 
@@ -255,22 +256,45 @@ def departures(declared: Program, now: Refit, parts: Sequence[Element]) -> list[
     own = torch.tensor([part.owner not in effects for part in parts])
     guessed = torch.tensor([any(part.name.startswith(guess) for guess in program.guesses) for part in parts])
     found = []
-    for name in ("process_noise", "measurement_noise"):
-        sides = [on_both_sides(part, partial(_log_spreads, name, program, fold)) for part in parts]
-        slope = torch.stack([(up - down) / (2 * part.step) for part, (up, down) in zip(parts, sides, strict=True)])
-        slope = slope * own.unsqueeze(-1)
+    for name in NOISE_SIZES:
+        slope = _slopes_of_spreads(name, program, fold, parts) * own.unsqueeze(-1)
         is_tested = (slope != 0).any(0) & ~(slope[guessed] != 0).any(0)
         away, *judged = (
             _log_spreads(name, one, drives) - _log_spreads(name, as_declared(declared, one), drives)
             for one, drives in zip((program, *now.judges.programs), (fold, *now.folds), strict=True)
         )
         mean = now.mean(judged)
-        for variant in [v for effect in catalogue(program) if effect.name == name for v in effect.variants(program)]:
-            channels = [program.channel_names.index(name) for name in variant.options.get("channels", ())]
-            if index := [i for i in channels or range(slope.shape[1]) if is_tested[i]]:
+        for variant in sizes_of_noise(program, name):
+            if index := [i for i in _places(program, variant, slope.shape[1]) if is_tested[i]]:
                 of_first, of_all = float(away[index].mean()), float(mean[index].mean())
                 found.append(Departure(variant, of_first, of_all, now.first_share, slope[:, index].mean(1)))
     return found
+
+
+def sizes_of_noise(program: Program, name: str) -> list[Variant]:
+    """One of `NOISE_SIZES` wherever it could act on a program."""
+    return [v for effect in catalogue(program) if effect.name == name for v in effect.variants(program)]
+
+
+@torch.no_grad()
+def is_learned(variant: Variant, program: Program, fold: Fold) -> bool:
+    """Whether the program's own numbers move the noise that one of `NOISE_SIZES` multiplies."""
+    if not (parts := elements(program)):
+        return False
+    slope = _slopes_of_spreads(variant.effect.name, program, fold, parts)
+    return bool((slope[:, _places(program, variant, slope.shape[1])] != 0).any())
+
+
+def _places(program: Program, variant: Variant, count: int) -> Sequence[int]:
+    """The channels or measurements whose noise it multiplies, of `count`."""
+    channels = [program.channel_names.index(name) for name in variant.options.get("channels", ())]
+    return channels or variant.options.get("columns") or range(count)
+
+
+def _slopes_of_spreads(effect: str, program: Program, fold: Fold, parts: Sequence[Element]) -> Tensor:
+    """Derivatives of `_log_spreads` in learnable numbers, `(P, C)` or `(P, K)`."""
+    sides = [on_both_sides(part, partial(_log_spreads, effect, program, fold)) for part in parts]
+    return torch.stack([(up - down) / (2 * part.step) for part, (up, down) in zip(parts, sides, strict=True)])
 
 
 def _log_spreads(effect: str, program: Program, fold: Fold) -> Tensor:

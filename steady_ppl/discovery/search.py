@@ -27,6 +27,7 @@ from steady_ppl.discovery.candidates import (
     likelier_places,
     screen_program,
 )
+from steady_ppl.discovery.noise_first import Correction, needless, with_suitable_noise, without, without_outliers
 from steady_ppl.discovery.particles import ParticleJudge
 from steady_ppl.discovery.refits import (
     NO_THRESHOLD,
@@ -38,8 +39,9 @@ from steady_ppl.discovery.refits import (
     judged_fits,
     refit_with,
 )
-from steady_ppl.discovery.screening import FAMILY_LEVEL, Tested
-from steady_ppl.effects import Effect, attached
+from steady_ppl.discovery.screening import FAMILY_LEVEL, NOISE_SIZES, Tested
+from steady_ppl.effects import Effect, Variant, attached
+from steady_ppl.likelihood.outliers import Outliers
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import with_substeps
@@ -54,6 +56,7 @@ MIN_NATS_OF_DIVERGENCE = 25.0  # nats above every fit that it is a part of, from
 MAX_SHIFT_OF_SIZES = 0.08  # nats by which twice the substeps may move what is reported: 0.4 standard deviations
 MAX_SUBSTEPS_OF_FIT = 128  # of a fitted program, at most: what a coarser step leaves would be named as an effect
 MAX_EFFECTS, MAX_CURVES = 5, 3  # effects in a program, and adding curves that are fitted
+MAX_ROUNDS = MAX_EFFECTS + 3  # with factors on noise, which take no place, and a last test
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,10 @@ class Settings:
     def wants(self, effect: Effect) -> bool:
         """Whether an effect is looked for."""
         return effect.name not in self.withheld and (not self.only or effect.verdict in self.only)
+
+    def corrects(self, variant: Variant) -> bool:
+        """Whether a declared noise may be corrected, whichever effects are looked for."""
+        return variant.effect.name not in self.withheld
 
     def screen(self, now: Refit, index: int) -> Screening:
         """Test every candidate that a fitted program does not have, in a round counted from 0."""
@@ -100,19 +107,23 @@ class Found:
 
     @property
     def aliases(self) -> list[Candidate]:
-        """Those that these drives cannot tell from the best, itself first."""
-        close = [c for c in self.candidates if c.total >= self.candidate.total - TIE_NATS]
-        return [self.candidate, *(c for c in close if c is not self.candidate and not c.against_its_sign)]
+        """Those that these drives cannot tell from the best, itself first, wherever its knee is."""
+        best = self.candidate
+        close = [c for c in self.candidates if c.total >= best.total - TIE_NATS and not c.against_its_sign]
+        return [best, *(c for c in close if c is not best and c.variant.name != best.variant.name)]
 
 
 @dataclass
 class Search:
     """The state of a search: what it has come to so far."""
 
-    base: Refit  # the program as it stands, fitted
+    as_it_stands: Refit  # the program, fitted
+    base: Refit  # the same with noise that is corrected, from which the search begins
     final: Refit  # the program with all effects that were found, fitted
-    step: StepCheck  # the program as it stands beside itself at finer steps; all else is at the step that suits
+    step: StepCheck  # the base beside itself at finer steps; all else is at the step that suits
     gained: float  # nats that fitting the program as it stands gained on the training drives
+    outliers: list[Outliers] = field(default_factory=list)  # of the training and of the validation drives
+    corrections: list[Correction] = field(default_factory=list)  # of the noise that it declares
     with_found: StepCheck | None = None  # the same with what was found, where that asked for a search at a finer step
     rounds: list[Round] = field(default_factory=list)  # the last tests the final program unless the search ended early
     found: list[Found] = field(default_factory=list)  # the effects that were added
@@ -124,6 +135,11 @@ class Search:
         """Whether the tests of the last round found nothing more that an effect or a curve could bring."""
         tests = self.rounds[-1].screening.tests
         return not any(tested.p_value <= tests.critical for tested in tests.tested if not tested.departure)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether it has as many effects as it may; factors on noise take no place."""
+        return sum(one.candidate.variant.effect.name not in NOISE_SIZES for one in self.found) >= MAX_EFFECTS
 
     @property
     def departed(self) -> list[Tested]:
@@ -150,31 +166,37 @@ class Search:
 def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
     """Look for the effects that a program lacks; its drives test it, both they and `valid` choose."""
 
-    def first(program: Program, nearer: Program | None = None) -> Refit:
-        return first_refit(replace(problem, program=program), valid, seed=settings.seed, nearer=nearer)
+    def fit(program: Program, train: Trajectories, valid: Trajectories, nearer: Program | None = None) -> Refit:
+        return first_refit(Problem(program, train, problem.known_start), valid, seed=settings.seed, nearer=nearer)
 
     program = problem.program
     with stages(("fitting the program as it stands", 1), ("comparing time steps", 1), ("", 8)) as begin:
         begin()
-        base = first(program)
-        gained = base.maxima[0].gained
+        own, outliers = without_outliers(partial(fit, program), problem.data, valid)
+        left, valid = (one.left for one in outliers)
+        base, corrections = with_suitable_noise(own, settings.corrects)
+        gained = own.maxima[0].gained
         begin()
         step = _step_of(base)
         if step.too_coarse:  # the step is no effect: what follows is about the program at the step that suits
-            program = with_substeps(program, step.suited.substeps)
-            settings = replace(settings, declared=with_substeps(settings.declared, step.suited.substeps))
-            base = first(program, step.suited.program)
+            finer = step.suited.substeps
+            nearer = with_substeps(own.program, finer) if corrections else step.suited.program
+            settings = replace(settings, declared=with_substeps(settings.declared, finer))
+            program = with_substeps(program, finer)
+            own = fit(program, left, valid, nearer)
+            base, corrections = with_suitable_noise(own, settings.corrects)
         begin()
-        found = _rounds(Search(base, base, step, gained), settings)
+        found = _rounds(Search(own, base, base, step, gained, outliers, corrections), settings)
         if not found.found:
             return found
         parameters = [variant.parameter for variant in attached(found.final.program)]
         with_found = _step_of(found.final, watched=parameters, max_shift=MAX_SHIFT_OF_SIZES)
         if with_found.too_coarse:  # what was found asks for a finer step: sizes are those of that step
             finer = with_found.suited.substeps
-            base = first(with_substeps(program, finer), with_substeps(found.base.program, finer))
+            own = fit(with_substeps(program, finer), left, valid, with_substeps(own.program, finer))
+            base, corrections = with_suitable_noise(own, settings.corrects)
             settings = replace(settings, declared=with_substeps(settings.declared, finer))
-            found = _rounds(Search(base, base, step, gained, with_found), settings)
+            found = _rounds(Search(own, base, base, step, gained, outliers, corrections, with_found), settings)
     return found
 
 
@@ -188,10 +210,10 @@ def _rounds(found: Search, settings: Settings) -> Search:
     """Test, fit and add until nothing is left."""
     with stages(("", 6), ("looking again", 1), ("fitting curves", 1)) as begin:
         begin()
-        shares = [(said, 0.5**index) for index in range(MAX_EFFECTS + 1) for said in ("testing every effect", "")]
+        shares = [(said, 0.5**index) for index in range(MAX_ROUNDS) for said in ("testing every effect", "")]
         with stages(*shares) as begin_part:
             earlier = list(found.found)
-            for index in range(MAX_EFFECTS + 1):
+            for index in range(MAX_ROUNDS):
                 begin_part()
                 try:
                     screening = settings.screen(found.final, index)
@@ -212,7 +234,7 @@ def _rounds(found: Search, settings: Settings) -> Search:
             prune(found)
             if set(labels(found.final)) != set(labels(final)):  # the same in another order has been tested
                 try:
-                    found.rounds.append(Round(settings.screen(found.final, MAX_EFFECTS + 1), [], None))
+                    found.rounds.append(Round(settings.screen(found.final, MAX_ROUNDS), [], None))
                 except Exception as error:
                     new = [label for label in labels(found.final) if label not in labels(final)]
                     found.taken_back = dict.fromkeys(new, reason_of(error))
@@ -220,13 +242,29 @@ def _rounds(found: Search, settings: Settings) -> Search:
         begin()
         if len(found.rounds) > 1 and not found.rounds[1].nothing_found and not found.curves:
             found.curves = _curves(found)
+    if found.found:
+        _drop_corrections(found, settings)
     return found
+
+
+def _drop_corrections(found: Search, settings: Settings) -> None:
+    """Take corrections of the noise back that are not needed beside what was found."""
+    dropped = needless(found.corrections, found.final, found.rounds[-1].screening)
+    if not dropped:
+        return
+    kept = [one for one in found.corrections if one not in dropped]
+    base = without(dropped, found.as_it_stands, found.base) if kept else found.as_it_stands
+    final = without(dropped, found.as_it_stands, found.final)
+    if base is None or final is None:
+        return
+    found.rounds.append(Round(settings.screen(final, MAX_ROUNDS + 1), [], None))
+    found.base, found.final, found.corrections = base, final, kept
 
 
 def _add_best(found: Search, screening: Screening, index: int) -> bool:
     """Fit what the tests of a round point at and add the best, if it brings enough; whether anything was added."""
     found.rounds.append(Round(screening, [], None))
-    if found.rounds[-1].nothing_found or index == MAX_EFFECTS:
+    if found.rounds[-1].nothing_found or found.is_full or index == MAX_ROUNDS - 1:
         return False
     judge, critical = ParticleJudge(found.final), screening.tests.critical
     best, candidates = judge.chosen(
@@ -256,15 +294,28 @@ def _first(is_enough: Callable[[Candidate], bool], ranked: Sequence[Candidate]) 
 
 def _place_again(search: Search, found: Found) -> None:
     """Move the knee or place of an effect to where it is likeliest beside those that were added after it."""
-    candidate = found.candidate
-    if not candidate.variant.profiled:
-        return
-    *_, (variant, fits) = likelier_places(search.base, search.final, candidate.variant)
-    if fits is search.final or isinstance(refit := judged_fits(fits), str):
-        return
-    search.final = refit
-    moved = replace(candidate, tested=candidate.tested.at(variant))
-    search.found[search.found.index(found)] = replace(found, candidate=moved)
+    search.final = _placed(search.base, search.final, found.candidate.variant)
+    _keep_places(search)
+
+
+def _placed(base: Refit, refit: Refit, variant: Variant) -> Refit:
+    """A fitted program with the knee or place of one of its effects, which `base` lacks, where it is likeliest."""
+    if not variant.profiled:
+        return refit
+    *_, (_, fits) = likelier_places(base, refit, variant)
+    if fits is refit or isinstance(moved := judged_fits(fits), str):
+        return refit
+    return moved
+
+
+def _keep_places(search: Search) -> None:
+    """Give what was found the knees and places that the final program has."""
+    there = {variant.name: variant for variant in attached(search.final.program)}
+    for index, found in enumerate(search.found):
+        candidate, final = found.candidate, there.get(found.candidate.variant.name)
+        if final is not None and final.profiled != candidate.variant.profiled:
+            moved = replace(candidate, tested=candidate.tested.at(final))
+            search.found[index] = replace(found, candidate=moved)
 
 
 def _refits(now: Refit, screening: Screening, first: bool) -> list[Candidate]:
@@ -325,6 +376,8 @@ def prune(search: Search) -> None:
             if rival.variant.name not in there and isinstance(rival.refit, Refit) and not imitates:
                 begin = rival.refit.coefficient(rival.variant)
                 refit = refit_with(without, rival.variant, begin, information=search.final.maxima[0])
+                for other in (one for one in search.found if one is not found):
+                    refit = refit if isinstance(refit, str) else _placed(search.base, refit, other.candidate.variant)
                 again.append(at_its_best_place(without, judged(without, rival.tested, refit)))
         as_it_stands = judged(without, chosen.tested, search.final)
         if all(c.total < as_it_stands.total for c in again if c.variant.name == chosen.variant.name):
@@ -338,6 +391,7 @@ def prune(search: Search) -> None:
         else:
             search.found[place] = Found(best, again, without)
             search.final = best.refit
+            _keep_places(search)
 
 
 def _without(search: Search, found: Found) -> Refit | str:

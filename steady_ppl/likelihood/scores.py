@@ -32,7 +32,16 @@ from steady_ppl.gaussian.posterior_moments import posterior_moments
 from steady_ppl.kernels.graph import NotCompilable
 from steady_ppl.kernels.rows import Slopes, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import Element, moved, on_both_sides
-from steady_ppl.model.handlers import AtMean, Recording, as_vector, normal_moments, residual, running, unwrapped
+from steady_ppl.model.handlers import (
+    AtMean,
+    Recording,
+    as_vector,
+    location,
+    normal_moments,
+    residual,
+    running,
+    unwrapped,
+)
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, all_rows, channel_scales, noisy_step, row_inputs, sample_channels
 from steady_ppl.utils.angles import wrap_angles
@@ -252,12 +261,12 @@ class Measured:
 
     def shift(self, other: Measured) -> Tensor:
         """How much more `other` measures on average, on the circle where a measurement lives there, `(..., K)`."""
-        return self._of_sites(lambda site, fn: residual(fn, other.distributions[site].mean))
+        return self._of_sites(lambda site, fn: residual(fn, location(other.distributions[site])))
 
     @property
     def reading(self) -> Tensor:
         """What is measured on average, `(..., K)`, on the circle where a measurement lives there."""
-        return self._of_sites(lambda _, fn: -residual(fn, torch.zeros_like(fn.mean)))
+        return self._of_sites(lambda _, fn: -residual(fn, torch.zeros_like(location(fn))))
 
     @property
     def spread(self) -> Tensor:

@@ -146,7 +146,7 @@ class AtMean(Messenger):
 
     def _pyro_sample(self, message: Any) -> None:
         if not message["is_observed"]:
-            message["value"] = message["fn"].mean
+            message["value"] = location(message["fn"])
 
 
 @dataclass(eq=False)
@@ -219,7 +219,13 @@ def residual(fn: Any, value: Tensor) -> Tensor:
     base = unwrapped(fn)
     if hasattr(base, "residual"):
         return base.residual(value)
-    return value - fn.mean
+    return value - location(fn)
+
+
+def location(fn: Any) -> Tensor:
+    """The mean of a site; of a Student t, which may have none, where it is centred."""
+    base = unwrapped(fn)
+    return base.loc if isinstance(base, dist.StudentT) else fn.mean
 
 
 def normal_moments(fn: Any, site: str) -> tuple[Tensor, Tensor]:

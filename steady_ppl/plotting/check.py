@@ -19,6 +19,7 @@ from steady_ppl.model.program import unit_of
 from steady_ppl.utils.text import with_unit
 
 DATA_COLOR, NEAR_COLOR, FAR_COLOR, BASELINE_COLOR, FLOOR_COLOR = "black", "#0072b2", "#d55e00", "#cc79a7", "#009e73"
+WRONG_COLOR = "#d00000"
 MAX_COMPONENTS_SHOWN = 4  # panels
 CHECK_TITLE_COLUMNS = 165  # letters of its line over the whole width
 
@@ -35,7 +36,7 @@ def check_picture(found: Check) -> Figure:
             predictions(found, drive, component, axes)
         panels[0].set_title(f"measured and predicted, drive {found.data.labels[drive]}", parse_math=False)
         panels[-1].set_xlabel("time [s]")
-        left.legend(*panels[0].get_legend_handles_labels(), fontsize=8, ncols=3, loc="outside lower center")
+        left.legend(*panels[0].get_legend_handles_labels(), fontsize=8, ncols=4, loc="outside lower center")
         figure.suptitle("\n".join(textwrap.wrap(verdict(found), CHECK_TITLE_COLUMNS)), fontsize=10)
         above, regime, against = right.subplots(3, 1, height_ratios=(1.2, 1, 1))
         where_and_when(found, above)
@@ -45,7 +46,10 @@ def check_picture(found: Check) -> Figure:
 
 
 def representative(found: Check) -> int:
-    """The drive of the strongest finding that names one, else the one that is predicted worst over the longest time."""
+    """The drive of the clearest outlier, else of the strongest finding that names one, else the one that is predicted
+    worst over the longest time."""
+    if found.outliers.found:
+        return max(found.outliers.found, key=lambda one: one.gain).drive
     for finding in found.misfit.significant:
         if "drive" in finding.cell.where:
             return int(finding.cell.where["drive"])
@@ -62,6 +66,10 @@ def predictions(found: Check, drive: int, component: int, axes: Axes) -> None:
         axes.fill_between(at, middle - half, middle + half, color=color, alpha=0.18, lw=0)
         axes.plot(at, middle, color=color, lw=1, label=f"{name} ahead, 90 % band")
     axes.plot(time, measured_values(found)[:, drive, component], ".", color=DATA_COLOR, ms=3, label="measured")
+    if bool((wrong := found.outliers.wrong[:, drive]).any()):  # also where this component has none, for the legend
+        there = wrong[:, component].numpy(force=True)
+        logged = found.outliers.data.measurements[:, drive, component].numpy(force=True)
+        axes.plot(time[there], logged[there], "x", color=WRONG_COLOR, ms=5, label="left out as wrong")
     program = found.program
     axes.set_ylabel(with_unit(program.measurement_names[component], program.measurement_units[component]))
 

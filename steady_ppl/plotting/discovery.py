@@ -16,7 +16,7 @@ from steady_ppl.discovery.candidates import Candidate
 from steady_ppl.discovery.curves import variables_along
 from steady_ppl.discovery.finding import Finding, gain_interval
 from steady_ppl.discovery.refits import Fold, Refit
-from steady_ppl.discovery.result import Discovery, limit_of, sentence
+from steady_ppl.discovery.result import Discovery, limit_of, sentences
 from steady_ppl.discovery.screening import Tested
 from steady_ppl.effects import Variant
 from steady_ppl.errors import UsageError
@@ -63,7 +63,7 @@ def discovery_picture(found: Discovery) -> Figure:
         left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
         tests(found, left)
         coefficients(found, right, rest=len(_remaining(found)))
-    figure.suptitle("\n".join(textwrap.wrap(sentence(found), DISCOVERY_TITLE_COLUMNS)), fontsize=10)
+    figure.suptitle("\n".join(textwrap.wrap(" ".join(sentences(found)), DISCOVERY_TITLE_COLUMNS)), fontsize=10)
     return figure
 
 

@@ -15,7 +15,7 @@ from steady_ppl.comparison.result import Proof, verdict as comparison_verdict
 from steady_ppl.criticism.result import Check, verdict as criticism_verdict
 from steady_ppl.data.table import to_frame
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.discovery.result import Discovery, sentence
+from steady_ppl.discovery.result import Discovery, sentences
 from steady_ppl.model.program import parameter_rows
 from steady_ppl.plotting.check import check_picture
 from steady_ppl.plotting.comparison import proof_picture
@@ -79,7 +79,7 @@ def _of_result(verdict: Callable[[Any], str], picture: Callable[[Any], Figure], 
 
 html.register(Check, partial(_of_result, criticism_verdict, check_picture))
 html.register(Proof, partial(_of_result, comparison_verdict, proof_picture))
-html.register(Discovery, partial(_of_result, sentence, discovery_picture))
+html.register(Discovery, partial(_of_result, lambda found: " ".join(sentences(found)), discovery_picture))
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Markup:

@@ -58,11 +58,29 @@ def test_a_stretch_that_nobody_measured_is_named_and_masked(work: Path, tmp_path
     assert steady("check", work / "hand", table, *FAST, "--mask", kept, "--json", figures) == 0
     said = capsys.readouterr()
     assert "the table: drive 2 between 1.00 and 2.50 s: x.x, x.y on a straight line" in said.out
-    assert f"{kept}: gap.csv without 1 stretch that nobody measured" in said.err
+    assert f"{kept}: gap.csv without 1 stretch that nobody measured and 0 readings that are wrong" in said.err
     (one,) = json.loads(figures.read_text())["stuck"]
     assert one["trajectory"] == "2" and one["seconds"] == pytest.approx([1.0, 2.5])
     again = read_table(kept)
     assert not again.observed[10:26, 1].any() and int((~again.observed).sum()) == 16 * 4
+
+
+def test_wrong_readings_are_named_marked_and_masked(work: Path, tmp_path: Path, capsys):
+    data = simulated(trajectories=3, rows=33)
+    readings = data.measurements.clone()
+    readings[10:13, 1, 2] += 2.5
+    table, kept, figures, picture = (tmp_path / name for name in ("jump.csv", "kept.csv", "check.json", "check.png"))
+    write_table(replace(data, measurements=readings), table)
+    files = ("--mask", kept, "--json", figures, "--picture", picture)
+    assert steady("check", work / "hand", table, *FAST, *files) == 0
+    said = capsys.readouterr()
+    assert "3 readings left out as wrong" in said.out
+    assert "trajectory 2 between 1.00 and 1.20 s: y.bearing_2" in said.out
+    assert f"{kept}: jump.csv without 0 stretches that nobody measured and 3 readings that are wrong" in said.err
+    (one,) = json.loads(figures.read_text())["outliers"]
+    assert (one["trajectory"], one["columns"]) == ("2", ["y.bearing_2"]) and picture.stat().st_size > 10_000
+    again = read_table(kept)
+    assert (~again.observed).nonzero().tolist() == [[row, 1, 2] for row in (10, 11, 12)]
 
 
 def test_a_mask_that_cannot_be_written_is_refused_before_anything_is_computed(work: Path, tmp_path: Path, refused):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from functools import partial
 
@@ -18,7 +19,7 @@ import steady_ppl as st
 from steady_ppl.discovery.candidates import _axis, _log_prior, _neighbours, variance_of_places
 from steady_ppl.discovery.curves import knots_of
 from steady_ppl.discovery.discover import NOT_CONVERGED, _note_of_one_drive
-from steady_ppl.discovery.finding import _interval, _spread, next_run
+from steady_ppl.discovery.finding import _interval, next_run
 from steady_ppl.effects import Effect, chosen_variant, parsed
 from steady_ppl.effects.registry import _EFFECTS, register
 from steady_ppl.likelihood.maximize import maximise
@@ -103,6 +104,36 @@ def test_a_fault_of_the_sensor_is_not_blamed_on_the_dynamics():
     found = discovered("landmark_bias:1=0.07")
     assert found.verdict == "sensor" and found.findings[0].aliases == ["landmark_bias:bearing_1"]
     assert abs(found.findings[0].coefficient[0] - 0.07) < 4 * found.findings[0].sd[0]
+
+
+@pytest.mark.slow
+def test_wrong_readings_decide_nothing():
+    program = owner()
+    tables_of_truth = tables(with_effects(program, "quadratic_drag=0.05"))
+    train, valid = (replace(one, measurements=one.measurements.clone()) for one in tables_of_truth)
+    for data in (train, valid):
+        data.measurements[30:36, 1, 2] += 1.5
+        data.measurements[50, 4, 0] -= 2.0
+    found = st.discover(program, train, valid, known_start=True, simulations=SETS)
+    assert [finding.aliases[0] for finding in found.findings] == ["quadratic_drag"]
+    assert abs(found.findings[0].coefficient[0] - 0.05) < 4 * found.findings[0].sd[0]
+    assert [one["columns"] for one in found.figures["outliers"]] == 2 * [["y.bearing_2"], ["y.bearing_0"]]
+    counts = [
+        int(count) for count in re.findall(r"(\d+) readings of the (?:training|validation) drives left", str(found))
+    ]
+    assert len(counts) == 2 and all(7 <= count <= 9 for count in counts)  # a good one beside a jump may go with it
+
+
+@pytest.mark.slow
+def test_a_sensor_declared_too_coarse_takes_no_effects_place():
+    program, truth = owner(), with_effects(owner(), "quadratic_drag=0.05")
+    program.bearing_sd = 2.5 * truth.bearing_sd
+    found = st.discover(program, *tables(truth), known_start=True, simulations=SETS)
+    drag, noise = found.findings
+    assert drag.aliases[0] == "quadratic_drag" and noise.variant.name == "measurement_noise"
+    assert noise.is_correction and noise.interval[0][0] < 0.4 < noise.interval[0][1]
+    assert str(found).startswith("These drives contradict the declared noise: measurement_noise = 0.")
+    assert [one["correction"] for one in found.figures["effects"]] == [False, True]
 
 
 @pytest.mark.slow
@@ -195,7 +226,7 @@ def test_not_knowing_a_knee_is_in_the_coefficients_interval():
     found = discovered("thrust_saturation:knee=0.6=0.8")
     (finding,) = found.findings
     assert finding.variant.name == "thrust_saturation" and abs(finding.coefficient[0] - 0.8) < 3 * finding.sd[0]
-    (alone,) = _spread(found.search, finding.variant)
+    (alone,) = found.search.rounds[-1].screening.spread_of(found.search.final, finding.variant).numpy()
     (one,) = found.search.found
     places = float(variance_of_places(one.without, one.candidate))
     assert places > 0.1 * alone**2 and finding.sd[0] ** 2 == pytest.approx(alone**2 + places, rel=1e-3)

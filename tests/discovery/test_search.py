@@ -17,11 +17,13 @@ def test_a_class_begins_with_what_was_chosen():
     class Stub:
         against_its_sign = False
 
-        def __init__(self, total):
-            self.total = total
+        def __init__(self, name, total):
+            self.variant, self.total = SimpleNamespace(name=name), total
 
-    more, chosen, near, far = Stub(10.5), Stub(10.0), Stub(8.5), Stub(7.0)
-    found = Found(chosen, [more, chosen, near, far], None)
+    named = {"more": 10.5, "chosen": 10.0, "near": 8.5, "far": 7.0}
+    more, chosen, near, far = (Stub(*pair) for pair in named.items())
+    elsewhere = Stub("chosen", 9.9)  # itself, at another knee
+    found = Found(chosen, [more, chosen, elsewhere, near, far], None)
     assert found.aliases == [chosen, more, near]
 
 
@@ -32,7 +34,10 @@ class Chosen:
 
     def __init__(self, name, total, explains=True, profiled=()):
         self.name, self.total, self.is_explanation = name, total, explains
-        self.refit, self.variant = object.__new__(Refit), SimpleNamespace(profiled=profiled)
+        self.refit, self.variant = (
+            object.__new__(Refit),
+            SimpleNamespace(name=name, profiled=profiled, effect=SimpleNamespace(name=name)),
+        )
 
     def significant(self, critical):
         return self.total > 2
@@ -50,18 +55,21 @@ def test_coloured_noise_enters_where_nothing_else_is_significant(monkeypatch, to
     candidates = [Chosen(name, *told) for name, told in totals.items()]
     monkeypatch.setattr(search, "_refits", lambda *_: candidates)
     screening = SimpleNamespace(tests=SimpleNamespace(p_value=0.0, critical=0.01))
-    found = search.Search(base=None, final=None, step=None, gained=0.0)
+    found = search.Search(None, base=None, final=None, step=None, gained=0.0)
     assert search._add_best(found, screening, 1) == (expected is not None)
     assert [one.candidate.name for one in found.found] == ([expected] if expected else [])
 
 
 def test_a_knee_is_moved_beside_what_is_added_after_it(monkeypatch):
-    knee, moved, later = (Chosen(name, 10.0, profiled=(name,)) for name in ("knee", "moved", "later"))
+    knee, moved, later = (Chosen(name, 10.0, profiled={name: 1.0}) for name in ("knee", "moved", "later"))
     knee.tested = SimpleNamespace(at=lambda variant: variant)
+    final = SimpleNamespace(name="knee", profiled={"knee": 2.0})
+    moved.refit.__dict__["programs"] = ["moved"]
+    monkeypatch.setattr(search, "attached", lambda program: [final] if program == "moved" else [])
     monkeypatch.setattr(search, "replace", lambda one, **to: SimpleNamespace(**{**vars(one), **to}))
-    monkeypatch.setattr(search, "likelier_places", lambda base, begun, at: [(at, begun), (moved.variant, "fits")])
+    monkeypatch.setattr(search, "likelier_places", lambda base, begun, at: [(at, begun), (final, "fits")])
     monkeypatch.setattr(search, "judged_fits", lambda fits: moved.refit)
     first = search.Found(knee, [knee], None)
-    found = search.Search(base=None, final=later.refit, step=None, gained=0.0, found=[first])
+    found = search.Search(None, base=None, final=later.refit, step=None, gained=0.0, found=[first])
     search._place_again(found, first)
-    assert found.final is moved.refit and found.found[0].candidate.tested is moved.variant
+    assert found.final is moved.refit and found.found[0].candidate.tested is final

@@ -1,7 +1,10 @@
 """What noise can be besides normal, constant and white."""
 
+from collections import defaultdict
 from functools import partial
+from itertools import takewhile
 
+import torch
 from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
@@ -26,6 +29,21 @@ def _groups(program: Program, data: Trajectories | None) -> Choices:
     return [{"channels": channels, "at": name} for name, channels in program.axes.items()]
 
 
+def _quantities(program: Program, data: Trajectories | None) -> Choices:
+    """The measurements in one unit together, called by what their names have in common."""
+    columns = defaultdict[str, list[int]](list)
+    for index, unit in enumerate(program.measurement_units):
+        columns[unit].append(index)
+    if len(columns) == 1:
+        return [{}]
+    names = [[program.measurement_names[index] for index in found] for found in columns.values()]
+    letters = [takewhile(lambda at: len(set(at)) == 1, zip(*found, strict=False)) for found in names]
+    begins = ["".join(letter for letter, *_ in same).rstrip("_0123456789") for same in letters]
+    common = [begin or "_".join(found[:3]) for begin, found in zip(begins, names, strict=True)]
+    called = common if len(set(common)) == len(common) else [found[0] for found in names]
+    return [{"columns": tuple(found), "at": at} for found, at in zip(columns.values(), called, strict=True)]
+
+
 NOISE: list[Effect] = []
 _noise = partial(declare, NOISE)
 
@@ -41,15 +59,17 @@ def heavy_tails(self: Program, c: Tensor) -> Tensor:
     return c.clamp(0.005, 0.49)
 
 
-@_noise("blur", "1", typical=1.5, limit=2.0, sign=1, null=1.0, lacks=needs(MEASURED))
-def measurement_noise(self: Program, state: Tensor, c: Tensor) -> Tensor:
-    r"""σ → c σ of every measurement
+@_noise("blur", "1", typical=1.5, limit=2.0, sign=1, null=1.0, choices=_quantities, lacks=needs(MEASURED))
+def measurement_noise(self: Program, state: Tensor, c: Tensor, columns: tuple[int, ...] = ()) -> Tensor:
+    r"""σ → c σ of the measurements in one unit
 
     equation: \sigma \to c\,\sigma
     feels: sees worse (or better) than its data sheet says
     occurs: a data sheet for other light, distance or temperature than the sensor has
     """
-    return c.expand(*state.shape[:-1], len(self.measurements))
+    every = range(len(self.measurements))
+    among = torch.tensor([float(index in (columns or every)) for index in every]).to(c)
+    return (1 + (c - 1) * among).expand(*state.shape[:-1], len(every))
 
 
 @_noise("blur", "1/m", typical=0.1, limit=1.0, sign=1, lacks=needs(PLANAR, BEARINGS))

@@ -1,0 +1,109 @@
+"""What is wrong with readings and declared noise, which is put right before effects are looked for.
+
+One wrong reading may decide which effect is named, so that outliers are left out. A program that learns its noise says
+itself how large it is. One that declares it would have what its sensors' data sheet got wrong in every test: too wide a
+noise hides effects, too narrow a one makes them of chance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from steady_ppl.data.trajectories import Trajectories
+from steady_ppl.discovery.candidates import CLEAR_GAIN, TIE_NATS, Screening
+from steady_ppl.discovery.refits import Refit, fit_near, judged_fits, refit_with
+from steady_ppl.discovery.screening import NOISE_SIZES, is_learned, sizes_of_noise
+from steady_ppl.effects import Variant, attached, catalogue
+from steady_ppl.gaussian.predict import HALF_WIDTH
+from steady_ppl.likelihood.outliers import AS_TAILS, Outliers, find_outliers
+
+MAX_FITS = 6  # without the outliers that were found in the fit before
+MIN_FACTOR = 1.25  # by which declared noise must be wrong; a smaller one is tested beside the effects
+
+
+def without_outliers(
+    fit: Callable[[Trajectories, Trajectories], Refit], train: Trajectories, valid: Trajectories
+) -> tuple[Refit, list[Outliers]]:
+    """What `fit` makes of training and validation drives without the outliers that its fits show, and these.
+
+    None is left out where noise with heavy tails makes all readings likelier.
+    """
+    none = [Outliers(data, [], torch.zeros_like(data.observed)) for data in (train, valid)]
+    found, whole = none, fit(train, valid)
+    refit = whole
+    for _ in range(MAX_FITS):
+        folds = zip(refit.programs, refit.folds, strict=True)
+        more = [find_outliers(fold.fitting(program), fold.path, against_tails=False) for program, fold in folds]
+        found = [one.with_more(other) for one, other in zip(found, more, strict=True)]
+        if not any(one.found for one in more):
+            break
+        refit = fit(*(one.left for one in found))
+    likely = _log_likelihood(refit) - sum(one.cost for one in found)
+    if refit is not whole and (tails := _with_tails(whole)) and _log_likelihood(tails) > likely:
+        return whole, [replace(one, note=AS_TAILS) for one in none[:1]] + none[1:]
+    return refit, found
+
+
+def _log_likelihood(fits: Refit) -> float:
+    """Of all drives, each under the program that was fitted to it."""
+    return sum(float(maximum.log_likelihood.sum()) for maximum in fits.maxima)
+
+
+def _with_tails(base: Refit) -> Refit | None:
+    """The program with Student t measurement noise; None where it has that already, or it cannot be fitted."""
+    there = {variant.name for variant in attached(base.program)}
+    for effect in catalogue(base.program):
+        if effect.form == "tails" and effect.name not in there:
+            refit = refit_with(base, effect.variant(), effect.typical)
+            return None if isinstance(refit, str) else refit
+    return None
+
+
+@dataclass(frozen=True)
+class Correction:
+    """A factor on declared standard deviations, in all fits that follow."""
+
+    variant: Variant
+    gain: float  # nats of held-out log p(y) that it brought
+
+
+def with_suitable_noise(base: Refit, wanted: Callable[[Variant], bool]) -> tuple[Refit, list[Correction]]:
+    """A fitted program with factors on the noise that it declares too wide or too narrow, and these."""
+    found, there = list[Correction](), {variant.name for variant in attached(base.program)}
+    for variant in [one for name in reversed(NOISE_SIZES) for one in sizes_of_noise(base.program, name)]:
+        if variant.name in there or not wanted(variant) or is_learned(variant, base.program, base.folds[0]):
+            continue
+        refit = refit_with(base, variant, 1.0)
+        if isinstance(refit, str) or len(refit.programs) < len(base.programs):
+            continue
+        gain, factor = float((refit.held_out - base.held_out).sum()), float(refit.coefficient(variant))
+        if gain > CLEAR_GAIN and abs(math.log(factor)) > math.log(MIN_FACTOR):
+            base = refit
+            found.append(Correction(variant, gain))
+    return base, found
+
+
+def needless(corrections: Sequence[Correction], final: Refit, screening: Screening) -> list[Correction]:
+    """Those whose factor may be one beside the effects that were found: what was missing looked like noise."""
+
+    def may_be_one(correction: Correction) -> bool:
+        factor, sd = final.coefficient(correction.variant), screening.spread_of(final, correction.variant)
+        return abs(math.log(float(factor))) < HALF_WIDTH * float(sd)
+
+    return [one for one in corrections if may_be_one(one)]
+
+
+def without(corrections: Sequence[Correction], as_it_stands: Refit, fitted: Refit) -> Refit | None:
+    """A fitted program without some corrections; None where it explains less of the held-out drives, or fails."""
+    dropped = {one.variant.name for one in corrections}
+    kept = [variant for variant in attached(fitted.program) if variant.name not in dropped]
+    own = {variant.name for variant in attached(as_it_stands.program)}
+    near = fit_near(as_it_stands, fitted, [variant for variant in kept if variant.name not in own])
+    refit = near if isinstance(near, str) else judged_fits(near)
+    if isinstance(refit, str) or float((refit.held_out - fitted.held_out).sum()) < -TIE_NATS:
+        return None
+    return refit

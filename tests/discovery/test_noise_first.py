@@ -1,0 +1,98 @@
+"""Noise that a program declares and the drives contradict."""
+
+from __future__ import annotations
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from pyro.distributions import constraints
+from pyro.nn import PyroParam
+
+import steady_ppl as st
+from steady_ppl.discovery.noise_first import needless, with_suitable_noise, without
+from steady_ppl.discovery.refits import first_refit, refit_with
+from steady_ppl.effects import attached, chosen_variant
+from steady_ppl.model.problem import Problem
+
+SD = 0.05
+
+
+class Cart(st.Program):
+    """A mass on a rail, its position and, in another unit, its speed measured."""
+
+    states = ("position [m]", "velocity [m/s]")
+    controls = ("force [N]",)
+    measurements = ("position_0 [m]", "position_1 [m]", "speed [m/s]")
+    channels = ("forward [m/s²]",)
+    motion = {"forward": ("position", "velocity")}
+    duration = 6.0
+    declared = SD
+
+    def __init__(self):
+        super().__init__()
+        self.mass = PyroParam(torch.tensor(2.0), constraints.positive)
+        self.noise = PyroParam(torch.tensor(0.1), constraints.positive)
+
+    def initial(self):
+        return pyro.sample("start", dist.Normal(torch.zeros(2), 0.1).to_event(1))
+
+    def transition(self, state, control, time, step):
+        position, velocity = state.unbind(-1)
+        acceleration = pyro.sample("forward", dist.Normal(control[..., 0] / self.mass, self.noise))
+        faster = velocity + acceleration * step
+        return st.stack(position + 0.5 * (velocity + faster) * step, faster)
+
+    def example_controls(self, time):
+        return torch.randn(*time.shape, 1, dtype=time.dtype).cumsum(0)
+
+    def observe(self, state):
+        pyro.sample("position", dist.Normal(state[..., [0, 0]], self.declared).to_event(1))
+        pyro.sample("speed", dist.Normal(state[..., 1], 0.1))
+
+
+class TooWide(Cart):
+    declared = 2.5 * SD
+
+
+class TooNarrow(Cart):
+    declared = SD / 2.5
+
+
+def begun(program, truth=None):
+    truth = truth or Cart()
+    train, valid = (st.for_program(program, st.simulate(truth, 8, seed=seed)) for seed in (1, 2))
+    return first_refit(Problem(program, train, False), valid, seed=0)
+
+
+@pytest.mark.parametrize(("program", "factor"), [(TooWide, 0.4), (TooNarrow, 2.5)])
+def test_a_sensor_that_is_declared_wrong_is_corrected_and_no_other(program, factor):
+    own = begun(program())
+    base, (correction,) = with_suitable_noise(own, lambda variant: True)
+    assert correction.variant.name == "measurement_noise:position" and correction.gain > 100
+    assert float(base.coefficient(correction.variant)) == pytest.approx(factor, rel=0.1)
+    assert [variant.name for variant in attached(base.program)] == ["measurement_noise:position"]
+    assert with_suitable_noise(base, lambda variant: True) == (base, [])
+
+
+def test_what_is_right_stays_as_it_is():
+    own = begun(Cart())
+    assert with_suitable_noise(own, lambda variant: True) == (own, [])
+
+
+def test_what_is_withheld_stays_as_it_is():
+    own = begun(TooWide())
+    assert with_suitable_noise(own, lambda variant: variant.effect.name != "measurement_noise") == (own, [])
+
+
+def test_what_was_an_effect_all_along_is_no_noise():
+    own = begun(Cart(), Cart().with_effect("sensor_bias:position_0", 0.3))
+    base, (correction,) = with_suitable_noise(own, lambda variant: True)
+    variant = chosen_variant(own.program, "sensor_bias:position_0")
+    both = refit_with(base, variant, 0.0)
+    screening = type("Screening", (), {"spread_of": lambda self, fitted, one: torch.tensor([0.05])})()
+    assert needless([correction], both, screening) == [correction] and needless([correction], base, screening) == []
+    alone = without([correction], own, both)
+    assert [one.name for one in attached(alone.program)] == [variant.name]
+    assert float(alone.coefficient(variant)) == pytest.approx(0.3, abs=0.05)
+    assert without([correction], own, base) is None
