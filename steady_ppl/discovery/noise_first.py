@@ -82,9 +82,16 @@ def with_suitable_noise(base: Refit, wanted: Callable[[Variant], bool]) -> tuple
             continue
         gain, factor = float((refit.held_out - base.held_out).sum()), float(refit.coefficient(variant))
         if gain > CLEAR_GAIN and abs(math.log(factor)) > math.log(MIN_FACTOR):
-            base = refit
+            base = refit if refit.converged else _fitted_further(base, refit, variant)
             found.append(Correction(variant, gain))
     return base, found
+
+
+def _fitted_further(base: Refit, refit: Refit, variant: Variant) -> Refit:
+    """From where a fit with a factor has come: it is far from where that began."""
+    near = fit_near(base, refit, [variant])
+    further = near if isinstance(near, str) else judged_fits(near)
+    return refit if isinstance(further, str) else further
 
 
 def needless(corrections: Sequence[Correction], final: Refit, screening: Screening) -> list[Correction]:
