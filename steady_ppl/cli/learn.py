@@ -132,7 +132,7 @@ def discover(
 ) -> None:
     """Learn which physical effect a program lacks: none, one by name, several, or a curve that has no name."""
     from steady_ppl.discovery.discover import kept_search
-    from steady_ppl.runs.folder import DISCOVERY
+    from steady_ppl.runs.folder import DISCOVERY, JOURNAL
     from steady_ppl.runs.recipes import fingerprint
 
     if out is None and resume:
@@ -145,20 +145,31 @@ def discover(
     drives, judges = st.read_table(table), st.read_table(valid) if valid else None
     settings: dict[str, Any] = {"known_start": known_start, "mix": mix, "simulations": simulations, "seed": seed}
     settings |= {"withheld": withhold or [], "only": only or []}
-    with kept_search(out, given, drives, judges, settings, force=force, resume=resume):
-        found = st.discover(given, drives, judges, **settings)
-        figures = {"source": source, **found.figures}
-        present(str(found), figures, json_file)
-        if out is not None:
-            used = {"table_sha256": fingerprint(drives), "valid_sha256": fingerprint(judges) if judges else None}
-            found.after.save_into(out, begun=used)
-            write_json(out / DISCOVERY, figures)
+    try:
+        with kept_search(out, given, drives, judges, settings, force=force, resume=resume) as begun:
+            found = st.discover(given, drives, judges, **settings)
+            figures = {"source": source, **found.figures}
+            present(str(found), figures, json_file)
+            if out is not None:
+                used = {"table_sha256": fingerprint(drives), "valid_sha256": fingerprint(judges) if judges else None}
+                found.after.save_into(out, begun=begun if found.search.interrupted else used)
+                write_json(out / DISCOVERY, figures)
+    except KeyboardInterrupt as stop:  # before there was anything to show, or once more
+        remarks = ["interrupted", *map(str, stop.args)]
+        if out is not None and (out / JOURNAL).is_dir():
+            remarks.append(f"`--resume` goes on with {out}")
+        say("; ".join(remarks), always=True)
+        raise typer.Exit(1) from stop
     if out is not None:
         say(*found.after.notes, f"{out}: {found.after.program}")
     if picture is not None:
         from steady_ppl.plotting.discovery import discovery_picture
 
         write_picture(discovery_picture(found), picture)
+    if found.search.interrupted:
+        usable = "" if out is None else f"; the run so far is usable, `--resume` goes on with {out}"
+        say(f"interrupted while {found.search.interrupted}{usable}", always=True)
+        raise typer.Exit(1)
 
 
 def add(

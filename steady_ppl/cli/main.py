@@ -5,9 +5,12 @@ Exit codes: 0 done, 1 the computation failed or was interrupted, 2 bad usage or 
 
 import os
 import shlex
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.metadata import version as installed_version
 from typing import Annotated
 
@@ -152,7 +155,13 @@ def main(arguments: list[str] | None = None) -> int:
         if isinstance(option, typer.core.TyperOption) and option.name in COMPLETION_OPTIONS:
             option.hidden = True
     typed = shlex.join(["steady", *(word for word in arguments if word not in ("--resume", "--force"))])
-    with bound(QUIET, "quiet" in asked), bound(COMMAND, typed), progress_line() as line, listening(line):
+    with (
+        bound(QUIET, "quiet" in asked),
+        bound(COMMAND, typed),
+        progress_line() as line,
+        listening(line),
+        _terminated_as_interrupted(),
+    ):
         try:
             code = command.main(arguments, prog_name="steady", standalone_mode=False) or 0
             if code == INTERRUPTED_CODE:
@@ -177,6 +186,20 @@ def main(arguments: list[str] | None = None) -> int:
                 return refusal.exit_code
             say(f"{one_line(error)} (--debug shows where)", always=True)
             return 1
+
+
+@contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """Let SIGTERM interrupt the block as Ctrl-C does, unless this process ignores it."""
+    before = signal.getsignal(signal.SIGTERM)
+    if before != signal.SIG_DFL or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def run() -> None:

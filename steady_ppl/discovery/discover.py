@@ -2,10 +2,11 @@
 
 import copy
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
@@ -14,7 +15,7 @@ from steady_ppl.comparison.scores import MIN_DRIVES
 from steady_ppl.data.table import refuse_long
 from steady_ppl.data.trajectories import Trajectories, concatenated
 from steady_ppl.discovery.candidates import TIE_NATS
-from steady_ppl.discovery.finding import corrections, findings, next_run, shape_of
+from steady_ppl.discovery.finding import NextRun, corrections, findings, next_run, shape_of
 from steady_ppl.discovery.fitting import ByDraws
 from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.result import Discovery
@@ -31,13 +32,18 @@ from steady_ppl.runs.diagnostics import diagnose_units
 from steady_ppl.runs.fit import Fit
 from steady_ppl.runs.folder import JOURNAL, require_same, run_folder, write_record
 from steady_ppl.runs.recipes import begun_record
+from steady_ppl.training.loop import Trained
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.journal import journal
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.random import seeded
+from steady_ppl.utils.text import reason_of
+
+Later = TypeVar("Later")
 
 MAX_UNREPORTED_GAIN = 10.0  # nats that fitting a run further may gain before it is said
 MIN_SETS = 50  # simulated sets for the calibration
+COMPARING, PROPOSING = "comparing before and after", "looking for a better next drive"
 NOT_CONVERGED = "the program's own fit has not converged: no ranking below is to be trusted"
 
 
@@ -58,7 +64,8 @@ def discover(
     """Find the physical effects that a program lacks.
 
     Every effect of the catalogue is tested at once and the test calibrated by simulated drives; the leaders are fitted
-    and chosen by log p(y) of drives that they were not fitted to; so on until the tests are quiet.
+    and chosen by log p(y) of drives that they were not fitted to; so on until the tests are quiet. An interrupt
+    (Ctrl-C) after the first tests ends the search with what it has found, and `search.interrupted` says so.
 
     Args:
         program: a program or a fit of one, with normal noise and at most some dozens of learnable numbers; it is not
@@ -123,35 +130,59 @@ def discover(
         notes.append(f"the tables were mixed: {kept}" if mix else f"no validation drives were given: {kept}")
     problem, choosing = (Problem.of_table(program, table, known_start) for table in (train, valid))
     require_searchable(problem, choosing.data, simulations)
-    with stages(("", 8), ("comparing before and after", 1), ("looking for a better next drive", 1)) as begin:
+    with stages(("", 8), (COMPARING, 1), (PROPOSING, 1)) as begin:
         begin()
         with seeded(seed, "search"), kernel_failures() as why:
             found = search(problem, choosing.data, settings)
         begin()
         shape = shape_of(found, program)
         effects = corrections(found) if shape else findings(found)
-        final = found.base if shape else found.final
-        said = {"simulations": simulations, "seed": seed}
-        fits = [Fit(refit.mean_program(), "discover", said, seed, known_start) for refit in (found.as_it_stands, final)]
         better = found.curve.refit if found.curve else found.final
         assert isinstance(better, Refit)
         rows = {"before": found.as_it_stands.judges.programs[0], "after": better.judges.programs[0]}
         judges = found.base.folds[0].held_out  # the validation drives without outliers
-        proof = prove(rows, judges, known_start=known_start, with_constant_velocity=False, seed=seed)
+        settings_of_proof: dict[str, Any] = {"known_start": known_start, "with_constant_velocity": False, "seed": seed}
+        proof = _afterwards(partial(prove, rows, judges, **settings_of_proof), found, COMPARING, notes)
         begin()
         unclear = [] if shape else [one for one in found.found if len(one.aliases) > 1]
         largest = max(unclear, key=lambda one: one.candidate.total, default=None)
-        proposed = next_run(largest, seed) if largest else None
-    notes += fallback_notes(why)
-    if largest and proposed is None:
+        proposed = _afterwards(partial(_proposed, largest, seed, notes), found, PROPOSING, notes) if largest else None
+    notes += fallback_notes(why) + diagnose_units(program, problem.data) + _notes(found)
+    if proof is not None:
+        notes += doubtful(proof.rows, judges)
+    said = {"simulations": simulations, "seed": seed}
+    trained = Trained([], kept=0, interrupted=True) if found.interrupted else None
+    before, after = (
+        Fit(refit.mean_program(), "discover", said, seed, known_start, trained)
+        for refit in (found.as_it_stands, found.base if shape else found.final)
+    )
+    return Discovery(found, effects, shape, proposed, proof, before, after, _doubts(found, is_fitted), notes)
+
+
+def _afterwards(compute: Callable[[], Later], found: Search, doing: str, notes: list[str]) -> Later | None:
+    """What is computed when the search has ended; None where it was interrupted, or where that fails, with a note."""
+    if found.interrupted:
+        return None
+    try:
+        return compute()
+    except KeyboardInterrupt:
+        found.interrupt(doing, cut_short=False)
+    except Exception as error:  # also of the program's own code; what was found stays
+        notes.append(f"{doing} failed: {reason_of(error)}")
+    return None
+
+
+def _proposed(largest: Found, seed: int, notes: list[str]) -> NextRun | None:
+    if (proposed := next_run(largest, seed)) is None:
         both = " from ".join(candidate.variant.name for candidate in largest.aliases[:2])
         notes.append(f"no way of driving that was tried tells {both} better than these drives do")
-    notes += diagnose_units(program, problem.data) + _notes(found) + doubtful(proof.rows, judges)
-    return Discovery(found, effects, shape, proposed, proof, fits[0], fits[1], _doubts(found, is_fitted), notes)
+    return proposed
 
 
 def _doubts(found: Search, is_fitted: bool) -> list[str]:
     doubts = [] if found.base.converged else [NOT_CONVERGED]
+    if found.interrupted:
+        doubts.append(f"interrupted while {found.interrupted}: this is what had been found until then")
     if is_fitted and found.gained > MAX_UNREPORTED_GAIN:
         doubts.append(
             f"the run had not converged: fitting it further gained {found.gained:.0f} nats on these drives, before "
@@ -197,7 +228,7 @@ def _notes(found: Search) -> list[str]:
     notes += [f"{label}: taken back, for with it the program fails: {why}" for label, why in found.taken_back.items()]
     if found.is_full:
         notes.append(f"the search stops at {MAX_EFFECTS} effects: add them, fit, and discover again from there")
-    if not found.is_complete:
+    if not found.is_complete and not found.cut_short:
         notes.append("something is left that no effect of the catalogue brings: the tests were not quiet at the end")
     notes += [f"{one.candidate.variant.label}: {said}" for one in found.found if (said := _note_of_one_drive(one))]
     symptoms = [one.variant.label for one in found.rounds[0].candidates if one.against_its_sign and one.total > 0]
@@ -275,8 +306,8 @@ def kept_search(
     *,
     force: bool,
     resume: bool,
-) -> Iterator[None]:
-    """The folder of a search for the block that makes it; nothing at all where there is none.
+) -> Iterator[dict[str, Any]]:
+    """The folder of a search for the block that makes it; yields what its record says, nothing where there is none.
 
     `given`, `train`, `valid` and `options` are those of `discover`. `resume` goes on with the journal that is there, if
     everything is as it was; `force` overwrites a run.
@@ -285,13 +316,16 @@ def kept_search(
         RunError: as `run_folder`, or what is given is not what the search was begun with.
     """
     if folder is None:
-        yield
+        yield {}
         return
     program = given.program if isinstance(given, Fit) else given
     parameters = hashlib.sha256()
     for name, value in program.state_dict().items():
         parameters.update(name.encode() + value.numpy(force=True).tobytes())
-    said: dict[str, Any] = {name: options[name] for name in ("known_start", "seed")}
+    known_start = options["known_start"]
+    if known_start is None:
+        known_start = isinstance(given, Fit) and given.known_start
+    said: dict[str, Any] = {"known_start": known_start, "seed": options["seed"]}
     said |= {"options": {**options, "parameters": parameters.hexdigest()}, "option_files": {}}
     begun = begun_record(program, folder, train, valid, recipe="discover", status="searching", **said)
     if resume:
@@ -300,4 +334,4 @@ def kept_search(
         if not resume:
             write_record(folder, begun)
         with journal(folder / JOURNAL):
-            yield
+            yield begun

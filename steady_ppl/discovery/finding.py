@@ -15,11 +15,13 @@ from steady_ppl.discovery.candidates import Candidate, variance_of_places
 from steady_ppl.discovery.refits import Refit, with_states_of
 from steady_ppl.discovery.screening import NOISE_SIZES, Tested
 from steady_ppl.discovery.search import MIN_GAIN_OF_CURVE, Found, Search
-from steady_ppl.effects import Effect, Variant
+from steady_ppl.effects import Effect, Variant, attached
 from steady_ppl.gaussian.predict import HALF_WIDTH, simulate_again
 from steady_ppl.gaussian.smoother import smooth
+from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, unit_of
+from steady_ppl.utils.matrices import ridged_inverse
 from steady_ppl.utils.random import seeded
 
 MAX_LOG_SD = 2.0  # of a factor: beyond it nothing is known but the sign
@@ -71,10 +73,10 @@ def findings(search: Search) -> list[Finding]:
 
 def corrections(search: Search) -> list[Finding]:
     """The factors on declared noise with which the search began."""
-    screening, found = search.rounds[-1].screening, list[Finding]()
+    found = list[Finding]()
     for one in search.corrections:
         factor = float(search.final.coefficient(one.variant))
-        sd = float(screening.spread_of(search.final, one.variant))
+        (sd,) = _spread(search, one.variant).tolist()
         interval, name = _around(factor, HALF_WIDTH * sd), one.variant.name
         found.append(Finding(one.variant, "noise", [name], None, [factor], [factor * sd], [interval], one.gain))
     return found
@@ -83,7 +85,7 @@ def corrections(search: Search) -> list[Finding]:
 def _finding(search: Search, found: Found) -> Finding:
     variant, effect = found.candidate.variant, found.candidate.variant.effect
     values = search.final.coefficient(variant).flatten().double().numpy()
-    spread = search.rounds[-1].screening.spread_of(search.final, variant).numpy()
+    spread = _spread(search, variant)
     is_positive = effect.null != 0  # and learned as its logarithm
     places = np.zeros_like(spread)
     if variant.profiled:
@@ -120,13 +122,28 @@ def _around(value: float, by: float) -> tuple[float, float]:
     return value * math.exp(-by), value * math.exp(by)
 
 
+def _spread(search: Search, variant: Variant) -> np.ndarray:
+    """See `Screening.spread_of`; where an interrupt came before its program was tested, by its own fit."""
+    screening, final = search.rounds[-1].screening, search.final
+    (there,) = [known for known in attached(final.program) if known.name == variant.name]
+    if any(part.owner == there.parameter for part in screening.parameters):
+        return screening.spread_of(final, variant).numpy()
+    parts, information = elements(final.program), final.maxima[0].information
+    if len(information) < len(parts):  # fits by draws tell none: that of its own test
+        (tested,) = [one.candidate.tested for one in search.found if one.candidate.variant.name == variant.name]
+        return math.sqrt(final.first_share) * tested.sd
+    index = [i for i, part in enumerate(parts) if part.owner == there.parameter]
+    return (final.first_share * ridged_inverse(information).diagonal()[index]).clamp(min=0).sqrt().numpy()
+
+
 def _confidence(search: Search, found: Found) -> float:
     """Posterior probability of the class; a curve is less likely before than a candidate, or than none."""
-    totals = {id(c): c.total for c in found.candidates if isinstance(c.refit, Refit)}
+    totals = {c.variant.name: c.total for c in found.candidates if isinstance(c.refit, Refit)}
+    totals[found.candidate.variant.name] = found.candidate.total  # its knee may have moved
     curve = max((c.total for c in search.curves if isinstance(c.refit, Refit)), default=-math.inf)
     rivals = [0.0, found.candidate.total + curve - search.gain - MIN_GAIN_OF_CURVE]
     whole = np.logaddexp.reduce([*totals.values(), *rivals])
-    return float(np.exp(np.logaddexp.reduce([totals[id(c)] for c in found.aliases]) - whole))
+    return float(np.exp(np.logaddexp.reduce([totals[c.variant.name] for c in found.aliases]) - whole))
 
 
 def _departure(tested: Tested) -> Finding:

@@ -30,6 +30,7 @@ VERDICT_PHRASES = {
     "sensor": "The sensor has",
     "noise": "The noise is not as declared:",
     "other": "Something is missing that is in no catalogue",
+    "undecided": "Something is missing",
 }
 WRONG_NOISE = "These drives contradict the declared noise:"
 PAIR_FORM, NUMBERS_FORM = [NUMBER, NUMBER], (NUMBER, [(NUMBER, None)], None)
@@ -52,7 +53,7 @@ SHAPE_FORM = {"channel": TEXT, "variable": TEXT, "points": [NUMBER], "curve": [N
 DISCOVERY_FORM = {
     "source?": TEXT,
     "sentence": TEXT,
-    "complete?": BOOL,
+    **dict.fromkeys(("complete?", "interrupted?"), BOOL),
     "candidates": [Paired(CANDIDATE_FORM, ("coefficient", "sd"))],
     "effects": [Paired(EFFECT_FORM, ("coefficient", "interval_90"))],
     "shape": (Paired(SHAPE_FORM, ("points", "curve", "band")), None),
@@ -72,7 +73,8 @@ class Discovery(Displayed):
         shape: the curve where no effect of the catalogue explains the drives.
         next_run: controls that would separate the first class of several members; None where there is none, or where
             no way of driving that was tried does.
-        proof: the program before and after on the validation drives, by the fits to the training drives.
+        proof: the program before and after on the validation drives, by the fits to the training drives; None where
+            the search was interrupted, or where a note says why there is none.
         before, after: the programs, fitted to all drives; equal where no effect was found by name.
         doubts: why no ranking is to be trusted, empty as a rule.
         notes: what was left out or is not as it seems.
@@ -82,7 +84,7 @@ class Discovery(Displayed):
     findings: list[Finding]
     shape: Shape | None
     next_run: NextRun | None
-    proof: Proof
+    proof: Proof | None
     before: Fit
     after: Fit
     doubts: list[str] = field(default_factory=list)
@@ -90,10 +92,11 @@ class Discovery(Displayed):
 
     @property
     def verdict(self) -> str:
-        """none, dynamics, actuator, sensor, noise or other: of what is missing, if only noise is wrong noise."""
+        """none, dynamics, actuator, sensor, noise or other: of what is missing, if only noise is wrong noise; undecided
+        where an interrupt came before a choice."""
         search = self.search
         if self.shape or (not search.rounds[0].nothing_found and not search.found and not search.departed):
-            return "other"
+            return "undecided" if search.cut_short and self.shape is None else "other"
         return self.findings[0].kind if self.findings else "none"
 
     @property
@@ -106,7 +109,8 @@ class Discovery(Displayed):
         """Everything as a plain dict, ready for JSON; every figure is finite, None where there is none."""
         first = self.findings[0] if self.findings else None
         kept = ("log_likelihood", "measurement", "coverage_90", "scales")
-        sides = {row["row"]: {key: row[key] for key in kept} for row in self.proof.figures["rows"]}
+        rows = self.proof.figures["rows"] if self.proof else []
+        sides = {row["row"]: {key: row[key] for key in kept} for row in rows}
         return {
             "verdict": self.verdict,
             "sentence": " ".join(sentences(self)),
@@ -116,12 +120,13 @@ class Discovery(Displayed):
             "class": first.aliases if first else [],
             "confidence": first.confidence if first else None,
             "complete": self.search.is_complete,
+            "interrupted": bool(self.search.interrupted),
             "effects": [_finding(finding) for finding in self.findings],
             "candidates": [_candidate(self, tested) for tested in ranked(self)],
             "shape": vars(self.shape) if self.shape else None,
             "next_run": vars(self.next_run) if self.next_run else None,
-            "before": sides["before"],
-            "after": sides["after"],
+            "before": sides.get("before"),
+            "after": sides.get("after"),
             "rounds": [
                 {"p_value": one.screening.tests.p_value, "added": one.chosen.variant.name if one.chosen else None}
                 for one in self.search.rounds
@@ -154,9 +159,10 @@ class Discovery(Displayed):
             asked = f"To tell {' from '.join(run.between[:2])}, drive {run.way}: {run.separation:.1f} nats a drive, "
             lines += ["", *textwrap.wrap(f"{asked}against {run.usual:.1f} of drives such as these.", TEXT_WIDTH)]
         notes = self.notes
-        if self.verdict != "none":
+        if self.proof is not None and self.verdict != "none":
             lines += ["", "On the validation drives:", str(self.proof)]
-            notes = [note for note in notes if note not in self.proof.notes]
+            known = self.proof.notes
+            notes = [note for note in notes if note not in known]
         return "\n".join(lines + [line for note in notes for line in textwrap.wrap(f"note: {note}", TEXT_WIDTH)])
 
     def __repr__(self) -> str:
@@ -293,6 +299,9 @@ def _verdict(found: Discovery, effects: Sequence[Finding]) -> str:
     if shape is not None:
         times = f" times {shape.times}" if shape.times else ""
         return f"{missing} {p_value}: {shape.channel} lacks a curve of {shape.variable}{times}."
+    if found.verdict == "undecided":
+        undecided = VERDICT_PHRASES["undecided"]
+        return f"{undecided} {p_value}; the search was interrupted before an effect was chosen."
     if not effects:
         return f"{missing} {p_value}, and neither an effect nor a curve brings anything on held-out drives."
     clauses: list[str] = []
@@ -300,7 +309,9 @@ def _verdict(found: Discovery, effects: Sequence[Finding]) -> str:
         said = [_said(finding, found.search.is_complete) for finding in effects if finding.kind == kind]
         words = VERDICT_PHRASES[kind] if not clauses else VERDICT_PHRASES[kind][0].lower() + VERDICT_PHRASES[kind][1:]
         clauses.append(f"{words} {' and '.join(said)}")
-    if not found.search.is_complete:
+    if found.search.cut_short:
+        clauses.append("the search was interrupted, so that there may be more")
+    elif not found.search.is_complete:
         clauses.append("they do not explain all, so that an effect nobody has named may stand behind these names")
     return f"{'; '.join(clauses)} {p_value}."
 

@@ -45,6 +45,7 @@ from steady_ppl.likelihood.outliers import Outliers
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import with_substeps
+from steady_ppl.utils.journal import close_journal
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.text import reason_of
 
@@ -57,6 +58,8 @@ MAX_SHIFT_OF_SIZES = 0.08  # nats by which twice the substeps may move what is r
 MAX_SUBSTEPS_OF_FIT = 128  # of a fitted program, at most: what a coarser step leaves would be named as an effect
 MAX_EFFECTS, MAX_CURVES = 5, 3  # effects in a program, and adding curves that are fitted
 MAX_ROUNDS = MAX_EFFECTS + 3  # with factors on noise, which take no place, and a last test
+LOOKING, FINER = "testing and fitting effects", "looking again at a finer time step"  # that may be interrupted
+NOTHING_TESTED = "the program as it stands was fitted, and no effect has been tested yet"
 
 
 @dataclass(frozen=True)
@@ -129,12 +132,20 @@ class Search:
     found: list[Found] = field(default_factory=list)  # the effects that were added
     curves: list[Candidate] = field(default_factory=list)  # fitted in place of the first effect, best first
     taken_back: dict[str, str] = field(default_factory=dict)  # effects with which the program failed, and how
+    interrupted: str = ""  # what was being done when an interrupt (Ctrl-C) came; empty as a rule
+    cut_short: bool = False  # whether the interrupt came before the search had ended
+
+    def interrupt(self, doing: str, *, cut_short: bool = True) -> None:
+        """End with what has been found so far."""
+        close_journal()
+        self.interrupted, self.cut_short = doing, cut_short
 
     @property
     def is_complete(self) -> bool:
         """Whether the tests of the last round found nothing more that an effect or a curve could bring."""
         tests = self.rounds[-1].screening.tests
-        return not any(tested.p_value <= tests.critical for tested in tests.tested if not tested.departure)
+        quiet = not any(tested.p_value <= tests.critical for tested in tests.tested if not tested.departure)
+        return quiet and not self.cut_short
 
     @property
     def is_full(self) -> bool:
@@ -143,7 +154,9 @@ class Search:
 
     @property
     def departed(self) -> list[Tested]:
-        """What says, in the last tests, that the fitted noise is not the declared."""
+        """What says, in the last tests, that the fitted noise is not the declared; a missing effect may say so too."""
+        if self.interrupted == LOOKING:
+            return []
         tests = self.rounds[-1].screening.tests
         return [tested for tested in tests.tested if tested.departure and tested.p_value <= tests.critical]
 
@@ -187,16 +200,22 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
             base, corrections = with_suitable_noise(own, settings.corrects)
         begin()
         found = _rounds(Search(own, base, base, step, gained, outliers, corrections), settings)
-        if not found.found:
+        if not found.found or found.interrupted:
             return found
-        parameters = [variant.parameter for variant in attached(found.final.program)]
-        with_found = _step_of(found.final, watched=parameters, max_shift=MAX_SHIFT_OF_SIZES)
-        if with_found.too_coarse:  # what was found asks for a finer step: sizes are those of that step
-            finer = with_found.suited.substeps
-            own = fit(with_substeps(program, finer), left, valid, with_substeps(own.program, finer))
-            base, corrections = with_suitable_noise(own, settings.corrects)
-            settings = replace(settings, declared=with_substeps(settings.declared, finer))
-            found = _rounds(Search(own, base, base, step, gained, outliers, corrections, with_found), settings)
+        try:
+            parameters = [variant.parameter for variant in attached(found.final.program)]
+            with_found = _step_of(found.final, watched=parameters, max_shift=MAX_SHIFT_OF_SIZES)
+            if with_found.too_coarse:  # what was found asks for a finer step: sizes are those of that step
+                finer = with_found.suited.substeps
+                own = fit(with_substeps(program, finer), left, valid, with_substeps(own.program, finer))
+                base, corrections = with_suitable_noise(own, settings.corrects)
+                settings = replace(settings, declared=with_substeps(settings.declared, finer))
+                again = _rounds(Search(own, base, base, step, gained, outliers, corrections, with_found), settings)
+                if not again.interrupted:
+                    return again
+                found.interrupt(FINER)
+        except KeyboardInterrupt:
+            found.interrupt(FINER)
     return found
 
 
@@ -207,43 +226,26 @@ def _step_of(refit: Refit, **watched: Any) -> StepCheck:
 
 
 def _rounds(found: Search, settings: Settings) -> Search:
-    """Test, fit and add until nothing is left."""
+    """Test, fit and add until nothing is left, or until an interrupt (Ctrl-C) after the first tests."""
     with stages(("", 6), ("looking again", 1), ("fitting curves", 1)) as begin:
-        begin()
-        shares = [(said, 0.5**index) for index in range(MAX_ROUNDS) for said in ("testing every effect", "")]
-        with stages(*shares) as begin_part:
-            earlier = list(found.found)
-            for index in range(MAX_ROUNDS):
-                begin_part()
-                try:
-                    screening = settings.screen(found.final, index)
-                except Exception as error:
-                    if index == 0:
-                        raise
-                    taken_back = found.found[-1]
-                    found.found, found.final = earlier, taken_back.without
-                    found.taken_back = {taken_back.candidate.variant.label: reason_of(error)}
-                    break
-                begin_part()
-                earlier = list(found.found)
-                if not _add_best(found, screening, index):
-                    break
-        begin()
-        if len(found.found) > 1:
-            before, final = list(found.found), found.final
-            prune(found)
-            if set(labels(found.final)) != set(labels(final)):  # the same in another order has been tested
-                try:
-                    found.rounds.append(Round(settings.screen(found.final, MAX_ROUNDS), [], None))
-                except Exception as error:
-                    new = [label for label in labels(found.final) if label not in labels(final)]
-                    found.taken_back = dict.fromkeys(new, reason_of(error))
-                    found.found, found.final = before, final
-        begin()
-        if len(found.rounds) > 1 and not found.rounds[1].nothing_found and not found.curves:
-            found.curves = _curves(found)
-    if found.found:
-        _drop_corrections(found, settings)
+        doing = LOOKING
+        try:
+            begin()
+            _add_all(found, settings)
+            doing = "looking again at what was found"
+            begin()
+            if len(found.found) > 1:
+                _look_again(found, settings)
+            doing = "fitting curves"
+            begin()
+            if len(found.rounds) > 1 and not found.rounds[1].nothing_found and not found.curves:
+                found.curves = _curves(found)
+            if found.found:
+                _drop_corrections(found, settings)
+        except KeyboardInterrupt as stop:
+            if not found.rounds:
+                raise KeyboardInterrupt(NOTHING_TESTED) from stop
+            found.interrupt(doing)
     return found
 
 
@@ -261,15 +263,50 @@ def _drop_corrections(found: Search, settings: Settings) -> None:
     found.base, found.final, found.corrections = base, final, kept
 
 
+def _add_all(found: Search, settings: Settings) -> None:
+    """Test, fit and add one effect after another."""
+    shares = [(said, 0.5**index) for index in range(MAX_ROUNDS) for said in ("testing every effect", "")]
+    with stages(*shares) as begin_part:
+        earlier = list(found.found)
+        for index in range(MAX_ROUNDS):
+            begin_part()
+            try:
+                screening = settings.screen(found.final, index)
+            except Exception as error:
+                if index == 0:
+                    raise
+                taken_back = found.found[-1]
+                found.found, found.final = earlier, taken_back.without
+                found.taken_back = {taken_back.candidate.variant.label: reason_of(error)}
+                break
+            begin_part()
+            earlier = list(found.found)
+            if not _add_best(found, screening, index):
+                break
+
+
+def _look_again(found: Search, settings: Settings) -> None:
+    """Prune, and test a program that has other effects then."""
+    before, final = list(found.found), found.final
+    prune(found)
+    if set(labels(found.final)) == set(labels(final)):  # the same in another order has been tested
+        return
+    try:
+        found.rounds.append(Round(settings.screen(found.final, MAX_ROUNDS), [], None))
+    except Exception as error:
+        new = [label for label in labels(found.final) if label not in labels(final)]
+        found.taken_back = dict.fromkeys(new, reason_of(error))
+        found.found, found.final = before, final
+
+
 def _add_best(found: Search, screening: Screening, index: int) -> bool:
     """Fit what the tests of a round point at and add the best, if it brings enough; whether anything was added."""
     found.rounds.append(Round(screening, [], None))
     if found.rounds[-1].nothing_found or found.is_full or index == MAX_ROUNDS - 1:
         return False
     judge, critical = ParticleJudge(found.final), screening.tests.critical
-    best, candidates = judge.chosen(
-        _refits(found.final, screening, index == 0), partial(_first, lambda c: c.significant(critical))
-    )
+    fitted = _refits(found.final, screening, index == 0, found.rounds[-1].candidates)
+    best, candidates = judge.chosen(fitted, partial(_first, lambda c: c.significant(critical)))
     if index == 0 and best is None:
         found.curves = _curves(found)
         if found.curve is None and not found.departed:  # neither can be what the tests found
@@ -279,8 +316,8 @@ def _add_best(found: Search, screening: Screening, index: int) -> bool:
     if best is None:
         return False
     assert isinstance(best.refit, Refit)
-    found.found.append(Found(best, candidates, found.final))
-    found.final = best.refit
+    # in one assignment, here and below: no interrupt comes between effects and the program that has them
+    found.found, found.final = [*found.found, Found(best, candidates, found.final)], best.refit
     for one in found.found[:-1]:
         _place_again(found, one)
     return True
@@ -294,8 +331,8 @@ def _first(is_enough: Callable[[Candidate], bool], ranked: Sequence[Candidate]) 
 
 def _place_again(search: Search, found: Found) -> None:
     """Move the knee or place of an effect to where it is likeliest beside those that were added after it."""
-    search.final = _placed(search.base, search.final, found.candidate.variant)
-    _keep_places(search)
+    final = _placed(search.base, search.final, found.candidate.variant)
+    search.found, search.final = _with_places_of(final, search.found), final
 
 
 def _placed(base: Refit, refit: Refit, variant: Variant) -> Refit:
@@ -308,18 +345,22 @@ def _placed(base: Refit, refit: Refit, variant: Variant) -> Refit:
     return moved
 
 
-def _keep_places(search: Search) -> None:
-    """Give what was found the knees and places that the final program has."""
-    there = {variant.name: variant for variant in attached(search.final.program)}
-    for index, found in enumerate(search.found):
-        candidate, final = found.candidate, there.get(found.candidate.variant.name)
-        if final is not None and final.profiled != candidate.variant.profiled:
-            moved = replace(candidate, tested=candidate.tested.at(final))
-            search.found[index] = replace(found, candidate=moved)
+def _with_places_of(final: Refit, found: Sequence[Found]) -> list[Found]:
+    """What was found, with the knees and places that the final program has."""
+    there = {variant.name: variant for variant in attached(final.program)}
+
+    def moved(one: Found) -> Found:
+        candidate, variant = one.candidate, there.get(one.candidate.variant.name)
+        if variant is None or variant.profiled == candidate.variant.profiled:
+            return one
+        return replace(one, candidate=replace(candidate, tested=candidate.tested.at(variant)))
+
+    return [moved(one) for one in found]
 
 
-def _refits(now: Refit, screening: Screening, first: bool) -> list[Candidate]:
-    candidates, chosen = list[Candidate](), leaders(screening.tests, first)
+def _refits(now: Refit, screening: Screening, first: bool, candidates: list[Candidate]) -> list[Candidate]:
+    """Fits of what the tests point at; each is added to `candidates` as it ends, whatever happens to the next."""
+    chosen = leaders(screening.tests, first)
     with stages(*((f"fitting with {tested.variant.label}", 1) for tested in chosen)) as begin:
         for fit in attempts(now, chosen, screening):
             begin()
@@ -384,14 +425,12 @@ def prune(search: Search) -> None:
             again = [as_it_stands, *(c for c in again if c.variant.name != chosen.variant.name)]
         needed = partial(_first, lambda c: c.total > TIE_NATS)
         best, again = ParticleJudge(without).chosen(again, needed)
-        place = search.found.index(found)
         if best is None or isinstance(best.refit, str):
-            search.found.pop(place)
-            search.final = without
+            search.found, search.final = [one for one in search.found if one is not found], without
         else:
-            search.found[place] = Found(best, again, without)
-            search.final = best.refit
-            _keep_places(search)
+            other = Found(best, again, without)
+            with_other = [other if one is found else one for one in search.found]
+            search.found, search.final = _with_places_of(best.refit, with_other), best.refit
 
 
 def _without(search: Search, found: Found) -> Refit | str:

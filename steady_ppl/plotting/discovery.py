@@ -51,10 +51,14 @@ def discovery_picture(found: Discovery) -> Figure:
     figure = Figure(figsize=(12, height), layout="constrained")
     if groups:
         left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1, 1.05), squeeze=False))
-        above, below = left.subplots(2, 1, height_ratios=(height - 3.5, 3))
-        gains([row for group in groups for row in group], above)
-        open_loop_picture(found.proof, axes=below)
-        titled(below, "predictions of the validation drives", below.get_xlabel())
+        rows = [row for group in groups for row in group]
+        if found.proof is None:
+            gains(rows, left.subplots())
+        else:
+            above, below = left.subplots(2, 1, height_ratios=(height - 3.5, 3))
+            gains(rows, above)
+            open_loop_picture(found.proof, axes=below)
+            titled(below, "predictions of the validation drives", below.get_xlabel())
         if found.shape:
             unknown_effect(found, axes=right.subplots())
         else:

@@ -278,6 +278,8 @@ def _discover(job: Job) -> dict[str, Any]:
     data = drives(job)
     program, start = with_noise(load_program(job.program), job), job.known_start
     searched = discover(program, data["train"], data["valid"], known_start=start, seed=job.seed, **job.settings)
+    if searched.search.interrupted:
+        raise RunError("it was interrupted")
     figures, first = searched.figures, searched.search.rounds[0].screening.tests.tested
     named = [one["effect"] for one in figures["effects"]]
     classes = [name for one in figures["effects"] for name in one["class"]]

@@ -13,6 +13,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,28 +29,45 @@ from steady_ppl.utils.tensor_files import read_tensors, write_tensors
 RANDOM_STATE = "random state"  # of torch, after the piece
 ENTRY_FORM = ({"values": {str: ANYTHING}}, {"failed": TEXT})
 
-_files: ContextVar[Iterator[Path] | None] = ContextVar("the files of a journal's pieces, in order", default=None)
+
+@dataclass
+class _Journal:
+    """The files of a journal's pieces, in order, and whether it is closed."""
+
+    files: Iterator[Path]
+    closed: bool = False
+
+
+_journal: ContextVar[_Journal | None] = ContextVar("the journal of the block", default=None)
 
 
 @contextmanager
 def journal(folder: Path) -> Iterator[None]:
-    """Keep the pieces of the block in a folder, and read those that are there; the folder goes when all went well.
-    RunError: it cannot be written, or a piece in it is damaged."""
+    """Keep the pieces of the block in a folder, and read those that are there. The folder goes when all went well and
+    nobody closed the journal. RunError: it cannot be written, or a piece in it is damaged."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"{folder} cannot be written: {error.strerror}") from error
-    with bound(_files, (folder / f"{number:06d}.safetensors" for number in itertools.count(1))):
+    pieces = _Journal(folder / f"{number:06d}.safetensors" for number in itertools.count(1))
+    with bound(_journal, pieces):
         yield
-    shutil.rmtree(folder)
+    if not pieces.closed:
+        shutil.rmtree(folder)
+
+
+def close_journal() -> None:
+    """Keep the journal of the block, if there is one, as it is: a computation that left its course has other pieces."""
+    if (pieces := _journal.get()) is not None:
+        pieces.closed = True
 
 
 def journaled(compute: Callable[[], Output]) -> Output:
     """The next piece: tensors, and what JSON can hold. A `FilterError` is a result like any other. Outside of a journal
-    nothing is kept."""
-    if (files := _files.get()) is None:
+    and after it was closed, nothing is kept."""
+    if (pieces := _journal.get()) is None or pieces.closed:
         return compute()
-    if not (file := next(files)).is_file():
+    if not (file := next(pieces.files)).is_file():
         _write(file, compute)
     tensors, said = _read(file)
     torch.set_rng_state(tensors.pop(RANDOM_STATE))

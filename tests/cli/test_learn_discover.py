@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -10,6 +13,8 @@ from examples import MODELS, example
 from small import HOVERCRAFT, simulated, steady, written
 
 from steady_ppl import Fit, simulate, write_table
+from steady_ppl.discovery import candidates, discover, search
+from steady_ppl.errors import FilterError
 
 MODEL = MODELS / "hovercraft.py"
 
@@ -127,3 +132,99 @@ def test_one_kind_is_looked_for_and_an_effect_left_out(table, capsys):
     candidates = json.loads(capsys.readouterr().out)["candidates"]
     names = {one["effect"].partition(":")[0] for one in candidates}
     assert "linear_drag" in names and not names & {"yaw_bias", "slope", "actuator_lag", "bearing_bias", "heavy_tails"}
+
+
+# --- interrupted and resumed ------------------------------------------------------------------------------------------
+
+FEW = ("--known-start", "--simulations", 50, "--only", "dynamics")
+
+
+def interrupted_at(call: int, function: Callable[..., Any], by: signal.Signals = signal.SIGINT) -> Callable[..., Any]:
+    """A function that a signal interrupts when it is called so often."""
+    calls = 0
+
+    def interrupted(*given: Any, **named: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls == call:
+            signal.raise_signal(by)
+        return function(*given, **named)
+
+    return interrupted
+
+
+@pytest.fixture(scope="module")
+def whole(table, tmp_path_factory):
+    """What a search says that nobody interrupted."""
+    run = tmp_path_factory.mktemp("whole") / "run"
+    assert steady("discover", MODEL, table, *FEW, "--out", run) == 0
+    return json.loads((run / "discovery.json").read_text())
+
+
+def test_an_interrupted_search_shows_what_it_found_and_ends_as_it_would_have(
+    table, whole, tmp_path, capsys, monkeypatch
+):
+    run, figures = tmp_path / "run", tmp_path / "found.json"
+    monkeypatch.setattr(search, "screen_program", interrupted_at(2, search.screen_program, signal.SIGTERM))
+    assert steady("discover", MODEL, table, *FEW, "--out", run, "--json", figures) == 1
+    said = capsys.readouterr()
+    assert said.out.startswith("warning: interrupted while testing and fitting effects")
+    assert "The dynamics lack yaw_bias = 0." in said.out and "there may be more" in said.out
+    assert f"`--resume` goes on with {run}" in said.err
+    content = json.loads(figures.read_text())
+    assert content["interrupted"] and not content["complete"] and content["before"] is None
+    assert content["effects"][0]["coefficient"] == pytest.approx(whole["effects"][0]["coefficient"])
+    assert content["effects"][0]["sd"] == pytest.approx(whole["effects"][0]["sd"], rel=0.5)
+    fit = Fit.load(run)
+    assert fit.trained.interrupted and hasattr(fit.program, "yaw_bias")
+    assert steady("discover", MODEL, table, *FEW, "--out", run, "--resume") == 0
+    assert json.loads((run / "discovery.json").read_text()) == whole
+    assert not (run / "journal").exists() and not Fit.load(run).trained
+
+
+def test_fits_that_ended_before_an_interrupt_are_shown(table, tmp_path, capsys, monkeypatch):
+    figures, picture = tmp_path / "found.json", tmp_path / "found.png"
+    monkeypatch.setattr(candidates, "finish", interrupted_at(3, candidates.finish))
+    assert steady("discover", MODEL, table, *FEW, "--json", figures, "--picture", picture) == 1
+    said = capsys.readouterr().out
+    assert "Something is missing (p = 0" in said and "interrupted before an effect was chosen" in said
+    content = json.loads(figures.read_text())
+    assert content["verdict"] == "undecided" and content["effect"] is None and not content["complete"]
+    assert sum(one["heldout_gain"] is not None for one in content["candidates"]) == 2
+    assert picture.stat().st_size > 10_000
+
+
+def test_an_interrupt_before_the_first_tests_is_said_in_a_line(table, whole, tmp_path, capsys, monkeypatch):
+    run = tmp_path / "run"
+    monkeypatch.setattr(search, "screen_program", interrupted_at(1, search.screen_program))
+    assert steady("discover", MODEL, table, *FEW, "--out", run) == 1
+    said = capsys.readouterr()
+    assert said.out == "" and len(said.err.splitlines()) == 1
+    assert "no effect has been tested yet" in said.err and f"`--resume` goes on with {run}" in said.err
+    assert steady("discover", MODEL, table, *FEW, "--out", run, "--resume") == 0
+    assert json.loads((run / "discovery.json").read_text()) == whole
+    capsys.readouterr()
+    monkeypatch.setattr(search, "first_refit", interrupted_at(1, search.first_refit))
+    assert steady("discover", MODEL, table, *FEW) == 1
+    assert capsys.readouterr().err == "steady: interrupted\n"
+
+
+def test_a_second_interrupt_ends_at_once_and_leaves_the_journal(table, tmp_path, capsys, monkeypatch):
+    run = tmp_path / "run"
+    monkeypatch.setattr(search, "screen_program", interrupted_at(2, search.screen_program))
+    monkeypatch.setattr(discover, "findings", interrupted_at(1, discover.findings))
+    assert steady("discover", MODEL, table, *FEW, "--out", run) == 1
+    said = capsys.readouterr()
+    assert said.out == "" and said.err == f"steady: interrupted; `--resume` goes on with {run}\n"
+    assert any((run / "journal").iterdir())
+
+
+def test_a_comparison_that_fails_takes_no_verdict_away(table, whole, tmp_path, monkeypatch):
+    def fails(*_, **__):
+        raise FilterError("the drives are odd")
+
+    monkeypatch.setattr(discover, "prove", fails)
+    assert steady("discover", MODEL, table, *FEW, "--json", tmp_path / "found.json") == 0
+    content = json.loads((tmp_path / "found.json").read_text())
+    assert content["effects"] == whole["effects"] and content["complete"] and content["after"] is None
+    assert "comparing before and after failed: the drives are odd" in content["notes"]

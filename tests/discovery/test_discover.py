@@ -18,8 +18,9 @@ from torch.distributions import constraints
 import steady_ppl as st
 from steady_ppl.discovery.candidates import _axis, _log_prior, _neighbours, variance_of_places
 from steady_ppl.discovery.curves import knots_of
-from steady_ppl.discovery.discover import NOT_CONVERGED, _note_of_one_drive
-from steady_ppl.discovery.finding import _interval, next_run
+from steady_ppl.discovery.discover import COMPARING, NOT_CONVERGED, _afterwards, _note_of_one_drive
+from steady_ppl.discovery.finding import _interval, _spread, next_run
+from steady_ppl.discovery.search import Search
 from steady_ppl.effects import Effect, chosen_variant, parsed
 from steady_ppl.effects.registry import _EFFECTS, register
 from steady_ppl.likelihood.maximize import maximise
@@ -468,3 +469,25 @@ def test_mixed_tables_are_one_and_every_second_drive_chooses() -> None:
     assert "the tables were mixed: 5 of the 11 drives were kept to choose by" in found.notes
     with pytest.raises(st.UsageError, match="mix puts two tables together"):
         st.discover(program, train, known_start=True, mix=True)
+
+
+def test_an_interrupt_after_the_search_leaves_it_complete():
+    def interrupted():
+        raise KeyboardInterrupt
+
+    search, notes = Search(None, base=None, final=None, step=None, gained=0.0), []
+    assert _afterwards(lambda: 3, search, COMPARING, notes) == 3 and not search.interrupted
+    assert _afterwards(interrupted, search, COMPARING, notes) is None
+    assert search.interrupted == COMPARING and not search.cut_short
+    assert _afterwards(interrupted, search, "a later part", notes) is None and notes == []
+    assert search.interrupted == COMPARING
+
+
+def test_the_sd_of_an_effect_whose_program_was_not_tested_is_that_of_its_fit(dragged):
+    (finding,) = dragged.findings
+    untested = replace(dragged.search, rounds=dragged.search.rounds[:1])
+    assert _spread(untested, finding.variant) == pytest.approx(finding.sd, rel=0.3)
+    maximum = replace(dragged.search.final.maxima[0], information=torch.zeros(0, 0))
+    by_draws = replace(untested, final=replace(dragged.search.final, maxima=[maximum]))
+    tested = dragged.search.found[0].candidate.tested
+    assert _spread(by_draws, finding.variant) == pytest.approx(tested.sd * dragged.search.final.first_share**0.5)
