@@ -197,7 +197,7 @@ def test_fits_that_ended_before_an_interrupt_are_shown(table, tmp_path, capsys, 
 def test_an_interrupt_before_the_first_tests_is_said_in_a_line(table, whole, tmp_path, capsys, monkeypatch):
     run = tmp_path / "run"
     monkeypatch.setattr(search, "screen_program", interrupted_at(1, search.screen_program))
-    assert steady("discover", MODEL, table, *FEW, "--out", run) == 1
+    assert steady("discover", MODEL, table, *FEW, "--out", run, "-q") == 1
     said = capsys.readouterr()
     assert said.out == "" and len(said.err.splitlines()) == 1
     assert "no effect has been tested yet" in said.err and f"`--resume` goes on with {run}" in said.err
@@ -213,7 +213,7 @@ def test_a_second_interrupt_ends_at_once_and_leaves_the_journal(table, tmp_path,
     run = tmp_path / "run"
     monkeypatch.setattr(search, "screen_program", interrupted_at(2, search.screen_program))
     monkeypatch.setattr(discover, "findings", interrupted_at(1, discover.findings))
-    assert steady("discover", MODEL, table, *FEW, "--out", run) == 1
+    assert steady("discover", MODEL, table, *FEW, "--out", run, "-q") == 1
     said = capsys.readouterr()
     assert said.out == "" and said.err == f"steady: interrupted; `--resume` goes on with {run}\n"
     assert any((run / "journal").iterdir())

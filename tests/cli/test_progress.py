@@ -1,15 +1,17 @@
-"""Progress on a terminal: one line that says what is being done and for how long, and is gone afterwards."""
+"""Progress: on a terminal one line that is gone afterwards, in a file a line now and then."""
 
 from __future__ import annotations
 
 import io
 import os
+import re
 import time
 
 import pytest
 
 from steady_ppl.cli import progress as progress_line
 from steady_ppl.cli.progress import in_words
+from steady_ppl.utils.context import QUIET, bound
 from steady_ppl.utils.progress import listening, stages
 
 
@@ -17,6 +19,7 @@ from steady_ppl.utils.progress import listening, stages
     ("share", "until_now", "elapsed", "said"),
     [
         (0.0, 0.0, 5.0, "x … 5 s so far"),
+        (0.0, 0.0, 300.0, "x … 5 min so far"),
         (0.5, 10.0, 12.0, "x … about 8 s left"),
         (0.1, 60.0, 60.0, "x … about 9 min left"),
         (0.9, 9.0, 20.0, "x … about to end"),
@@ -54,6 +57,41 @@ def test_progress_is_drawn_on_a_terminal_only_and_cleared(monkeypatch, is_termin
     assert "first … 0 s so far" in shown or "first … 1 s so far" in shown
     assert "second … about to end" in shown or "second … about 1 s left" in shown
     assert shown.endswith(progress_line.CLEAR_LINE)
+
+
+def written_to_a_file(monkeypatch, patience: float) -> list[str]:
+    """The lines that two stages leave in a file."""
+    file = io.StringIO()
+    monkeypatch.setattr("sys.stderr", file)
+    monkeypatch.setattr(progress_line, "FILE_PATIENCE_SECONDS", patience)
+    with progress_line.progress_line() as line, listening(line):
+        monkeypatch.setattr("sys.stderr", io.StringIO())  # as a command may that keeps its notes to itself
+        two_seconds()
+    return file.getvalue().splitlines()
+
+
+def test_a_file_gets_a_plain_line_a_stage(monkeypatch) -> None:
+    first, second = written_to_a_file(monkeypatch, 0.3)
+    assert re.fullmatch(r"steady: first … \d s gone by", first)
+    assert re.fullmatch(r"steady: second … \d s gone by, about (\d s left|to end)", second)
+    assert len(written_to_a_file(monkeypatch, 0.9)) == 1
+
+
+def test_a_file_gets_nothing_of_a_short_command_or_in_quiet(monkeypatch) -> None:
+    assert written_to_a_file(monkeypatch, 5.0) == []
+    with bound(QUIET, True):
+        assert written_to_a_file(monkeypatch, 0.1) == []
+
+
+def test_a_file_that_cannot_be_written_ends_nothing(monkeypatch) -> None:
+    class Full(io.StringIO):
+        def write(self, text: str) -> int:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("sys.stderr", Full())
+    monkeypatch.setattr(progress_line, "FILE_PATIENCE_SECONDS", 0.1)
+    with progress_line.progress_line() as line, listening(line):
+        two_seconds()
 
 
 @pytest.mark.parametrize("width", [2, 30])
