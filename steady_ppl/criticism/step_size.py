@@ -26,6 +26,7 @@ from steady_ppl.model.stability import can_be_cut, counts_rows, is_step
 from steady_ppl.model.substeps import MAX_SUBSTEPS, with_substeps
 from steady_ppl.utils.matrices import pseudo_inverse
 from steady_ppl.utils.random import seeded
+from steady_ppl.utils.text import reason_of
 
 MIN_GAIN = 3.0  # nats, of all drives together, from which a finer step counts
 MAX_SHIFT = 2.0  # nats that watched parameters of another step lie below the maximum: two standard deviations
@@ -205,7 +206,7 @@ def check_step(
     def again(coarse: StepTrial, fine: StepTrial) -> StepTrial:
         try:
             found = trial(coarse.substeps, fine.program, fine.path, MAX_REFIT_STEPS)
-        except FilterError:  # it diverges with these parameters, or these drives do not tell them apart
+        except Exception:  # it diverges with these parameters, drives do not tell them apart, or its own code fails
             return coarse
         return found if found.log_likelihood > coarse.log_likelihood - MIN_GAIN else coarse
 
@@ -252,8 +253,8 @@ def check_step(
             risen = fine.log_likelihood > begun_from.get(coarse.substeps, -math.inf) + MIN_GAIN
             if refits and risen and _differs(coarse, fine, max_shift):
                 trials[index] = again(coarse, fine)
-    except FilterError as error:
-        reason = f"{UNKNOWN}: with {2 * trials[-1].substeps} substeps a row {error}"
+    except Exception as error:  # also of the program's own code, in steps that nobody tried before
+        reason = f"{UNKNOWN}: with {2 * trials[-1].substeps} substeps a row {reason_of(error)}"
     found = StepCheck(tuple(trials), max_shift)
     return replace(found, uncompared=_uncompared(found, reason))
 

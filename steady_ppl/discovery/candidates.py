@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations, pairwise
+from itertools import accumulate, combinations, pairwise
 from typing import Any, NamedTuple
 
 import torch
@@ -48,6 +48,7 @@ LINEAR_FORMS = ("push", "command", "history", "measured", "viewpoint")  # of eff
 UNEXPLAINED = "colour"  # the form of effects that imitate whatever is missing, and may enter when nothing else does
 MIN_GAIN_OF_PLACE = 0.3  # nats by which another knee or place has to be likelier
 MAX_COORDINATE_SWEEPS = 4  # along all knees and places in turns, with steps of one size
+NOT_SIMULATED = "with it too many simulated drives blow up"
 NEIGHBOUR_SHARE = 0.25  # of the grid's spacing, at which a place's likelihood is compared with its neighbours'
 
 
@@ -146,19 +147,30 @@ def screen_program(
     variants = [sizes.of(v) for effect in effects for v in effect.variants(program, seen) if v.name not in there]
     spread, sharpness = typical_spreads(program, fold.drives, smoothed(ahead, fold.drives))
     variants += [curve for curve in curves(program, seen, spread, sharpness) if wanted(curve.effect)]
-    columns = columns_of(variants)
-    observed = scores_along(problem, ahead, parts, columns)
-    if broken := (~torch.isfinite(observed).all(-1)).nonzero().flatten().tolist():
+    columns, count = columns_of(variants), len(parts)
+    own, found = scores_along(problem, ahead, parts, columns)
+    failed = [(column, why) for column, why in zip(columns, found, strict=True) if isinstance(why, str)]
+    columns = [column for column, scores in zip(columns, found, strict=True) if not isinstance(scores, str)]
+    observed = torch.cat([own, *(scores for scores in found if not isinstance(scores, str))], -1)
+    if broken := (~torch.isfinite(own).all(-1)).nonzero().flatten().tolist():
         raise FilterError(f"trajectory {fold.drives.labels[broken[0]]}: the fitted program blows up on it")
     starts = fold.path.states[0].expand(sets, -1, -1)  # known, or draws of their posterior
     if not fold.known_start:
         with seeded(seed, "starts"):
             starts = ahead.draws(sets)[1][:, 0].to(starts)
     simulated, _ = journaled(lambda: ({"scores": simulate_scores(problem, starts, parts, columns, seed=seed)}, {}))
-    tests = screen(observed, simulated["scores"], len(parts), columns, away)
-    information, first = {"": tests.information[: len(parts), : len(parts)]}, len(parts)
+    finite = torch.isfinite(simulated["scores"]).all(0).all(0)
+    ends = accumulate((column.size for column in columns), initial=count)
+    places = [slice(*pair) for pair in pairwise(ends)]
+    for place in places:
+        finite[place] = bool(finite[place].all())
+    able = [(column, bool(finite[place.start])) for column, place in zip(columns, places, strict=True)]
+    failed += [(column, NOT_SIMULATED) for column, is_able in able if not is_able]
+    columns = [column for column, is_able in able if is_able]
+    tests = screen(observed[:, finite], simulated["scores"][..., finite], count, columns, away, failed)
+    information, first = {"": tests.information[:count, :count]}, count
     for column in columns:
-        index = [*range(len(parts)), *range(first, first + column.size)]
+        index = [*range(count), *range(first, first + column.size)]
         information[_key(column)] = tests.information[index][:, index]
         first += column.size
     return Screening(tests, parts, information)
@@ -329,6 +341,8 @@ def variance_of_places(now: Refit, candidate: Candidate) -> Tensor:
         options = {**one.beside.options, other.name: other.beside.options[other.name]}
         if (both := moved_to(replace(one.beside, options=options))) is not None:
             curvature[i, j] = curvature[j, i] = one.sign * other.sign * (both[1] - one.fall - other.fall)
+    if not bool(torch.isfinite(curvature).all()):
+        return variance + here.square()
     values, turn = torch.linalg.eigh(curvature)
     along = torch.stack([step.slope for step in steps], -1) @ turn
     return variance + (along.square() / (values.clamp(min=0) + min(step.prior for step in steps))).sum(-1)

@@ -22,7 +22,7 @@ from steady_ppl.discovery.result import Discovery
 from steady_ppl.discovery.search import MAX_EFFECTS, Found, Search, Settings, search
 from steady_ppl.effects import catalogue, of_name, record, restore, written_class
 from steady_ppl.effects.declaration import VERDICT_OF_FORM
-from steady_ppl.errors import DataError, UsageError
+from steady_ppl.errors import DataError, FilterError, UsageError
 from steady_ppl.gaussian.linearize import require_linear
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
 from steady_ppl.likelihood.parameters import elements
@@ -133,7 +133,7 @@ def discover(
     with stages(("", 8), (COMPARING, 1), (PROPOSING, 1)) as begin:
         begin()
         with seeded(seed, "search"), kernel_failures() as why:
-            found = search(problem, choosing.data, settings)
+            found = _searched(problem, choosing.data, settings)
         begin()
         shape = shape_of(found, program)
         effects = corrections(found) if shape else findings(found)
@@ -157,6 +157,14 @@ def discover(
         for refit in (found.as_it_stands, found.base if shape else found.final)
     )
     return Discovery(found, effects, shape, proposed, proof, before, after, _doubts(found, is_fitted), notes)
+
+
+def _searched(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
+    """The search; FilterError where what it begins with fails, also by a fault of numbers in the program's own code."""
+    try:
+        return search(problem, valid, settings)
+    except (ArithmeticError, ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
+        raise FilterError(f"the program cannot be searched on these drives: {reason_of(error)}") from error
 
 
 def _afterwards(compute: Callable[[], Later], found: Search, doing: str, notes: list[str]) -> Later | None:
@@ -217,6 +225,8 @@ def _notes(found: Search) -> list[str]:
     notes += [f"all fits are at a finer step: {step.note}" for step in steps if step.note]
     if found.step.uncompared:
         notes.append(found.step.uncompared)
+    if found.coarse:
+        notes.append(f"what was found was not looked at in finer time steps: {found.coarse}")
     if found.curve is not None:
         notes.append(
             "a curve has no name and is not kept: 'after' is what it would bring, --out has the program as it stood, "

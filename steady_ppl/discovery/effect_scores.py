@@ -1,5 +1,7 @@
 """The score of every effect of the catalogue at a program that has none of them."""
 
+import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
@@ -30,6 +32,7 @@ from steady_ppl.model.program import Program
 from steady_ppl.model.substeps import acting_controls, row_controls
 from steady_ppl.utils.cores import Output, run_in_parallel
 from steady_ppl.utils.random import seeded
+from steady_ppl.utils.text import reason_of
 
 TRAJECTORIES_OF_JOB = 400  # that are scored at a time
 MIN_SHARE_OF_FINITE_SETS = 0.8  # share of the simulated sets that must not blow up
@@ -213,17 +216,31 @@ class Scoring:
         return torch.where(at.present[1:], product * ratio * ratio.new_tensor(chosen), 0.0).sum((0, -1))
 
 
-def scores_along(problem: Problem, ahead: Lookahead, parts: Sequence[Element], columns: Sequence[Column]) -> Tensor:
-    """Scores of parameters and columns, `(B, N)`."""
+def scores_along(
+    problem: Problem, ahead: Lookahead, parts: Sequence[Element], columns: Sequence[Column]
+) -> tuple[Tensor, list[Tensor | str]]:
+    """Scores of the parameters, `(B, P)`, and of each column, `(B, size)`, or why it has none."""
     along = (problem.program, problem.data, smoothed(ahead, problem.data))
-    return torch.cat([parameter_scores(*along, list(parts)), *map(Scoring(*along), columns)], -1)
+    scoring = Scoring(*along)
+
+    def tried(column: Column) -> Tensor | str:
+        try:
+            scores = scoring(column)
+        except Exception as error:  # also of the program's own code, on commands and states that nobody tried before
+            return reason_of(error)
+        return scores if bool(torch.isfinite(scores).all()) else "it is not finite along these drives"
+
+    return parameter_scores(*along, list(parts)), [tried(column) for column in columns]
 
 
 @torch.no_grad()
 def simulate_scores(
     problem: Problem, starts: Tensor, parts: Sequence[Element], columns: Sequence[Column], *, seed: int
 ) -> Tensor:
-    """Scores `(S, B, N)` of drives that a program makes from `starts` `(S, B, D)`, with the same controls and gaps."""
+    """Scores `(S, B, N)` of drives that a program makes from `starts` `(S, B, D)`, with the same controls and gaps.
+
+    Sets that blow up are left out. Columns with which too many would are not finite.
+    """
     program, data, sets = problem.program, problem.data, len(starts)
     with seeded(seed, "bootstrap"):
         drives, path = simulate_again(program, data, starts, len(program.channels))
@@ -231,13 +248,26 @@ def simulate_scores(
     def score(index: Tensor) -> Output:
         part = replace(problem, data=drives.subset(index))
         ahead = smooth(part, ReferencePath(path.states[:, index], path.noise[:, index]), passes=2)
-        return {"scores": scores_along(part, ahead, parts, columns), "likely": ahead.log_likelihood}, {}
+        own, found = scores_along(part, ahead, parts, columns)
+        each = [
+            own.new_full((len(index), column.size), math.nan) if isinstance(one, str) else one
+            for column, one in zip(columns, found, strict=True)
+        ]
+        return {"scores": torch.cat([own, *each], -1), "likely": ahead.log_likelihood}, {}
 
     jobs = [partial(score, index) for index in torch.arange(len(drives)).split(TRAJECTORIES_OF_JOB)]
     found = [tensors for tensors, _ in run_in_parallel(jobs)]
     scores, likely = (torch.cat([one[name] for one in found]) for name in ("scores", "likely"))
     scores = scores.unflatten(0, (sets, len(data)))
-    whole = torch.isfinite(scores).all(-1).all(-1) & torch.isfinite(likely.view(sets, len(data))).all(-1)
+    finite = torch.isfinite(scores).all(1)
+    able = torch.isfinite(likely.view(sets, len(data))).all(-1) & finite[:, : len(parts)].all(-1)
+    ends = itertools.accumulate((column.size for column in columns), initial=len(parts))
+    of_columns = torch.stack([able, *(finite[:, first:end].all(-1) for first, end in itertools.pairwise(ends))])
+    breaks = (able & ~of_columns).sum(1)
+    kept = sorted(range(len(breaks)), key=lambda index: int(breaks[index]))
+    while len(kept) > 1 and int(of_columns[kept].all(0).sum()) < MIN_SHARE_OF_FINITE_SETS * sets:
+        kept.pop()  # what breaks most of them
+    whole = of_columns[kept].all(0)
     if int(whole.sum()) < MIN_SHARE_OF_FINITE_SETS * sets:
         raise FilterError(
             f"{int((~whole).sum())} of {sets} simulated sets blew up: the fitted program does not even explain "

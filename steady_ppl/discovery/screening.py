@@ -27,12 +27,15 @@ from steady_ppl.likelihood.parameters import Element, elements, on_both_sides
 from steady_ppl.likelihood.scores import measured, substep_spreads
 from steady_ppl.model.program import Program
 from steady_ppl.utils.matrices import pseudo_inverse, ridged_inverse
+from steady_ppl.utils.text import reason_of
 
 FAMILY_LEVEL, POWER = 0.05, 0.95  # of the tests of all candidates together, and at a detection limit
 MIN_SHARE_OF_INFORMATION = 1e-4  # of a column, that the fitted parameters must leave for it to be tested
 CONTAINED = "the fitted parameters already explain it"
 NOISE_SIZES = ("process_noise", "measurement_noise")  # the effects that multiply a standard deviation
 UNEXCITED = "these drives never excite it"
+NOT_FINITE = "its test is not finite"
+MAX_NONCENTRALITY = 1e4  # of a detection limit's χ²
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,12 @@ class Screened:
 
 
 def screen(
-    observed: Tensor, simulated: Tensor, fitted: int, columns: Sequence[Column], departures: Sequence[Departure] = ()
+    observed: Tensor,
+    simulated: Tensor,
+    fitted: int,
+    columns: Sequence[Column],
+    departures: Sequence[Departure] = (),
+    failed: Sequence[tuple[Column, str]] = (),
 ) -> Screened:
     """Test every candidate.
 
@@ -96,6 +104,7 @@ def screen(
         observed: scores of the drives, `(B, N)`: of the `fitted` parameters first and then of the columns, in order.
         simulated: the same of simulated sets, `(S, B, N)`.
         departures: of the fitted noise from the declared.
+        failed: columns that have no scores, and why.
     """
     sums = simulated.sum(1)
     bias = sums.mean(0)
@@ -117,14 +126,16 @@ def screen(
     tests, curves = list[Tested](), list[Tested]()
     for members in groups.values():
         found = [_test(columns[i], places[i], projected, left, before) for i in members]
-        if alive := [test for test in found if test is not None]:
+        if alive := [test for test in found if isinstance(test, Tested)]:
             tests.append(_best_of(alive))
         else:
-            why = CONTAINED if any(bool((before[places[i]] > 0).any()) for i in members) else UNEXCITED
-            column, certain = columns[members[0]], np.ones(len(scores))
-            nothing, endless = np.zeros(column.size), np.full(column.size, math.inf)
-            tests.append(Tested(column, places[members[0]], 0.0, certain, nothing, endless, endless, untestable=why))
+            why = next((why for why in found if why != UNEXCITED), UNEXCITED)
+            tests.append(_untested(columns[members[0]], places[members[0]], str(why), len(scores)))
         curves += [_best_of([test]) for test in alive if test.is_curve]
+    for column, why in failed:
+        if (name := CURVE if column.is_curve else column.variant.name) not in groups:
+            groups[name] = []
+            tests.append(_untested(column, slice(0, 0), why, len(scores)))
     tests += [_departed(departure, information[own, own], scores[:, own]) for departure in departures]
     tests.sort(key=Tested.rank)
     family = np.stack([np.ones(len(scores)), *(test.p_values for test in tests)]).min(0)
@@ -162,17 +173,41 @@ def _limit(tested: Tested, critical: float) -> np.ndarray:
     if tested.untestable or tested.is_curve or tested.alone is None or not math.isfinite(tested.variant.effect.null):
         return np.full(size, math.inf)
     threshold = special.chdtri(size, -math.expm1(math.log1p(-critical) / tested.effective))
-    needed = optimize.brentq(lambda away: 1 - special.chndtr(threshold, size, away) - POWER, 1e-6, 1e4)
+
+    def more_power(away: float) -> float:
+        return float(1 - special.chndtr(threshold, size, away) - POWER)
+
+    if not more_power(MAX_NONCENTRALITY) > 0:  # simulated drives look as wrong as can be
+        return np.full(size, math.inf)
+    least = 1e-6
+    needed = least if more_power(least) > 0 else optimize.brentq(more_power, least, MAX_NONCENTRALITY)
     return math.sqrt(needed) * tested.alone
 
 
-def _test(column: Column, place: slice, projected: Tensor, left: Tensor, before: Tensor) -> Tested | None:
+def _untested(column: Column, place: slice, why: str, sets: int) -> Tested:
+    nothing, endless = np.zeros(column.size), np.full(column.size, math.inf)
+    return Tested(column, place, 0.0, np.ones(sets), nothing, endless, endless, untestable=why)
+
+
+def _test(column: Column, place: slice, projected: Tensor, left: Tensor, before: Tensor) -> Tested | str:
+    """A column's test, or why it has none."""
     own, scores = left[place, place], projected[:, place]
-    if column.is_curve:
-        return _test_of_curve(column, place, scores, own) if bool((own.diagonal() > 0).any()) else None
-    enough = own.diagonal() > MIN_SHARE_OF_INFORMATION * before[place]
-    if not bool((before[place] > 0).all()) or not bool(enough.all()):
-        return None
+    if not bool((before[place] > 0).any()):
+        return UNEXCITED
+    try:
+        if column.is_curve:
+            found = _test_of_curve(column, place, scores, own) if bool((own.diagonal() > 0).any()) else None
+        else:
+            enough = (before[place] > 0) & (own.diagonal() > MIN_SHARE_OF_INFORMATION * before[place])
+            found = _test_of_effect(column, place, scores, own) if bool(enough.all()) else None
+    except RuntimeError as error:  # of a matrix that is singular
+        return reason_of(error)
+    if found is None:
+        return CONTAINED
+    return found if math.isfinite(found.statistic) and bool(np.isfinite(found.p_values).all()) else NOT_FINITE
+
+
+def _test_of_effect(column: Column, place: slice, scores: Tensor, own: Tensor) -> Tested:
     steps = torch.linalg.solve(own, scores.T).T
     statistics = (scores * steps).sum(-1).numpy()
     p_values = special.chdtrc(column.size, statistics.clip(min=0))  # by rounding some are negative
@@ -209,6 +244,8 @@ def _departed(departure: Departure, information: Tensor, scores: Tensor) -> Test
     """A Wald test of the fitted noise against the declared."""
     step = ridged_inverse(information) @ departure.slope  # a vanished noise has no information
     sd = float((departure.slope @ step).sqrt())
+    if not (math.isfinite(departure.away) and 0 < sd < math.inf):
+        return replace(_untested(Column(departure.variant), slice(0, 0), NOT_FINITE, len(scores)), departure=True)
     z = torch.cat([torch.tensor([departure.away]).double(), scores[1:] @ step]).numpy() / sd
     p_values = 2 * special.ndtr(-np.abs(z))
     factor = math.exp(departure.on_all)
@@ -221,7 +258,8 @@ def _largest_canonical_correlations(left: Tensor, places: Sequence[slice]) -> Te
     def whitening(own: Tensor) -> Tensor:
         if not bool((own.diagonal() > 0).all()):
             return torch.zeros_like(own)
-        return torch.linalg.inv(torch.linalg.cholesky(own + 1e-10 * torch.diag(own.diagonal())))
+        root, failed = torch.linalg.cholesky_ex(own + 1e-10 * torch.diag(own.diagonal()))
+        return torch.zeros_like(own) if failed else torch.linalg.inv(root)
 
     whitened = [whitening(left[place, place]) for place in places]
     correlations = torch.eye(len(places), dtype=torch.float64)

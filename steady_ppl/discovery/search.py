@@ -132,6 +132,7 @@ class Search:
     found: list[Found] = field(default_factory=list)  # the effects that were added
     curves: list[Candidate] = field(default_factory=list)  # fitted in place of the first effect, best first
     taken_back: dict[str, str] = field(default_factory=dict)  # effects with which the program failed, and how
+    coarse: str = ""  # why what was found was not looked at in finer time steps, empty as a rule
     interrupted: str = ""  # what was being done when an interrupt (Ctrl-C) came; empty as a rule
     cut_short: bool = False  # whether the interrupt came before the search had ended
 
@@ -216,6 +217,8 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
                 found.interrupt(FINER)
         except KeyboardInterrupt:
             found.interrupt(FINER)
+        except Exception as error:  # also of the program's own code, in steps that nobody tried before
+            found.coarse = reason_of(error)
     return found
 
 

@@ -171,8 +171,8 @@ def stubbed(monkeypatch, levels, *, at=True, looks=5.0):
             fits.append(changed.substeps)
         earlier = fits.count(changed.substeps) - (changed.substeps > 1)
         level = ends[min(max(0, earlier), len(ends) - 1)]
-        if isinstance(level, str):
-            raise FilterError(level)
+        if isinstance(level, Exception):
+            raise level
         value, promised = level if isinstance(level, tuple) else (level, 0.0)
         every = tuple(part.name for part in elements(changed))
         likely = torch.full((3,), value / 3, dtype=torch.float64)
@@ -192,10 +192,13 @@ def stubbed(monkeypatch, levels, *, at=True, looks=5.0):
         ({1: [-100], 2: [-4000], 4: [-4000]}, 1, True),  # finer steps are worse: a world that takes the own step
         ({1: [-100], 2: [-150], 4: [-140], 8: [-130]}, 1, True),
         ({1: [-100], 2: [(-150, 30.0)], 4: [(-145, 200.0)]}, 1, False),  # fits that have not converged say nothing
-        ({1: [-100], 2: [-4000], 4: ["broken"]}, 1, False),
-        ({1: [-100], 2: ["broken"]}, 1, False),
+        ({1: [-100], 2: [-4000], 4: [FilterError("broken")]}, 1, False),
+        ({1: [-100], 2: [FilterError("broken")]}, 1, False),
+        ({1: [-100], 2: [ZeroDivisionError()]}, 1, False),  # of the program's own code
         ({1: [-100, -50], 2: [-200, -50], 4: [-50]}, 1, True),  # several maxima of one program, no matter of its step
-        ({1: [-100, "diverges"], 2: [-50], 4: [-50]}, 2, True),  # the finer step's parameters diverge at the coarse one
+        # the finer step's parameters diverge at the coarse one
+        ({1: [-100, FilterError("diverges")], 2: [-50], 4: [-50]}, 2, True),
+        ({1: [-100, ZeroDivisionError()], 2: [-50], 4: [-50]}, 2, True),
     ],
 )
 def test_what_fits_at_finer_steps_say_and_do_not(monkeypatch, levels, substeps, known) -> None:

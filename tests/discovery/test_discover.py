@@ -16,9 +16,10 @@ from small import finite
 from torch.distributions import constraints
 
 import steady_ppl as st
+from steady_ppl.discovery import discover as module
 from steady_ppl.discovery.candidates import _axis, _log_prior, _neighbours, variance_of_places
 from steady_ppl.discovery.curves import knots_of
-from steady_ppl.discovery.discover import COMPARING, NOT_CONVERGED, _afterwards, _note_of_one_drive
+from steady_ppl.discovery.discover import COMPARING, NOT_CONVERGED, _afterwards, _note_of_one_drive, _searched
 from steady_ppl.discovery.finding import _interval, _spread, next_run
 from steady_ppl.discovery.search import Search
 from steady_ppl.effects import Effect, chosen_variant, parsed
@@ -491,3 +492,22 @@ def test_the_sd_of_an_effect_whose_program_was_not_tested_is_that_of_its_fit(dra
     by_draws = replace(untested, final=replace(dragged.search.final, maxima=[maximum]))
     tested = dragged.search.found[0].candidate.tested
     assert _spread(by_draws, finding.variant) == pytest.approx(tested.sd * dragged.search.final.first_share**0.5)
+
+
+@pytest.mark.parametrize(
+    ("error", "raised"),
+    [
+        (ZeroDivisionError("by the tide"), st.FilterError),
+        (st.DataError("no tide"), st.DataError),
+        (KeyError(1), KeyError),
+    ],
+)
+def test_a_fault_of_numbers_before_the_first_tests_is_a_line(monkeypatch, error, raised):
+    def fails(*_):
+        raise error
+
+    monkeypatch.setattr(module, "search", fails)
+    with pytest.raises(raised) as caught:
+        _searched(None, None, None)
+    if isinstance(error, ZeroDivisionError):
+        assert str(caught.value) == "the program cannot be searched on these drives: ZeroDivisionError: by the tide"

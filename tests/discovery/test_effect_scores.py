@@ -11,9 +11,12 @@ from examples import drives, example
 from paths import at_rest, settled
 
 from steady_ppl.discovery.curves import curves
-from steady_ppl.discovery.effect_scores import Column, Scoring
+from steady_ppl.discovery.effect_scores import Column, Scoring, scores_along, simulate_scores
 from steady_ppl.effects import attach, chosen_variant, parsed
+from steady_ppl.gaussian.smoother import smooth
+from steady_ppl.likelihood.parameters import elements
 from steady_ppl.likelihood.scores import typical_spreads
+from steady_ppl.model.problem import Problem
 
 EFFECTS = (
     "linear_drag",
@@ -107,3 +110,36 @@ def test_the_regression_of_smoothed_residuals_is_biased_and_the_scores_are_not()
     step = float(score.sum() / (len(score) * null.var()))
     assert shortcut < 0.35 * 0.05
     assert step == pytest.approx(0.05, rel=0.35)  # the information's standard error is 1/√30, and a step is not the end
+
+
+def with_function(column: Column, function) -> Column:
+    return replace(column, variant=replace(column.variant, effect=replace(column.variant.effect, function=function)))
+
+
+def test_a_candidate_that_fails_takes_no_other_along(hovercraft):
+    """Its own code raises, it is not finite, or it is not finite on drives that are simulated."""
+    program, data, _, path = hovercraft
+    problem, parts = Problem(program, data, False), elements(program)
+    sound = Column(chosen_variant(program, "yaw_bias", ""))
+
+    def raises(*_, c, **__):
+        raise ZeroDivisionError("no wind")
+
+    def is_not_finite(self, state, *_, c, **__):
+        return {"yaw": c * state[..., 0] * float("nan")}
+
+    def fails_elsewhere(self, state, *_, c, **__):
+        near = torch.isin(state[..., 0], seen)
+        return {"yaw": torch.where(near, c * state[..., 0], float("nan"))}
+
+    ahead = smooth(problem, path, passes=3, tolerance=0.01)
+    columns = [sound, with_function(sound, raises), with_function(sound, is_not_finite)]
+    _, (scores, why, other) = scores_along(problem, ahead, parts, columns)
+    assert why == "ZeroDivisionError: no wind" and "not finite" in other
+    assert torch.equal(scores_along(problem, ahead, parts, [sound])[1][0], scores)
+
+    seen = torch.empty(0).double()  # of simulated drives none
+    starts = path.states[0].expand(20, -1, -1)
+    simulated = simulate_scores(problem, starts, parts, [sound, with_function(sound, fails_elsewhere)], seed=1)
+    assert torch.equal(simulated[..., :-1], simulate_scores(problem, starts, parts, [sound], seed=1))
+    assert bool(simulated[..., -1].isnan().any())

@@ -9,7 +9,7 @@ from examples import example
 from scipy import stats
 
 from steady_ppl.discovery.effect_scores import Column
-from steady_ppl.discovery.screening import FAMILY_LEVEL, _critical, _test, screen
+from steady_ppl.discovery.screening import FAMILY_LEVEL, UNEXCITED, _critical, _limit, _test, screen
 from steady_ppl.effects import chosen_variant
 
 DRIVES, PARAMETERS = 16, 3
@@ -84,3 +84,40 @@ def test_a_statistic_that_rounding_made_negative_says_nothing():
     information[0, 1] = information[1, 0] = 1 + 1e-6  # two columns that are nearly one
     found = _test(column, slice(0, 2), scores, information, information.diagonal())
     assert found.statistic < 0 and found.p_values[0] == 1.0
+
+
+def test_a_candidate_without_a_test_leaves_the_others_theirs():
+    """A matrix that is singular, a test that is not finite, and columns without scores are said to be untestable."""
+    simulated, drives, found = scores_of(200, 7), scores_of(1, 8)[0], columns()
+    plain = screen(drives, simulated, PARAMETERS, found)
+    (slope,) = (index for index, column in enumerate(found) if column.variant.name == "slope")
+    first = PARAMETERS + sum(column.size for column in found[:slope])
+    for scores in (simulated, drives):
+        scores[..., first + 1] = scores[..., first]
+    drives[0, -1] = float("inf")  # of the last candidate
+    screened = screen(drives, simulated, PARAMETERS, found)
+    why = {tested.variant.name: tested.untestable for tested in screened.tested}
+    assert "singular" in why["slope"] and why[NAMES[-1]] == "its test is not finite"
+    without = screen(drives[:, :-1], simulated[..., :-1], PARAMETERS, found[:-1], failed=[(found[-1], "it failed")])
+    assert {tested.variant.name: tested.untestable for tested in without.tested}[NAMES[-1]] == "it failed"
+    for one in (screened, without):
+        assert len(one.tested) == len(plain.tested) and one.correlations.shape == (len(NAMES), len(NAMES))
+        by_name = {tested.variant.name: tested.p_value for tested in one.tested}
+        expected = {tested.variant.name: tested.p_value for tested in plain.tested}
+        assert by_name["linear_drag"] == pytest.approx(expected["linear_drag"])
+        assert by_name[NAMES[-1]] == 1
+
+
+@pytest.mark.parametrize("critical", [0.0, 1e-300, 1 - 1e-16])
+def test_a_limit_exists_at_every_level(critical):
+    tested = screen(scores_of(1, 9)[0], scores_of(200, 10), PARAMETERS, columns()).tested[0]
+    limit = _limit(tested, critical)
+    assert (limit > 0).all() and bool(np.isfinite(limit).all()) == (critical > 0)
+
+
+def test_a_candidate_that_is_never_excited_is_said_to_be():
+    simulated, drives = scores_of(200, 11), scores_of(1, 12)[0]
+    for scores in (simulated, drives):
+        scores[..., PARAMETERS] = 0
+    screened = screen(drives, simulated, PARAMETERS, columns())
+    assert {tested.variant.name: tested.untestable for tested in screened.tested}[NAMES[0]] == UNEXCITED

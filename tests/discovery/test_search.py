@@ -73,3 +73,28 @@ def test_a_knee_is_moved_beside_what_is_added_after_it(monkeypatch):
     found = search.Search(None, base=None, final=later.refit, step=None, gained=0.0, found=[first])
     search._place_again(found, first)
     assert found.final is moved.refit and found.found[0].candidate.tested is final
+
+
+@pytest.mark.parametrize("failure", [RuntimeError("the tide is out"), KeyboardInterrupt()])
+def test_what_was_found_stays_where_finer_time_steps_fail_or_are_interrupted(monkeypatch, failure):
+    step = SimpleNamespace(too_coarse=False)
+    base = SimpleNamespace(maxima=[SimpleNamespace(gained=0.0)], program=None)
+
+    def looked_at(refit, **watched):
+        if watched:
+            raise failure
+        return step
+
+    monkeypatch.setattr(search, "without_outliers", lambda *_: (base, 2 * [SimpleNamespace(left=None)]))
+    monkeypatch.setattr(search, "with_suitable_noise", lambda base, wanted: (base, []))
+    monkeypatch.setattr(search, "attached", lambda program: [])
+    monkeypatch.setattr(search, "_step_of", looked_at)
+    rounds = [search.Round(SimpleNamespace(tests=SimpleNamespace(p_value=0.5, tested=[], critical=0.01)), [], None)]
+    ended = search.Search(base, base, base, step, 0.0, found=[Found(Chosen("drag", 9.0), [], None)], rounds=rounds)
+    monkeypatch.setattr(search, "_rounds", lambda *_: ended)
+    found = search.search(SimpleNamespace(program=None, data=None), None, search.Settings(declared=None))
+    assert found is ended and len(found.found) == 1
+    if isinstance(failure, KeyboardInterrupt):
+        assert found.interrupted == search.FINER and not found.is_complete
+    else:
+        assert found.coarse == "RuntimeError: the tide is out" and found.is_complete
