@@ -21,6 +21,7 @@ from steady_ppl.likelihood.parameters import Element
 from steady_ppl.likelihood.scores import (
     Smoothed,
     channel_moments,
+    component_major,
     measured,
     parameter_scores,
     smoothed,
@@ -118,10 +119,16 @@ class Scoring:
         """Scores of the heights at the knots of a curve that is added to some readings, `(B, K)`."""
         at, knots, circular = self.at.measurements, variant.options["knots"], variant.options["circular"]
         found = []
+        rows, drives = at.mean.shape[:2]
         for index, name in enumerate(self.program.measurement_names):
             if name in variant.options["chosen"]:
-                values = self.reading[at.places(index), ..., index]
-                found.append(by_height(values, at.weights(index) * self.at.sharpness[..., index], knots, circular))
+                which = at.cells.of_component(index)
+                values = self.reading[at.cells.points[:, which], 0, index]
+                weights = at.weights(index) * at.at_cells(self.at.sharpness, which)
+                by_row = values.new_zeros(2, 3, rows * drives)
+                by_row[..., at.cells.row[which]] = torch.stack([values, weights])
+                along, by = by_row.view(2, 3, rows, drives)
+                found.append(by_height(along, by, knots, circular))
         return torch.stack(found).sum(0)
 
     def _curve_of_channel(self, variant: Variant) -> Tensor:
@@ -180,16 +187,24 @@ class Scoring:
 
     @cached_property
     def reading(self) -> Tensor:
-        """What is measured on average at the measurements' points, `(P, T + 1, B, K)`."""
+        """What is measured on average at the measurements' points, `(N, 1, K)`."""
         return measured(self.program, self.at.measurements.points).reading
 
     def _measured(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
-        up, down = (variant(self.program, self.at.measurements.points, self.reading, c=value) for value in c)
-        return self.at.measurements.of_mean((up - down) * self.at.sharpness / width)
+        at, component = self.at.measurements, variant.options.get("component")
+        if not isinstance(component, int):
+            up, down = (variant(self.program, at.points, self.reading, c=value) for value in c)
+            return at.of_mean(at.own(up - down) * at.at_cells(self.at.sharpness) / width)
+        which = at.cells.of_component(component)
+        own = (one.squeeze(1)[at.cells.points[:, which]] for one in (at.points, self.reading))
+        points, reading = map(component_major, own)
+        up, down = (variant(self.program, points, reading, c=value)[..., component] for value in c)
+        return at.of_mean((up - down) * at.at_cells(self.at.sharpness, which) / width, which)
 
     def _viewpoint(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
-        up, down = (measured(self.program, variant(self.program, self.at.measurements.points, c=value)) for value in c)
-        return self.at.measurements.of_mean(down.shift(up) * self.at.sharpness / width)
+        at = self.at.measurements
+        up, down = (measured(self.program, variant(self.program, at.points, c=value)) for value in c)
+        return at.of_mean(at.own(down.shift(up)) * at.at_cells(self.at.sharpness) / width)
 
     def _spread(self, variant: Variant, c: tuple[Tensor, Tensor], width: float) -> Tensor:
         factors = (variant(self.program, self.at.states[:-1], *self.rows, c=value) for value in c)

@@ -32,6 +32,7 @@ from steady_ppl.gaussian.lanes import (
     add_outer,
     add_product,
     in_lanes,
+    is_some,
     out_of_lanes,
     put,
     set_scaled,
@@ -307,7 +308,8 @@ def backward(given: LinearArrays, log_scale: Array, first: Potential, futures: P
     each row's, `futures`, and the noise that they ask for in each interval. `log_scale` is of each row's own.
     """
     rows, blocks, components, dimension, lanes = given.measurement.shape
-    weighted, pull = np.zeros((components, dimension, lanes)), np.zeros((components, 1, lanes))
+    matrix, column = (components, dimension, lanes), (components, 1, lanes)
+    by_state, weighted, apart, pull = np.zeros(matrix), np.zeros(matrix), np.zeros(column), np.zeros(column)
     half, gain = np.zeros((dimension, dimension, lanes)), np.zeros(steering.gain.shape[2:])
     moved, room = np.zeros((dimension, 1, lanes)), _room(dimension, steering.gain.shape[2], lanes)
     for k in range(blocks):
@@ -316,12 +318,18 @@ def backward(given: LinearArrays, log_scale: Array, first: Potential, futures: P
             put(futures.precision[t, k], ahead.precision)
             put(futures.information[t, k], ahead.information)
             put(futures.log_scale[t, k], ahead.log_scale)
-            by_state, apart = given.measurement[t, k], given.residual[t, k]
-            set_scaled(weighted, by_state, given.precision[t, k])
-            set_scaled(pull, apart, given.precision[t, k])
-            add_gram(ahead.precision, weighted, by_state, 1.0)
-            add_gram(ahead.information, by_state, pull, 1.0)
-            add_gram(ahead.log_scale, apart, pull, -0.5)
+            count = 0  # of components that some trajectory of the block has
+            for a in range(components):
+                precision = given.precision[t, k, a : a + 1]
+                if is_some(precision):
+                    put(by_state[count], given.measurement[t, k, a])
+                    put(apart[count], given.residual[t, k, a])
+                    set_scaled(weighted[count : count + 1], given.measurement[t, k, a : a + 1], precision)
+                    set_scaled(pull[count : count + 1], given.residual[t, k, a : a + 1], precision)
+                    count += 1
+            add_gram(ahead.precision, weighted[:count], by_state[:count], 1.0)
+            add_gram(ahead.information, by_state[:count], pull[:count], 1.0)
+            add_gram(ahead.log_scale, apart[:count], pull[:count], -0.5)
             add(ahead.log_scale, log_scale[t, k], 1.0)
             if t > 0:
                 forward = given.state[t - 1, k]

@@ -134,3 +134,12 @@ def set_scaled(out: Array, matrix: Array, scale: Array) -> None:
         for j in range(columns):
             for lane in range(lanes):
                 out[i, j, lane] = matrix[i, j, lane] * scale[i, 0, lane]
+
+
+@njit(cache=True, error_model="numpy")
+def is_some(values: Array) -> bool:
+    """Whether some value is not zero."""
+    for i in range(values.size):  # noqa: SIM110
+        if values.flat[i] != 0.0:
+            return True
+    return False

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import Lookahead
-from steady_ppl.gaussian.posterior_moments import posterior_moments
+from steady_ppl.gaussian.posterior_moments import Cells, posterior_moments
 from steady_ppl.kernels.graph import NotCompilable
 from steady_ppl.kernels.rows import Slopes, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import Element, moved, on_both_sides
@@ -49,12 +49,26 @@ from steady_ppl.utils.angles import wrap_angles
 
 @dataclass(frozen=True)
 class Deviations:
-    """The posterior of standardised deviations from their means, of channels or of measurements."""
+    """The posterior of standardised deviations from their means."""
 
     mean: Tensor  # (rows, B, C), zero where there is none
     variance: Tensor  # likewise
-    points: Tensor  # x̂, x̂ + v and x̂ − v for each component, (1 + 2 C, rows, B, D)
+    points: Tensor  # of the state, where slopes of the means are wanted, (..., D)
     present: Tensor  # (rows, B, C) bool
+
+    def of_spread(self, slope: Tensor) -> Tensor:
+        """Score of a change of the log standard deviations by `slope`, `(rows, B, C)`; `(B,)`."""
+        return torch.where(self.present, self.excess * slope, 0.0).sum((0, -1))
+
+    @cached_property
+    def excess(self) -> Tensor:
+        """By how much mean squares are larger than under the program, `(rows, B, C)`."""
+        return self.mean.square() + self.variance - 1
+
+
+@dataclass(frozen=True)
+class ChannelDeviations(Deviations):
+    """Of channels; `points` are x̂, x̂ + v and x̂ − v for each component, `(1 + 2 C, rows, B, D)`."""
 
     def of_mean(self, slope: Tensor) -> Tensor:
         """Score of a change of the means by `slope` deviations at `points`, `(1 + 2 C, rows, B, C)`; `(B,)`."""
@@ -82,15 +96,6 @@ class Deviations:
         """Which `points` are those of one component."""
         return [0, 1 + index, 1 + self.mean.shape[-1] + index]
 
-    def of_spread(self, slope: Tensor) -> Tensor:
-        """Score of a change of the log standard deviations by `slope`, `(rows, B, C)`; `(B,)`."""
-        return torch.where(self.present, self.excess * slope, 0.0).sum((0, -1))
-
-    @cached_property
-    def excess(self) -> Tensor:
-        """By how much mean squares are larger than under the program, `(rows, B, C)`."""
-        return self.mean.square() + self.variance - 1
-
     def of_slopes(self, slopes: Slopes, sharpness: Tensor) -> Tensor:
         """Scores of learnable numbers, `(B, P)`, from the slopes of the means and, after them, of the log standard
         deviations, at `points` row by row; `sharpness` is 1 / the standard deviations, `(rows, B, C)`."""
@@ -109,13 +114,58 @@ class Deviations:
 
 
 @dataclass(frozen=True)
+class ReadingDeviations(Deviations):
+    """Of measurements; `points` are those of the `cells`, `(N, 1, D)` in their order."""
+
+    cells: Cells
+
+    def of_mean(self, slope: Tensor, which: slice = slice(None)) -> Tensor:
+        """Score of a change of the means by `slope` deviations at the three points of cells, `(3, M)`; `(B,)`."""
+        rows, drives = self.mean.shape[:2]
+        by_cell = self.at_cells(self.mean, which) * slope[0] + (slope[1] - slope[2]) / 2
+        by_row = by_cell.new_zeros(rows * drives).index_add(0, self.cells.row[which], by_cell)
+        return by_row.view(rows, drives).sum(0)
+
+    def weights(self, index: int) -> Tensor:
+        """What `of_mean` multiplies the slopes with, of the cells of one component, `(3, M)`."""
+        mean = self.at_cells(self.mean, self.cells.of_component(index))
+        half = torch.full_like(mean, 0.5)
+        return torch.stack([mean, half, -half])
+
+    def of_slopes(self, slopes: Slopes, sharpness: Tensor) -> Tensor:
+        """Scores of learnable numbers, `(B, P)`, from the slopes of the means and, after them, of the log standard
+        deviations, at `points`; `sharpness` is 1 / the standard deviations, `(rows, B, K)`."""
+        rows, drives, count = self.mean.shape
+        values, by_row = slopes.values.squeeze(-1), self.mean.new_zeros(len(slopes.values), rows * drives)
+        for place, (component, value) in enumerate(zip(slopes.components.tolist(), values, strict=True)):
+            which = self.cells.of_component(component % count)
+            here, up, down = value[self.cells.points[:, which]]
+            if component < count:
+                own = (self.at_cells(self.mean, which) * here + (up - down) / 2) * self.at_cells(sharpness, which)
+            else:
+                own = self.at_cells(self.excess, which) * here
+            by_row[place, self.cells.row[which]] = own
+        by_drive, of_means = by_row.view(-1, rows, drives).sum(1), slopes.components < count
+        parts = [by_drive[kind].double().t() @ slopes.by_number[kind] for kind in (of_means, ~of_means)]
+        return parts[0] + parts[1]
+
+    def own(self, values: Tensor) -> Tensor:
+        """What values at `points`, `(N, 1, K)`, are of each cell's own component at its three points, `(3, M)`."""
+        return values.squeeze(1)[self.cells.points, self.cells.component]
+
+    def at_cells(self, values: Tensor, which: slice = slice(None)) -> Tensor:
+        """What values `(rows, B, K)` are at cells, `(M,)`."""
+        return values.movedim(-1, 0).flatten(1)[self.cells.component[which], self.cells.row[which]]
+
+
+@dataclass(frozen=True)
 class Smoothed:
     """What scores need of a smoothed program."""
 
     states: Tensor  # posterior means, (T + 1, B, D)
-    channels: Deviations  # of (T, B, C) channels
+    channels: ChannelDeviations  # of (T, B, C) channels
     lag: Tensor  # posterior covariance of each channel's deviation with its last one, (T, B, C), zero at the first
-    measurements: Deviations  # of (T + 1, B, K) measurements
+    measurements: ReadingDeviations  # of (T + 1, B, K) measurements
     sharpness: Tensor  # 1 / their standard deviations, (T + 1, B, K); those of the normal that touches a Student t
     ahead: Lookahead  # of which these are the moments
 
@@ -185,11 +235,13 @@ def smoothed(ahead: Lookahead, data: Trajectories) -> Smoothed:
     found = posterior_moments(ahead, data)
     lag = torch.from_numpy(found.lag).movedim(0, -1).to(precision.device)
     inside = data.transitions.unsqueeze(-1).expand_as(lag)
+    seen = found.measurements.tensors(precision.device)
+    seen["points"] = seen["points"].unsqueeze(1)
     return Smoothed(
         states=component_major(found.states.to(kind)),
-        channels=Deviations(**found.channels.tensors(precision.device), present=inside),
+        channels=ChannelDeviations(**found.channels.tensors(precision.device), present=inside),
         lag=torch.where(inside, lag, 0.0),
-        measurements=Deviations(**found.measurements.tensors(precision.device), present=precision > 0),
+        measurements=ReadingDeviations(**seen, present=precision > 0, cells=found.cells),
         sharpness=component_major(precision.sqrt().to(kind)),
         ahead=ahead,
     )
@@ -301,8 +353,8 @@ def measured(program: Program, states: Tensor) -> Measured:
 def typical_spreads(program: Program, data: Trajectories, at: Smoothed) -> tuple[Tensor, Tensor]:
     """Root mean square standard deviations of the channels, `(C,)`, and of the measurements, `(K,)`."""
     spread = substep_spreads(program, data, at.channels.points[:1])
-    sharp = measured(program, at.measurements.points[:1]).spread
-    return spread[0][data.transitions].square().mean(0).sqrt(), sharp[0][data.rows].square().mean(0).sqrt()
+    sharp = measured(program, at.states).spread
+    return spread[0][data.transitions].square().mean(0).sqrt(), sharp[data.rows].square().mean(0).sqrt()
 
 
 @torch.no_grad()
@@ -371,20 +423,22 @@ def _of_measurements(program: Program, at: Smoothed, parts: list[Element]) -> Te
             raise NotCompilable("the degrees of freedom of a Student t have no slope")
         return torch.cat([there.reading, there.spread.log().expand(there.reading.shape)], -1)
 
-    slopes = slopes_on_all_rows(program, "readings", readings, {"state": points.flatten(0, 1)}, parts)
+    slopes = slopes_on_all_rows(program, "readings", readings, {"state": points}, parts)
     if isinstance(slopes, Slopes):
         return found.of_slopes(slopes, at.sharpness)
-    scores = at.states.new_zeros((points.shape[2], len(parts))).double()
+    scores, here = at.states.new_zeros((at.states.shape[1], len(parts))).double(), measured(program, at.states)
+    at_points, sharpness = measured(program, points), found.at_cells(at.sharpness)
     for index, part in enumerate(parts):
-        up, down = on_both_sides(part, lambda: measured(program, points[:1]))
+        up, down = on_both_sides(part, lambda: measured(program, at.states))
         alike = (up.spread == down.spread) & (up.freedom == down.freedom)
         if bool((up.shift(down) == 0).all()) and bool(alike.all()):
             continue
-        width, here = 2 * part.step, measured(program, points)
+        width = 2 * part.step
+        of_spread = found.of_spread((up.spread / down.spread).log() / width)
+        of_tails = (_of_tails(here, up, at) - _of_tails(here, down, at)) / width
         up, down = on_both_sides(part, lambda: measured(program, points))
-        of_mean = found.of_mean((here.shift(up) - here.shift(down)) * at.sharpness / width)
-        of_spread = found.of_spread((up.spread[0] / down.spread[0]).log() / width)
-        scores[:, index] = of_mean + of_spread + (_of_tails(here, up, at) - _of_tails(here, down, at)) / width
+        of_mean = found.of_mean(found.own(at_points.shift(up) - at_points.shift(down)) * sharpness / width)
+        scores[:, index] = of_mean + of_spread + of_tails
     return scores
 
 
@@ -392,8 +446,8 @@ def _of_tails(here: Measured, other: Measured, at: Smoothed) -> Tensor:
     """Posterior mean of the measurements' log-density with the degrees of freedom of `other`, `(B,)`; 0 if normal."""
     if not bool(torch.isfinite(here.freedom).any()):
         return at.states.new_zeros(at.states.shape[1])
-    scale = here.spread[0] * at.sharpness
-    freedom = other.freedom[0].double()
+    scale = here.spread * at.sharpness
+    freedom = other.freedom.double()
     mean, sd = at.measurements.mean, at.measurements.variance.clamp(min=0).sqrt()
     one, two = (_log_student((z / scale.clamp(min=1e-12)).double(), freedom) for z in (mean + sd, mean - sd))
     return torch.where(at.measurements.present, (one + two) / 2, 0.0).sum((0, -1))

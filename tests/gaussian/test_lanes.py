@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from examples import drives, example
@@ -12,8 +13,9 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import look_ahead
+from steady_ppl.gaussian.lanes import Array
 from steady_ppl.gaussian.linearize import ReferencePath, linearize
-from steady_ppl.gaussian.posterior_moments import posterior_moments
+from steady_ppl.gaussian.posterior_moments import Posterior, posterior_moments
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 
@@ -23,9 +25,38 @@ def found(program: Program, data: Trajectories, path: ReferencePath) -> list[Ten
     ahead = look_ahead(linearize(Problem(program, data), path))
     moments = posterior_moments(ahead, data)
     of_rows = (ahead.precision, ahead.information, *ahead.means(), *ahead.covariances())
-    arrays = (moments.lag, *moments.channels, *moments.measurements)
-    last = (torch.from_numpy(array).movedim(-1, 0) for array in arrays)
+    arrays = (moments.lag, *moments.channels, *moments.measurements[:2])
+    last = (torch.from_numpy(array).movedim(-1, 0) for array in (*arrays, points_by_trajectory(moments)))
     return [ahead.log_likelihood, *(part.movedim(1, 0) for part in of_rows), *last]
+
+
+def points_by_trajectory(moments: Posterior) -> Array:
+    """The measurements' points, `(D, 3, K, rows, B)`, zero where nothing was measured."""
+    count, rows, drives = moments.measurements.mean.shape
+    points, cells = moments.measurements.points, moments.cells
+    found = np.zeros((len(points), 3, count, rows * drives), points.dtype)
+    found[:, :, cells.component, cells.row] = points[:, cells.points]
+    return found.reshape(*found.shape[:3], rows, drives)
+
+
+def test_points_are_where_something_is_measured() -> None:
+    """Three of a cell, of which the one at the mean is that of all cells of a row."""
+    program = example("gps_boat")
+    data = drives(program, 9, 12, gaps=True)
+    seen = data.observed
+    moments = posterior_moments(look_ahead(linearize(Problem(program, data), anywhere(program, data))), data)
+    cells = moments.cells
+    assert 0 < int(seen.sum()) < seen.numel()
+    assert cells.total == moments.measurements.points.shape[1] == int(seen.any(-1).sum() + 2 * seen.sum())
+    assert torch.equal(torch.stack([cells.row, cells.component], -1), _sorted_by_component(seen))
+    middle = torch.from_numpy(moments.measurements.points).t()[cells.points[0]]
+    assert torch.equal(middle, moments.states.flatten(0, 1)[cells.row].to(middle))
+    for index in range(seen.shape[-1]):
+        assert bool((cells.component[cells.of_component(index)] == index).all())
+
+
+def _sorted_by_component(seen: Tensor) -> Tensor:
+    return seen.flatten(0, 1).t().nonzero().flip(-1)
 
 
 @pytest.mark.parametrize("name", ["linear_gaussian", "pendulum", "hovercraft"])
