@@ -14,6 +14,7 @@ from steady_ppl.discovery.curves import CURVE, by_height, multiplier, over_readi
 from steady_ppl.effects import Variant
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
+from steady_ppl.gaussian.lanes import LANES
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.gaussian.smoother import smooth
@@ -35,7 +36,8 @@ from steady_ppl.utils.cores import Output, run_in_parallel
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import reason_of
 
-TRAJECTORIES_OF_JOB = 400  # that are scored at a time
+TRAJECTORIES_OF_JOB = 400  # that are scored at a time at most
+NUMBERS_OF_JOB = 2**23  # in the slopes of its measurements at most, as far as lanes are filled
 MIN_SHARE_OF_FINITE_SETS = 0.8  # share of the simulated sets that must not blow up
 
 
@@ -260,6 +262,8 @@ def simulate_scores(
     with seeded(seed, "bootstrap"):
         drives, path = simulate_again(program, data, starts, len(program.channels))
 
+    slopes = drives.measurements.numel() * len(program.states)
+
     def score(index: Tensor) -> Output:
         part = replace(problem, data=drives.subset(index))
         ahead = smooth(part, ReferencePath(path.states[:, index], path.noise[:, index]), passes=2)
@@ -270,7 +274,8 @@ def simulate_scores(
         ]
         return {"scores": torch.cat([own, *each], -1), "likely": ahead.log_likelihood}, {}
 
-    jobs = [partial(score, index) for index in torch.arange(len(drives)).split(TRAJECTORIES_OF_JOB)]
+    count = max(LANES, min(TRAJECTORIES_OF_JOB, NUMBERS_OF_JOB * len(drives) // slopes // LANES * LANES))
+    jobs = [partial(score, index) for index in torch.arange(len(drives)).split(count)]
     found = [tensors for tensors, _ in run_in_parallel(jobs)]
     scores, likely = (torch.cat([one[name] for one in found]) for name in ("scores", "likely"))
     scores = scores.unflatten(0, (sets, len(data)))

@@ -19,7 +19,8 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError, UsageError
 from steady_ppl.gaussian.lanes import Array, array
-from steady_ppl.kernels.rows import derivatives, on_all_rows
+from steady_ppl.kernels.codegen import SIMD_LANES
+from steady_ppl.kernels.rows import ROWS_WORTH_COMPILING, derivatives, on_all_rows
 from steady_ppl.model.handlers import (
     NEEDS_NORMAL,
     Observing,
@@ -157,18 +158,35 @@ def linearize_sensors(
     observation_weight: float = 1.0,
     kernels: bool | None = None,
 ) -> Sensors:
-    """The part of `linearize` that is about what is measured, around states `(T + 1, B, D)`."""
+    """The part of `linearize` that is about what is measured, around states `(T + 1, B, D)`.
+
+    Rows without a measurement are left out, unless hardly any has one.
+    """
     given = {"state": states, "measurement": data.measurements, "observed": data.observed}
     measure, count = partial(_residuals, program), data.measurements.shape[-1]
+    if kernels is None:
+        kernels = states[..., 0].numel() >= ROWS_WORTH_COMPILING
+    seen = data.observed.any(-1).flatten()
+    looks_everywhere = bool(seen.all()) or int(seen.sum()) < SIMD_LANES
+    if not looks_everywhere:
+        given = {name: values.flatten(0, 1)[seen].unsqueeze(1) for name, values in given.items()}
     measured, (by,), in_plain_torch = on_all_rows(program, "measure", measure, given, ("state",), kernels, count)
     residuals, log_sd, log_density = measured.chunk(3, -1)
     by_measured = -by[..., :count, :]
-    observed = data.observed & torch.isfinite(by_measured.sum(-1))  # a bearing to where one stands has no derivative
+    observed = given["observed"] & torch.isfinite(by_measured.sum(-1))  # where one stands a bearing has no derivative
+
+    def of_all_rows(values: Tensor) -> Tensor:
+        if looks_everywhere:
+            return values
+        found = values.new_zeros(len(seen), *values.shape[2:])
+        found[seen] = values.squeeze(1)
+        return found.unflatten(0, states.shape[:2])
+
     return Sensors(
-        residual=_where(observed, residuals).double(),
-        measurement=_where(observed[..., None], by_measured).double(),
-        precision=observation_weight * _where(observed, (-2 * log_sd).exp()).double(),
-        log_scale=observation_weight * _where(observed, log_density).double().sum(-1),
+        residual=of_all_rows(_where(observed, residuals).double()),
+        measurement=of_all_rows(_where(observed[..., None], by_measured).double()),
+        precision=of_all_rows(observation_weight * _where(observed, (-2 * log_sd).exp()).double()),
+        log_scale=of_all_rows(observation_weight * _where(observed, log_density).double().sum(-1)),
         in_plain_torch=in_plain_torch,
     )
 
@@ -202,13 +220,14 @@ def require_linear(problem: Problem, what: str, advice: str = "") -> None:
 def _residuals(program: Program, state: Tensor, measurement: Tensor, observed: Tensor) -> Tensor:
     """Residuals and, beside them, log standard deviations and log-densities at residual zero, `(..., 3 K)`; where the
     noise is not normal, of the normal that touches it."""
-    with running(*state.shape[:-1]), Recording() as seen, Observing(measurement, observed):
-        program.observe(state)
     residuals, log_sds, heights = {}, {}, {}
-    for site, fn in seen.distributions.items():
-        residuals[site] = residual(fn, seen.observed[site])
-        sd, heights[site] = tangent_normal(fn, residuals[site], site)
-        log_sds[site] = sd.log()
+    with running(*state.shape[:-1]):
+        with Recording() as seen, Observing(measurement, observed):
+            program.observe(state)
+        for site, fn in seen.distributions.items():
+            residuals[site] = residual(fn, seen.observed[site])
+            sd, heights[site] = tangent_normal(fn, residuals[site], site)
+            log_sds[site] = sd.log()
     parts = (joined(values, seen.distributions, state.shape[:-1]) for values in (residuals, log_sds, heights))
     return torch.cat(list(parts), -1)
 

@@ -19,7 +19,6 @@ from steady_ppl.gaussian.information_filter import Lookahead, Steering
 from steady_ppl.gaussian.lanes import Array, add_outer, add_product, is_some, out_of_lanes, set_scaled
 from steady_ppl.gaussian.linearize import LinearArrays
 
-
 Places = np.ndarray[Any, np.dtype[np.int64]]
 
 

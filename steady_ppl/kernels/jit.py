@@ -102,6 +102,7 @@ class Method:
         particle: examples of the arguments that differ between particles, the first ones.
         trajectory: examples of those that differ between trajectories only.
         along: the arguments in which to differentiate; the Jacobian's rows follow the values.
+        outputs: of how many of the first values there are such rows; None: of all.
         by_parameters: differentiate in the parameters that the kernel takes; these derivatives come last.
 
     Raises:
@@ -117,6 +118,7 @@ class Method:
         trajectory: Examples,
         *,
         along: Sequence[str] = (),
+        outputs: int | None = None,
         by_parameters: bool = False,
     ) -> None:
         levels = dict.fromkeys(particle, PARTICLE) | dict.fromkeys(trajectory, TRAJECTORY)
@@ -130,7 +132,7 @@ class Method:
         self.slopes: list[tuple[int, int]] = []  # value and parameter of each derivative that `by_parameters` adds
         if along:
             inputs = [self.graph.scalar("input", name, k) for name in along for k in range(particle[name].numel())]
-            zero, rows = self.graph.constant(0.0), derivatives(self.graph, values, inputs)
+            zero, rows = self.graph.constant(0.0), derivatives(self.graph, values[:outputs], inputs)
             self.graph.outputs += [zero if derivative is None else derivative for row in rows for derivative in row]
         if by_parameters:
             self._add_slopes(values)

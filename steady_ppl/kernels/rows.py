@@ -70,11 +70,11 @@ def on_all_rows(
     Raises:
         ProgramError: an operation has no derivative.
     """
-    found = _computed(program, name, function, arguments, kernels, along=along)
+    found = _computed(program, name, function, arguments, kernels, along=along, outputs=outputs)
     if isinstance(found, tuple):
-        method, values, rest = found
+        _, values, rest = found
         widths = [arguments[at].shape[-1] for at in along]
-        by = list(rest.unflatten(-1, (method.values, sum(widths))).split(widths, -1)) if along else []
+        by = list(rest.unflatten(-1, (-1, sum(widths))).split(widths, -1)) if along else []
         return Computed(values, by, None)
     if not along:
         return Computed(function(*arguments.values()), [], found)

@@ -225,7 +225,7 @@ def residual(fn: Any, value: Tensor) -> Tensor:
 def location(fn: Any) -> Tensor:
     """The mean of a site; of a Student t, which may have none, where it is centred."""
     base = unwrapped(fn)
-    return base.loc if isinstance(base, dist.StudentT) else fn.mean
+    return base.loc.expand(fn.shape()) if isinstance(base, dist.StudentT) else fn.mean
 
 
 def normal_moments(fn: Any, site: str) -> tuple[Tensor, Tensor]:

@@ -77,6 +77,15 @@ def test_nothing_happens_at_zero_and_to_a_single_row(acts) -> None:
     assert torch.equal(lagged(control, time, torch.tensor(0.0)), control)
 
 
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+def test_the_compiled_loop_of_a_lag_is_torchs(kind: torch.dtype) -> None:
+    control, time = (part.to(kind) for part in held())
+    learned = torch.tensor(0.17, dtype=kind, requires_grad=True)
+    by_torch = lagged(control, time, learned)
+    assert by_torch.requires_grad
+    assert torch.equal(lagged(control, time, learned.detach()), by_torch)
+
+
 @pytest.mark.parametrize("acts", [lagged, delayed])
 def test_a_control_that_never_changes_stays(acts) -> None:
     _, time = held()
