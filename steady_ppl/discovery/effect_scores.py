@@ -76,8 +76,8 @@ class Scoring:
         self.row_spread = spread[0]
         self.substep_spread = substep_spreads(program, data, at.channels.points[:1], self.acting)[0]
         self._around = cache(at.channels.around)
-        self._means_around = cache(self._means_near)
-        self._variables_around = cache(self._variables_near)
+        self._means: dict[int, dict[str, Tensor]] = {}  # by channel; a cached method would keep all this in a cycle
+        self._variables: dict[int, dict[str, Tensor]] = {}
 
     def __call__(self, column: Column) -> Tensor:
         """Scores of a column, `(B, size)`, in double precision."""
@@ -141,15 +141,20 @@ class Scoring:
         weights = self.at.channels.weights(index) / self.substep_spread[..., index] * times
         return by_height(self._variables_around(index)[variable], weights, knots, variable in self.program.angles)
 
-    def _variables_near(self, index: int) -> dict[str, Tensor]:
+    def _variables_around(self, index: int) -> dict[str, Tensor]:
         """What curves may depend on, at the points of one channel, each `(3, T, B)`."""
-        found = variables(self.program, self._around(index), *self.rows[:2], self._means_around(index))
-        return {name: value.expand(3, *self.substep_spread.shape[:2]) for name, value in found.items()}
+        if index not in self._variables:
+            found = variables(self.program, self._around(index), *self.rows[:2], self._means_around(index))
+            shape = (3, *self.substep_spread.shape[:2])
+            self._variables[index] = {name: value.expand(shape) for name, value in found.items()}
+        return self._variables[index]
 
-    def _means_near(self, index: int) -> dict[str, Tensor]:
+    def _means_around(self, index: int) -> dict[str, Tensor]:
         """The channels' means at the points of one of them, each `(3, T, B)`."""
-        at = self.at.channels.places(index)
-        return {name: self.means[at, ..., k] for k, name in enumerate(self.program.channel_names)}
+        if index not in self._means:
+            at = self.at.channels.places(index)
+            self._means[index] = {name: self.means[at, ..., k] for k, name in enumerate(self.program.channel_names)}
+        return self._means[index]
 
     def _pushed(self, variant: Variant, value: Tensor, index: int, few: bool = False) -> dict[str, Tensor]:
         """At the points of one channel; of `few`, of the first drive only."""
