@@ -21,7 +21,7 @@ from steady_ppl.likelihood.parameter_posterior import (
     LogLikelihood,
     about_maximum,
     adapt,
-    linearised,
+    log_likelihood_along,
     log_posterior,
     own_values,
     resampled,
@@ -79,7 +79,7 @@ def ranked(seed: int) -> dict:
         maximum = maximise(Problem(program, data))
         problem = Problem(program, data)
         shape = about_maximum(problem, maximum.path)
-        judge = linearised(problem, maximum.path)
+        judge = log_likelihood_along(problem, maximum.path)
         values, log_weights = adapt(program, shape, judge, VALUES)
         some = torch.randperm(VALUES)[:BLIND_VALUES]
         density = log_posterior(program, values[some], judge) - log_weights[some]

@@ -18,7 +18,7 @@ from steady_ppl import (
     why_not_linear,
 )
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
-from steady_ppl.likelihood.identifiability import undetermined
+from steady_ppl.likelihood.parameter_posterior import undetermined
 from steady_ppl.model.problem import Problem
 from steady_ppl.utils.progress import stages
 

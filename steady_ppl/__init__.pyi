@@ -80,8 +80,7 @@ from .model.planar_vehicle import (
 from .model.program import Program as Program, for_program as for_program
 from .model.substeps import with_substeps as with_substeps
 from .plotting.comparison import open_loop_picture as open_loop_picture
-from .reporting.html import Report as Report
-from .reporting.report import report as report
+from .reporting.report import Report as Report, report as report
 from .runs.export import Dynamics as Dynamics
 from .runs.fit import Fit as Fit
 from .smc.filter import particle_filter as particle_filter

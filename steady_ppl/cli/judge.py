@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 import steady_ppl as st
-from steady_ppl.cli import options
+from steady_ppl.cli import common
 from steady_ppl.cli.common import load_runs, present, program_from, run_labels, runs_and_table, used_before
 from steady_ppl.errors import UsageError
 from steady_ppl.utils.files import require_picture, require_place, write_picture
@@ -19,9 +19,9 @@ SIMULATIONS = 100  # sets for the bands of a report
 
 
 def check(
-    run: options.Run,
+    run: common.Run,
     table: Annotated[Path, typer.Argument(help="Drives to compare with, best others than those of the fit.")],
-    json_file: options.Json = None,
+    json_file: common.Json = None,
     picture: Annotated[Path | None, typer.Option(help="Draw the picture into this file, for example .png.")] = None,
     mask: Annotated[
         Path | None,
@@ -29,9 +29,9 @@ def check(
             help="Write the table without outliers and stretches that nobody measured, for fits and checks, here."
         ),
     ] = None,
-    simulations: Annotated[int, options.count("Simulated sets for the bands.", least=20)] = 100,
-    program: options.Moved = None,
-    seed: options.Seed = 0,
+    simulations: Annotated[int, common.count("Simulated sets for the bands.", least=20)] = 100,
+    program: common.Moved = None,
+    seed: common.Seed = 0,
 ) -> None:
     """Compare a run with measurements: where, when and in which regime it fails, and who is at fault."""
     from steady_ppl.data.frozen_sensors import without_stretches
@@ -59,13 +59,13 @@ def check(
 
 
 def prove(
-    arguments: options.RunsAndTable,
+    arguments: common.RunsAndTable,
     truth: Annotated[str | None, typer.Option(help="The program that made the drives, if it is known.")] = None,
     oracle: Annotated[Path | None, typer.Option(help="A run of the true structure, fitted like the others.")] = None,
-    json_file: options.Json = None,
+    json_file: common.Json = None,
     picture: Annotated[Path | None, typer.Option(help="Draw the errors into this file, for example .png.")] = None,
-    program: Annotated[list[str] | None, options.moved("once for each RUN and the oracle, in order")] = None,
-    seed: options.Seed = 0,
+    program: Annotated[list[str] | None, common.moved("once for each RUN and the oracle, in order")] = None,
+    seed: common.Seed = 0,
 ) -> None:
     """Prove that runs are better than the first one: log p(y), open-loop errors and noise, with paired intervals."""
     from steady_ppl.runs.recipes import fingerprint
@@ -89,15 +89,15 @@ def prove(
 
 def evaluate(
     arguments: Annotated[list[Path], typer.Argument(metavar="RUN... TABLE", help="Run folders, then the table.")],
-    json_file: options.Json = None,
-    particles: Annotated[int | None, options.count("Particles of the filters.", least=2)] = None,
-    rollouts: Annotated[int, options.count("Noisy roll-outs from each true state.")] = 1000,
-    seed: options.Seed = 0,
+    json_file: common.Json = None,
+    particles: Annotated[int | None, common.count("Particles of the filters.", least=2)] = None,
+    rollouts: Annotated[int, common.count("Noisy roll-outs from each true state.")] = 1000,
+    seed: common.Seed = 0,
     surveyed: Annotated[
         str | None,
         typer.Option("--map", help="The same vehicle with the true landmarks, for runs that learned theirs."),
     ] = None,
-    program: Annotated[list[str] | None, options.moved("with several RUNs once for each, in their order")] = None,
+    program: Annotated[list[str] | None, common.moved("with several RUNs once for each, in their order")] = None,
 ) -> None:
     """The paper's errors where true states exist; errors in measurement space always."""
     from steady_ppl.comparison.evaluate import evaluate_all, incomparable, table_of
@@ -135,7 +135,7 @@ def evaluate(
 
 
 def states(
-    run: options.Run,
+    run: common.Run,
     table: Annotated[Path, typer.Argument(help="Drives.")],
     out: Annotated[
         Path,
@@ -143,10 +143,10 @@ def states(
             "--out", help="A table (.csv, .parquet) of medians and 90 % intervals, or all draws for ArviZ (.nc)."
         ),
     ],
-    draws: Annotated[int, options.count("Paths of each drive.")] = 100,
-    particles: Annotated[int | None, options.count("Particles of the filter.")] = None,
-    program: options.Moved = None,
-    seed: options.Seed = 0,
+    draws: Annotated[int, common.count("Paths of each drive.")] = 100,
+    particles: Annotated[int | None, common.count("Particles of the filter.")] = None,
+    program: common.Moved = None,
+    seed: common.Seed = 0,
 ) -> None:
     """Write where the vehicle probably was, given all measurements of a drive: posterior draws of its states.
 
@@ -168,16 +168,16 @@ def states(
 
 
 def report(
-    arguments: options.RunsAndTable,
+    arguments: common.RunsAndTable,
     out: Annotated[Path, typer.Option("--out", help="The page to write.")] = Path("report.html"),
     discovery: Annotated[
         Path | None,
         typer.Option(help="What `steady discover` found: its RUN or its --json file, if none of the RUNs has it."),
     ] = None,
     title: Annotated[str | None, typer.Option(help="Of the page; the runs' names when not given.")] = None,
-    simulations: Annotated[int, options.count("Simulated sets for the bands.", least=20)] = SIMULATIONS,
-    program: Annotated[list[str] | None, options.moved("once for each RUN, in order")] = None,
-    seed: options.Seed = 0,
+    simulations: Annotated[int, common.count("Simulated sets for the bands.", least=20)] = SIMULATIONS,
+    program: Annotated[list[str] | None, common.moved("once for each RUN, in order")] = None,
+    seed: common.Seed = 0,
 ) -> None:
     """Write one page of HTML: verdict, measured against predicted, where it fails, what is missing, before and after.
 

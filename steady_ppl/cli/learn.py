@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 import steady_ppl as st
-from steady_ppl.cli import options
+from steady_ppl.cli import common
 from steady_ppl.cli.common import fit_or_program, present, program_from, write_json
 from steady_ppl.errors import RunError, UsageError
 from steady_ppl.utils.context import QUIET
@@ -21,7 +21,7 @@ GuideName = Literal["lookahead", "gaussian", "bootstrap", "network", "mean-field
 
 def fit(
     context: typer.Context,
-    model: options.Model,
+    model: common.Model,
     table: Annotated[Path, typer.Argument(help="Training drives, .csv or .parquet.")],
     out: Annotated[Path, typer.Option("--out", help="Run folder to write.")],
     valid: Annotated[Path | None, typer.Option(help="Held-out drives that decide when to stop.")] = None,
@@ -38,18 +38,18 @@ def fit(
     ] = None,
     hand: Annotated[str | None, typer.Option(help="The program written by hand, for fit-hand.")] = None,
     known_start: Annotated[bool, typer.Option(help="Give the first row's x. columns as the exact start.")] = False,
-    substeps: options.Substeps = None,
-    particles: Annotated[int | None, options.count("Particles for each drive.")] = None,
-    draws: Annotated[int | None, options.count("Paths for each drive in the M step.")] = None,
-    steps: Annotated[int | None, options.count("E steps.")] = None,
+    substeps: common.Substeps = None,
+    particles: Annotated[int | None, common.count("Particles for each drive.")] = None,
+    draws: Annotated[int | None, common.count("Paths for each drive in the M step.")] = None,
+    steps: Annotated[int | None, common.count("E steps.")] = None,
     setting: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Any other setting of the recipe, for example ramp=0.7."),
     ] = None,
-    seed: options.Seed = 0,
+    seed: common.Seed = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="Where to compute.")] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
-    force: options.Overwrite = False,
+    force: common.Overwrite = False,
 ) -> None:
     """Learn a program's parameters from measurements."""
     from steady_ppl.runs.recipes import run_recipe
@@ -95,8 +95,8 @@ def _settings(pairs: list[str], found: dict[str, Any]) -> dict[str, Any]:
             found[name] = ast.literal_eval(word)
         except (ValueError, SyntaxError):
             found[name] = LITERALS.get(word, word)
-        if isinstance(found[name], int) and abs(found[name]) > options.MAX_COUNT:
-            raise UsageError(f"--set {shown(pair, 60)}: expected a whole number up to {options.MAX_COUNT}")
+        if isinstance(found[name], int) and abs(found[name]) > common.MAX_COUNT:
+            raise UsageError(f"--set {shown(pair, 60)}: expected a whole number up to {common.MAX_COUNT}")
     return found
 
 
@@ -110,14 +110,14 @@ def discover(
         bool | None,
         typer.Option(help="Give the first row's x. columns as the exact start; a RUN's own setting when not given."),
     ] = None,
-    substeps: options.Substeps = None,
+    substeps: common.Substeps = None,
     mix: Annotated[
         bool, typer.Option("--mix", help="Put both tables together and keep every second drive to choose by.")
     ] = False,
     out: Annotated[Path | None, typer.Option("--out", help="Run folder for the improved fit.")] = None,
-    json_file: options.Json = None,
+    json_file: common.Json = None,
     picture: Annotated[Path | None, typer.Option(help="Draw what was found into this file, for example .png.")] = None,
-    simulations: Annotated[int, options.count("Simulated sets for the calibration.", least=50)] = 200,
+    simulations: Annotated[int, common.count("Simulated sets for the calibration.", least=50)] = 200,
     withhold: Annotated[
         list[str] | None, typer.Option(metavar="EFFECT", help="Leave an effect out of the search; as often as needed.")
     ] = None,
@@ -125,10 +125,10 @@ def discover(
         list[str] | None,
         typer.Option(metavar="KIND", help="Look for one kind alone: dynamics, actuator, sensor or noise; or for some."),
     ] = None,
-    program: options.MovedOfRun = None,
-    seed: options.Seed = 0,
+    program: common.MovedOfRun = None,
+    seed: common.Seed = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a search that was stopped.")] = False,
-    force: options.Overwrite = False,
+    force: common.Overwrite = False,
 ) -> None:
     """Learn which physical effect a program lacks: none, one by name, several, or a curve that has no name."""
     from steady_ppl.discovery.discover import kept_search
@@ -179,7 +179,7 @@ def add(
         list[str] | None,
         typer.Argument(metavar="EFFECT...", help="NAME[:AT][:OPTION=NUMBER][=NUMBER[,NUMBER]], see `steady effects`."),
     ] = None,
-    program: options.MovedOfRun = None,
+    program: common.MovedOfRun = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing file.")] = False,
 ) -> None:
     """Write a program with physical effects; `fit` it like any other.
@@ -215,7 +215,7 @@ def effects(
 def study(
     plan: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="What is compared with what.")],
     out: Annotated[Path, typer.Option("--out", help="Folder of the results; an existing one is resumed.")],
-    workers: Annotated[int | None, options.count("Processes of this machine; its cores when not given.")] = None,
+    workers: Annotated[int | None, common.count("Processes of this machine; its cores when not given.")] = None,
     cluster: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, tcp://HOST:PORT, in place of processes.")
     ] = None,

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 import steady_ppl as st
-from steady_ppl.cli import options
+from steady_ppl.cli import common
 from steady_ppl.cli.common import program_from
 from steady_ppl.errors import UsageError
 from steady_ppl.utils.progress import stages
@@ -91,12 +91,12 @@ app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 @app.command("alpha-truck", epilog="Example:  steady data alpha-truck alpha_truck/train --out train.csv")
 def alpha_truck(
     folder: Annotated[Path, typer.Argument(help="One split: holds vrpn-pose.csv and vesc_drive.csv.")],
-    out: options.Table,
+    out: common.Table,
     sigma_deg: Annotated[float, typer.Option(help="Standard deviation of the simulated bearings, degrees.")] = 5.0,
     centred: Annotated[
         bool, typer.Option("--centred", help="Velocities of each row itself, not the authors' of half a row later.")
     ] = False,
-    seed: options.Seed = 0,
+    seed: common.Seed = 0,
 ) -> None:
     """One split of the AlphaTruck logs to a table, resampled as the authors do.
 
@@ -112,7 +112,7 @@ def alpha_truck(
 def cut(
     table: Annotated[Path, typer.Argument(help="Drives.")],
     seconds: Annotated[float, typer.Option(help="Length of a piece, s.")],
-    out: options.Table,
+    out: common.Table,
 ) -> None:
     """Long drives in pieces, `…-1`, `…-2`, … of the drive's name.
 
@@ -135,10 +135,10 @@ def data() -> None:
 
 
 def simulate(
-    model: options.Model,
-    out: options.Table,
-    trajectories: Annotated[int | None, options.count("How many drives, 16 when not given.")] = None,
-    seed: options.Seed = 0,
+    model: common.Model,
+    out: common.Table,
+    trajectories: Annotated[int | None, common.count("How many drives, 16 when not given.")] = None,
+    seed: common.Seed = 0,
     controls: Annotated[Path | None, typer.Option(help="Take time, controls and gaps from this table.")] = None,
     substeps: Annotated[
         int | None,

@@ -28,8 +28,8 @@ from steady_ppl.gaussian.linearize import require_linear
 from steady_ppl.gaussian.predict import named_horizons, predict
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
-from steady_ppl.likelihood.identifiability import undetermined
 from steady_ppl.likelihood.outliers import find_outliers
+from steady_ppl.likelihood.parameter_posterior import undetermined
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.runs.diagnostics import diagnose_units

@@ -18,13 +18,13 @@ from steady_ppl.errors import FilterError, UsageError
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.likelihood.maximize import Maximum, maximise, widen_noise
+from steady_ppl.likelihood.parameter_posterior import pseudo_inverse
 from steady_ppl.likelihood.parameters import elements, values_of
 from steady_ppl.likelihood.scores import widens
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.model.stability import can_be_cut, counts_rows, is_step
 from steady_ppl.model.substeps import MAX_SUBSTEPS, with_substeps
-from steady_ppl.utils.matrices import pseudo_inverse
 from steady_ppl.utils.random import seeded
 from steady_ppl.utils.text import reason_of
 

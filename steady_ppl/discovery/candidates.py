@@ -32,11 +32,11 @@ from steady_ppl.discovery.screening import FAMILY_LEVEL, Screened, Tested, depar
 from steady_ppl.effects import Effect, Sizes, Variant, attached, catalogue
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import smooth
+from steady_ppl.likelihood.parameter_posterior import ridged_inverse
 from steady_ppl.likelihood.parameters import Element, elements
 from steady_ppl.likelihood.scores import measured, smoothed, typical_spreads
 from steady_ppl.model.program import Program
 from steady_ppl.utils.journal import journaled
-from steady_ppl.utils.matrices import ridged_inverse
 from steady_ppl.utils.random import seeded
 
 MIN_LEADERS, MIN_ALIAS_CORRELATION = 6, 0.85  # how many are refitted, and those whose columns are so like the first's

@@ -23,10 +23,10 @@ from steady_ppl.discovery.curves import CURVE, prior_covariance
 from steady_ppl.discovery.effect_scores import Column
 from steady_ppl.discovery.refits import Fold, Refit, as_declared
 from steady_ppl.effects import Variant, attached, catalogue
+from steady_ppl.likelihood.parameter_posterior import pseudo_inverse, ridged_inverse
 from steady_ppl.likelihood.parameters import Element, elements, on_both_sides
 from steady_ppl.likelihood.scores import measured, substep_spreads
 from steady_ppl.model.program import Program
-from steady_ppl.utils.matrices import pseudo_inverse, ridged_inverse
 from steady_ppl.utils.text import reason_of
 
 FAMILY_LEVEL, POWER = 0.05, 0.95  # of the tests of all candidates together, and at a detection limit

@@ -1,4 +1,4 @@
-"""How far drives leave a program's parameters open: draws of them, from the linearised program's likelihood.
+"""How far drives leave a program's parameters open: draws of them, what is not determined, and covariances.
 
 The likelihood's maximum and curvature give a Student t, from which values are drawn and weighed by likelihood and
 prior; these shape a second and a third. All values count, as draws of the mixture of all three (adaptive multiple
@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
@@ -24,7 +25,16 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, require
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import smooth
-from steady_ppl.likelihood.maximize import MAX_MOVE, PASSES, TOLERANCE, log_prior, maximise, posterior_score
+from steady_ppl.likelihood.maximize import (
+    MAX_MOVE,
+    PASSES,
+    TOLERANCE,
+    Term,
+    linearised,
+    log_prior,
+    maximise,
+    posterior_score,
+)
 from steady_ppl.likelihood.parameters import Element, elements, on_both_sides, set_values, values_of
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
@@ -35,6 +45,10 @@ from steady_ppl.utils.random import seeded
 if TYPE_CHECKING:
     import arviz
 
+RIDGE = 1e-10  # beside an information of one
+MIN_CURVATURE = 1.0  # of log p(y) in a direction's own size, nats: below it a number is open by a factor of e
+MIN_DRIVES_OF_NUMBER = 2  # for the cross products of their scores to tell the information
+MIN_SHARE, SAME_SHARE = 0.1, 0.1  # of a direction's largest part, for a number to belong to it, or to be as large
 DEGREES_OF_FREEDOM = 5.0  # of the Student t: its tails are heavier than those of any posterior that data tell
 ROUND_SHARES = (0.25, 0.25, 0.5)  # shares of the values; each round draws about what those before found
 MIN_EFFECTIVE_DRAWS = 4  # effective values a number, for which the weights that shape the next round are tempered
@@ -111,7 +125,9 @@ def parameter_posterior(
         begin()
         path = maximise(problem).path
         begin()
-        proposed, log_weights = adapt(program, about_maximum(problem, path), linearised(problem, path), proposals)
+        proposed, log_weights = adapt(
+            program, about_maximum(problem, path), log_likelihood_along(problem, path), proposals
+        )
         return resampled(program, proposed, log_weights, draws)
 
 
@@ -180,7 +196,7 @@ def observed_information(problem: Problem, path: ReferencePath, parts: list[Elem
     return (found + found.T) / 2
 
 
-def linearised(problem: Problem, path: ReferencePath) -> LogLikelihood:
+def log_likelihood_along(problem: Problem, path: ReferencePath) -> LogLikelihood:
     """log p(y) of the linearised program as it stands, summed over drives."""
 
     def judge(program: Program) -> Tensor:
@@ -248,3 +264,73 @@ def _log_prior(program: Program) -> float:
                 transform = transform_to(constraint)
                 total += float(transform.log_abs_det_jacobian(free, transform(free)).sum())
     return total
+
+
+@torch.no_grad()
+def undetermined(problem: Problem, path: ReferencePath) -> list[str]:
+    """Sentences about what drives leave open of a program that was fitted to them, or to others like them.
+
+    Directions are eigenvectors of the information matrix, in logarithms and, of numbers with a unit, in their own size.
+
+    Args:
+        problem: its program has some dozens of learnable numbers.
+        path: of the drives, near their posterior means.
+    """
+    term = Term.alone(problem, path)
+    if not (parts := term.parts):
+        return []
+    scores = linearised([term]).scores
+    directions = _open_directions(parts, scores.T @ scores)
+    if directions or len(scores) < MIN_DRIVES_OF_NUMBER * len(parts):
+        directions = _open_directions(parts, observed_information(problem, path, parts))
+    return [_sentence(parts, direction) for direction in directions]
+
+
+def _open_directions(parts: Sequence[Element], information: Tensor) -> list[Tensor]:
+    """Directions along which log p(y) hardly bends, each `(P,)` and of few numbers, in the numbers' own sizes."""
+    own = information.diagonal().clamp(min=0)
+    size = torch.where(own > 0, torch.maximum(values_of(parts).abs(), 3 * own.rsqrt()), 1.0)
+    size = torch.where(torch.tensor([part.has_unit for part in parts]), size, 1.0)
+    curvature, turn = torch.linalg.eigh(size * information * size[:, None])
+    basis = turn[:, curvature < MIN_CURVATURE].T.clone()
+    for row in range(len(basis)):  # the same space by directions of few numbers: Gauss and Jordan
+        at = divmod(int(basis[row:].abs().argmax()), len(parts))
+        basis[[row, row + at[0]]] = basis[[row + at[0], row]]
+        basis[row] /= basis[row, at[1]].clone()
+        others = torch.arange(len(basis)) != row
+        basis[others] -= basis[others][:, at[1], None] * basis[row]
+    return list(basis)
+
+
+def _sentence(parts: Sequence[Element], direction: Tensor) -> str:
+    share = direction / direction.abs().max()
+    chosen = [index for index in range(len(parts)) if abs(float(share[index])) > MIN_SHARE]
+    names = [parts[index].name for index in chosen]
+    if len(chosen) == 1:
+        return f"these drives do not tell {names[0]}: many values are as likely"
+    listed = f"{', '.join(names[:-1])} and {names[-1]}"
+    pair = [float(share[index]) for index in chosen]
+    equal = len(pair) == 2 and abs(abs(pair[0]) - abs(pair[1])) < SAME_SHARE
+    if equal and not any(parts[index].has_unit for index in chosen):
+        what = "product" if pair[0] * pair[1] < 0 else "ratio"
+        return f"these drives tell only the {what} of {listed}, not each"
+    return f"these drives tell {listed} only together, not each"
+
+
+def in_own_sizes(inverse: Callable[[Tensor], Tensor], information: Tensor) -> Tensor:
+    """An inverse of a matrix `(N, N)`, taken of the one that has ones on its diagonal: the same in any units."""
+    size = information.diagonal().clamp(min=0).sqrt()
+    per = torch.where(size > 0, 1 / size, 1.0)
+    return per * inverse(per * information * per[:, None]) * per[:, None]
+
+
+def pseudo_inverse(information: Tensor) -> Tensor:
+    """The covariance of what the information tells; zero of what it does not tell. `lstsq` rounds differently from run
+    to run."""
+    return in_own_sizes(partial(torch.linalg.pinv, hermitian=True), information)
+
+
+def ridged_inverse(information: Tensor) -> Tensor:
+    """The covariance; of what the information does not tell it is huge."""
+    ridge = RIDGE * torch.eye(len(information)).to(information)
+    return in_own_sizes(lambda matrix: torch.linalg.inv(matrix + ridge), information)

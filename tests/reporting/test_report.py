@@ -14,7 +14,7 @@ from report_pages import EVIL, FOUND, Elements, content, content_of, six_drives,
 from small import steady
 
 import steady_ppl as st
-from steady_ppl.reporting.html import said
+from steady_ppl.reporting.report import said
 
 MOST = 6_000_000  # bytes
 

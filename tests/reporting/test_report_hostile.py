@@ -13,7 +13,7 @@ from report_pages import FOUND, Elements, content, in_a_browser, opened, with_sc
 
 import steady_ppl as st
 from steady_ppl.errors import ComputationError
-from steady_ppl.reporting.html import _data
+from steady_ppl.reporting.report import _data
 
 IMAGE = "<img src=x onerror=window.broken=1>"
 LINK = '<a href="javascript:window.broken=1">x</a>'  # plotly makes links of these

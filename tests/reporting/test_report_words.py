@@ -9,7 +9,7 @@ from examples import example
 from markupsafe import escape
 
 from steady_ppl.effects import attached
-from steady_ppl.reporting.html import _equation, said, spread
+from steady_ppl.reporting.report import _equation, said, spread
 
 
 def test_an_equation_that_is_no_latex_is_said_in_words():

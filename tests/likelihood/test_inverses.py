@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from steady_ppl.utils.matrices import pseudo_inverse, ridged_inverse
+from steady_ppl.likelihood.parameter_posterior import pseudo_inverse, ridged_inverse
 
 SIZES = torch.tensor([1e-9, 1.0, 1e7], dtype=torch.float64)
 

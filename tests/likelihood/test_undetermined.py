@@ -9,8 +9,8 @@ from pyro.distributions import constraints
 from pyro.nn import PyroParam
 
 from steady_ppl import check
-from steady_ppl.likelihood.identifiability import undetermined
 from steady_ppl.likelihood.maximize import maximise
+from steady_ppl.likelihood.parameter_posterior import undetermined
 from steady_ppl.model.problem import Problem
 from steady_ppl.runs.fit import Fit
 
