@@ -288,12 +288,15 @@ def require_searchable(problem: Problem, valid: Trajectories, simulations: int) 
 
 
 def shared_drives(one: Trajectories, other: Trajectories) -> list[str]:
-    """Labels of those of the second drives whose measurements are also among the first."""
+    """Labels of those of the second drives that are also among the first. Sensors that saturate say the same of
+    different drives, whose controls tell them apart."""
 
     def content(data: Trajectories, index: int) -> bytes:
         rows = int(data.lengths[index])
         seen = data.observed[:rows, index]
-        return torch.where(seen, data.measurements[:rows, index], 0.0).numpy().tobytes() + seen.numpy().tobytes()
+        readings = torch.where(seen, data.measurements[:rows, index], 0.0)
+        acting = data.controls[: rows - 1, index]  # the last row acts on nothing
+        return b"".join(values.contiguous().numpy().tobytes() for values in (readings, seen, acting))
 
     known = {content(one, index) for index in range(len(one))}
     return [label for index, label in enumerate(other.labels) if content(other, index) in known]

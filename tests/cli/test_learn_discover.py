@@ -12,7 +12,7 @@ import torch
 from examples import MODELS, example
 from small import HOVERCRAFT, simulated, steady, written
 
-from steady_ppl import Fit, simulate, write_table
+from steady_ppl import Fit, for_program, simulate, write_table
 from steady_ppl.discovery import candidates, discover, search
 from steady_ppl.errors import FilterError
 
@@ -77,6 +77,13 @@ def test_drives_that_both_tables_have_are_refused(tmp_path, capsys):
     other = written(tmp_path / "other.csv", drives.subset(range(3, 8)))
     said = refused(capsys, "discover", HOVERCRAFT, one, "--valid", other)
     assert "3 of the validation drives are training drives as well (4, 5, 6)" in said
+
+
+def test_drives_of_saturated_sensors_are_not_taken_for_one_drive():
+    one, other = (for_program(example("hovercraft", torch.float32), simulated(rows=20, seed=seed)) for seed in (0, 1))
+    for drives in (one, other):
+        drives.measurements[:] = 1.5
+    assert discover.shared_drives(one, other) == [] and discover.shared_drives(one, one) == ["1", "2", "3"]
 
 
 def test_a_folder_that_does_not_exist_is_said_before_anything_is_computed(tmp_path, capsys):
