@@ -22,6 +22,7 @@ from steady_ppl.gaussian.predict import HALF_WIDTH
 from steady_ppl.likelihood.outliers import AS_TAILS, Outliers, find_outliers
 
 MAX_FITS = 6  # without the outliers that were found in the fit before
+WIDE = 3.0  # a factor to begin with where the process noise was fitted many times wider: it may stand for the sensor's
 MIN_FACTOR = 1.25  # by which declared noise must be wrong; a smaller one is tested beside the effects
 
 
@@ -77,14 +78,20 @@ def with_suitable_noise(base: Refit, wanted: Callable[[Variant], bool]) -> tuple
     for variant in [one for name in reversed(NOISE_SIZES) for one in sizes_of_noise(base.program, name)]:
         if variant.name in there or not wanted(variant) or is_learned(variant, base.program, base.folds[0]):
             continue
-        refit = refit_with(base, variant, 1.0)
-        if isinstance(refit, str) or len(refit.programs) < len(base.programs):
+        starts = (1.0,) if base.unwidened is None else (1.0, WIDE)
+        refits = [refit for start in starts if isinstance(refit := refit_with(base, variant, start), Refit)]
+        refit = max((one for one in refits if len(one.programs) == len(base.programs)), key=_held_out, default=base)
+        if refit is base:
             continue
         gain, factor = float((refit.held_out - base.held_out).sum()), float(refit.coefficient(variant))
         if gain > CLEAR_GAIN and abs(math.log(factor)) > math.log(MIN_FACTOR):
             base = refit if refit.converged else _fitted_further(base, refit, variant)
             found.append(Correction(variant, gain))
     return base, found
+
+
+def _held_out(refit: Refit) -> float:
+    return float(refit.held_out.sum())
 
 
 def _fitted_further(base: Refit, refit: Refit, variant: Variant) -> Refit:
