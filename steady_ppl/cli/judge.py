@@ -55,7 +55,7 @@ def check(
         st.write_table(found.outliers.without(without_stretches(drives, found.stuck)), mask)
         count, cells = len(found.stuck), found.outliers.cells
         stretches = f"{count} stretch{'' if count == 1 else 'es'} that nobody measured"
-        say(f"{mask}: {table.name} without {stretches} and {cells} reading{'' if cells == 1 else 's'} that are wrong")
+        say(f"{mask}: {table.name} without {stretches} and {cells} wrong reading{'' if cells == 1 else 's'}")
 
 
 def prove(

@@ -17,7 +17,7 @@ from steady_ppl.data.trajectories import Trajectories, concatenated
 from steady_ppl.discovery.candidates import TIE_NATS
 from steady_ppl.discovery.finding import NextRun, corrections, findings, next_run, shape_of
 from steady_ppl.discovery.fitting import ByDraws
-from steady_ppl.discovery.refits import Refit
+from steady_ppl.discovery.refits import Refit, with_states_of
 from steady_ppl.discovery.result import Discovery
 from steady_ppl.discovery.search import MAX_EFFECTS, Found, Search, Settings, search
 from steady_ppl.effects import catalogue, of_name, record, restore, written_class
@@ -25,6 +25,7 @@ from steady_ppl.effects.declaration import VERDICT_OF_FORM
 from steady_ppl.errors import DataError, FilterError, UsageError
 from steady_ppl.gaussian.linearize import require_linear
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
+from steady_ppl.likelihood.outliers import find_outliers
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
@@ -230,9 +231,11 @@ def _notes(found: Search) -> list[str]:
     if found.curve is not None:
         notes.append(
             "a curve has no name and is not kept: 'after' is what it would bring, --out has the program as it stood, "
-            "fitted"
+            "fitted, with the noise that these drives show"
         )
-    notes += [one.note for one in found.outliers if one.note]
+    notes += [one.note for one in found.outliers if one.note] + found.notes
+    if said := _no_longer_wrong(found):
+        notes.append(said)
     if not found.final.converged and found.found:
         notes.append("the fit with what was found has not converged")
     notes += [f"{label}: taken back, for with it the program fails: {why}" for label, why in found.taken_back.items()]
@@ -243,6 +246,23 @@ def _notes(found: Search) -> list[str]:
     notes += [f"{one.candidate.variant.label}: {said}" for one in found.found if (said := _note_of_one_drive(one))]
     symptoms = [one.variant.label for one in found.rounds[0].candidates if one.against_its_sign and one.total > 0]
     return notes + [f"{label} would help with a sign that physics rules out: a symptom" for label in symptoms]
+
+
+def _no_longer_wrong(found: Search) -> str:
+    """Whether readings were left out that are not wrong by the program with what was found."""
+    before = found.outliers[0] if found.outliers else None
+    if before is None or not before.found or not found.found or found.interrupted:
+        return ""
+    fold = found.final.folds[0]
+    states = with_states_of(found.final.program, before.data)
+    again = find_outliers(Problem(found.final.program, states, fold.known_start), fold.path, against_tails=False)
+    count = int((before.wrong & ~again.wrong).sum())
+    if count <= 0.5 * before.cells:
+        return ""
+    return (
+        f"{count} of {before.cells} readings of the training drives that were left out are not wrong by the program "
+        "with what was found: discover again from there"
+    )
 
 
 def _note_of_one_drive(found: Found) -> str:

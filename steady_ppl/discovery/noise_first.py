@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 
@@ -19,47 +20,70 @@ from steady_ppl.discovery.refits import Refit, fit_near, judged_fits, refit_with
 from steady_ppl.discovery.screening import NOISE_SIZES, is_learned, sizes_of_noise
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.gaussian.predict import HALF_WIDTH
-from steady_ppl.likelihood.outliers import AS_TAILS, Outliers, find_outliers
+from steady_ppl.likelihood.outliers import AS_TAILS, Outliers, find_outliers, too_many
+from steady_ppl.utils.text import reason_of
 
 MAX_FITS = 6  # without the outliers that were found in the fit before
 WIDE = 3.0  # a factor to begin with where the process noise was fitted many times wider: it may stand for the sensor's
 MIN_FACTOR = 1.25  # by which declared noise must be wrong; a smaller one is tested beside the effects
 
 
-def without_outliers(
-    fit: Callable[[Trajectories, Trajectories], Refit], train: Trajectories, valid: Trajectories
-) -> tuple[Refit, list[Outliers]]:
-    """What `fit` makes of training and validation drives without the outliers that its fits show, and these.
+class Cleaned(NamedTuple):
+    """Fits without outliers."""
 
-    None is left out where noise with heavy tails makes all readings likelier.
+    refit: Refit
+    outliers: list[Outliers]  # of the training and of the validation drives
+    whole: Refit  # the fit to all readings
+
+
+def without_outliers(
+    fit: Callable[[Trajectories, Trajectories], Refit],
+    train: Trajectories,
+    valid: Trajectories,
+    wanted: Callable[[Variant], bool],
+) -> Cleaned:
+    """What `fit` makes of training and validation drives without the outliers that its fits show.
+
+    None is left out where noise with heavy tails, if it is `wanted`, makes all readings likelier.
     """
     none = [Outliers(data, [], torch.zeros_like(data.observed)) for data in (train, valid)]
     found, whole = none, fit(train, valid)
     refit = whole
     for _ in range(MAX_FITS):
-        folds = zip(refit.programs, refit.folds, strict=True)
-        more = [find_outliers(fold.fitting(program), fold.path, against_tails=False) for program, fold in folds]
-        found = [one.with_more(other) for one, other in zip(found, more, strict=True)]
-        if not any(one.found for one in more):
+        try:
+            folds = zip(refit.programs, refit.folds, strict=True)
+            more = [find_outliers(fold.fitting(program), fold.path, against_tails=False) for program, fold in folds]
+            every = [one.with_more(other) for one, other in zip(found, more, strict=True)]
+            if said := next(filter(None, (too_many(one.data, one.wrong) or one.note for one in every)), ""):
+                return Cleaned(whole, [replace(none[0], note=said), none[1]], whole)
+            if not any(one.found for one in more):
+                break
+            refit, found = fit(*(one.left for one in every)), every
+        except Exception as error:  # also of the program's own code
+            found = [
+                replace(found[0], note=f"wrong readings were not looked for further: {reason_of(error)}"),
+                found[1],
+            ]
             break
-        refit = fit(*(one.left for one in found))
-    likely = _log_likelihood(refit) - sum(one.cost for one in found)
-    if refit is not whole and (tails := _with_tails(whole)) and _log_likelihood(tails) > likely:
-        return whole, [replace(one, note=AS_TAILS) for one in none[:1]] + none[1:]
-    return refit, found
+    if refit is not whole and (tails := _with_tails(whole, wanted)) is not None:
+        likely = _log_likelihood(refit, wanted) - sum(one.cost for one in found)
+        if _log_likelihood(tails, wanted) > likely:
+            return Cleaned(whole, [replace(none[0], note=AS_TAILS), none[1]], whole)
+    return Cleaned(refit, found, whole)
 
 
-def _log_likelihood(fits: Refit) -> float:
-    """Of all drives, each under the program that was fitted to it."""
-    return sum(float(maximum.log_likelihood.sum()) for maximum in fits.maxima)
+def _log_likelihood(fits: Refit, wanted: Callable[[Variant], bool]) -> float:
+    """Of all drives, each under the program that was fitted to it, with suitable noise."""
+    suited, _ = with_suitable_noise(fits, wanted)
+    return sum(float(maximum.log_likelihood.sum()) for maximum in suited.maxima)
 
 
-def _with_tails(base: Refit) -> Refit | None:
+def _with_tails(base: Refit, wanted: Callable[[Variant], bool]) -> Refit | None:
     """The program with Student t measurement noise; None where it has that already, or it cannot be fitted."""
     there = {variant.name for variant in attached(base.program)}
     for effect in catalogue(base.program):
-        if effect.form == "tails" and effect.name not in there:
-            refit = refit_with(base, effect.variant(), effect.typical)
+        if effect.form == "tails" and effect.name not in there and wanted(variant := effect.variant()):
+            refit = refit_with(base, variant, effect.typical)
             return None if isinstance(refit, str) else refit
     return None
 
@@ -74,7 +98,7 @@ class Correction:
 
 def with_suitable_noise(base: Refit, wanted: Callable[[Variant], bool]) -> tuple[Refit, list[Correction]]:
     """A fitted program with factors on the noise that it declares too wide or too narrow, and these."""
-    found, there = list[Correction](), {variant.name for variant in attached(base.program)}
+    own, found, there = base, list[Correction](), {variant.name for variant in attached(base.program)}
     for variant in [one for name in reversed(NOISE_SIZES) for one in sizes_of_noise(base.program, name)]:
         if variant.name in there or not wanted(variant) or is_learned(variant, base.program, base.folds[0]):
             continue
@@ -87,6 +111,11 @@ def with_suitable_noise(base: Refit, wanted: Callable[[Variant], bool]) -> tuple
         if gain > CLEAR_GAIN and abs(math.log(factor)) > math.log(MIN_FACTOR):
             base = refit if refit.converged else _fitted_further(base, refit, variant)
             found.append(Correction(variant, gain))
+    for one in list(found) if len(found) > 1 else []:  # a factor may have stood for one that was added later
+        near_one = abs(math.log(float(base.coefficient(one.variant)))) <= math.log(MIN_FACTOR)
+        if near_one and (fewer := without([one], own, base)) is not None:
+            base = fewer
+            found.remove(one)
     return base, found
 
 
@@ -98,7 +127,7 @@ def _fitted_further(base: Refit, refit: Refit, variant: Variant) -> Refit:
     """From where a fit with a factor has come: it is far from where that began."""
     near = fit_near(base, refit, [variant])
     further = near if isinstance(near, str) else judged_fits(near)
-    return refit if isinstance(further, str) else further
+    return refit if isinstance(further, str) else replace(further, unwidened=refit.unwidened)
 
 
 def needless(corrections: Sequence[Correction], final: Refit, screening: Screening) -> list[Correction]:
@@ -120,4 +149,4 @@ def without(corrections: Sequence[Correction], as_it_stands: Refit, fitted: Refi
     refit = near if isinstance(near, str) else judged_fits(near)
     if isinstance(refit, str) or float((refit.held_out - fitted.held_out).sum()) < -TIE_NATS:
         return None
-    return refit
+    return replace(refit, unwidened=fitted.unwidened)

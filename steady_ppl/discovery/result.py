@@ -69,13 +69,14 @@ class Discovery(Displayed):
 
     Attributes:
         search: everything that was tested and fitted.
-        findings: the effects that are missing, the one that brings most first; empty where none or a curve is.
+        findings: the effects that are missing, the one that brings most first, and then how large the noise is where
+            that was declared otherwise; of effects none where none or a curve is missing.
         shape: the curve where no effect of the catalogue explains the drives.
         next_run: controls that would separate the first class of several members; None where there is none, or where
             no way of driving that was tried does.
         proof: the program before and after on the validation drives, by the fits to the training drives; None where
             the search was interrupted, or where a note says why there is none.
-        before, after: the programs, fitted to all drives; equal where no effect was found by name.
+        before, after: the programs, fitted to all drives; they differ by what was found and by corrected noise.
         doubts: why no ranking is to be trusted, empty as a rule.
         notes: what was left out or is not as it seems.
     """
@@ -107,7 +108,7 @@ class Discovery(Displayed):
     @property
     def figures(self) -> dict[str, Any]:
         """Everything as a plain dict, ready for JSON; every figure is finite, None where there is none."""
-        first = self.findings[0] if self.findings else None
+        first = self.findings[0] if self.findings and self.verdict != "other" else None
         kept = ("log_likelihood", "measurement", "coverage_90", "scales")
         rows = self.proof.figures["rows"] if self.proof else []
         sides = {row["row"]: {key: row[key] for key in kept} for row in rows}
@@ -284,7 +285,7 @@ def sentences(found: Discovery) -> list[str]:
         noise = f"{VERDICT_PHRASES['noise']} {' and '.join(sizes)}"
         if not effects and found.verdict == "noise" and not found.search.rounds[0].nothing_found:
             return [*said, f"{noise} {_p_value(found)}."]
-        said.append(f"{WRONG_NOISE} {' and '.join(sizes)}. All that follows is with the noise that they show.")
+        said.append(f"{WRONG_NOISE} {' and '.join(sizes)}. What is found is fitted with the noise that they show.")
     return [*said, _verdict(found, effects)]
 
 
@@ -336,7 +337,7 @@ def _table(found: Discovery) -> list[str]:
     header = ["candidate", "kind", "test", "p", "held-out gain", "one step", "± sd", "limit", "unit"]
     tests = ranked(found)
     rows, rest = [header, *(_line(found, tested) for tested in tests[:CANDIDATES_SHOWN])], tests[CANDIDATES_SHOWN:]
-    more = _limits(found, rest) if found.verdict == "none" else [f"and {len(rest)} more"] * bool(rest)
+    more = _limits(found, rest) if found.search.rounds[0].nothing_found else [f"and {len(rest)} more"] * bool(rest)
     return aligned(rows, left=(0, 1, len(header) - 1)) + more
 
 

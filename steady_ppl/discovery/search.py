@@ -133,6 +133,7 @@ class Search:
     curves: list[Candidate] = field(default_factory=list)  # fitted in place of the first effect, best first
     taken_back: dict[str, str] = field(default_factory=dict)  # effects with which the program failed, and how
     coarse: str = ""  # why what was found was not looked at in finer time steps, empty as a rule
+    notes: list[str] = field(default_factory=list)  # what could not be done
     interrupted: str = ""  # what was being done when an interrupt (Ctrl-C) came; empty as a rule
     cut_short: bool = False  # whether the interrupt came before the search had ended
 
@@ -186,10 +187,10 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
     program = problem.program
     with stages(("fitting the program as it stands", 1), ("comparing time steps", 1), ("", 8)) as begin:
         begin()
-        own, outliers = without_outliers(partial(fit, program), problem.data, valid)
+        own, outliers, whole = without_outliers(partial(fit, program), problem.data, valid, settings.corrects)
         left, valid = (one.left for one in outliers)
         base, corrections = with_suitable_noise(own, settings.corrects)
-        gained = own.maxima[0].gained
+        gained = whole.maxima[0].gained
         begin()
         step = _step_of(base)
         if step.too_coarse:  # the step is no effect: what follows is about the program at the step that suits
@@ -255,15 +256,16 @@ def _rounds(found: Search, settings: Settings) -> Search:
 def _drop_corrections(found: Search, settings: Settings) -> None:
     """Take corrections of the noise back that are not needed beside what was found."""
     dropped = needless(found.corrections, found.final, found.rounds[-1].screening)
-    if not dropped:
+    final = without(dropped, found.as_it_stands, found.final) if dropped else None
+    if final is None:
+        return
+    try:
+        last = Round(settings.screen(final, MAX_ROUNDS + 1), [], None)
+    except Exception as error:  # also of the program's own code
+        found.notes.append(f"the declared noise was not taken back, for with it the tests fail: {reason_of(error)}")
         return
     kept = [one for one in found.corrections if one not in dropped]
-    base = without(dropped, found.as_it_stands, found.base) if kept else found.as_it_stands
-    final = without(dropped, found.as_it_stands, found.final)
-    if base is None or final is None:
-        return
-    found.rounds.append(Round(settings.screen(final, MAX_ROUNDS + 1), [], None))
-    found.base, found.final, found.corrections = base, final, kept
+    found.rounds, found.final, found.corrections = [*found.rounds, last], final, kept
 
 
 def _add_all(found: Search, settings: Settings) -> None:

@@ -27,8 +27,9 @@ from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.model.problem import Problem
 
 MIN_SD_OF_PEAK = 5.0  # of a cell's residual given all others, in robust standard deviations: runs are tried around it
-RUN_ROWS = (1, 2, 3, 5, 8, 13, 21)  # lengths of runs that are tried
-ROWS_OFF = 5  # at either end of the best run, that may be taken off
+RUN_ROWS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)  # lengths of runs that are tried
+OTHER_PEAKS = 6  # rows of a column that are farthest off, at which a run may end as well
+ROWS_OFF = (0, 1, 2, 3, 4, 8, 13, 21, 34)  # at either end of the best run, that may be taken off
 MAX_LINES = 8  # of text
 MAX_RUNS = 12  # of a trajectory
 MAX_SHARE = 0.1  # of a column's cells: where more look wrong, the program is
@@ -84,7 +85,7 @@ class Outliers:
 
     def with_more(self, other: Outliers) -> Outliers:
         """These and those that were found in what they leave."""
-        found = sorted([*self.found, *other.found], key=lambda one: (one.drive, one.rows))
+        found = _in_order([*self.found, *other.found])
         return replace(self, found=found, wrong=self.wrong | other.wrong, note=self.note or other.note)
 
     @property
@@ -137,12 +138,9 @@ def find_outliers(problem: Problem, path: ReferencePath, *, against_tails: bool 
         active = active[sorted(best)]
     if against_tails and found and own.gain_of_tails() > sum(one.gain for one in found):
         return Outliers(data, [], none, AS_TAILS)
-    share = wrong.sum((0, 1)) / data.observed.sum((0, 1)).clamp(min=1)
-    if bool((share > MAX_SHARE).any()):
-        column = data.measurement_names[int(share.argmax())]
-        said = f"{100 * float(share.max()):.0f} % of y.{column} look wrong: too many for outliers, so that all are kept"
+    if said := too_many(data, wrong):
         return Outliers(data, [], none, said)
-    return Outliers(data, sorted(found, key=lambda one: (one.drive, one.rows)), wrong)
+    return Outliers(data, _in_order(found), wrong)
 
 
 def _log_ranges(data: Trajectories) -> Tensor:
@@ -150,7 +148,8 @@ def _log_ranges(data: Trajectories) -> Tensor:
     columns = zip(data.measurements.double().unbind(-1), data.observed.unbind(-1), strict=True)
     seen = [values[there] for values, there in columns]
     ranges = [float(values.max() - values.min()) if len(values) else 0.0 for values in seen]
-    return torch.tensor([math.log(one) if one > 0 else 0.0 for one in ranges]).double()
+    logs = [math.log(one) if one > 0 else 0.0 for one in ranges]
+    return torch.tensor(logs, dtype=torch.float64, device=data.measurements.device)
 
 
 def _outlier(data: Trajectories, drive: int, run: Run, away: float) -> Outlier:
@@ -158,6 +157,36 @@ def _outlier(data: Trajectories, drive: int, run: Run, away: float) -> Outlier:
     names = tuple(f"y.{data.measurement_names[column]}" for column in columns)
     seconds = (float(data.elapsed[rows[0], drive]), float(data.elapsed[rows[-1], drive]))
     return Outlier(drive, data.labels[drive], (rows[0], rows[-1]), seconds, names, away, run.gain, run.cost)
+
+
+def _in_order(found: Sequence[Outlier]) -> list[Outlier]:
+    """Runs by trajectory and row; those of the same columns that touch each other are one."""
+    merged = list[Outlier]()
+    for one in sorted(found, key=lambda one: (one.drive, one.columns, one.rows)):
+        before = merged[-1] if merged else one
+        alike = (before.drive, before.columns) == (one.drive, one.columns)
+        if merged and alike and one.rows[0] <= before.rows[1] + 1:
+            later = max(before, one, key=lambda run: run.rows[1])
+            merged[-1] = replace(
+                before,
+                rows=(before.rows[0], later.rows[1]),
+                seconds=(before.seconds[0], later.seconds[1]),
+                away=max(before.away, one.away),
+                gain=before.gain + one.gain,
+                cost=before.cost + one.cost,
+            )
+        else:
+            merged.append(one)
+    return sorted(merged, key=lambda one: (one.drive, one.rows))
+
+
+def too_many(data: Trajectories, wrong: Tensor) -> str:
+    """Why so many cells cannot be wrong, `(T + 1, B, K)` bool; empty where they can."""
+    share = wrong.sum((0, 1)) / data.observed.sum((0, 1)).clamp(min=1)
+    if not bool((share > MAX_SHARE).any()):
+        return ""
+    column = data.measurement_names[int(share.argmax())]
+    return f"{100 * float(share.max()):.0f} % of y.{column} look wrong: too many for outliers, so that all are kept"
 
 
 class Run(NamedTuple):
@@ -173,7 +202,8 @@ class _Robust:
 
     def __init__(self, ahead: Lookahead, sd: Tensor | None = None) -> None:
         """`sd` `(K,)` are known robust ones, in declared ones."""
-        self.linear, self.sd = ahead.linearization, torch.ones(ahead.linearization.precision.shape[-1]).double()
+        self.linear = ahead.linearization
+        self.sd = self.linear.precision.new_ones(self.linear.precision.shape[-1])
         self.ahead = ahead
         for _ in range(1 if sd is not None else 3):
             factor = sd if sd is not None else self._median_sd() / self.sd
@@ -185,7 +215,7 @@ class _Robust:
         sizes, seen = self.z.abs(), self.linear.precision > 0
         medians = [float(sizes[..., k][seen[..., k]].median()) for k in range(len(self.sd)) if bool(seen[..., k].any())]
         found, known = self.sd.clone(), seen.flatten(0, 1).any(0)
-        found[known] = found[known] * torch.tensor(medians).double() / NORMAL_MEDIAN
+        found[known] = found[known] * found.new_tensor(medians) / NORMAL_MEDIAN
         return found.clamp(*ROBUST_RANGE)
 
     @property
@@ -244,14 +274,16 @@ def _best_runs(
 
         run = best(list(_runs(robust.z[:, drive], seen, units)))
         if run.gain > 0:
-            found[drive] = best(list(_shortened(run.cells)))
+            found[drive] = best(list(_shortened(best(list(_shortened(run.cells))).cells)))
     return found
 
 
 def _shortened(cells: Tensor) -> Iterator[Tensor]:
     """The run itself and with a few rows less at its ends."""
     rows = cells.any(1).nonzero().flatten().tolist()
-    for first, last in itertools.product(rows[:ROWS_OFF], rows[-ROWS_OFF:]):
+    ends = [count for count in ROWS_OFF if count < len(rows)]
+    for off, of_end in itertools.product(ends, ends):
+        first, last = rows[off], rows[-1 - of_end]
         if first <= last:
             shorter = torch.zeros_like(cells)
             shorter[first : last + 1] = cells[first : last + 1]
@@ -259,22 +291,27 @@ def _shortened(cells: Tensor) -> Iterator[Tensor]:
 
 
 def _runs(z: Tensor, seen: Tensor, units: Sequence[str]) -> Iterator[Tensor]:
-    """Cells `(T + 1, K)` of runs that begin, end or have their middle where `z` is largest, of its column and of all
-    columns in its unit."""
+    """Cells `(T + 1, K)` of runs that begin, end or have their middle where `z` is largest, and of those that end at
+    other peaks of its column, which the ends of a long jump are: of this column and of all columns in its unit."""
     row, column = divmod(int(z.abs().argmax()), z.shape[1])
-    alike = torch.tensor([unit == units[column] for unit in units])
+    alike = torch.tensor([unit == units[column] for unit in units], device=seen.device)
     alone = torch.zeros_like(alike)
     alone[column] = True
+    lengths = [length for length in RUN_ROWS if length <= len(z)]
+    spans = [(first, first + n) for n in lengths for first in (row, row - n + 1, row - n // 2)]
+    peaks = z[:, column].abs().topk(min(OTHER_PEAKS, len(z))).indices.tolist()
+    for one in peaks:  # the peak itself may lie on either side of an end
+        low, high = sorted((row, one))
+        spans += [(low + first, high + last) for first in (0, 1) for last in (0, 1)]
     known = set[tuple[int, ...]]()
-    for columns, length in itertools.product((alone, alike), RUN_ROWS):
-        for first in (row, row - length + 1, row - length // 2):
-            cells = torch.zeros_like(seen)
-            cells[max(0, first) : max(0, first + length)] = columns
-            cells &= seen
-            key = tuple(cells.flatten().nonzero().flatten().tolist())
-            if key not in known:
-                known.add(key)
-                yield cells
+    for columns, (first, end) in itertools.product((alone, alike), spans):
+        cells = torch.zeros_like(seen)
+        cells[max(0, first) : max(0, end)] = columns
+        cells &= seen
+        key = tuple(cells.flatten().nonzero().flatten().tolist())
+        if key and key not in known:
+            known.add(key)
+            yield cells
 
 
 def _best_student_t(z: Tensor) -> float:

@@ -240,6 +240,7 @@ def report(
         for label, fit in runs.items():
             begin()
             checks[label] = check(fit, data, simulations=simulations, seed=seed)
+            data = checks[label].outliers.without(data)  # what a run finds wrong is left out for all that follow
         shown = chosen_drives(list(checks.values()))
         drawn = []
         for label, fit in runs.items():

@@ -85,7 +85,7 @@ def test_what_was_found_stays_where_finer_time_steps_fail_or_are_interrupted(mon
             raise failure
         return step
 
-    monkeypatch.setattr(search, "without_outliers", lambda *_: (base, 2 * [SimpleNamespace(left=None)]))
+    monkeypatch.setattr(search, "without_outliers", lambda *_: (base, 2 * [SimpleNamespace(left=None)], base))
     monkeypatch.setattr(search, "with_suitable_noise", lambda base, wanted: (base, []))
     monkeypatch.setattr(search, "attached", lambda program: [])
     monkeypatch.setattr(search, "_step_of", looked_at)

@@ -51,6 +51,13 @@ def test_a_jump_that_lasts_is_found_to_the_row(boat, drives):
     assert int(found.left.observed.sum()) == int(drives.observed.sum()) - 17
 
 
+@pytest.mark.parametrize(("rows", "by"), [(30, 20.0), (60, 5.0), (60, 20.0)])
+def test_a_long_jump_goes_and_the_good_readings_stay(boat, rows, by):
+    data = st.for_program(boat, st.simulate(boat, 8, seed=1))
+    wrong = found_in(boat, moved(data, (slice(50, 50 + rows), 2, 0, by))).wrong[:, 2, 0]
+    assert wrong[50 : 50 + rows].all() and int(wrong.sum()) <= rows + 4
+
+
 def test_a_noise_that_is_declared_too_narrow_makes_none(boat, drives):
     narrow = boat.with_effect("measurement_noise:gps", 0.4).with_effect("measurement_noise:compass", 0.4)
     assert found_in(narrow, drives).found == []
@@ -60,7 +67,8 @@ def test_where_a_sensor_reads_anything_nothing_is_called_an_outlier(boat, drives
     rows = torch.arange(len(drives.time)) % 60 < 10
     wild = moved(drives, *((rows, drive, 0, by) for drive, by in enumerate((40.0, -40.0, 30.0, -50.0))))
     found = found_in(boat, wild)
-    assert found.found == [] and not found.wrong.any() and "too many for outliers" in found.note
+    assert found.found == [] and not found.wrong.any()
+    assert found.note == AS_TAILS or "too many for outliers" in found.note
 
 
 def test_heavy_tails_are_no_outliers(boat):
