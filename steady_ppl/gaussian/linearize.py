@@ -34,7 +34,7 @@ from steady_ppl.model.handlers import (
 )
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import mean_step, noisy_step, row_inputs
+from steady_ppl.model.substeps import mean_step, noisy_step, row_chain, row_inputs
 from steady_ppl.model.validate import noise_size, start_size
 from steady_ppl.utils.angles import wrap
 
@@ -128,7 +128,8 @@ def linearize(
         angles = angles_on_a_circle(program, data, states[0, :1])
     given = {"state": states[:-1], "noise": noise} | row_inputs(program, data)._asdict()
     step, along = partial(noisy_step, program), ("state", "noise")
-    moved, (by_state, by_noise), in_plain_torch = on_all_rows(program, "step", step, given, along, kernels)
+    chain = partial(row_chain, program, **given) if program.substeps > 1 else None
+    moved, (by_state, by_noise), in_plain_torch = on_all_rows(program, "step", step, given, along, kernels, chain=chain)
     offset = (moved - (by_noise @ noise.unsqueeze(-1)).squeeze(-1) - states[1:]).double()
     offset[..., angles] = wrap(offset[..., angles])  # a program may keep its angles on the circle, and so may a path
     start_offset, start_noise = (part.double() for part in _start(problem, states[0]))

@@ -1,7 +1,9 @@
 """Functions of a program on all rows of all trajectories, by kernels: values, Jacobians, slopes in its parameters."""
 
+from __future__ import annotations
+
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial
@@ -13,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from steady_ppl.errors import ProgramError
+from steady_ppl.kernels.chains import Chain, discard_chain, run_chain
 from steady_ppl.kernels.codegen import SIMD_LANES
 from steady_ppl.kernels.jit import Method, Number, close, compiled, discard
 from steady_ppl.utils.context import bound
@@ -20,7 +23,7 @@ from steady_ppl.utils.context import bound
 COMPARED_EVERY = 16  # of a program's runs on all rows; the first two are compared as well
 ROWS_WORTH_COMPILING = 1000  # of all trajectories together
 NO_SLOPES = "some of its slopes are no numbers"
-_RUNS: WeakKeyDictionary[nn.Module, Counter[Method]] = WeakKeyDictionary()
+_RUNS: WeakKeyDictionary[nn.Module, Counter[Hashable]] = WeakKeyDictionary()
 _WHY: ContextVar[dict[str, str] | None] = ContextVar("why functions had no kernel, by their names", default=None)
 
 
@@ -55,6 +58,7 @@ def on_all_rows(
     along: Sequence[str] = (),
     kernels: bool | None = None,
     outputs: int | None = None,
+    chain: Callable[[], Chain] | None = None,
 ) -> Computed:
     """A function's value and Jacobians, by a kernel where one can serve, and else in plain torch.
 
@@ -66,12 +70,17 @@ def on_all_rows(
         along: those in which to differentiate, the first ones.
         kernels: whether a kernel is worth compiling; None: if there are `ROWS_WORTH_COMPILING`.
         outputs: how many of the first components have to be differentiated; None: all.
+        chain: gives the function in steps, by which it is computed where it has no kernel as a whole.
 
     Raises:
         ProgramError: an operation has no derivative.
     """
-    found = _computed(program, name, function, arguments, kernels, along=along, outputs=outputs)
+    in_steps = None if chain is None else partial(_in_steps, program, name, function, arguments, along, chain)
+    found = _computed(program, name, function, arguments, kernels, in_steps, along=along, outputs=outputs)
+    if isinstance(found, Computed):
+        return found
     if isinstance(found, tuple):
+        assert not isinstance(found, Slopes)  # only Jacobians are asked for
         _, values, rest = found
         widths = [arguments[at].shape[-1] for at in along]
         by = list(rest.unflatten(-1, (-1, sum(widths))).split(widths, -1)) if along else []
@@ -118,18 +127,24 @@ class Slopes(NamedTuple):
         return by_slope.t() @ self.by_number
 
 
+InSteps = Computed | Slopes
+
+
 def slopes_on_all_rows(
     program: nn.Module,
     name: str,
     function: Callable[..., Tensor],
     arguments: dict[str, Tensor],
     numbers: Sequence[Number],
+    chain: Callable[[], Chain] | None = None,
 ) -> Slopes | str | None:
     """A function's slopes in a program's learnable numbers, if by a kernel; why there is none; or None where it is not
     worth one. The arguments are those of `on_all_rows`."""
-    found = _computed(program, name, function, arguments, None, by_parameters=True)
-    if not isinstance(found, tuple):
+    in_steps = None if chain is None else partial(_slopes_in_steps, program, name, function, arguments, numbers, chain)
+    found = _computed(program, name, function, arguments, None, in_steps, by_parameters=True)
+    if found is None or isinstance(found, str | Slopes):
         return found
+    assert not isinstance(found, Computed)  # slopes are asked for
     method, values, rest = found
     if not bool(torch.isfinite(rest.sum())):  # a root of zero, say, over which differences step
         return _noted(name, NO_SLOPES)
@@ -143,9 +158,10 @@ def _computed(
     function: Callable[..., Tensor],
     arguments: dict[str, Tensor],
     kernels: bool | None,
+    in_steps: Callable[[], InSteps | str] | None = None,
     **derivatives: Any,
-) -> tuple[Method, Tensor, Tensor] | str | None:
-    """The kernel, the function's value and the derivatives `(rows, B, ·)`."""
+) -> tuple[Method, Tensor, Tensor] | InSteps | str | None:
+    """The kernel, the function's value and the derivatives `(rows, B, ·)`; or what it comes to in steps."""
     first = next(iter(arguments.values()))
     rows, trajectories = first.shape[:2]
     cells = rows * trajectories
@@ -160,19 +176,73 @@ def _computed(
     build = partial(Method, program, lambda *given: (function(*given),), examples, {}, **derivatives)
     method = compiled(program, compiled_as, build)
     if isinstance(method, str):
-        return _noted(name, method)
+        stepped = method if in_steps is None else in_steps()
+        return _noted(name, stepped) if isinstance(stepped, str) else stepped
     inputs = [value.float().reshape(cells, 1, -1).permute(2, 1, 0).contiguous().numpy() for value in arguments.values()]
     out = torch.empty(len(method.graph.outputs), 1, cells)
     method.kernel(method.parameters(program), np.zeros((1, 0), np.float32), inputs, None, out.numpy())
     found = out.squeeze(1).t().reshape(rows, trajectories, -1)
     values, rest = found[..., : method.values], found[..., method.values :]
-    runs = _RUNS.setdefault(program, Counter())
-    runs[method] += 1
-    if runs[method] <= 2 or runs[method] % COMPARED_EVERY == 0:
-        plain = function(*(_subsample(value) for value in arguments.values()))
-        if not close(_subsample(values), plain):
-            return _noted(name, discard(program, compiled_as))
+    if _differs(program, method, function, arguments, values):
+        return _noted(name, discard(program, compiled_as))
     return method, values, rest
+
+
+def _differs(
+    program: nn.Module, run: Hashable, function: Callable[..., Tensor], arguments: Mapping[str, Tensor], values: Tensor
+) -> bool:
+    """Whether a function's values differ from torch's, as far as this run of its is compared."""
+    runs = _RUNS.setdefault(program, Counter())
+    runs[run] += 1
+    if runs[run] > 2 and runs[run] % COMPARED_EVERY != 0:
+        return False
+    return not close(_subsample(values), function(*(_subsample(value) for value in arguments.values())))
+
+
+def _in_steps(
+    program: nn.Module,
+    name: str,
+    function: Callable[..., Tensor],
+    arguments: dict[str, Tensor],
+    along: Sequence[str],
+    chain: Callable[[], Chain],
+) -> Computed | str:
+    """A function's value and Jacobians by its steps, see `on_all_rows`."""
+    steps = chain()
+    found = run_chain(program, name, steps, differentiate=bool(along))
+    if isinstance(found, str):
+        return found
+    shape = steps.moved[1].shape[:2]
+    values = found.values.t().unflatten(0, shape)
+    if _differs(program, f"{name} in steps", function, arguments, values):
+        return discard_chain(program, name, steps)
+    widths = [arguments[at].shape[-1] for at in along]
+    by = found.slopes.float().permute(2, 0, 1).unflatten(0, shape).split(widths, -1) if along else ()
+    return Computed(values, list(by), None)
+
+
+def _slopes_in_steps(
+    program: nn.Module,
+    name: str,
+    function: Callable[..., Tensor],
+    arguments: dict[str, Tensor],
+    numbers: Sequence[Number],
+    chain: Callable[[], Chain],
+) -> Slopes | str:
+    """A function's slopes by its steps, one of each component in each learnable number."""
+    steps = chain()
+    found = run_chain(program, f"{name} by parameters", steps, numbers=numbers)
+    if isinstance(found, str):
+        return found
+    shape = steps.moved[1].shape[:2]
+    values = found.values.t().unflatten(0, shape)
+    if not bool(torch.isfinite(found.slopes.sum())):
+        return NO_SLOPES
+    if _differs(program, f"{name} by parameters in steps", function, arguments, values):
+        return discard_chain(program, f"{name} by parameters", steps)
+    size, count = found.slopes.shape[:2]
+    components, by_number = torch.arange(size).repeat_interleave(count), torch.eye(count).double().repeat(size, 1)
+    return Slopes(values, components, found.slopes.flatten(0, 1).unflatten(1, shape), by_number)
 
 
 def note_failures(why: Mapping[str, str]) -> None:

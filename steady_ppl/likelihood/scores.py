@@ -43,7 +43,15 @@ from steady_ppl.model.handlers import (
     unwrapped,
 )
 from steady_ppl.model.program import Program
-from steady_ppl.model.substeps import acting_controls, all_rows, channel_scales, noisy_step, row_inputs, sample_channels
+from steady_ppl.model.substeps import (
+    acting_controls,
+    all_rows,
+    channel_scales,
+    noisy_step,
+    row_chain,
+    row_inputs,
+    sample_channels,
+)
 from steady_ppl.utils.angles import wrap_angles
 
 
@@ -394,7 +402,8 @@ def _of_ends(program: Program, data: Trajectories, at: Smoothed, parts: list[Ele
     """The parameters' part in where rows end, `(B, P)`."""
     arriving = arrivals(at.ahead, data)
     given = all_rows(program, data, state=arriving.states, noise=arriving.noise)
-    slopes = slopes_on_all_rows(program, "ends", partial(noisy_step, program), given, parts)
+    chain = partial(row_chain, program, **given)
+    slopes = slopes_on_all_rows(program, "ends", partial(noisy_step, program), given, parts, chain)
     scores, left = at.states.new_zeros((len(data), len(parts))).double(), list(range(len(parts)))
     if isinstance(slopes, Slopes):
         scores, left = arriving.of_slopes(slopes), of_actuators(program, data, parts)

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from functools import partial
 from numbers import Integral
 from typing import Any, NamedTuple
 
@@ -27,6 +28,7 @@ from torch import Tensor
 
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import ProgramError, UsageError
+from steady_ppl.kernels.chains import Chain, Step
 from steady_ppl.model.actuation import row_spans
 from steady_ppl.model.handlers import AtMean, Recording, Standardised, joined, parted, running, unwrapped, with_moments
 from steady_ppl.model.program import Program
@@ -91,6 +93,16 @@ def noisy_step(program: Program, state: Tensor, noise: Tensor, control: Tensor, 
     """Return where a row ends under noise `(..., C)` in standard deviations; the rest is as in `advance`."""
     with running(*state.shape[:-1]), Standardised(noise):
         return advance(program, state, control, time, step)
+
+
+def row_chain(program: Program, state: Tensor, noise: Tensor, control: Tensor, time: Tensor, step: Tensor) -> Chain:
+    """Return `noisy_step` of rows `(rows, B, ·)` as a chain of substeps."""
+    steps = []
+    for given, ends in _parts(program, control, time, step):
+        name = "the last substep" if ends else "a substep"
+        named = dict(zip(("control", "time", "step"), given, strict=True))
+        steps.append(Step(name, partial(_noisy_substep, program, ends), named))
+    return Chain(steps, ("state", state), ("noise", noise))
 
 
 def sample_channels(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> None:
@@ -228,6 +240,11 @@ def _parts(program: Program, control: Tensor, time: Tensor, step: Tensor) -> Ite
     held = [control] * count if control.shape[-1] == controls else control.split(controls, -1)
     for index, acting_now in enumerate(held):
         yield (acting_now, time + index * short, short), index == count - 1
+
+
+def _noisy_substep(program: Program, ends: bool, state: Tensor, noise: Tensor, *given: Tensor) -> Tensor:
+    with running(*state.shape[:-1]), Standardised(noise), within_row(ends):
+        return program.transition(state, *given)
 
 
 def _sample(program: Program, state: Tensor, control: Tensor, time: Tensor, step: Tensor) -> dict[str, Tensor]:
