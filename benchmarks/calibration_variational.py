@@ -26,7 +26,7 @@ from steady_ppl import (
     VariationalGuide,
     train,
 )
-from steady_ppl.model.joint import Joint
+from steady_ppl.model.problem import Joint
 
 Family = Callable[..., VariationalGuide]
 FAMILIES: dict[str, Family] = {"svi smoother": SmootherGuide, "svi network": InferenceNetwork}

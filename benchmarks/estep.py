@@ -44,8 +44,7 @@ from steady_ppl import (
 )
 from steady_ppl.gaussian.smoother import find_and_smooth
 from steady_ppl.gaussian.twisted_proposal import Twist
-from steady_ppl.model.joint import Joint
-from steady_ppl.model.problem import Problem
+from steady_ppl.model.problem import Joint, Problem
 
 MUSTS = {"good": Bound(0.05), "first": Bound(0.1)}
 CHEAPER = 20

@@ -67,7 +67,6 @@ from .model.interventions import (
     pushed as pushed,
     widened as widened,
 )
-from .model.joint import Joint as Joint
 from .model.loading import load_program as load_program
 from .model.planar_vehicle import (
     ExplicitEuler as ExplicitEuler,
@@ -77,6 +76,7 @@ from .model.planar_vehicle import (
     dense as dense,
     stack as stack,
 )
+from .model.problem import Joint as Joint
 from .model.program import Program as Program, for_program as for_program
 from .model.substeps import with_substeps as with_substeps
 from .plotting.comparison import open_loop_picture as open_loop_picture

@@ -20,7 +20,7 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import RunError, TrainingError, require
 from steady_ppl.gaussian.linearize import why_not_linear
 from steady_ppl.likelihood.evidence import log_likelihood
-from steady_ppl.model.joint import Joint
+from steady_ppl.model.problem import Joint
 from steady_ppl.model.program import Program, for_program, parameter_name
 from steady_ppl.smc.filter import STEPS_WORTH_COMPILING
 from steady_ppl.training.checkpoint import Checkpoint, read_checkpoint, write_checkpoint

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -144,6 +144,14 @@ def test_one_kind_is_looked_for_and_an_effect_left_out(table, capsys):
 # --- interrupted and resumed ------------------------------------------------------------------------------------------
 
 FEW = ("--known-start", "--simulations", 50, "--only", "dynamics")
+
+
+@pytest.fixture(autouse=True)
+def interrupts_arrive() -> Iterator[None]:
+    """Also where the tests run in the background of a shell, which ignores them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 def interrupted_at(call: int, function: Callable[..., Any], by: signal.Signals = signal.SIGINT) -> Callable[..., Any]:
