@@ -48,7 +48,7 @@ LINEAR_FORMS = ("push", "command", "history", "measured", "viewpoint")  # of eff
 UNEXPLAINED = "colour"  # the form of effects that imitate whatever is missing, and may enter when nothing else does
 MIN_GAIN_OF_PLACE = 0.3  # nats by which another knee or place has to be likelier
 MAX_COORDINATE_SWEEPS = 4  # along all knees and places in turns, with steps of one size
-NOT_SIMULATED = "with it too many simulated drives blow up"
+NOT_SIMULATED = "with it too many simulated drives diverge"
 NEIGHBOUR_SHARE = 0.25  # of the grid's spacing, at which a place's likelihood is compared with its neighbours'
 
 
@@ -61,11 +61,16 @@ class Screening:
     information: Mapping[str, Tensor]  # of parameters and one candidate, by the candidate; the parameters' alone by ""
 
     def spread_of(self, fitted: Refit, variant: Variant) -> Tensor:
-        """Standard deviations `(k,)` of an effect of the fitted program that was tested, of a fit to all drives: of the
-        coefficient as it is learned, of a factor its logarithm."""
-        (there,) = [known for known in attached(fitted.program) if known.name == variant.name]
-        index = [i for i, part in enumerate(self.parameters) if part.owner == there.parameter]
-        return (fitted.first_share * ridged_inverse(self.information[""]).diagonal()[index]).clamp(min=0).sqrt()
+        """See the function `spread_of`, for an effect of the fitted program that was tested."""
+        return spread_of(fitted, variant, self.parameters, self.information[""])
+
+
+def spread_of(fitted: Refit, variant: Variant, parts: Sequence[Element], information: Tensor) -> Tensor:
+    """Standard deviations `(k,)` of an effect of a program, of a fit to all drives: of the coefficient as it is
+    learned, of a factor its logarithm. `information` is that of the first fold's drives on the numbers `parts`."""
+    (there,) = [known for known in attached(fitted.program) if known.name == variant.name]
+    index = [i for i, part in enumerate(parts) if part.owner == there.parameter]
+    return (fitted.first_share * ridged_inverse(information).diagonal()[index]).clamp(min=0).sqrt()
 
 
 @dataclass(frozen=True)

@@ -148,7 +148,8 @@ def discover(
         unclear = [] if shape else [one for one in found.found if len(one.aliases) > 1]
         largest = max(unclear, key=lambda one: one.candidate.total, default=None)
         proposed = _afterwards(partial(_proposed, largest, seed, notes), found, PROPOSING, notes) if largest else None
-    notes += fallback_notes(why) + diagnose_units(program, problem.data) + _notes(found)
+    again = _afterwards(partial(_not_wrong_after_all, found), found, "looking at wrong readings again", notes)
+    notes += fallback_notes(why) + diagnose_units(program, problem.data) + _notes(found) + (again or [])
     if proof is not None:
         notes += doubtful(proof.rows, judges)
     said = {"simulations": simulations, "seed": seed}
@@ -226,16 +227,12 @@ def _notes(found: Search) -> list[str]:
     notes += [f"all fits are at a finer step: {step.note}" for step in steps if step.note]
     if found.step.uncompared:
         notes.append(found.step.uncompared)
-    if found.coarse:
-        notes.append(f"what was found was not looked at in finer time steps: {found.coarse}")
     if found.curve is not None:
         notes.append(
             "a curve has no name and is not kept: 'after' is what it would bring, --out has the program as it stood, "
             "fitted, with the noise that these drives show"
         )
     notes += [one.note for one in found.outliers if one.note] + found.notes
-    if said := _no_longer_wrong(found):
-        notes.append(said)
     if not found.final.converged and found.found:
         notes.append("the fit with what was found has not converged")
     notes += [f"{label}: taken back, for with it the program fails: {why}" for label, why in found.taken_back.items()]
@@ -248,21 +245,21 @@ def _notes(found: Search) -> list[str]:
     return notes + [f"{label} would help with a sign that physics rules out: a symptom" for label in symptoms]
 
 
-def _no_longer_wrong(found: Search) -> str:
-    """Whether readings were left out that are not wrong by the program with what was found."""
-    before = found.outliers[0] if found.outliers else None
-    if before is None or not before.found or not found.found or found.interrupted:
-        return ""
+def _not_wrong_after_all(found: Search) -> list[str]:
+    """A note where most readings that were left out are not wrong by the program with what was found."""
+    before = found.outliers[0]
+    if not (before.found and found.found):
+        return []
     fold = found.final.folds[0]
     states = with_states_of(found.final.program, before.data)
     again = find_outliers(Problem(found.final.program, states, fold.known_start), fold.path, against_tails=False)
     count = int((before.wrong & ~again.wrong).sum())
     if count <= 0.5 * before.cells:
-        return ""
-    return (
+        return []
+    return [
         f"{count} of {before.cells} readings of the training drives that were left out are not wrong by the program "
         "with what was found: discover again from there"
-    )
+    ]
 
 
 def _note_of_one_drive(found: Found) -> str:

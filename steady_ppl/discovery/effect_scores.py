@@ -261,7 +261,7 @@ def simulate_scores(
 ) -> Tensor:
     """Scores `(S, B, N)` of drives that a program makes from `starts` `(S, B, D)`, with the same controls and gaps.
 
-    Sets that blow up are left out. Columns with which too many would are not finite.
+    Sets that diverge are left out. Columns with which too many would are not finite.
     """
     program, data, sets = problem.program, problem.data, len(starts)
     with seeded(seed, "bootstrap"):

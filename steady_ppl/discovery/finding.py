@@ -11,14 +11,13 @@ from torch import Tensor
 
 from steady_ppl.comparison.scores import RESAMPLES
 from steady_ppl.data.trajectories import Trajectories
-from steady_ppl.discovery.candidates import Candidate, variance_of_places
+from steady_ppl.discovery.candidates import Candidate, spread_of, variance_of_places
 from steady_ppl.discovery.refits import Refit, with_states_of
 from steady_ppl.discovery.screening import NOISE_SIZES, Tested
 from steady_ppl.discovery.search import MIN_GAIN_OF_CURVE, Found, Search
 from steady_ppl.effects import Effect, Variant, attached
 from steady_ppl.gaussian.predict import HALF_WIDTH, simulate_again
 from steady_ppl.gaussian.smoother import smooth
-from steady_ppl.likelihood.parameter_posterior import ridged_inverse
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, unit_of
@@ -132,8 +131,7 @@ def _spread(search: Search, variant: Variant) -> np.ndarray:
     if len(information) < len(parts):  # fits by draws tell none: that of its own test
         (tested,) = [one.candidate.tested for one in search.found if one.candidate.variant.name == variant.name]
         return math.sqrt(final.first_share) * tested.sd
-    index = [i for i, part in enumerate(parts) if part.owner == there.parameter]
-    return (final.first_share * ridged_inverse(information).diagonal()[index]).clamp(min=0).sqrt().numpy()
+    return spread_of(final, variant, parts, information).numpy()
 
 
 def _confidence(search: Search, found: Found) -> float:

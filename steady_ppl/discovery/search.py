@@ -132,7 +132,6 @@ class Search:
     found: list[Found] = field(default_factory=list)  # the effects that were added
     curves: list[Candidate] = field(default_factory=list)  # fitted in place of the first effect, best first
     taken_back: dict[str, str] = field(default_factory=dict)  # effects with which the program failed, and how
-    coarse: str = ""  # why what was found was not looked at in finer time steps, empty as a rule
     notes: list[str] = field(default_factory=list)  # what could not be done
     interrupted: str = ""  # what was being done when an interrupt (Ctrl-C) came; empty as a rule
     cut_short: bool = False  # whether the interrupt came before the search had ended
@@ -219,7 +218,7 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
         except KeyboardInterrupt:
             found.interrupt(FINER)
         except Exception as error:  # also of the program's own code, in steps that nobody tried before
-            found.coarse = reason_of(error)
+            found.notes.append(f"what was found was not looked at in finer time steps: {reason_of(error)}")
     return found
 
 

@@ -35,6 +35,7 @@ MAX_RUNS = 12  # of a trajectory
 MAX_SHARE = 0.1  # of a column's cells: where more look wrong, the program is
 AS_TAILS = "readings are far off at all distances, as heavy tails have them: none is left out"
 NORMAL_MEDIAN = 0.6745  # of |z| of a standard normal
+PASSES_OF_SD = 3  # in which robust standard deviations are found
 ROBUST_RANGE = (0.1, 10.0)  # of a column's robust standard deviation over the declared one
 DEGREES_OF_FREEDOM = (2.0, 3.0, 4.0, 6.0, 10.0)  # of the Student t that is compared
 
@@ -120,7 +121,7 @@ def find_outliers(problem: Problem, path: ReferencePath, *, against_tails: bool 
     `against_tails` keeps them all where a Student t, compared on residuals, explains them better.
     """
     data, none = problem.data, torch.zeros_like(problem.data.observed)
-    own = _Robust(smooth(problem, path))
+    own = _Robust.declared(smooth(problem, path)).with_median_sd()
     found, wrong, active = list[Outlier](), none.clone(), own.peaks.nonzero().flatten()
     log_range, units = _log_ranges(data), problem.program.measurement_units
     by_chance = math.log(max(1, int(data.observed.sum()))) + math.log(len(RUN_ROWS))
@@ -129,7 +130,7 @@ def find_outliers(problem: Problem, path: ReferencePath, *, against_tails: bool 
             break
         part = Problem(problem.program, data.subset(active).without(wrong[:, active]), problem.known_start)
         near = ReferencePath(path.states[:, active], path.noise[:, active])
-        robust = _Robust(smooth(part, near), own.sd)
+        robust = _Robust.declared(smooth(part, near)).with_sd(own.sd)
         best = _best_runs(robust, part.data, log_range, units, by_chance)
         for place, run in best.items():
             drive = int(active[place])
@@ -197,28 +198,38 @@ class Run(NamedTuple):
     cost: float
 
 
+@dataclass(frozen=True)
 class _Robust:
     """Drives along a path, the sensors' standard deviations replaced by robust ones."""
 
-    def __init__(self, ahead: Lookahead, sd: Tensor | None = None) -> None:
-        """`sd` `(K,)` are known robust ones, in declared ones."""
-        self.linear = ahead.linearization
-        self.sd = self.linear.precision.new_ones(self.linear.precision.shape[-1])
-        self.ahead = ahead
-        for _ in range(1 if sd is not None else 3):
-            factor = sd if sd is not None else self._median_sd() / self.sd
-            self.sd = self.sd * factor
-            self.linear = _with_sd(self.linear, factor)
-            self.ahead = look_ahead(self.linear)
+    ahead: Lookahead  # with these
+    sd: Tensor  # in declared ones, (K,)
 
-    def _median_sd(self) -> Tensor:
-        sizes, seen = self.z.abs(), self.linear.precision > 0
-        medians = [float(sizes[..., k][seen[..., k]].median()) for k in range(len(self.sd)) if bool(seen[..., k].any())]
-        found, known = self.sd.clone(), seen.flatten(0, 1).any(0)
-        found[known] = found[known] * found.new_tensor(medians) / NORMAL_MEDIAN
-        return found.clamp(*ROBUST_RANGE)
+    @classmethod
+    def declared(cls, ahead: Lookahead) -> _Robust:
+        """With the declared standard deviations."""
+        return cls(ahead, ahead.linearization.precision.new_ones(ahead.linearization.precision.shape[-1]))
 
     @property
+    def linear(self) -> Linearization:
+        return self.ahead.linearization
+
+    def with_sd(self, sd: Tensor) -> _Robust:
+        return _Robust(look_ahead(_with_sd(self.linear, sd / self.sd)), sd)
+
+    def with_median_sd(self) -> _Robust:
+        """With those by which the median residual is that of a normal, found in some passes."""
+        found = self
+        for _ in range(PASSES_OF_SD):
+            sizes, seen = found.z.abs(), found.linear.precision > 0
+            known = seen.flatten(0, 1).any(0)
+            medians = [float(sizes[..., k][seen[..., k]].median()) for k in known.nonzero().flatten().tolist()]
+            sd = found.sd.clone()
+            sd[known] = sd[known] * sd.new_tensor(medians) / NORMAL_MEDIAN
+            found = found.with_sd(sd.clamp(*ROBUST_RANGE))
+        return found
+
+    @cached_property
     def z(self) -> Tensor:
         """Residuals given all other cells, in their own standard deviations, `(T + 1, B, K)`; zero where missing."""
         linear, (means, _), (states, *_) = self.linear, self.ahead.means(), self.ahead.covariances()
@@ -228,7 +239,7 @@ class _Robust:
         left = (1 - linear.precision * known).clamp(min=1e-9)
         return torch.where(linear.precision > 0, apart * (linear.precision / left).sqrt(), 0.0)
 
-    @cached_property
+    @property
     def peaks(self) -> Tensor:
         """Trajectories with a cell that is far off, `(B,)`."""
         return (self.z.abs() > MIN_SD_OF_PEAK).any(-1).any(0)

@@ -97,4 +97,5 @@ def test_what_was_found_stays_where_finer_time_steps_fail_or_are_interrupted(mon
     if isinstance(failure, KeyboardInterrupt):
         assert found.interrupted == search.FINER and not found.is_complete
     else:
-        assert found.coarse == "RuntimeError: the tide is out" and found.is_complete
+        assert found.notes == ["what was found was not looked at in finer time steps: RuntimeError: the tide is out"]
+        assert found.is_complete
