@@ -139,9 +139,11 @@ def _columns(frame: pd.DataFrame, name: str) -> tuple[list[str], list[str], list
     """The control, measurement and state columns, in the table's order."""
     columns: list[Any] = list(frame.columns)
     groups: dict[str, list[str]] = {"u.": [], "y.": [], "x.": []}
-    for i, column in enumerate(columns):
-        if column in columns[:i]:
+    seen = set[Any]()
+    for column in columns:
+        if column in seen:
             fail(name, "this column appears twice", column=column)
+        seen.add(column)
         if column in ("trajectory", "time"):
             continue
         if str(column)[:2] not in groups or len(column) < 3:

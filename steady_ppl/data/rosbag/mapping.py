@@ -105,10 +105,11 @@ class BagMapping:
     def __post_init__(self) -> None:
         if mismatch(self.step, NUMBER) or self.step <= 0:
             raise UsageError(f"step is {self.step!r}, expected the seconds between two rows, more than 0")
-        names = [column.name for column in self.columns]
-        for i, column in enumerate(self.columns):
-            if column.name in names[:i]:
+        names = set[str]()
+        for column in self.columns:
+            if column.name in names:
                 raise UsageError(f"column {column.name} is given twice")
+            names.add(column.name)
             if column.longest is not None and column.longest < 2 * self.step:
                 # else a measurement in the pause could be in a row on either side of it
                 least = f"expected at least two steps of {self.step} s"
