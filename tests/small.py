@@ -31,6 +31,12 @@ def steady(*arguments: object) -> int:
     return main([str(argument) for argument in arguments])
 
 
+def without_progress(said: str) -> list[str]:
+    """The lines of a command's standard error but those that tell how long it has taken: there are some where it is
+    slow."""
+    return [line for line in said.splitlines() if " gone by" not in line]
+
+
 def simulated(name: str = "hovercraft.py:HovercraftTruth", trajectories: int = 3, rows: int = 13, seed: int = 0):
     """Drives of an example program, as a table holds them."""
     program = example(name, torch.float32)

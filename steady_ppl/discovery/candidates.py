@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -40,11 +41,13 @@ from steady_ppl.utils.journal import journaled
 from steady_ppl.utils.random import seeded
 
 MIN_LEADERS, MIN_ALIAS_CORRELATION = 6, 0.85  # how many are refitted, and those whose columns are so like the first's
+MAX_PLACES_OF_SENSOR_EFFECT = 2  # measurements at which one effect is refitted: of thirty landmarks each may be biased
 TIE_NATS = 2.0  # of held-out log p(y) within which two candidates cannot be told apart
 CLEAR_GAIN = 10.0  # nats of held-out log p(y) for which a test need only be near the family's level
 NEAR_FAMILY_LEVEL = FAMILY_LEVEL / 5  # p-value of a single test that is near it
 MIN_STATISTIC_TO_RETRY = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
 LINEAR_FORMS = ("push", "command", "history", "measured", "viewpoint")  # of effects in proportion to the coefficient
+OF_MEASUREMENTS = ("measured", "blur")  # forms of effects that act on one column or on a few
 UNEXPLAINED = "colour"  # the form of effects that imitate whatever is missing, and may enter when nothing else does
 MIN_GAIN_OF_PLACE = 0.3  # nats by which another knee or place has to be likelier
 MAX_COORDINATE_SWEEPS = 4  # along all knees and places in turns, with steps of one size
@@ -182,7 +185,8 @@ def screen_program(
 
 
 def leaders(screened: Screened, first: bool) -> list[Tested]:
-    """Those to fit: all that are nearly significant, of the best few in later rounds, and the aliases of the first.
+    """Those to fit: all that are nearly significant, of the best few in later rounds, and the aliases of the first; of
+    an effect on measurements where it tells most.
 
     How far behind a test is says little where much is missing: scores look one step ahead, and a drag of which they see
     a trace may be what holds everything else in its wrong place.
@@ -190,9 +194,14 @@ def leaders(screened: Screened, first: bool) -> list[Tested]:
     alive = [(i, t) for i, t in enumerate(screened.tested) if not (t.untestable or t.departure or t.is_curve)]
     if not alive:
         return []
-    top = alive[0][0]
-    best = [i for i, _ in alive[:MIN_LEADERS]]
-    near = [i for i, tested in alive if tested.p_value < NEAR_FAMILY_LEVEL]
+    top, places, able = alive[0][0], Counter[str](), list[tuple[int, Tested]]()
+    for i, tested in alive:
+        effect = tested.variant.effect
+        places[effect.name] += effect.form in OF_MEASUREMENTS
+        if places[effect.name] <= MAX_PLACES_OF_SENSOR_EFFECT:
+            able.append((i, tested))
+    best = [i for i, _ in able[:MIN_LEADERS]]
+    near = [i for i, tested in able if tested.p_value < NEAR_FAMILY_LEVEL]
     few = {*best, *near} if first else {top, *(i for i in best if i in near)}
     return [tested for i, tested in alive if i in few or float(screened.correlations[top, i]) > MIN_ALIAS_CORRELATION]
 

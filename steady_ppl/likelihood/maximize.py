@@ -45,7 +45,7 @@ SHARE_AGAINST_SCORE = 1 / 3
 no score there, and a fit cannot return."""
 SHARE_THAT_GOES_ON = 0.8  # share of fits that take one step more, by which the time left is told
 CONVERGED_DECREMENT = 0.1  # nats that another step may gain where a fit has converged
-MAX_DECREASE = 0.3  # nats by which an objective may fall: paths are at rest but for the tolerance
+MAX_DECREASE = 0.3  # nats below the most so far to which an objective may fall: paths are nearly at rest
 MAX_ROUGHNESS = 1.5  # mean square deviation, in the program's own, from which noise is widened before a fit
 OUTLIER_SD, SEARCHES = 6.0, 3  # standard deviations by which an outlier is less likely, and searches for its path
 
@@ -188,7 +188,7 @@ def maximise_sum(
     reach = torch.where(is_open, torch.maximum(reach, MAX_MOVE_SD * information.diagonal().rsqrt()), reach)
     taken, decrement, passes = 0, 0.0, PASSES
     few_drives = len(here.scores) < 2 * len(information)  # they know too little: what they say is seen twice
-    is_small = False
+    is_small, most = False, here.objective
     rises = deque[float](maxlen=3)  # of log p(y) by the last steps
     with stages(*(("", SHARE_THAT_GOES_ON**step) for step in range(steps + 1))) as begin:
         for taken in range(steps + 1):
@@ -215,17 +215,17 @@ def maximise_sum(
             move = move * min(1.0, 1 / max(1e-9, float((move.abs() / reach).max())))
             against = move * here.gradient < 0
             move = torch.where(against, move.clamp(-SHARE_AGAINST_SCORE * reach, SHARE_AGAINST_SCORE * reach), move)
-            share, there = _line_search(here, move, passes)
+            share, there = _line_search(here, move, passes, most - MAX_DECREASE)
             if there is not None:
                 information = _bfgs_update(information, share * move, here.gradient - there.gradient)
                 rises.append(there.log_likelihood - here.log_likelihood)
-                here = there
+                here, most = there, max(most, there.objective)
             elif passes == STALLED_PASSES:
                 break
             else:
                 passes = STALLED_PASSES
                 here = linearised([at.term for at in here.terms], passes)
-                information = _by_cross_products(here)
+                information, most = _by_cross_products(here), here.objective
                 rises.append(math.inf)  # along other paths
     return [
         Maximum(
@@ -242,14 +242,17 @@ def maximise_sum(
     ]
 
 
-def _line_search(here: LinearizedObjective, move: Tensor, passes: int) -> tuple[float, LinearizedObjective | None]:
-    """The share of a move that does not fall, and where it leads; None where none does and nothing is moved."""
+def _line_search(
+    here: LinearizedObjective, move: Tensor, passes: int, least: float
+) -> tuple[float, LinearizedObjective | None]:
+    """The share of a move that leads to the `least` objective or more, and where; None, and nothing is moved, if none
+    does."""
     share, terms = 1.0 if bool(torch.isfinite(move).all()) else 0.0, [at.term for at in here.terms]
     before = [values_of(term.parts) for term in terms]
     while share > 0.01:
         for term, values in zip(terms, before, strict=True):
             set_values(term.parts, values + share * move[term.columns])
-        if (there := _tried(terms, passes, here.objective - MAX_DECREASE)) is not None:
+        if (there := _tried(terms, passes, least)) is not None:
             return share, there
         share /= 3
     for term, values in zip(terms, before, strict=True):

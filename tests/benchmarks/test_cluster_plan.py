@@ -20,6 +20,7 @@ def test_two_workers_do_nine_tenths_of_what_one_does_twice():
     assert len(found) >= 3 and np.mean(found) >= 0.9
 
 
+@pytest.mark.slow
 def test_the_plan_of_a_cluster_is_that_of_what_was_measured_and_the_pages():
     fits = pd.read_parquet(RESULTS / "observation-noise.parquet")
     plan = cluster_plan.tables(json.loads((RESULTS / "cluster.json").read_text()), fits)

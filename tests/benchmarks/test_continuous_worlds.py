@@ -97,6 +97,7 @@ def test_a_cart_on_a_spring_swings_as_a_cosine():
     assert np.allclose(path[:, 0, 0], np.cos(2 * 0.1 * np.arange(31)), atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", WORLDS, ids=lambda world: type(world).__name__)
 def test_half_the_integration_step_changes_little(world):
     world = replace(world, duration=3.0)
@@ -192,6 +193,7 @@ def test_planar_forces_are_those_of_the_catalogue(name):
         assert np.allclose(pushed, np.asarray(theirs.get(channel, 0.0)), atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", GROUPS)
 def test_every_program_reads_the_drives_of_its_world(name):
     group = GROUPS[name]
@@ -203,6 +205,7 @@ def test_every_program_reads_the_drives_of_its_world(name):
     assert drives.median_step == pytest.approx(user_program(group).step)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name, group in GROUPS.items() if group.effects])
 def test_every_effect_of_a_group_is_in_the_catalogue_and_in_the_world(name):
     group = GROUPS[name]

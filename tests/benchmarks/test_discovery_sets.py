@@ -59,6 +59,7 @@ def test_large_sizes_are_those_that_are_clearly_felt_and_exceed_six_limits():
         assert limits_of(text) > 6 or effect.components  # a vector points anywhere
 
 
+@pytest.mark.slow
 def test_no_size_is_more_than_a_vehicle_can_show():
     for text in (text for one in EVERY for text in one.effects):
         effect, value = find(parsed(text)[0], owner()), np.array(parsed(text)[3])
@@ -98,6 +99,7 @@ def test_wind_comes_with_the_drag_through_which_it_acts():
     assert owner(windy[0].known).quadratic_drag.item() == pytest.approx(parsed(windy[0].effects[0])[2]["drag"])
 
 
+@pytest.mark.slow
 def test_tables_are_the_same_every_time_and_differ_from_each_other():
     chosen = next(one for one in EVERY if one.planted == ("actuator_lag",))
     train, valid, test = tables(chosen)
@@ -127,6 +129,7 @@ def sharp(known=()):
     return program
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rival", ["pysindy", "weak pysindy", "stepwise"])
 def test_regressions_find_a_strong_effect_in_exact_measurements(rival, monkeypatch):
     pytest.importorskip("pysindy")
@@ -140,6 +143,7 @@ def test_regressions_find_a_strong_effect_in_exact_measurements(rival, monkeypat
     assert ranking.detected and ranking.effects[0] == "quadratic_drag"
 
 
+@pytest.mark.slow
 def test_rivals_leave_out_what_is_withheld(monkeypatch):
     pytest.importorskip("pysindy")
     from discovery_rivals import RIVALS

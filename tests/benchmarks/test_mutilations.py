@@ -21,6 +21,7 @@ def told(data) -> list[torch.Tensor]:
     return [data.time, data.controls, data.measurements * data.observed, data.observed, data.lengths]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WAYS)
 def test_a_way_changes_drives_and_repeats(name):
     data = simulated(trajectories=6, rows=12)

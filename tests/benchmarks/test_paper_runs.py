@@ -67,6 +67,7 @@ def test_hov_is_simulated_as_it_was_published_bit_for_bit() -> None:
         assert torch.equal(getattr(drives, part), getattr(published, part)), part
 
 
+@pytest.mark.slow
 def test_hov_is_that_of_the_code_that_made_the_tables() -> None:
     """The ends of the first drive of seed 1, as `hov(1)` had them at commit 072b915."""
     drive = hov(1, 16, 1, 1)[0]
@@ -78,6 +79,7 @@ def test_hov_is_that_of_the_code_that_made_the_tables() -> None:
     torch.testing.assert_close(drive.measurements[-1, 0], torch.tensor(bearings, dtype=torch.float64), **few_ulps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("experiment", ["hov", "hov+", "truck"])
 @pytest.mark.parametrize("method", [*paper_methods.RECIPES])
 def test_the_tables_fit_the_papers_programs(monkeypatch: pytest.MonkeyPatch, method: str, experiment: str) -> None:
@@ -101,6 +103,7 @@ def test_the_papers_world_is_not_cut_into_finer_steps() -> None:
 # --- from drives to records -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "settings"), [("hand", {}), ("fit-truth", FEW)])
 def test_a_run_of_a_method(method: str, settings: dict, tmp_path: Path) -> None:
     made = json.loads(json.dumps(paper.judged(method, "hov", 1, settings, tmp_path, True, tmp_path)))
@@ -122,6 +125,7 @@ def test_a_filter_that_fails_is_a_record_without_numbers(monkeypatch: pytest.Mon
     assert math.isnan(found["log_likelihood"]) and found["why_not"] == "every weight is zero"
 
 
+@pytest.mark.slow
 def test_settings_are_judged_by_held_out_drives(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     made = choose.judged("fit-truth", "hov", 101, FEW, tmp_path)
     assert made["kept_step"] == 2 and math.isfinite(made["log_likelihood"])
@@ -131,6 +135,7 @@ def test_settings_are_judged_by_held_out_drives(monkeypatch: pytest.MonkeyPatch,
     assert f"| fit-truth | hov | steps 2, validate_every 2 | {mean} | {mean}, {mean} | 2, 2 |" in choose.table(records)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not LOGS.is_dir(), reason="the AlphaTruck logs are not part of this repository")
 def test_the_picture_of_velocities(tmp_path: Path) -> None:
     for name in ("first", "second"):

@@ -125,6 +125,7 @@ def test_a_run_that_lacks_or_failed_leaves_its_musts_not_run(method: str) -> Non
     assert not all_met([*records, failed], 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("experiment", "method", "metric", "said"),
     [
@@ -277,6 +278,7 @@ def test_the_exit_code(
     )
 
 
+@pytest.mark.slow
 def test_the_benchmark_starts() -> None:
     command = [sys.executable, PUBLISHED.parent / "paper.py", "--help"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)

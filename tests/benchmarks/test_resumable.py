@@ -54,6 +54,7 @@ def test_records_of_another_source_are_refused(tmp_path: Path) -> None:
         resumable.run(counted, {}, file, version="b")
 
 
+@pytest.mark.slow
 def test_a_digest_is_of_what_is_imported_and_of_files(tmp_path: Path) -> None:
     file = tmp_path / "settings.py"
     file.write_text("1")

@@ -14,6 +14,7 @@ ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
 
 
+@pytest.mark.slow
 def test_the_filed_tables_are_those_of_the_filed_results():
     tables, _ = studies.tables(RESULTS)
     assert (RESULTS / "studies.md").read_text() == tables
@@ -29,6 +30,7 @@ def test_figures_of_the_page_are_those_of_the_tables():
     assert len(quoted) >= 10 and [one for one in quoted if one not in tables] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("study", "method", "place", "sentence"),
     [

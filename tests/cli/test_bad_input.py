@@ -39,6 +39,7 @@ BAD_TABLES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("spoil", "says"), BAD_TABLES)
 def test_a_bad_table_is_refused_before_anything_is_written(tmp_path: Path, refused, spoil, says: str) -> None:
     good, bad, run = written(tmp_path / "good.csv"), written(tmp_path / "bad.csv"), tmp_path / "run"
@@ -49,6 +50,7 @@ def test_a_bad_table_is_refused_before_anything_is_written(tmp_path: Path, refus
         refused(2, says, "simulate", HOVERCRAFT, "--controls", bad, "--out", tmp_path / "out.csv")
 
 
+@pytest.mark.slow
 def test_a_bad_table_in_an_evaluation_is_refused(tmp_path: Path, work: Path, refused) -> None:
     bad = rewritten(written(tmp_path / "bad.csv"), "y.bearing_2", "y.baring_2")
     refused(2, "no column y.bearing_2", "evaluate", work / "hand", bad, "--json", tmp_path / "e.json")
@@ -77,6 +79,7 @@ BAD_PROGRAMS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("text", "says"), BAD_PROGRAMS)
 def test_a_bad_program_is_refused_before_anything_is_written(tmp_path: Path, refused, text: str, says: str) -> None:
     table, program = written(tmp_path / "t.csv"), tmp_path / "boat.py"
@@ -99,6 +102,7 @@ def test_a_class_that_is_no_complete_program_is_refused(tmp_path: Path, refused)
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "says"),
     [
@@ -146,6 +150,7 @@ def test_a_known_start_needs_every_first_state(tmp_path: Path, refused) -> None:
     assert steady("fit", HOVERCRAFT, good, "--known-start", *FEW, "--out", tmp_path / "run") == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["run", "file", "empty folder"])
 def test_what_exists_is_not_overwritten(tmp_path: Path, work: Path, refused, kind: str) -> None:
     table, there = written(tmp_path / "t.csv"), work / "hand" if kind == "run" else tmp_path / "there"

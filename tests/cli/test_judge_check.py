@@ -15,6 +15,7 @@ from steady_ppl import read_table, write_table
 FAST = ("--simulations", 20)
 
 
+@pytest.mark.slow
 def test_it_prints_the_verdict_first_and_writes_the_same_figures_and_a_picture(work: Path, tmp_path: Path, capsys):
     json_file, picture = tmp_path / "check.json", tmp_path / "check.png"
     options = (*FAST, "--json", json_file, "--picture", picture)
@@ -26,6 +27,7 @@ def test_it_prints_the_verdict_first_and_writes_the_same_figures_and_a_picture(w
     assert sorted(path.name for path in tmp_path.iterdir()) == ["check.json", "check.png"]
 
 
+@pytest.mark.slow
 def test_one_drive_is_enough(work: Path, tmp_path: Path, capsys):
     table = written(tmp_path / "one.csv", simulated(trajectories=1, rows=33))
     assert steady("check", work / "hand", table, *FAST) == 0
@@ -48,6 +50,7 @@ def test_what_it_cannot_read_is_one_line_and_writes_nothing(work: Path, tmp_path
     refused(2, "greater than or equal to 20", "check", work / "hand", table, "--simulations", 5)
 
 
+@pytest.mark.slow
 def test_a_stretch_that_nobody_measured_is_named_and_masked(work: Path, tmp_path: Path, capsys):
     data = simulated(trajectories=3, rows=33)
     states = data.states.clone()

@@ -79,6 +79,7 @@ def test_particles_that_suffice_are_passed_over(work: Path, capsys) -> None:
     assert "particles" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_runs_of_one_name_are_told_apart_and_a_table_that_was_used_is_said(tmp_path: Path, work: Path, capsys) -> None:
     twin = tmp_path / "steady"
     twin.symlink_to(work / "steady")
@@ -242,6 +243,7 @@ def test_figures_that_cannot_be_written_are_refused_first(tmp_path: Path, work: 
     assert "cannot be written: there is no folder" in said.err and not said.out
 
 
+@pytest.mark.slow
 def test_degrees_are_suspected_by_whatever_judges(tmp_path: Path, capsys) -> None:
     data = simulated(trajectories=6)
     turned = replace(data, measurements=data.measurements * 180 / math.pi)

@@ -27,6 +27,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_medians_and_intervals_are_those_of_the_draws(run: Path, suffix: str, capsys) -> None:
     out = run / f"states{suffix}"

@@ -33,6 +33,7 @@ def work(ready: Path, tmp_path: Path) -> Path:
 # --- add --------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_add_writes_a_program_that_is_fitted_and_judged_like_any_other(work: Path, capsys) -> None:
     new = work / "hovercraft_with_drag.py"
     capsys.readouterr()

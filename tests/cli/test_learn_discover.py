@@ -123,6 +123,7 @@ def test_a_run_whose_program_changed_is_refused(table, tmp_path, capsys):
     assert "changed" in refused(capsys, "discover", tmp_path / "run", table)
 
 
+@pytest.mark.slow
 def test_one_kind_is_looked_for_and_an_effect_left_out(table, capsys):
     given = (
         "--known-start",
@@ -176,6 +177,7 @@ def whole(table, tmp_path_factory):
     return json.loads((run / "discovery.json").read_text())
 
 
+@pytest.mark.slow
 def test_an_interrupted_search_shows_what_it_found_and_ends_as_it_would_have(
     table, whole, tmp_path, capsys, monkeypatch
 ):
@@ -197,6 +199,7 @@ def test_an_interrupted_search_shows_what_it_found_and_ends_as_it_would_have(
     assert not (run / "journal").exists() and not Fit.load(run).trained
 
 
+@pytest.mark.slow
 def test_fits_that_ended_before_an_interrupt_are_shown(table, tmp_path, capsys, monkeypatch):
     figures, picture = tmp_path / "found.json", tmp_path / "found.png"
     monkeypatch.setattr(candidates, "finish", interrupted_at(3, candidates.finish))
@@ -209,6 +212,7 @@ def test_fits_that_ended_before_an_interrupt_are_shown(table, tmp_path, capsys, 
     assert picture.stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_an_interrupt_before_the_first_tests_is_said_in_a_line(table, whole, tmp_path, capsys, monkeypatch):
     run = tmp_path / "run"
     monkeypatch.setattr(search, "screen_program", interrupted_at(1, search.screen_program))
@@ -224,6 +228,7 @@ def test_an_interrupt_before_the_first_tests_is_said_in_a_line(table, whole, tmp
     assert capsys.readouterr().err == "steady: interrupted\n"
 
 
+@pytest.mark.slow
 def test_a_second_interrupt_ends_at_once_and_leaves_the_journal(table, tmp_path, capsys, monkeypatch):
     run = tmp_path / "run"
     monkeypatch.setattr(search, "screen_program", interrupted_at(2, search.screen_program))
@@ -234,6 +239,7 @@ def test_a_second_interrupt_ends_at_once_and_leaves_the_journal(table, tmp_path,
     assert any((run / "journal").iterdir())
 
 
+@pytest.mark.slow
 def test_a_comparison_that_fails_takes_no_verdict_away(table, whole, tmp_path, monkeypatch):
     def fails(*_, **__):
         raise FilterError("the drives are odd")

@@ -84,6 +84,7 @@ def test_a_defect_of_the_library_is_one_line_and_code_1(tmp_path: Path, monkeypa
     refused(1, "RuntimeError: first line", "simulate", TRUTH, "--out", tmp_path / "t.csv")
 
 
+@pytest.mark.slow
 def test_a_command_loads_nothing_that_it_does_not_use(tmp_path: Path) -> None:
     """No compiler of torch, no algebra, nothing that draws; the table is large enough for kernels."""
     table, run = tmp_path / "t.csv", tmp_path / "run"

@@ -73,6 +73,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_json_can_be_printed_and_then_nothing_else_is(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
     assert steady("check", run / "r", run / "t.csv", "--simulations", 20, "--json", "-") == 0
@@ -81,6 +82,7 @@ def test_json_can_be_printed_and_then_nothing_else_is(run: Path, capsys: pytest.
     assert json.loads(capsys.readouterr().out)["runs"][0]["recipe"] == "hand"
 
 
+@pytest.mark.slow
 def test_quiet_says_results_and_errors_but_no_notes(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("simulate", TRUTH, "--effect", "yaw_bias", "--trajectories", 2, "--out", run / "biased.csv")
     capsys.readouterr()

@@ -25,6 +25,7 @@ ROOT = MODELS.parent
 # --- init -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_it_copies_the_rooms_and_simulates_drives(tmp_path: Path, capsys, refused):
     lab = tmp_path / "lab"
     assert steady("init", lab) == 0
@@ -105,6 +106,7 @@ def test_the_wheel_is_enough(tmp_path: Path):
 # --- simulate ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_simulate_writes_the_same_drives_as_csv_and_as_parquet(tmp_path: Path) -> None:
     for name in ("drives.csv", "drives.parquet"):
         assert steady("simulate", TRUTH, "--trajectories", 2, "--seed", 5, "--out", tmp_path / name) == 0
@@ -117,6 +119,7 @@ def test_simulate_writes_the_same_drives_as_csv_and_as_parquet(tmp_path: Path) -
     assert columns[8:] == ["x.x", "x.y", "x.heading", "x.vx", "x.vy", "x.yaw_rate"]
 
 
+@pytest.mark.slow
 def test_simulate_draws_other_drives_from_another_seed(tmp_path: Path) -> None:
     for name, seed in (("a.csv", 1), ("b.csv", 1), ("c.csv", 2)):
         assert steady("simulate", HOVERCRAFT, "--trajectories", 1, "--seed", seed, "--out", tmp_path / name) == 0
@@ -144,6 +147,7 @@ def test_simulate_refuses_a_table_without_the_programs_control(tmp_path: Path, r
     refused(2, says, "simulate", TRUTH, "--controls", table, "--out", tmp_path / "out.csv")
 
 
+@pytest.mark.slow
 def test_simulate_with_effects_says_their_values(tmp_path: Path, capsys) -> None:
     few = ("--trajectories", 2, "--seed", 3)
     given = ("--effect", "linear_drag", "--effect", "slope=0.05,-0.03", "--effect", "thrust_saturation:knee=0.6=0.3")
@@ -180,6 +184,7 @@ def test_simulate_refuses_an_effect_that_is_none(tmp_path: Path, capsys, effects
 # --- data alpha-truck and data cut ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_alpha_truck_turns_logs_into_a_table_that_the_truck_program_reads(tmp_path: Path) -> None:
     write_logs(tmp_path, pose_log(), command_log())
     for name, degrees in (("five.csv", 5), ("one.csv", 1)):

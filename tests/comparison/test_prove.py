@@ -166,6 +166,7 @@ def test_a_whole_turn_of_the_true_heading_changes_no_error(dragged):
         assert other.rows["a"].sums[key].value == pytest.approx(one.rows["a"].sums[key].value, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_an_added_effect_is_named():
     truth = hovercraft().with_effect("linear_drag", 0.5).requires_grad_(False)
     truth.duration = 4.0
@@ -189,6 +190,7 @@ def test_another_reference_turns_the_signs(dragged, truth):
     assert found.figures["verdict"].startswith("before is worse than after")
 
 
+@pytest.mark.slow
 def test_without_true_states_there_are_no_errors_of_states(dragged, truth):
     found = prove({"before": hovercraft(), "after": truth}, only_start(dragged), known_start=True)
     assert line(found, "after")["state"] == {} and "location" not in str(found)
@@ -265,6 +267,7 @@ def test_a_program_that_cannot_be_linearised_is_named(cart):
 # --- the command ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_command_writes_figures_and_a_picture(tmp_path, work, capsys):
     table = written(tmp_path / "test.csv", simulated(trajectories=6, rows=33, seed=4))
     files = "--json", tmp_path / "proof.json", "--picture", tmp_path / "proof.png"
@@ -296,6 +299,7 @@ def test_the_command_refuses_without_touching_a_file(tmp_path, work, refused, ca
     assert "cannot be written" in capsys.readouterr().err and contents(tmp_path) == before
 
 
+@pytest.mark.slow
 def test_a_table_that_a_run_was_fitted_to_proves_nothing(tmp_path, work, capsys):
     table = written(tmp_path / "test.csv", simulated(trajectories=5, rows=33, seed=4))
     for name, how in (("seen", FEW), ("given", ("--recipe", "hand"))):

@@ -57,6 +57,7 @@ def clean() -> st.Check:
     return judged(table(hovercraft(), seed=3))
 
 
+@pytest.mark.slow
 def test_clean_drives_are_left_alone(clean):
     figures = clean.figures
     assert figures["who"] == "nothing found" and figures["p_value"] > 0.05
@@ -74,6 +75,7 @@ def test_missing_drag_is_dynamics_and_the_yaw_rate_is_where(dragged):
     assert "dynamics" in figures["verdict"] and "steady discover" in figures["verdict"]
 
 
+@pytest.mark.slow
 def test_a_landmark_off_its_place_is_the_sensors_fault():
     data = table(hovercraft(), seed=3)
     measurements = data.measurements.clone()
@@ -85,6 +87,7 @@ def test_a_landmark_off_its_place_is_the_sensors_fault():
     assert overall["mean"] > 0 and "bearing_1 measured" in overall["text"] and "rad above" in overall["text"]
 
 
+@pytest.mark.slow
 def test_controls_that_act_late_are_the_actuators_fault():
     program = hovercraft()
     data = table(program, seed=3)
@@ -95,6 +98,7 @@ def test_controls_that_act_late_are_the_actuators_fault():
     assert "of all controls" in figures["evidence"]["directions"][0]["direction"]
 
 
+@pytest.mark.slow
 def test_more_scatter_than_declared_is_noise_and_nothing_else():
     program = hovercraft()
     program.bearing_sd = 2 * program.bearing_sd
@@ -102,6 +106,7 @@ def test_more_scatter_than_declared_is_noise_and_nothing_else():
     assert figures["who"] == "noise" and "scatter of bearing" in figures["verdict"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 4])
 def test_rougher_motion_than_declared_moves_drives_apart_and_is_noise(seed):
     """So it is for 26 of the first 30 seeds; the scores of the rest would pass for a mean effect's at the level."""
@@ -125,6 +130,7 @@ def test_the_real_set_is_scaled_like_any_other():
     np.testing.assert_allclose(there_and_back[[7, *range(1, 7), 0, *range(8, 30)]], scaled(list(range(30))))
 
 
+@pytest.mark.slow
 def test_a_mass_that_does_not_fit_is_a_parameter():
     program = hovercraft()
     program.mass = torch.tensor(1.9)
@@ -132,6 +138,7 @@ def test_a_mass_that_does_not_fit_is_a_parameter():
     assert figures["who"] == "parameters" and "mass (more" in figures["verdict"]
 
 
+@pytest.mark.slow
 def test_false_discoveries_on_clean_drives_are_as_rare_as_they_should_be(cart):
     seeds, found, blamed = 12, 0, 0
     for seed in range(seeds):
@@ -185,6 +192,7 @@ def test_the_noise_floor_is_what_kalman_expects_of_its_own_errors(cart, even):
     assert_mean(torch.from_numpy(result.floor[1]).square(), float((expected + cart.measurement_sd**2).mean()))
 
 
+@pytest.mark.slow
 def test_the_reference_ignores_controls_and_scans_its_noise(clean):
     reference = clean.reference
     assert isinstance(reference, Reference) and len(reference.program.scales) == 3
@@ -201,6 +209,7 @@ def test_the_reference_ignores_controls_and_scans_its_noise(clean):
     assert bool((moved[0] == moved[1]).all())
 
 
+@pytest.mark.slow
 def test_the_reference_of_a_program_takes_no_parameters_of_another():
     """Kernels have them as constants."""
     data = table(hovercraft(), 16)
@@ -218,6 +227,7 @@ def test_the_reference_of_a_program_takes_no_parameters_of_another():
         assert reference.log_likelihood == pytest.approx(float(plain.sum()), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_program_that_loses_to_constant_velocity_is_told_so():
     class Backwards(type(hovercraft())):
         """Thrust pushes the other way."""

@@ -185,6 +185,7 @@ def stubbed(monkeypatch, levels, *, at=True, looks=5.0):
     return check_step(program, data, own), fits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("levels", "substeps", "known"),
     [
@@ -208,6 +209,7 @@ def test_what_fits_at_finer_steps_say_and_do_not(monkeypatch, levels, substeps, 
     assert found.too_coarse == (substeps > 1)
 
 
+@pytest.mark.slow
 def test_a_coarser_step_is_fitted_again_where_the_next_one_has_risen_since(monkeypatch) -> None:
     """All three end at −50, the own one only from the parameters that two steps have got from four."""
     found, fits = stubbed(monkeypatch, {1: [-100, -100, -50], 2: [-95, -50], 4: [-50]})
@@ -215,6 +217,7 @@ def test_a_coarser_step_is_fitted_again_where_the_next_one_has_risen_since(monke
     assert not found.too_coarse and [trial.log_likelihood for trial in found.trials] == pytest.approx([-50] * 3)
 
 
+@pytest.mark.slow
 def test_no_more_is_fitted_than_is_needed(monkeypatch) -> None:
     _, fits = stubbed(monkeypatch, {1: [-100], 2: [-150], 4: [-145], 8: [-140]})
     assert fits == [2, 4, 2]  # the last is two steps from the parameters of four
@@ -222,6 +225,7 @@ def test_no_more_is_fitted_than_is_needed(monkeypatch) -> None:
     assert fits == [1] and found.settled and not found.too_coarse
 
 
+@pytest.mark.slow
 def test_parameters_of_finer_steps_are_those_of_the_vehicle(steps_of_turning) -> None:
     """Response times of .3 and .2 s; one explicit step a row makes them longer."""
     own, finest = steps_of_turning.trials[0].program, steps_of_turning.trials[-1].program
@@ -230,6 +234,7 @@ def test_parameters_of_finer_steps_are_those_of_the_vehicle(steps_of_turning) ->
         assert off[1] < 0.5 * off[0]
 
 
+@pytest.mark.slow
 def test_the_second_order_step_is_fine_enough_for_the_hovercraft_and_explicit_euler_is_not() -> None:
     table = in_continuous_time(Hovercraft(thrust=2.0), 8, seed=1)
     assert not checked(example("hovercraft", torch.float32), table, known_start=True).too_coarse
@@ -240,6 +245,7 @@ def test_the_second_order_step_is_fine_enough_for_the_hovercraft_and_explicit_eu
     )
 
 
+@pytest.mark.slow
 def test_what_a_finer_step_has_gained_is_kept_where_the_next_one_fails(turning, monkeypatch) -> None:
     maximise = step_size.maximise
 
@@ -254,6 +260,7 @@ def test_what_a_finer_step_has_gained_is_kept_where_the_next_one_fails(turning, 
     assert found.gain > 3 and "(fit with --substeps 2)" in found.sentence
 
 
+@pytest.mark.slow
 def test_check_says_the_step_first(turning) -> None:
     program = Turning()
     with seeded(0, "paths"):
@@ -305,6 +312,7 @@ def test_the_exact_unicycle_lacks_nothing_but_a_finer_step(tmp_path, capsys) -> 
     assert trials[content["step"]["substeps"]] / 12 >= 785
 
 
+@pytest.mark.slow
 def test_an_unstable_step_is_told_by_every_command(tmp_path, capsys) -> None:
     model = tmp_path / "stiff.py"
     source = (MODELS / "linear_gaussian.py").read_text()
@@ -322,6 +330,7 @@ def test_an_unstable_step_is_told_by_every_command(tmp_path, capsys) -> None:
         check(Fit(load_program(model), "hand"), drives, simulations=20)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [{"information": torch.nan}, {"log_likelihood": 1e30}])
 def test_parameters_that_diverge_are_no_trial(change, monkeypatch) -> None:
     """A measurement that never changes has a likelihood without a maximum: its noise shrinks without end."""
@@ -342,6 +351,7 @@ def test_parameters_that_diverge_are_no_trial(change, monkeypatch) -> None:
     assert len(found) > 2 and "likelihood has no maximum on these drives" in said.uncompared
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_two_maxima_of_one_program_are_no_matter_of_its_step(seed) -> None:
     """From a bias of 30 m/s² the coarser fit ends at a lower maximum than the finer one, which begins where it ends."""

@@ -43,6 +43,7 @@ def test_a_control_may_have_y_in_its_name():
     assert pieces.labels == ("1-2",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf"), 1e-20, 1e-320])
 def test_no_length_of_time_is_refused(seconds):
     with pytest.raises(st.UsageError, match="seconds"):
@@ -57,6 +58,7 @@ def test_what_cannot_be_cut_says_why():
         st.cut(replace(data, labels=("a", "a-1", "b"), lengths=torch.tensor([21, 8, 21])), 1.0)
 
 
+@pytest.mark.slow
 def test_what_looks_at_drives_as_a_whole_refuses_long_ones(tmp_path, capsys):
     rows = MAX_DRIVE_ROWS + 1
     frame = st.to_frame(simulated(trajectories=6, rows=11))

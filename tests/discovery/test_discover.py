@@ -389,6 +389,7 @@ def gappy(data, seed: int):
     )
 
 
+@pytest.mark.slow
 def test_a_run_that_has_an_effect_is_searched_for_the_next_one(dragged, tmp_path):
     dragged.after.save(tmp_path / "run")
     train, valid = tables(with_effects(owner(), "quadratic_drag=0.05"))
@@ -444,6 +445,7 @@ def test_the_text_says_the_verdict_first(dragged, clean):
     assert all(len(line) <= 125 for line in str(dragged).splitlines())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("withheld", "says"), [(["linaer_drag"], "did you mean linear_drag"), ("wind", "a list of")])
 def test_what_is_withheld_is_an_effect(withheld, says):
     program = example("hovercraft")
@@ -451,6 +453,7 @@ def test_what_is_withheld_is_an_effect(withheld, says):
         st.discover(program, st.simulate(program, 10), withheld=withheld)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("only", "says"), [(["physics"], "there are dynamics, actuator, sensor, noise"), ("noise", "list")]
 )
@@ -460,6 +463,7 @@ def test_what_is_looked_for_is_a_kind(only, says):
         st.discover(program, st.simulate(program, 10), only=only)
 
 
+@pytest.mark.slow
 def test_mixed_tables_are_one_and_every_second_drive_chooses() -> None:
     program = example("hovercraft", torch.float32)
     train, valid = drives(program, 6, 21, seed=1), drives(program, 5, 21, seed=2)

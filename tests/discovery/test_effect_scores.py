@@ -44,6 +44,7 @@ def hovercraft():
     return program, data, at, path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", EFFECTS)
 def test_scores_of_effects_are_slopes_of_log_likelihood_where_they_are_absent(hovercraft, text):
     program, data, at, path = hovercraft
@@ -66,6 +67,7 @@ def test_scores_of_effects_are_slopes_of_log_likelihood_where_they_are_absent(ho
         assert ratio == pytest.approx(1, abs=0.05), text
 
 
+@pytest.mark.slow
 def test_scores_of_curves_are_those_of_their_heights(hovercraft):
     """Against the same curve attached with a small height at one knot."""
     program, data, at, path = hovercraft
@@ -93,6 +95,7 @@ def test_scores_of_curves_are_those_of_their_heights(hovercraft):
             assert close, f"{name} knot {knot}: {found[:, knot].tolist()} for {expected.tolist()}"
 
 
+@pytest.mark.slow
 def test_the_regression_of_smoothed_residuals_is_biased_and_the_scores_are_not():
     """The reference's bias: the smoother has already believed the program without the drag."""
     truth = example("hovercraft").with_effect("linear_drag", 0.05)

@@ -65,6 +65,7 @@ def test_a_program_whose_linearised_likelihood_is_off_is_fitted_by_draws(monkeyp
     assert float((found.maxima[0].log_likelihood - there).sum()) > -TIE_NATS
 
 
+@pytest.mark.slow
 def test_a_nearly_linear_program_is_fitted_by_likelihood() -> None:
     program = example("hovercraft")
     base = first_refit(Problem(program, drives(program, 4, 41, seed=1), True), drives(program, 4, 41, seed=2), seed=0)

@@ -85,6 +85,7 @@ def test_drives_are_judged_with_noise_that_all_of_them_tell(carts):
     assert float(carts.held_out.sum()) > float(carts.held_out_alone.sum()) + 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 4])
 @pytest.mark.parametrize("counts", [(4, 4), (5, 8)])
 def test_no_other_noise_in_common_is_likelier(seed, counts):
@@ -102,6 +103,7 @@ def test_no_other_noise_in_common_is_likelier(seed, counts):
             assert likelihood(neighbours, refit.folds) < best
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("priors", [{}, {"noise": dist.Normal(0.3, 0.03)}], ids=["no prior", "a prior"])
 def test_programs_that_have_everything_in_common_are_one(priors):
     """The prior of a number in common counts once."""
@@ -133,6 +135,7 @@ def test_noise_that_is_learned_as_a_variance_is_in_common_too():
     assert float(refit.held_out.sum()) > float(refit.held_out_alone.sum()) + 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", ["process_noise", "coloured_noise"])
 def test_effects_that_are_noise_are_in_common_too(effect):
     """Else the noise that one half wants comes back in the effect's coefficient."""

@@ -65,6 +65,7 @@ def begun(program, truth=None):
     return first_refit(Problem(program, train, False), valid, seed=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("program", "factor"), [(TooWide, 0.4), (TooNarrow, 2.5)])
 def test_a_sensor_that_is_declared_wrong_is_corrected_and_no_other(program, factor):
     own = begun(program())
@@ -75,6 +76,7 @@ def test_a_sensor_that_is_declared_wrong_is_corrected_and_no_other(program, fact
     assert with_suitable_noise(base, lambda variant: True) == (base, [])
 
 
+@pytest.mark.slow
 def test_what_is_right_stays_as_it_is():
     own = begun(Cart())
     assert with_suitable_noise(own, lambda variant: True) == (own, [])
@@ -85,6 +87,7 @@ def test_what_is_withheld_stays_as_it_is():
     assert with_suitable_noise(own, lambda variant: variant.effect.name != "measurement_noise") == (own, [])
 
 
+@pytest.mark.slow
 def test_what_was_an_effect_all_along_is_no_noise():
     own = begun(Cart(), Cart().with_effect("sensor_bias:position_0", 0.3))
     base, (correction,) = with_suitable_noise(own, lambda variant: True)

@@ -26,6 +26,7 @@ from steady_ppl.likelihood.maximize import maximise
 from steady_ppl.model.problem import Problem
 
 
+@pytest.mark.slow
 def test_fits_by_draws_begin_at_the_likelier_program() -> None:
     good, far = example("hovercraft", torch.float32), example("hovercraft", torch.float32)
     data = drives(good, 4, 41, seed=1)
@@ -44,6 +45,7 @@ def test_fits_by_draws_begin_at_the_likelier_program() -> None:
         starts_by_draws(stiff, stiff, fold)
 
 
+@pytest.mark.slow
 def test_where_a_climb_by_draws_diverges_another_begins_at_the_program_as_given(monkeypatch) -> None:
     given, fitted = example("hovercraft", torch.float32), example("hovercraft", torch.float32)
     data = drives(fitted, 4, 41, seed=1)
@@ -68,6 +70,7 @@ def test_where_a_climb_by_draws_diverges_another_begins_at_the_program_as_given(
     assert began == pytest.approx([1.5])
 
 
+@pytest.mark.slow
 def test_drives_are_judged_by_fits_that_have_seen_them_for_the_noise_alone():
     truth = example("hovercraft").with_effect("yaw_bias", 0.08)
     program = example("hovercraft")
@@ -86,6 +89,7 @@ def test_drives_are_judged_by_fits_that_have_seen_them_for_the_noise_alone():
     assert float((found.held_out - base.held_out).sum()) > 5
 
 
+@pytest.mark.slow
 def test_fits_begin_at_the_declared_noise_as_well_where_the_program_alone_explains_nothing():
     """A sensor far worse than declared: without it, only process noise beyond all measure explains the drives."""
     truth, program = example("hovercraft"), example("hovercraft")
@@ -102,6 +106,7 @@ def test_fits_begin_at_the_declared_noise_as_well_where_the_program_alone_explai
     assert all(one.noise.detach().max() < base.program.noise.detach().max() / 20 for one in found.programs)
 
 
+@pytest.mark.slow
 def test_a_fit_at_another_knee_is_the_one_from_nothing():
     truth, program = example("hovercraft").with_effect("thrust_saturation", 0.8, knee=0.6), example("hovercraft")
     train, valid = drives(truth, 5, 41, seed=1), drives(truth, 5, 41, seed=2)

@@ -32,6 +32,7 @@ def scores_of(sets: int, seed: int, missing: float = 0.0) -> torch.Tensor:
     return scores + missing * information[:, PARAMETERS + 1]
 
 
+@pytest.mark.slow
 def test_p_values_are_uniform_where_nothing_is_missing():
     found, drives = columns(), scores_of(400, 2)
     p_values = []

@@ -106,6 +106,7 @@ def test_a_class_lists_its_effects(tmp_path: Path) -> None:
     probe(program)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "rate"),
     [
@@ -132,6 +133,7 @@ def test_the_program_itself_is_left_alone() -> None:
     assert program.mass.item() == pytest.approx(1.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved", [False, True])
 def test_a_run_remembers_the_effects_that_were_added(tmp_path: Path, moved: bool) -> None:
     (tmp_path / "hovercraft.py").write_text((MODELS / "hovercraft.py").read_text())

@@ -28,6 +28,7 @@ def variants(program, effect: str):
 # --- each effect ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @every_effect
 def test_without_its_coefficient_the_effect_is_not_there(name: str, effect: str) -> None:
     """The same seed gives the same drives; tails come near the normal's as far as their cap lets them."""
@@ -41,6 +42,7 @@ def test_without_its_coefficient_the_effect_is_not_there(name: str, effect: str)
         torch.testing.assert_close(with_it.measurements, plain.measurements, **exact)
 
 
+@pytest.mark.slow
 @every_effect
 def test_with_its_typical_coefficient_the_effect_is_felt_by_a_sound_program(name: str, effect: str) -> None:
     program = short(name, rows=40)
@@ -225,6 +227,7 @@ def test_noise_is_as_wide_as_the_equations_say() -> None:
 # --- coloured noise ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_coloured_noise_has_the_spread_and_the_memory_that_it_claims() -> None:
     """Stationary sd σ and lag-1 correlation c; 5 standard errors, drives being independent."""
     program = load_program(f"{MODELS / 'hovercraft.py'}:Hovercraft").double()

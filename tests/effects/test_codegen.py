@@ -62,6 +62,7 @@ def is_clean(folder: Path) -> None:
         assert done.returncode == 0, done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pendulum", *(pytest.param(name, marks=pytest.mark.slow) for name in SYSTEMS[:2])])
 def test_every_effect_written_out_is_the_effect(folder: Path, name: str) -> None:
     base = load_program(folder / f"{name}.py")
@@ -79,6 +80,7 @@ def test_every_effect_written_out_is_the_effect(folder: Path, name: str) -> None
     is_clean(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "effects"),
     [
@@ -300,6 +302,7 @@ def test_an_effect_whose_name_does_not_say_all_is_refused(folder: Path) -> None:
     assert not list(folder.glob("*new.py"))
 
 
+@pytest.mark.slow
 def test_the_example_of_the_page_runs(folder: Path, capsys) -> None:
     """Registered by the program's file: simulated, listed, written out; the lines are the reader's own."""
     text = (ROOT / "docs" / "own-effect.md").read_text()

@@ -189,7 +189,7 @@ ONCE = [
 
 
 @pytest.mark.parametrize("kind", QUICK, ids=str)
-@few(4)
+@few(2)
 @given(data=st.data())
 def test_a_spoiled_file_is_read_or_refused_in_a_line(desk: Desk, kind: Kind, data: st.DataObject) -> None:
     how = data.draw(st.sampled_from(sorted(kind.changes)), "change")
@@ -204,6 +204,7 @@ def test_every_change_of_every_file(full_desk: Desk, kind: Kind, how: str, words
     spoil(full_desk, kind, data, how, data.draw(st.sampled_from(kind.commands), "command") if LONG else words)
 
 
+@pytest.mark.slow
 @few(40)
 @given(data=st.data())
 def test_a_misspelt_command_is_done_or_refused_in_a_line(desk: Desk, data: st.DataObject) -> None:

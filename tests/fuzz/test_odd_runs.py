@@ -136,6 +136,7 @@ ANY_LENGTH = ("candidates", "effects", "class", "doubts", "notes", "between", "d
 LISTS = [place for place in places(FULL) if isinstance(at(FULL, place), list)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [pytest.param(place, id=".".join(map(str, place))) for place in LISTS])
 @pytest.mark.parametrize("longer", [False, True])
 def test_a_list_of_another_length_is_refused_or_shown(tmp_path: Path, place: tuple[Any, ...], longer: bool) -> None:

@@ -65,6 +65,7 @@ def cut(path: Path, lines: int) -> None:
     path.write_text("\n".join(path.read_text().splitlines()[:lines]) + "\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(NAMED))
 def test_a_hostile_table_is_refused(tmp_path: Path, table: Path, cart_run: Path, capsys, name: str) -> None:
     spoil, says = NAMED[name]
@@ -91,6 +92,7 @@ FINE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(FINE))
 def test_an_odd_table_is_read(tmp_path: Path, table: Path, cart_run: Path, capsys, name: str) -> None:
     FINE[name](table)

@@ -55,6 +55,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", list(FAULTS))
 def test_a_fault_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
     for limit, value in {"MOST_MIB": 20, "SECONDS": 1, "LONG": 1, "PATIENCE": 3}.items():

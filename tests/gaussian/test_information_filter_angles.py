@@ -75,6 +75,7 @@ def turning():
     return data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known_start", [False, True])
 def test_a_program_may_keep_its_angles_on_the_circle(turning, known_start):
     straight, circle = found(Truth(), turning, known_start), found(OnTheCircle(), turning, known_start)

@@ -14,6 +14,7 @@ from steady_ppl.kernels import jit, rows as rows_by_kernels
 from steady_ppl.model.problem import Problem
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_a_kernels_jacobians_are_those_of_torch(name, monkeypatch):
     program = single(name)

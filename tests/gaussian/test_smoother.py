@@ -30,6 +30,7 @@ def test_a_path_is_found_from_the_measurements_alone(hovercraft, bearings, known
     assert max(wrap(apart[..., 2])[bearings.rows].abs().max(), apart[bearings.rows][:, [0, 1]].abs().max()) < 2e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [1, 10])
 def test_a_path_is_found_from_sharp_bearings_without_a_start(every):
     program = example("hovercraft:HovercraftTruth").requires_grad_(False)
@@ -42,6 +43,7 @@ def test_a_path_is_found_from_sharp_bearings_without_a_start(every):
     assert (found > best - 0.5).all()  # drives on a wrong path are off by thousands of nats
 
 
+@pytest.mark.slow
 def test_steps_that_go_too_far_are_halved():
     """A drive past two landmarks under an untrained network: whole steps never settle, and end anywhere from -6987 to
     140; a bootstrap filter of 20,000 particles says 148."""
@@ -56,6 +58,7 @@ def test_steps_that_go_too_far_are_halved():
             assert float(find_and_smooth(Problem(program, drive, True)).log_likelihood) > 140
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_drive_past_a_beacon_three_centimetres_off_comes_to_rest_where_a_filter_can_follow(seed):
     """Every step changes the bearing's derivative by its own size. By whole steps, taken back only where log p(y) fell,

@@ -82,6 +82,7 @@ def bad_aim(cart) -> tuple:
     return other, {"measurements": lambda data: data.measurements + 0.1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known_start", [False, True])
 @pytest.mark.parametrize("resample_below", [0.0, 0.5, 1.0])
 def test_a_bad_twist_is_unbiased(cart, uneven, resample_below, known_start):
@@ -224,6 +225,7 @@ class Coarse(type(example("hovercraft:HovercraftTruth"))):
     bearing_sd = math.radians(20)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("known_start", "rows", "blind"), [(True, 8, 3000), (False, 5, 10_000)])
 def test_looking_ahead_agrees_with_a_large_bootstrap_filter(hovercraft, known_start, rows, blind):
     runs = 40

@@ -138,6 +138,7 @@ def smc_guide(program, data, posteriors):
     return guide
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make_guide", [exact_guide, smc_guide])
 def test_an_m_step_improves_log_p_y_by_at_least_what_q_gains(make_guide):
     gained, improved, apart = improvement(make_guide)
@@ -332,6 +333,7 @@ def test_noise_that_bends_the_next_state_too_much_is_refused():
         true_paths(program, drives(program, 2, 12))
 
 
+@pytest.mark.slow
 def test_noise_is_told_from_states_that_no_vehicle_has():
     """What total variation makes of poor fixes, in single precision: hundreds of m/s, thousands of m/s²."""
     program = example("neural_vehicle:NeuralHovercraft", torch.float32).requires_grad_(False)

@@ -95,6 +95,7 @@ def test_a_gaussian_guides_draws_have_the_moments_of_the_exact_smoother(known_st
         assert_mean(squares, exact.latent_covariance.diagonal()[2:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guide", GUIDES)
 def test_a_tempered_guide_draws_from_the_power_posterior(guide):
     program = example("linear_gaussian").requires_grad_(False)

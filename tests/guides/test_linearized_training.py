@@ -116,6 +116,7 @@ def test_a_search_that_was_not_needed_may_fail(guide, monkeypatch):
         looking.refresh(data, 0.3)
 
 
+@pytest.mark.slow
 def test_a_search_that_is_lost_for_one_drive_serves_the_others(monkeypatch):
     program = example("hovercraft:HovercraftTruth").requires_grad_(False)
     data = drives(program, 3, 12, gaps=True)
@@ -151,6 +152,7 @@ def test_a_guide_refuses_other_drives_of_the_same_labels():
 # --- training ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guide", GUIDES)
 def test_the_maximum_likelihood_estimate_of_the_cart_is_learned(guide):
     program, data, top = slow_cart()
@@ -195,6 +197,7 @@ def killed_at(guide, step: int):
     return guide
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", [None, 2])
 @pytest.mark.parametrize("guide", GUIDES)
 def test_a_resumed_run_repeats_an_uninterrupted_one_bit_for_bit(data, tmp_path, guide, batch):

@@ -62,6 +62,7 @@ def worst(problem: Reference, states: Tensor) -> float:
 # --- agreement --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("engine", "name"), [*EXACT, (gaussian, "hovercraft")])
 def test_draws_have_the_moments_that_nuts_found(engine, name):
     assert worst(reference(name), states(engine, name)) < LIMIT
@@ -92,6 +93,7 @@ def test_the_stored_moments_are_known_to_a_fiftieth_of_a_standard_deviation(name
 # --- mistakes that must be noticed ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_wrong_landmark_is_noticed(engine):
     problem = reference("hovercraft")
@@ -104,6 +106,7 @@ def test_a_wrong_landmark_is_noticed(engine):
     assert worst(problem, drawn(engine(wrong), problem.data)) > NOTICED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_measurements_in_another_order_are_noticed(engine):
     problem = reference("hovercraft")
@@ -129,6 +132,7 @@ def test_ancestors_applied_twice_are_noticed(name, monkeypatch):
     assert worst(problem, drawn(bootstrap(problem.program), problem.data)) > NOTICED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_half_the_weight_of_the_observations_is_noticed(engine):
     problem = reference("hovercraft")

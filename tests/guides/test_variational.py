@@ -62,6 +62,7 @@ def test_the_smoother_is_exact_on_a_linear_program(cart, uneven, draws: int, kno
     torch.testing.assert_close(found, exact.expand(5), rtol=1e-9, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_gradient_at_the_exact_posterior_is_that_of_log_p_of_y(uneven) -> None:
     """Fisher's identity, by paths that move with the parameters."""
     program = example("linear_gaussian")
@@ -76,6 +77,7 @@ def test_the_gradient_at_the_exact_posterior_is_that_of_log_p_of_y(uneven) -> No
         assert_mean(torch.stack([draw[index] for draw in draws]), gradient)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(GUIDES))
 @pytest.mark.parametrize("draws", [1, 2])
 def test_every_elbo_is_a_bound(cart, uneven, name: str, draws: int) -> None:
@@ -104,6 +106,7 @@ NEAR = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rows", "name", "gap"), NEAR)
 def test_training_brings_the_bound_near(rows: int, name: str, gap: float) -> None:
     """Nats a drive, some twice what was seen; independent normals cannot say that accelerations make up for each
@@ -119,6 +122,7 @@ def test_training_brings_the_bound_near(rows: int, name: str, gap: float) -> Non
     assert exact - gap * len(data) - error < values.mean() < exact + error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known_start", [False, True])
 @pytest.mark.parametrize("name", list(GUIDES))
 def test_the_kl_weight_is_that_of_the_kl_divergence(cart, uneven, name: str, known_start: bool) -> None:
@@ -148,6 +152,7 @@ def test_the_kl_weight_follows_its_schedule(cart, even) -> None:
     assert guide.refresh(even, 0.25) == {"kl_weight": pytest.approx(0.55)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["network", *(pytest.param(name, marks=LONG) for name in GUIDES if name != "network")])
 def test_past_a_drives_end_there_is_no_divergence(cart, even, name: str) -> None:
     """A longer drive beside a short one changes nothing in what the short one adds."""
@@ -168,6 +173,7 @@ def test_past_a_drives_end_there_is_no_divergence(cart, even, name: str) -> None
     assert abs(float(apart)) < 4 * error + 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known_start", [False, True])
 @pytest.mark.parametrize("name", ["hovercraft", "truck", "pendulum", "neural_vehicle:NeuralHovercraft"])
 def test_the_guide_changes_nothing_in_the_model(name: str, known_start: bool) -> None:

@@ -56,6 +56,7 @@ def test_a_row_in_substeps_is_the_row(effects: tuple[str, ...], substeps: int) -
     torch.testing.assert_close(slopes[..., size:], by[1], rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effects", EFFECTS[1:])
 def test_a_row_too_long_for_a_kernel_is_run_in_substeps(effects: tuple[str, ...], monkeypatch) -> None:
     """What the whole row comes to by its own kernels, or in plain torch."""

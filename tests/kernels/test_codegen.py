@@ -135,6 +135,7 @@ def test_arithmetic_is_that_of_torch(function):
     torch.testing.assert_close(kernel_of(function, x[0], y[0])[0], each.expand(1, -1), rtol=3e-6, atol=3e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("function", ARITHMETIC)
 def test_derivatives_are_those_of_torch(function):
     torch.manual_seed(0)

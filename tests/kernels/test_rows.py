@@ -46,6 +46,7 @@ def arguments(program, data):
     return {"state": states, "noise": noise, "control": controls, "time": data.elapsed[:-1], "step": data.steps}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("substeps", [1, 2])
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_slopes_are_the_differences_of_the_programs_own_lines(name: str, substeps: int):

@@ -105,6 +105,7 @@ def age(file: Path, seconds: float) -> float:
 # what is kept
 
 
+@pytest.mark.slow
 def test_another_process_finds_the_code_and_comes_to_the_same_bits(folder):
     first, second = said(KERNEL), said(KERNEL)
     assert first[0] == "written" and second == first[1:]
@@ -139,6 +140,7 @@ def test_a_text_that_cannot_be_written_leaves_nothing(folder):
     assert compiled("a") and not compiled("a")
 
 
+@pytest.mark.slow
 def test_several_processes_at_once(folder):
     processes = [start(MANY) for _ in range(4)]
     for process in processes:

@@ -61,6 +61,7 @@ def test_the_start_does_not_matter(cart):
         torch.testing.assert_close(ours.parameter.data, theirs.parameter.data, atol=0.02, rtol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2])
 def test_fits_that_are_made_one_after_another_are_the_same_on_any_cores(count, monkeypatch):
     monkeypatch.setattr(cores, "_cores", lambda: count)
@@ -122,6 +123,7 @@ def test_a_prior_pulls(cart):
     assert before < gain < 2.0 and 2.0 - gain < (2.0 - before) / 4
 
 
+@pytest.mark.slow
 def test_noise_is_widened_before_a_program_that_explains_nothing_is_fitted():
     """A strong yaw drag that is missing: from the declared noise scoring steps end anywhere."""
     truth, program = example("hovercraft"), example("hovercraft")
@@ -137,6 +139,7 @@ def test_noise_is_widened_before_a_program_that_explains_nothing_is_fitted():
     assert torch.equal(right.noise.detach(), before)
 
 
+@pytest.mark.slow
 def test_a_fit_that_cannot_reach_what_it_must_ends_after_six_steps_and_one_that_rises_goes_on(cart):
     _, data, maximum = cart
     best = float(maximum.log_likelihood.sum())
@@ -163,6 +166,7 @@ def test_a_fit_that_begins_with_too_much_information_does_not_end_at_once(cart):
     assert again.objective == pytest.approx(maximum.objective, abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_drive_whose_path_is_lost_is_fitted_again():
     program = example("hovercraft", torch.float32)
     program.noise, program.guesses = torch.tensor([0.08, 0.08, 0.05]), ()
@@ -190,6 +194,7 @@ class Biased(type(example("linear_gaussian"))):
         return super().transition(state, control + self.bias * self.unit, time, step)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1e-4, 1.0, 1e4])
 def test_a_number_with_a_unit_is_found_in_any_unit(unit):
     program = Biased().double()

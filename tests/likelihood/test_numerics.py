@@ -39,6 +39,7 @@ def quiet(sd: float, dtype: torch.dtype = torch.float64) -> st.Program:
 # --- noise that vanishes ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_as_noise_vanishes_the_likelihood_has_a_limit():
     data = drives(quiet(1e-4), 4, 101)
     limit = judged(quiet(1e-8), data)
@@ -47,6 +48,7 @@ def test_as_noise_vanishes_the_likelihood_has_a_limit():
         assert (judged(quiet(sd), data) - limit).abs().max() < 0.1
 
 
+@pytest.mark.slow
 def test_no_noise_at_all_is_said(data):
     with pytest.raises(st.FilterError, match=r"log p\(y\) is not finite"):
         judged(quiet(0.0), data)
@@ -66,6 +68,7 @@ def test_a_sensor_that_is_nearly_exact_leaves_the_smoother_exact(sd):
 # --- a landmark underfoot ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("look_ahead", [True, False])
 def test_a_vehicle_that_stands_on_a_landmark_has_a_likelihood(look_ahead):
     class Over(type(example(TRUTH))):
@@ -102,6 +105,7 @@ def test_single_precision_agrees_with_double(data):
     assert (apart.abs() / spread).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_thousand_drives_are_judged_like_four():
     program = example(TRUTH, torch.float32)
     many = drives(program, 1000, 21)

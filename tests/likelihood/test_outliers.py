@@ -36,10 +36,12 @@ def moved(data, *wrong):
     return replace(data, measurements=readings)
 
 
+@pytest.mark.slow
 def test_clean_drives_have_none(boat, drives):
     assert found_in(boat, drives).found == []
 
 
+@pytest.mark.slow
 def test_a_jump_that_lasts_is_found_to_the_row(boat, drives):
     found = found_in(boat, moved(drives, (slice(50, 58), 2, slice(0, 2), 20.0), (30, 3, 2, 1.0)))
     position, compass = found.found
@@ -51,6 +53,7 @@ def test_a_jump_that_lasts_is_found_to_the_row(boat, drives):
     assert int(found.left.observed.sum()) == int(drives.observed.sum()) - 17
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rows", "by"), [(30, 20.0), (60, 5.0), (60, 20.0)])
 def test_a_long_jump_goes_and_the_good_readings_stay(boat, rows, by):
     data = st.for_program(boat, st.simulate(boat, 8, seed=1))
@@ -58,11 +61,13 @@ def test_a_long_jump_goes_and_the_good_readings_stay(boat, rows, by):
     assert wrong[50 : 50 + rows].all() and int(wrong.sum()) <= rows + 4
 
 
+@pytest.mark.slow
 def test_a_noise_that_is_declared_too_narrow_makes_none(boat, drives):
     narrow = boat.with_effect("measurement_noise:gps", 0.4).with_effect("measurement_noise:compass", 0.4)
     assert found_in(narrow, drives).found == []
 
 
+@pytest.mark.slow
 def test_where_a_sensor_reads_anything_nothing_is_called_an_outlier(boat, drives):
     rows = torch.arange(len(drives.time)) % 60 < 10
     wild = moved(drives, *((rows, drive, 0, by) for drive, by in enumerate((40.0, -40.0, 30.0, -50.0))))
@@ -71,12 +76,14 @@ def test_where_a_sensor_reads_anything_nothing_is_called_an_outlier(boat, drives
     assert found.note == AS_TAILS or "too many for outliers" in found.note
 
 
+@pytest.mark.slow
 def test_heavy_tails_are_no_outliers(boat):
     tailed = boat.with_effect("heavy_tails", 0.45)
     found = found_in(boat, st.for_program(boat, st.simulate(tailed, 8, seed=2)))
     assert found.found == [] and found.note == AS_TAILS
 
 
+@pytest.mark.slow
 def test_a_table_with_further_columns_loses_the_same_cells(boat, drives):
     found = found_in(boat, moved(drives, (30, 3, 2, 1.0)))
     names = ("rain", *reversed(drives.measurement_names))

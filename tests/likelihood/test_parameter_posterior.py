@@ -67,6 +67,7 @@ def exact(program: st.Program, table: st.Trajectories) -> tuple[float, float]:
     return score / information, math.sqrt(1 / information)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [Drift, Believed, Scaled])
 def test_the_rate_of_a_drift_has_the_posterior_of_a_regression(kind):
     program, draws = kind(), 2000
@@ -84,6 +85,7 @@ def test_the_rate_of_a_drift_has_the_posterior_of_a_regression(kind):
     )
 
 
+@pytest.mark.slow
 def test_the_program_stays_as_it_is_and_the_same_seed_draws_the_same():
     program = example("hovercraft:HovercraftTruth", torch.float32)
     table = st.simulate(program, 2, seed=1)
@@ -94,6 +96,7 @@ def test_the_program_stays_as_it_is_and_the_same_seed_draws_the_same():
     assert (one.draws > 0).all()
 
 
+@pytest.mark.slow
 def test_draws_are_told_to_be_untrustworthy_where_they_are():
     program = example("hovercraft:HovercraftTruth", torch.float32)
     found = st.parameter_posterior(program, st.simulate(program, 1, seed=1), proposals=20, draws=20)
@@ -106,6 +109,7 @@ def test_arviz_reads_them():
     assert found.posterior["rate"].shape == (1, 30)
 
 
+@pytest.mark.slow
 def test_a_network_has_too_many_numbers_to_be_drawn():
     program = example("neural_vehicle:NeuralHovercraft", torch.float32)
     with pytest.raises(st.UsageError, match="learnable numbers"):

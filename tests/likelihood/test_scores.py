@@ -37,6 +37,7 @@ def test_a_linear_program_has_its_kalman_filters_scores():
         torch.testing.assert_close(found[:, index], (up - down) / 2e-4, rtol=2e-3, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_scores_of_parameters_are_slopes_of_log_likelihood(hovercraft):
     program, data, at, path = hovercraft
     parts = elements(program)
@@ -51,6 +52,7 @@ def test_scores_of_parameters_are_slopes_of_log_likelihood(hovercraft):
         assert apart < 0.06, f"{part.name}: {found[:, index].tolist()} for {expected.tolist()}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("substeps", [1, 2])
 @pytest.mark.parametrize("effect", ["actuator_lag", "dead_zone", "battery_sag"])
 def test_kernels_and_torch_find_the_same_scores_of_an_actuator(effect, substeps, monkeypatch):

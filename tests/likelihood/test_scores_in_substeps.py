@@ -41,6 +41,7 @@ def beside_the_maximum(damping, substeps):
     return program, data, at_rest(program, data, path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("damping", "substeps"), [(0.8, 1), (0.8, 4), (10.0, 16), (30.0, 32)])
 def test_scores_are_slopes(damping, substeps) -> None:
     program, data, ahead = beside_the_maximum(damping, substeps)
@@ -55,6 +56,7 @@ def test_scores_are_slopes(damping, substeps) -> None:
         assert score == pytest.approx((ends[0] - ends[1]) / (0.2 * part.step), rel=2e-3, abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_fit_that_calls_itself_converged_is_at_the_maximum() -> None:
     """Noise held 30 % too small: what the mean alone says of the damping leads elsewhere."""
     data = for_program(Cart().double(), simulate(fast(30.0, 32), 12, seed=1, substeps=32)).without_truth()
@@ -70,6 +72,7 @@ def test_a_fit_that_calls_itself_converged_is_at_the_maximum() -> None:
                 assert log_likelihood(program, data, maximum.path) < best + 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("damping", "substeps"), [(0.8, 4), (3.0, 8), (10.0, 16)])
 def test_the_density_of_given_draws_has_the_same_slopes(damping, substeps) -> None:
     """What an M step climbs, by 4,000 draws in ten lots."""

@@ -53,6 +53,7 @@ class Idle(CART):
         self.spare = PyroParam(torch.tensor(1.0), constraints.positive)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trajectories", [2, 12])
 @pytest.mark.parametrize(
     ("program", "expected"),

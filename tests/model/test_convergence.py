@@ -84,6 +84,7 @@ def test_every_file_of_models_is_looked_at() -> None:
     assert files == {name.partition(":")[0] for name in PROGRAMS}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_a_program_converges_at_its_own_substeps(name) -> None:
     assert worst(example(name)) < 0.1
@@ -94,6 +95,7 @@ def test_explicit_euler_does_not() -> None:
     assert worst(example("paper:PaperHovercraft")) > 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "effect"),
     [

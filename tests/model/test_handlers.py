@@ -25,6 +25,7 @@ def test_shapes_that_do_not_go_together_are_the_same_error() -> None:
             function((3,), (2,))
 
 
+@pytest.mark.slow
 def test_no_sympy_is_loaded_for_it() -> None:
     code = (
         "import sys; from steady_ppl.model.handlers import broadcast_shapes\n"

@@ -74,6 +74,7 @@ def step_by_step(program: Program, data: Trajectories, paths: Paths, *, known_st
     return total.sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draws", [1, 4])
 @pytest.mark.parametrize("known_start", [False, True])
 @pytest.mark.parametrize("name", PROGRAMS)

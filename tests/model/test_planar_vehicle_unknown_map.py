@@ -62,6 +62,7 @@ def test_landmarks_in_whole_metres_are_learned_too() -> None:
     assert program.map.dtype == torch.get_default_dtype() and program.map.requires_grad
 
 
+@pytest.mark.slow
 def test_fit_tv_learns_no_map_that_only_true_starts_would_fix() -> None:
     vehicle, table = type(load_program(HOVERCRAFT)), simulated(rows=9)
     fit = find_recipe("fit-tv")
@@ -70,6 +71,7 @@ def test_fit_tv_learns_no_map_that_only_true_starts_would_fix() -> None:
     fit(type("Surveyed", (UnknownMap, vehicle), {"surveyed": (0, 2)})(), table, steps=1, progress=False)
 
 
+@pytest.mark.slow
 def test_a_wrong_map_is_mended_from_bearings_and_known_starts() -> None:
     program = load_program(UNKNOWN)
     truth = load_program(HOVERCRAFT)

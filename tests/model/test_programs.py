@@ -53,6 +53,7 @@ def test_the_program_is_well_formed(name: str) -> None:
     assert sorted(named) == sorted(program.state_names) or not program.error_groups
 
 
+@pytest.mark.slow
 @every_program
 def test_simulated_drives_are_finite_and_have_the_declared_columns(name: str) -> None:
     program = example(name)
@@ -70,6 +71,7 @@ def test_simulated_drives_are_finite_and_have_the_declared_columns(name: str) ->
     assert not torch.equal(data.states[0, 0], data.states[0, 1])  # the drives start apart
 
 
+@pytest.mark.slow
 @every_program
 def test_step_after_step_is_the_same_as_all_steps_at_once(name: str) -> None:
     """Given the channel noise, the sequential run and the one over all rows give equal states and densities."""
@@ -97,6 +99,7 @@ def test_step_after_step_is_the_same_as_all_steps_at_once(name: str) -> None:
     torch.testing.assert_close(together[data.transitions], states[1:][data.transitions], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 @every_program
 def test_every_parameter_has_a_finite_gradient_that_is_not_zero(name: str) -> None:
     program = stirred(example(name))
@@ -125,6 +128,7 @@ def test_single_and_double_precision_agree(name: str) -> None:
     torch.testing.assert_close(moved[1].double(), moved[0], rtol=1e-5, atol=1e-5)  # single precision
 
 
+@pytest.mark.slow
 def test_to_swap_programs_is_to_name_another_file(tmp_path: Path) -> None:
     table = written(tmp_path / "t.csv")
     few = ("--steps", 1, "--particles", 10, "--draws", 2)
@@ -133,6 +137,7 @@ def test_to_swap_programs_is_to_name_another_file(tmp_path: Path) -> None:
         assert steady("fit", program, table, *few, "--out", tmp_path / str(number)) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["linear_gaussian.py", "pendulum.py", "truck.py"])
 def test_the_same_commands_serve_every_system(tmp_path: Path, name: str) -> None:
     program, table, run = MODELS / name, tmp_path / "t.csv", tmp_path / "run"

@@ -39,6 +39,7 @@ class Stiff(Cart):
         return stack(position + velocity * step, velocity + acceleration * step)
 
 
+@pytest.mark.slow
 def test_a_step_that_is_unstable_is_told_by_its_number() -> None:
     stiff = Stiff().double()
     data = for_program(stiff, simulate(stiff, 2, seed=1))
@@ -128,6 +129,7 @@ class QuietAtRest(Cart):
         return torch.where((time > 2).unsqueeze(-1), 1.0, 0.0).to(time)
 
 
+@pytest.mark.slow
 def test_a_channel_without_noise_in_some_rows_is_simulated_in_substeps() -> None:
     program = QuietAtRest().double()
     fine = simulate(program, 2, seed=1)

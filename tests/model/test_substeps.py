@@ -271,6 +271,7 @@ def test_substeps_are_a_whole_number(count) -> None:
         probe(Odd())
 
 
+@pytest.mark.slow
 def test_simulated_drives_do_not_depend_on_how_fine_their_steps_are() -> None:
     program = example("hovercraft:HovercraftTruth")
     fine, finer = simulate(program, 3, seed=1), simulate(program, 3, seed=1, substeps=80)
@@ -280,6 +281,7 @@ def test_simulated_drives_do_not_depend_on_how_fine_their_steps_are() -> None:
     assert step < 0.1 * (coarse.states - finer.states).abs().max()
 
 
+@pytest.mark.slow
 def test_a_run_remembers_its_substeps(tmp_path) -> None:
     table, run = written(tmp_path / "drives.csv"), tmp_path / "run"
     assert steady("fit", HOVERCRAFT, table, "--recipe", "likelihood", "--substeps", 3, "--out", run) == 0
@@ -287,6 +289,7 @@ def test_a_run_remembers_its_substeps(tmp_path) -> None:
     assert Fit.load(run).program.substeps == 3
 
 
+@pytest.mark.slow
 def test_a_program_that_add_writes_keeps_the_substeps_of_its_run(tmp_path) -> None:
     table, run, model = written(tmp_path / "drives.csv"), tmp_path / "run", tmp_path / "hovercraft.py"
     model.write_text(HOVERCRAFT.read_text())

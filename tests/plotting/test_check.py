@@ -11,6 +11,7 @@ from steady_ppl import Fit, UsageError, check
 from steady_ppl.plotting.check import innovations
 
 
+@pytest.mark.slow
 def test_innovations_are_the_checks_standardised_errors() -> None:
     program, data = example("hovercraft"), simulated(rows=30, trajectories=4)
     data.observed[5, 2, 1] = False

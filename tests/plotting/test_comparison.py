@@ -20,6 +20,7 @@ def proof() -> st.Proof:
     return st.prove(rows, st.simulate(truth, 5, seed=2), known_start=True, truth="after")
 
 
+@pytest.mark.slow
 def test_the_picture_has_a_line_for_each_row_and_a_grey_floor(proof):
     axes = open_loop_picture(proof)
     assert [found.get_label() for found in axes.get_lines()] == ["before", "after", "constant velocity"]

@@ -86,6 +86,7 @@ def test_a_trajectory_that_is_not_there_is_an_error(drawn) -> None:
         posterior_states(drawn, "1", ["x", "speed"])
 
 
+@pytest.mark.slow
 def test_names_from_a_table_are_not_read_as_formulas() -> None:
     program = example("hovercraft", torch.float32)
     data = replace(simulated(rows=81), labels=(r"$\frac{$", "$x^2$", "3"))

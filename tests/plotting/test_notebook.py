@@ -57,6 +57,7 @@ def fits():
     }
 
 
+@pytest.mark.slow
 def test_a_check_and_a_proof_show_verdict_picture_and_figures(fits) -> None:
     data = simulated(rows=40, trajectories=6)
     for found in (st.check(fits["hovercraft"], data, simulations=20), st.prove(fits, data)):

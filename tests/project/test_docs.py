@@ -43,6 +43,7 @@ def test_the_readme_shows_every_command_or_points_at_it() -> None:
     assert [one.name for one in app.registered_commands if f"steady {one.name}" not in text] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RUN)
 def test_the_examples_of_a_page_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a folder as `steady init` makes it, a namespace for the page; blocks with a title are files."""

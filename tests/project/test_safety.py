@@ -79,6 +79,7 @@ def refusals(text: str) -> list[tuple[str, int]]:
     return list(dict.fromkeys(found))
 
 
+@pytest.mark.slow
 def test_no_source_reads_pickles_evaluates_text_or_calls_out() -> None:
     used, seen = set(), 0
     for name, text in sources():

@@ -38,6 +38,7 @@ def typed(folder: Path, command: list[str]) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_a_log_becomes_three_tables(folder: Path) -> None:
     (script,) = blocks("python")
     typed(folder, [sys.executable, "-c", script])

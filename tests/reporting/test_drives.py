@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from report_pages import two_run_report, two_runs, unpacked
 from small import simulated
 
@@ -23,6 +24,7 @@ def test_numbers_come_back_as_finely_as_sixteen_bits_are():
     np.testing.assert_array_equal(unpacked(in_sixteen_bits(np.full(3, 7.0))), 7.0)
 
 
+@pytest.mark.slow
 def test_a_place_to_look_at_is_where_the_misfit_is():
     table = simulated("hovercraft.py:HovercraftTruth", trajectories=6, rows=41)
     measurements = table.measurements.clone()
@@ -46,6 +48,7 @@ def test_a_place_to_look_at_is_where_the_misfit_is():
         assert bool(((near >= low - 1e-6) & (near <= high + 1e-6)).any())
 
 
+@pytest.mark.slow
 def test_there_is_room_for_the_strongest_drives():
     checks = list(two_run_report().checks.values())
     assert chosen_drives(checks).note is None
@@ -56,6 +59,7 @@ def test_there_is_room_for_the_strongest_drives():
     assert len(tiny.drives) == 1 and tiny.every > 1 and "th row" in tiny.note
 
 
+@pytest.mark.slow
 def test_what_is_shown_row_by_row_has_an_upper_bound():
     """A page of three hundred drives is hardly larger than one of thirty."""
     checks = [st.check(one, simulated(trajectories=6, rows=101), simulations=20) for one in two_runs().values()]

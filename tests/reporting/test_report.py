@@ -41,6 +41,7 @@ def page(found, tmp_path_factory) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_it_has_every_verdict_and_loads_nothing(found, page):
     text = page.read_text()
     for verdict in [found.proof.figures["verdict"], *(one.figures["verdict"] for one in found.checks.values())]:
@@ -67,6 +68,7 @@ def test_every_label_of_a_section_a_select_and_a_table_is_there(page):
     assert ("html", {"lang": "en"}) in elements.tags
 
 
+@pytest.mark.slow
 def test_what_is_drawn_is_what_was_computed(found, page, runs, data):
     drawn = content(page)
     check = found.checks["before"]
@@ -89,6 +91,7 @@ def test_what_is_drawn_is_what_was_computed(found, page, runs, data):
     assert np.nanmax(abs(shown)) == pytest.approx(strongest, abs=0.001)
 
 
+@pytest.mark.slow
 def test_one_run_alone_is_a_report_without_a_proof(runs, data, tmp_path):
     found = st.report({"only": runs["before"]}, data, simulations=20, draws=5)
     assert isinstance(found.proof, str) and "one run only" in found.html
@@ -114,6 +117,7 @@ class Turned(type(example("hovercraft"))):
     measurements = tuple(f"bearing_{i} [rad]" for i in reversed(range(4)))
 
 
+@pytest.mark.slow
 def test_every_run_is_drawn_against_its_own_components(runs, data):
     """Not against the first run's, which may measure the same in another order; and without a known start a heading is
     on the truth's turn."""
@@ -155,6 +159,7 @@ def test_the_command_writes_it(work: Path, tmp_path: Path, capsys, refused):
     assert not list(tmp_path.glob("*.partial"))
 
 
+@pytest.mark.slow
 def test_the_command_that_is_shown_is_the_one_that_was_given(work: Path, tmp_path: Path):
     page, table = tmp_path / "report.html", work / "valid.parquet"
     asked = ("--simulations", 20, "--title", "my page", "--seed", 3)
@@ -166,6 +171,7 @@ def test_the_command_that_is_shown_is_the_one_that_was_given(work: Path, tmp_pat
     assert f"# {table}: sha256 of its drives " in text
 
 
+@pytest.mark.slow
 def test_what_was_discovered_is_among_what_is_to_be_repeated(work: Path, tmp_path: Path):
     shutil.copytree(work / "hand", tmp_path / "found")
     (tmp_path / "found" / "discovery.json").write_text(json.dumps(FOUND))

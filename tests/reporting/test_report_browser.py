@@ -22,6 +22,7 @@ def page(tmp_path_factory) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_a_browser_draws_it_without_an_error(page):
     wide = ("--window-size=1280,9000", "--dump-dom")
     dom, log = opened(page, *wide)
@@ -31,6 +32,7 @@ def test_a_browser_draws_it_without_an_error(page):
     assert '<option value="2">' in dom and dom.count("<option") > 8
 
 
+@pytest.mark.slow
 def test_a_link_shows_its_drive_and_seconds(page):
     dom, log = opened(page, "--dump-dom", "--window-size=1280,2000", anchor="#run=0&drive=3&from=1&to=2.5")
     assert "CONSOLE" not in log, log
@@ -39,6 +41,7 @@ def test_a_link_shows_its_drive_and_seconds(page):
     assert 'role="status">after, drive 1, all seconds<' in dom
 
 
+@pytest.mark.slow
 def test_clicking_a_place_shows_its_seconds(page):
     click = """
     const place = (id) => document.getElementById(id), said = [];
@@ -60,6 +63,7 @@ def test_clicking_a_place_shows_its_seconds(page):
     assert third.startswith("#run=1&drive=") and third != second
 
 
+@pytest.mark.slow
 def test_in_a_notebooks_frame_it_answers_as_well(page):
     script = """
     setTimeout(() => {
@@ -77,6 +81,7 @@ def test_in_a_notebooks_frame_it_answers_as_well(page):
     assert "<title>after, drive 2, all seconds</title>" in dom
 
 
+@pytest.mark.slow
 def test_every_place_of_the_maps_is_a_link_as_well(page):
     script = """
     for (const id of ["strips-list", "regimes-list"]) document.getElementById(id).open = true;
@@ -94,6 +99,7 @@ def test_every_place_of_the_maps_is_a_link_as_well(page):
     assert place.startswith("#run=1&drive=0&from=") and focused == "h-drives"
 
 
+@pytest.mark.slow
 def test_a_link_that_was_followed_can_be_followed_again(page):
     script = """
     const link = document.createElement("a");
@@ -127,6 +133,7 @@ def test_addresses_that_are_nonsense_show_what_is_nearest(page):
         assert "CONSOLE" not in log and f'role="status">{shown}<' in dom, anchor
 
 
+@pytest.mark.slow
 def test_the_keyboard_meets_no_tools_and_every_picture_has_a_name(page):
     script = """
     setTimeout(() => window.dispatchEvent(new Event("beforeprint")), 500);
@@ -162,6 +169,7 @@ def test_paper_is_as_wide_as_what_is_drawn_on_it(page, tmp_path):
     assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
 
 
+@pytest.mark.slow
 def test_a_phone_need_not_scroll_sideways(page):
     script = "setTimeout(() => { document.title = document.documentElement.scrollWidth; }, 3000);"
     frame = page.with_name("frame.html")
@@ -171,6 +179,7 @@ def test_a_phone_need_not_scroll_sideways(page):
     assert int(re.findall("<title>(.*?)</title>", dom)[0]) == 390
 
 
+@pytest.mark.slow
 def test_a_system_of_one_state_is_drawn(tmp_path):
     program = Motor()
     program.duration = 6.0

@@ -71,6 +71,7 @@ def page(tmp_path_factory) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_hostile_names_are_text_of_the_page(page: Path) -> None:
     text = page.read_text()
     assert IMAGE not in text and LINK not in text and "<!--<script" not in text and "<svg onload" not in text
@@ -89,6 +90,7 @@ def test_hostile_names_are_text_of_the_data(page: Path) -> None:
     assert "<" not in page.read_text().partition('type="application/json">')[2].partition("</script>")[0]
 
 
+@pytest.mark.slow
 @in_a_browser
 def test_hostile_names_are_text_in_a_browser(page: Path) -> None:
     """Everything is drawn, every list is opened, and every point is pointed at."""

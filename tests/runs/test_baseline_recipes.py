@@ -46,6 +46,7 @@ def learned(name: str, program, train, valid=None, **options):
     return find_recipe(name.split()[0])(program, train, valid, **options, **QUIET)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [pytest.param(name, marks=pytest.mark.slow if name.startswith(("svi", "fit-tv")) else ()) for name in RECIPES],
@@ -68,6 +69,7 @@ def test_each_beats_hand(name: str) -> None:
     assert held_out(program, valid) > before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known_start", [True, False])
 @pytest.mark.parametrize("name", list(FEW))
 def test_none_of_them_looks_at_the_true_states(name: str, known_start: bool) -> None:
@@ -132,6 +134,7 @@ def test_what_is_the_networks_alone_is_refused_elsewhere() -> None:
         learned("svi", load_program(HOVERCRAFT), simulated(rows=5), guide="mean-field", width=8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("recipe", "setting", "value", "wanted"),
     [
@@ -194,6 +197,7 @@ def test_settings_of_another_kind_are_refused(tmp_path, capsys, setting: str, wa
     assert wanted in capsys.readouterr().err and not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("word", "value"), [("false", False), ("true", True), ("none", None), ("False", False)])
 def test_a_word_for_yes_and_no_is_one(tmp_path, word: str, value: bool | None) -> None:
     table, run = written(tmp_path / "t.csv", simulated(rows=5)), tmp_path / "run"
@@ -243,6 +247,7 @@ def test_steady_minus_does_not_temper() -> None:
     assert fit.recipe == "steady-minus"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guide", ["network", "mean-field", "smoother"])
 def test_svi_resumes_as_if_nothing_had_happened(tmp_path, guide: str) -> None:
     """The guide's parameters are in the checkpoint as well."""

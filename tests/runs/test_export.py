@@ -167,6 +167,7 @@ def test_a_step_goes_forward() -> None:
         st.Fit(example("hovercraft"), "hand").dynamics(step=0.0)
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_a_controller_plans_with_it() -> None:
     """Model-predictive path integral control (Williams et al. 2017) brings the hovercraft to a goal, and it stays."""

@@ -96,6 +96,7 @@ def test_a_name_that_is_too_long_is_one_line(work: Path, monkeypatch, refused, c
     refused(2, "name too long", *command, folder=work)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [240, 255])
 def test_a_name_may_be_as_long_as_the_file_system_has_them(tmp_path: Path, length: int) -> None:
     table = tmp_path / f"{'n' * (length - 4)}.csv"
@@ -110,6 +111,7 @@ READ_ONLY = """mount -t tmpfs -o size=1m none "$1" && mkdir "$1/run" && mount -o
 shift; exec "$@" """
 
 
+@pytest.mark.slow
 def test_a_file_system_that_is_read_only_is_one_line(tmp_path: Path) -> None:
     place = tmp_path / "ro"
     place.mkdir()
@@ -137,6 +139,7 @@ def odd(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_run_whose_name_is_no_utf8_is_read_like_any_other(work: Path, odd: Path) -> None:
     table = written(odd / "train\udcfe.csv")
     run = odd / "run\udcfe"

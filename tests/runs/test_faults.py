@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from examples import example
-from small import HOVERCRAFT, steady, written
+from small import HOVERCRAFT, steady, without_progress, written
 
 import steady_ppl as st
 from steady_ppl.runs.folder import LOCK, run_folder
@@ -53,6 +53,7 @@ def writer(run: Path):
     process.stdout.close()
 
 
+@pytest.mark.slow
 def test_of_two_writers_the_second_is_refused(run: Path, writer, tmp_path: Path, refused) -> None:
     command = ("fit", HOVERCRAFT, tmp_path / "table.csv", "--recipe", "hand", "--force", "--out", run)
     refused(2, "another process writes to it", *command)
@@ -62,6 +63,7 @@ def test_of_two_writers_the_second_is_refused(run: Path, writer, tmp_path: Path,
     assert not (run / LOCK).exists()
 
 
+@pytest.mark.slow
 def test_the_lock_of_a_killed_writer_is_none_and_the_old_run_comes_back(run: Path, writer) -> None:
     before = st.Fit.load(run.parent / "run", HOVERCRAFT) if (run / "run.json").exists() else None
     assert before is None  # the writer has put the old run aside
@@ -169,6 +171,7 @@ def same_results(desk: Path, name: str, out: str) -> None:
     assert not any((desk / out / left).exists() for left in ("journal", LOCK, "previous"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "begun"),
     [
@@ -188,6 +191,7 @@ def test_a_command_that_is_killed_goes_on_to_the_same_result(desk: Path, name: s
     same_results(desk, name, out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("room", "some"),
     [  # bytes: less than the largest of the pieces, and less than the first
@@ -200,7 +204,7 @@ def test_a_search_on_a_disk_that_fills_up_goes_on_when_there_is_room(desk: Path,
     out = f"full_{room}"
     command = (*COMMANDS["discover"], "--out", out)
     assert started(desk, *command, room=room).wait() == 2
-    (said,) = (desk / "errors").read_text().splitlines()
+    (said,) = without_progress((desk / "errors").read_text())
     assert said.startswith("steady: ") and said.endswith("cannot be written: File too large")
     if not some:
         assert not (desk / out).exists()

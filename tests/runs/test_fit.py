@@ -317,6 +317,7 @@ def test_what_is_no_run_is_an_error_of_the_run(tmp_path: Path) -> None:
         Fit.load(tmp_path / "run")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keep", [0, 50, -1])
 def test_a_checkpoint_cut_short_is_damaged_and_says_so_in_one_line(tmp_path: Path, capsys, keep: int) -> None:
     run = tmp_path / "run"

@@ -16,6 +16,7 @@ from steady_ppl.utils.angles import wrap
 FIT_TV = recipe_file("fit-tv")
 
 
+@pytest.mark.slow
 def test_fit_tv_differentiates_what_it_finds() -> None:
     """Sharp bearings of a smooth drive: velocities within what a second of thrust changes."""
     program = example("hovercraft")
@@ -30,6 +31,7 @@ def test_fit_tv_differentiates_what_it_finds() -> None:
     assert float(away[..., :2].abs().median()) < 0.02 and float(away[..., 3:5].abs().median()) < 0.1
 
 
+@pytest.mark.slow
 def test_fit_tv_bridges_gaps_and_uneven_steps() -> None:
     """Poses of a steady motion, at uneven times, some of them missing: its velocity everywhere."""
     program = example("hovercraft")
@@ -46,6 +48,7 @@ def test_fit_tv_bridges_gaps_and_uneven_steps() -> None:
     torch.testing.assert_close(found, torch.tensor([2.0, -1.0, 3.0]).double().expand(len(found), -1), rtol=0, atol=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("row", "end"), [(0, "first"), (40, "last")])
 def test_fit_tv_invents_no_motion_before_the_first_pose_and_after_the_last(row: int, end: str) -> None:
     program = example("hovercraft")
@@ -55,6 +58,7 @@ def test_fit_tv_invents_no_motion_before_the_first_pose_and_after_the_last(row: 
         run_file(FIT_TV).differentiated(program, data, poses, 1e-3, 10)
 
 
+@pytest.mark.slow
 def test_fit_tv_says_how_many_rows_it_interpolated() -> None:
     program, data = example("hovercraft"), drives(example("hovercraft"), 2, 9)
     observed = data.observed.clone()

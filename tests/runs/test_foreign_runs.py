@@ -70,6 +70,7 @@ def test_a_run_of_a_newer_version_says_so_to_every_command(run, tmp_path, capsys
     assert not list(tmp_path.glob("*.html")) and not list(tmp_path.glob("added.py"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["run/mine.py", "run/deep/mine.py", "other/mine.py"])
 def test_no_command_executes_a_program_that_came_with_a_run(tmp_path: Path, capsys, run: Path, place: str) -> None:
     mark, file = tmp_path / "executed", payload(tmp_path / place, tmp_path / "executed")
@@ -101,6 +102,7 @@ def test_a_program_that_came_with_a_run_is_executed_where_the_person_names_it(tm
     assert st.Fit.load(run, f"{file}:Hovercraft").recipe == "hand" and mark.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "program",
     [
@@ -125,6 +127,7 @@ def test_a_record_that_names_its_program_strangely_is_damaged(tmp_path: Path, ru
     assert not (tmp_path / "executed").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", ["__import__('os').system('true')", "wind:__import__=1:x", "linear_drag:x=(1,2)"])
 def test_effects_of_a_record_are_names_of_the_catalogue(run: Path, effect: str) -> None:
     rerecorded(run, effects=[effect])
@@ -135,6 +138,7 @@ def test_effects_of_a_record_are_names_of_the_catalogue(run: Path, effect: str) 
 # --- links ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["previous", "journal"])
 def test_overwriting_a_run_removes_nothing_behind_a_link(tmp_path: Path, refused, run: Path, name: str) -> None:
     other = tmp_path / "precious"

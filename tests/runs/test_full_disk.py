@@ -61,6 +61,7 @@ def words(command: tuple, work: Path, out: Path) -> list[object]:
     return [word.format(work=work, out=out) if isinstance(word, str) else word for word in command]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0, 2000], ids=["nothing fits", "two kilobytes fit"])
 @pytest.mark.parametrize("name", WRITING)
 def test_a_full_disk_is_one_line_and_leaves_nothing(name: str, size: int, work: Path, tmp_path: Path, capsys) -> None:
@@ -122,6 +123,7 @@ def locked(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in WRITING if name != "add"])
 def test_a_folder_that_cannot_be_written_is_one_line(name: str, work: Path, locked: Path, capsys) -> None:
     capsys.readouterr()

@@ -21,6 +21,7 @@ def fitted(lighter) -> st.Fit:
     return find_recipe("likelihood")(st.load_program(HOVERCRAFT), *lighter, known_start=True)
 
 
+@pytest.mark.slow
 def test_it_finds_what_made_the_drives(fitted):
     assert float(fitted.program.mass.detach()) == pytest.approx(1.2, rel=0.05)
     assert float(fitted.program.noise[0].detach()) == pytest.approx(0.08, rel=0.4)
@@ -30,6 +31,7 @@ def test_it_finds_what_made_the_drives(fitted):
     assert last["log_likelihood"] > first["log_likelihood"] + 1 and fitted.trained.still_rising is None
 
 
+@pytest.mark.slow
 def test_long_training_does_not_get_further(fitted, lighter):
     program = st.load_program(HOVERCRAFT)
     long = find_recipe("steady")(program, lighter[0], known_start=True, steps=150, progress=False).program
@@ -47,6 +49,7 @@ def likelihood(program, table) -> float:
     return float(smooth(Problem(program, data, True), path, passes=4).log_likelihood.sum())
 
 
+@pytest.mark.slow
 def test_it_is_a_recipe_of_the_command_line(tmp_path: Path, lighter, capsys):
     tables = [written(tmp_path / f"{name}.csv", data) for name, data in zip(("train", "valid"), lighter, strict=True)]
     command = ("fit", HOVERCRAFT, tables[0], "--valid", tables[1], "--recipe", "likelihood", "--known-start")

@@ -151,6 +151,7 @@ def test_drives_without_labels_are_numbered() -> None:
     assert result["posterior"]["trajectory"].values.tolist() == ["1", "2", "3"]
 
 
+@pytest.mark.slow
 def test_the_draws_of_the_cart_have_the_exact_posterior_mean() -> None:
     program = example("linear_gaussian")
     data = replace(drives(program, 2, 5, gaps=True), labels=("a", "b"))

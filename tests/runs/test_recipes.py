@@ -53,6 +53,7 @@ def test_hand_changes_nothing(tmp_path: Path) -> None:
 # --- steady -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guide", list(GUIDES))
 def test_steady_finds_a_mass_that_was_wrong_by_far(guide: str) -> None:
     """Believed to be twice as heavy as it is and seen through bearings only; held-out drives must gain as well."""
@@ -68,6 +69,7 @@ def test_steady_finds_a_mass_that_was_wrong_by_far(guide: str) -> None:
     assert held_out(program, valid) > before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guide", list(GUIDES))
 @pytest.mark.parametrize("known_start", [True, False])
 @pytest.mark.parametrize("name", ["hovercraft.py:Hovercraft", "neural_vehicle.py:NeuralHovercraft"])
@@ -137,6 +139,7 @@ def test_a_guide_that_there_is_not_or_what_it_does_not_take_is_refused(options, 
         find_recipe("steady")(load_program(HOVERCRAFT), simulated(rows=4), **options, **QUIET)
 
 
+@pytest.mark.slow
 def test_the_gaussian_guide_says_when_the_posterior_is_not_normal() -> None:
     """Landmarks among the drives, whose starts are not known: bearings turn quickly there."""
     far, near = load_program(HOVERCRAFT), load_program(HOVERCRAFT)
@@ -210,6 +213,7 @@ def test_fit_truth_is_least_squares_on_the_true_states() -> None:
     np.testing.assert_array_less(abs(program.noise.detach().numpy() / [0.08, 0.08, 0.05] - 1), 4 * error)
 
 
+@pytest.mark.slow
 def test_fit_truth_beats_hand_on_held_out_measurements() -> None:
     train, valid = simulated(rows=41), simulated(rows=41, seed=1)
     program = load_program(HOVERCRAFT)
@@ -315,6 +319,7 @@ def test_noise_that_cannot_be_linearised_is_steadys(tmp_path: Path, monkeypatch:
     )
 
 
+@pytest.mark.slow
 def test_a_fit_says_which_and_keeps_it_and_goes_on_with_it(tmp_path: Path, capsys):
     table = written(tmp_path / "t.csv")
     assert steady("fit", HOVERCRAFT, table, "--out", tmp_path / "one") == 0

@@ -96,6 +96,7 @@ def test_other_settings_and_other_tensors_are_traced_anew():
     assert_same(*both(program, data))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("look_ahead", [False, True])
 @pytest.mark.parametrize(
     ("name", "substeps", "known_start", "gaps"),
@@ -131,6 +132,7 @@ def test_a_filter_estimates_the_same_with_kernels_as_without(name, substeps, kno
     assert_mean((likelihood[0] - likelihood[1]).t(), 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("look_ahead", [False, True])
 @pytest.mark.parametrize("resample_below", [0.0, 0.5, math.inf])
 @pytest.mark.parametrize("block_bytes", [compiled.BLOCK_BYTES, 3 * 8000, 2 * 8000, 1])

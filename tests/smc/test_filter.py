@@ -79,6 +79,7 @@ class Shifted(Proposal):
         return noise, (math.log(self.width) + (white.square() - noise.square()) / 2).sum(-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known_start", [False, True])
 @pytest.mark.parametrize("resample_below", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("drive", ["even", "uneven"])

@@ -21,6 +21,7 @@ NAMES = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_same_seed_gives_the_same_drives_and_leaves_the_callers_generator_alone(name):
     program = example(name, torch.float32)

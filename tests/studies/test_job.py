@@ -95,6 +95,7 @@ def test_every_program_of_a_job_knows_the_noise_of_the_bearings(tmp_path: Path):
     assert settings["hand"].bearing_sd == pytest.approx(math.radians(20)) and settings["lineages"] == 2
 
 
+@pytest.mark.slow
 def test_what_was_changed_while_a_study_went_on_is_no_result(tmp_path: Path):
     folder = tmp_path / "a.pyenv"  # a folder may be called so
     folder.mkdir()

@@ -97,6 +97,7 @@ def test_a_search_has_no_test_drives(tmp_path: Path):
         read_plan(written(tmp_path, search_study().replace("valid = 2", "valid = 2\ntest = 2")))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["known_start", "train", "program", "seed", "particles"])
 def test_a_search_takes_the_settings_that_are_its_own(tmp_path: Path, name: str):
     require_runnable(read_plan(written(tmp_path, search_study(simulations=20, withheld="[['stiffness']]"))))

@@ -19,6 +19,7 @@ from steady_ppl.studies.runner import require_runnable
 from steady_ppl.studies.table import TABLE, read_results
 
 
+@pytest.mark.slow
 def test_the_command_computes_what_is_not_there_and_draws_it(tmp_path: Path, capsys):
     file, out = written(tmp_path), tmp_path / "out"
     assert steady("study", file, "--workers", 2, "--out", out) == 0
@@ -80,6 +81,7 @@ def test_a_start_that_tables_do_not_know_is_said_before_any_job_is_begun(tmp_pat
         require_runnable(read_plan(written(tmp_path, text)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("column", "says"),
     [
@@ -93,6 +95,7 @@ def test_errors_that_no_program_has_are_said_before_any_job_is_begun(tmp_path: P
         require_runnable(read_plan(written(tmp_path, text)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", sorted((MODELS.parent / "studies").glob("*.toml")), ids=lambda file: file.stem)
 def test_a_ready_study_can_be_begun(tmp_path: Path, file: Path):
     for part in ("train", "valid", "test"):

@@ -16,6 +16,7 @@ from steady_ppl.training.loop import _judge
 from steady_ppl.utils.tensor_files import read_tensors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", [None, 2])
 @pytest.mark.parametrize("stop", [1, 3, 4, 5])
 def test_a_resumed_run_repeats_an_uninterrupted_one_bit_for_bit(data, tmp_path, stop, batch):

@@ -89,6 +89,7 @@ def test_a_program_moves_on_one_thread() -> None:
     assert seen == {1} and torch.get_num_threads() == 3
 
 
+@pytest.mark.slow
 def test_the_command_has_one_thread_whatever_the_environment_says() -> None:
     code = (
         "import sys; from steady_ppl.cli.main import run\n"

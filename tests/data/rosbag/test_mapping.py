@@ -41,6 +41,7 @@ def test_the_mapping_that_the_how_to_shows_is_one() -> None:
     assert heading == BagColumn("x.heading", "/mocap", "pose.pose.orientation", reading="yaw")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "says"),
     [

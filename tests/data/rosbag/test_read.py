@@ -19,6 +19,7 @@ from steady_ppl.data.table import to_frame
 # --- kinds of bags ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_bag_gives_the_numbers_that_were_written(tmp_path: Path, capsys, kind: str) -> None:
     bag = write_bag(tmp_path / "drive", kind, drive())
@@ -152,6 +153,7 @@ def test_a_pause_over_which_a_command_is_held_is_said(tmp_path: Path, capsys) ->
 # --- end to end -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_simulated_drives_come_back_from_bags_as_they_were(tmp_path: Path, kind: str) -> None:
     drives, bags = simulated(trajectories=3, rows=25), []

@@ -14,6 +14,7 @@ from steady_ppl import BagColumn, BagMapping, UsageError, read_bags, read_table
 Y = ("--map", "y.a=/scan:ranges[0]")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

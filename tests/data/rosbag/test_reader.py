@@ -32,6 +32,7 @@ def without_definitions(bag: Path, types: str = "%") -> Path:
     return bag
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", ["folder", "file"])
 def test_what_a_bag_does_not_define_comes_from_files_or_else_from_humble(
     tmp_path: Path, capsys, refused, given: str
@@ -121,6 +122,7 @@ def test_topics_that_spell_alike_are_columns_of_their_own(tmp_path: Path, capsys
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_damage_is_never_a_traceback(tmp_path: Path, kind: str) -> None:
     """Cut short anywhere, or with some bytes changed, it is read or refused."""
