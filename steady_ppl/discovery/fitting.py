@@ -37,6 +37,8 @@ from steady_ppl.training.loop import Optimization, Validation, train
 from steady_ppl.utils.random import seeded
 
 MAX_LINEARISATION_ERROR = 0.5  # nats a drive by which the linearised log p(y) may be off
+MAX_NATS_BETWEEN_FILTERS = 1.0  # a drive: beyond it a filter has lost its particles, as at a jump of the GPS
+MIN_SHARE_OF_SURE_DRIVES = 0.5  # in which two filters agree; where they do in fewer, none can say
 GUIDE_PARTICLES, JUDGE_PARTICLES = 100, 400  # of the guide and of the judge: see docs/discovery.md, step 4
 NOISE_FORMS = ("spread", "colour")  # of effects that are process noise
 PROBE_MOVE = 0.1  # by how much a number is moved
@@ -114,12 +116,19 @@ Fitting = ByLikelihood | ByDraws
 
 
 def is_doubtful(problem: Problem, path: ReferencePath) -> bool:
-    """Whether the linearised log p(y) is off by more than half a nat a drive, or no particle filter can say."""
+    """Whether the linearised log p(y) is off by more than half a nat a drive, or no particle filter can say.
+
+    Drives on which two filters disagree say nothing: there a wrong reading leaves few particles.
+    """
     ahead = _smooth(problem, path)
     try:
-        return float(_neglected(problem, ahead).abs().mean()) > MAX_LINEARISATION_ERROR
+        one, other = (_neglected(problem, ahead, seed=seed) for seed in (0, 1))
     except FilterError:
         return True
+    sure = (one - other).abs() <= MAX_NATS_BETWEEN_FILTERS
+    if float(sure.double().mean()) < MIN_SHARE_OF_SURE_DRIVES:
+        return True
+    return float((one + other)[sure].abs().mean()) / 2 > MAX_LINEARISATION_ERROR
 
 
 def _smooth(problem: Problem, path: ReferencePath) -> Lookahead:

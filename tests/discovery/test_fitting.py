@@ -13,6 +13,7 @@ from steady_ppl.discovery.candidates import TIE_NATS
 from steady_ppl.discovery.fitting import ByDraws, ByLikelihood, is_doubtful
 from steady_ppl.discovery.refits import first_refit, refit_with
 from steady_ppl.effects import chosen_variant
+from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path
 from steady_ppl.likelihood.maximize import maximise
 from steady_ppl.model.problem import Problem
@@ -70,3 +71,21 @@ def test_a_nearly_linear_program_is_fitted_by_likelihood() -> None:
     program = example("hovercraft")
     base = first_refit(Problem(program, drives(program, 4, 41, seed=1), True), drives(program, 4, 41, seed=2), seed=0)
     assert isinstance(base.fitting, ByLikelihood)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "doubtful"),
+    [
+        ([-20.4, 0.4, -70.5, 0.2, -4.4, 0.1], [-9.2, 0.3, -111.2, 0.2, -5.5, 0.0], False),  # jumps of the GPS
+        ([0.2, -0.9, -0.3, -1.6, -0.5, -0.5], [0.1, -1.0, -0.2, -1.2, -0.5, -0.4], True),  # limits that bind
+        ([-20.4, 0.4, -70.5, 7.0, -4.4, 0.1], [-9.2, 0.3, -111.2, 1.2, -5.5, 0.0], True),  # lost nearly everywhere
+    ],
+    ids=["wrong readings", "off", "lost"],
+)
+def test_drives_on_which_two_filters_disagree_say_nothing(monkeypatch, one, other, doubtful) -> None:
+    found = {0: torch.tensor(one), 1: torch.tensor(other)}
+    monkeypatch.setattr("steady_ppl.discovery.fitting._smooth", lambda problem, path: None)
+    monkeypatch.setattr("steady_ppl.discovery.fitting._neglected", lambda problem, ahead, *, seed: found[seed])
+    program = example("hovercraft", torch.float32)
+    problem = Problem(program, drives(program, 6, 11, seed=1), True)
+    assert is_doubtful(problem, ReferencePath(torch.zeros(1), torch.zeros(1))) is doubtful

@@ -18,7 +18,15 @@ from steady_ppl import for_program, simulate
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path, smooth
 from steady_ppl.kernels import jit, rows
-from steady_ppl.likelihood.maximize import Term, maximise, maximise_each, maximise_sum, refit_outliers, widen_noise
+from steady_ppl.likelihood.maximize import (
+    MAX_DECREASE,
+    Term,
+    maximise,
+    maximise_each,
+    maximise_sum,
+    refit_outliers,
+    widen_noise,
+)
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
 from steady_ppl.utils import cores
@@ -112,6 +120,16 @@ def test_what_a_fit_gives_up_is_no_matter_of_the_program(monkeypatch):
     with rows.kernel_failures() as why:
         smooth(problem, path)
     assert why == {}
+
+
+def test_a_wrong_slope_does_not_lead_further_and_further_down(cart, monkeypatch):
+    """As where a path swings about its mode, and the slope along it is not that of log p(y)."""
+    program, data, maximum = cart
+    own = copy.deepcopy(program)
+    wrong = torch.tensor([40.0, -40.0, 30.0, 30.0], dtype=torch.float64)
+    monkeypatch.setattr("steady_ppl.likelihood.maximize._slope_of_prior", lambda program, parts, shares: wrong)
+    ended = maximise(Problem(own, data, True))
+    assert ended.objective > maximum.objective - 2.1 * MAX_DECREASE  # once more along paths at rest
 
 
 def test_a_prior_pulls(cart):
