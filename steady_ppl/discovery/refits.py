@@ -28,6 +28,7 @@ from steady_ppl.utils.text import reason_of
 
 MAX_LOG_NOISE_RATIO = math.log(20.0)  # of noise after a fit and before, beyond which a program explains nothing
 AlongStates = TypeVar("AlongStates", bound=Trajectories | ReferencePath)
+MIN_GAIN_OF_START = 1.0  # nats by which a fit from another start must be likelier
 MAX_LOSS = 2.0  # nats below the program without, after which a fit is given up
 
 
@@ -146,6 +147,10 @@ def first_refit(problem: Problem, valid: Trajectories, *, seed: int, nearer: Pro
         one = fit_by_likelihood(own, train, known_start=known_start)
         other = Problem(copy.deepcopy(own), valid, known_start)
         second = refit_outliers(other, maximise(other, find_path(other)))
+    first, one = _from(other.program, Problem(own, train, known_start), one)
+    if first.program is not own:
+        own = first.program
+        other, second = _from(own, other, second)
     fold = Fold(train, one.path, valid, second.path, known_start)
     programs, folds = [own, other.program], [fold, Fold(valid, second.path, train, one.path, known_start)]
     parts = elements(own)
@@ -155,6 +160,16 @@ def first_refit(problem: Problem, valid: Trajectories, *, seed: int, nearer: Pro
     if unwidened is None and is_doubtful(fold.fitting(own), one.path):
         return first_by_draws(program, programs, folds, seed)
     return replace(_refit(programs, folds, [one, second]), unwidened=unwidened)
+
+
+def _from(start: Program, problem: Problem, maximum: Maximum) -> tuple[Problem, Maximum]:
+    """A fit, or the one that begins at the parameters of `start`, if that is likelier: there may be several maxima."""
+    again = replace(problem, program=copy.deepcopy(start))
+    with suppress(FilterError):  # the drives cannot be followed from there
+        found = maximise(again, maximum.path)
+        if found.objective > maximum.objective + MIN_GAIN_OF_START:
+            return again, found
+    return problem, maximum
 
 
 class Start(NamedTuple):

@@ -397,7 +397,9 @@ def _curves(search: Search) -> list[Candidate]:
     adding = [tested for tested in screening.tests.curves if not multiplies(tested)]
     multiplying = [tested for tested in screening.tests.curves if multiplies(tested)]
     chosen = [*adding[:MAX_CURVES], *multiplying[:1]]
-    found = [replace(fit(threshold), behind=named) for fit in attempts(base, chosen, screening, threshold)]
+    judge = ParticleJudge(base)
+    fitted = (replace(fit(threshold), behind=named) for fit in attempts(base, chosen, screening, threshold))
+    found = [judge.confirm(candidate) for candidate in fitted]
     # the simpler one, unless the other brings clearly more
     return sorted(found, key=lambda c: c.total - MIN_GAIN_OF_CURVE * multiplies(c), reverse=True)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from steady_ppl.discovery.candidates import gain_of_fits
 from steady_ppl.discovery.fitting import ByDraws
 from steady_ppl.discovery.refits import (
     Fold,
+    _from,
     first_by_draws,
     first_refit,
     fit_near,
@@ -24,6 +26,25 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path, smooth
 from steady_ppl.likelihood.maximize import maximise
 from steady_ppl.model.problem import Problem
+
+
+@pytest.mark.parametrize(("more", "is_taken"), [(5.0, True), (0.5, False), (None, False)])
+def test_a_fit_begins_where_that_of_the_other_drives_ended_if_that_is_likelier(monkeypatch, more, is_taken) -> None:
+    program = example("linear_gaussian")
+    problem = Problem(program, drives(program, 3, 21, seed=1), True)
+    maximum, start = maximise(problem), copy.deepcopy(program)
+    start.gain = 2 * program.gain.detach()
+
+    def found(problem, path):
+        if more is None:
+            raise FilterError("the drives cannot be followed")
+        return replace(maximum, objective=maximum.objective + more)
+
+    monkeypatch.setattr("steady_ppl.discovery.refits.maximise", found)
+    taken, ended = _from(start, problem, maximum)
+    assert (taken is problem) != is_taken and (ended is maximum) != is_taken
+    assert torch.equal(taken.program.gain, start.gain if is_taken else program.gain)
+    assert taken.program is not start
 
 
 @pytest.mark.slow
