@@ -5,8 +5,10 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from steady_ppl.discovery import search
+from steady_ppl.discovery.candidates import leaders
 from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.search import Found
 
@@ -25,6 +27,23 @@ def test_a_class_begins_with_what_was_chosen():
     elsewhere = Stub("chosen", 9.9)  # itself, at another knee
     found = Found(chosen, [more, chosen, elsewhere, near, far], None)
     assert found.aliases == [chosen, more, near]
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_of_an_effect_on_measurements_the_two_columns_are_refitted_where_it_tells_most(first):
+    def tested(name, form="push", p_value=1e-6, at=""):
+        variant = SimpleNamespace(effect=SimpleNamespace(name=name, form=form), at=at)
+        return SimpleNamespace(variant=variant, p_value=p_value, untestable=None, departure=False, is_curve=False)
+
+    drags = [tested(f"drag_{axis}") for axis in range(3)]
+    biases = [tested("sensor_bias", "measured", at=f"range_{column}") for column in range(30)]
+    weak = tested("wind", p_value=0.5)
+    ranked = [biases[0], drags[0], *biases[1:], *drags[1:], weak]
+    correlations = torch.eye(len(ranked))
+    correlations[0, ranked.index(biases[20])] = 0.95  # looks like the first
+    chosen = leaders(SimpleNamespace(tested=ranked, correlations=correlations), first)
+    best = [biases[0], drags[0], biases[1], biases[20], *drags[1:], *[weak] * first]
+    assert chosen == best  # six at least in the first round, aliases beside them
 
 
 class Chosen:

@@ -47,8 +47,8 @@ TOML: Mapping[str, Change] = {
     "nested 10,000 deep": _at(0, f"step = {'[' * 10_000}{']' * 10_000}"),
     "tables 10,000 deep": _behind(f"[{'.'.join(['a'] * 10_000)}]"),
     "a number of 10,000 digits": _at(0, f"step = {'9' * 10_000}"),
-    "5,000 columns": _behind(
-        *(f'[columns."y.c{i}"]\ntopic = "/scan"\nfield = "ranges[0]"' for i in range(5_000)),
+    "10,000 columns": _behind(
+        *(f'[columns."y.c{i}"]\ntopic = "/scan"\nfield = "ranges[0]"' for i in range(10_000)),
     ),
     "messages from the root": _at(1, 'messages = ["/proc/self"]'),
     "messages without end": _at(1, 'messages = ["/dev/zero"]'),
