@@ -47,10 +47,10 @@ test: $(INSTALLED)
 	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal --durations 25
 
 test-slow: $(INSTALLED)
-	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal -m slow --durations 25
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder -m "slow and not exhaustive" --durations 25
 
 test-all: $(INSTALLED)
-	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal -m "slow or not slow" --durations 25
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder -m "slow or not slow" --durations 25
 
 calibrate: $(INSTALLED)
 	$(BIN)/python benchmarks/calibrate.py $(if $(QUICK),--quick) --results $(OUT)/calibration.jsonl

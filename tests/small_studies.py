@@ -35,6 +35,33 @@ y = ["log_likelihood"]
 published = {{log_likelihood = {{learned = [[50, -5.0], [60, -4.0]]}}}}
 """
 
+UNFITTED = """
+title = "Nothing is fitted"
+seeds = [1]
+known_start = true
+
+[data]
+simulate = "{model}"
+train = [2, 3]
+valid = 2
+test = 2
+
+[[method]]
+name = "as declared"
+program = "{model}"
+recipe = "hand"
+
+[[method]]
+name = "again"
+program = "{model}"
+recipe = "hand"
+settings = {{}}
+
+[picture]
+x = "data.train"
+y = ["log_likelihood"]
+"""
+
 
 def search_study(**settings: object) -> str:
     """The text of a study that searches what its data lack."""

@@ -10,7 +10,7 @@ import pytest
 from calibration_tables import tables
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_quick_suite_meets_its_musts_and_a_job_that_fails_is_one_that_is_missed(tmp_path: Path, capsys):
     file = tmp_path / "quick.jsonl"
     assert calibrate.main(["--quick", "--results", str(file)]) == 0

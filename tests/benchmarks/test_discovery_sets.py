@@ -129,7 +129,7 @@ def sharp(known=()):
     return program
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("rival", ["pysindy", "weak pysindy", "stepwise"])
 def test_regressions_find_a_strong_effect_in_exact_measurements(rival, monkeypatch):
     pytest.importorskip("pysindy")

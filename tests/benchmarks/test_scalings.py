@@ -25,7 +25,7 @@ def sizes_of(case: str, system: str) -> dict[str, tuple[float, float]]:
     return {variant.name: (sizes.of(variant).scale, unit_of(variant, SYSTEMS[system])) for variant in every}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("case", ["demo", "boat"])
 @pytest.mark.parametrize("system", ["mixed, small time", "mixed, large time"])
 def test_sizes_are_multiplied_as_their_units_are(case, system):

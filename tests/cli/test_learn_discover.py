@@ -123,7 +123,7 @@ def test_a_run_whose_program_changed_is_refused(table, tmp_path, capsys):
     assert "changed" in refused(capsys, "discover", tmp_path / "run", table)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_one_kind_is_looked_for_and_an_effect_left_out(table, capsys):
     given = (
         "--known-start",

@@ -151,7 +151,7 @@ def test_false_discoveries_on_clean_drives_are_as_rare_as_they_should_be(cart):
     assert most < seeds / 2
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_single_drive_beside_few_simulated_ones_accuses_nobody_either():
     """Twenty drives tell the covariance of some eighty scores: simulated ones, too, are judged by the others' alone."""
     program, seeds = hovercraft("hovercraft:HovercraftTruth"), 20
@@ -162,7 +162,7 @@ def test_a_single_drive_beside_few_simulated_ones_accuses_nobody_either():
     assert accused <= 4  # one in 400
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_where_a_single_drive_dwells_is_not_taken_for_a_regime():
     """Of forty drives these three were accused, one of them at less than 1e-4, while simulated drives were sorted by
     the ranges of the measured one, in which they hardly were; since each is sorted by its own, none of the forty is

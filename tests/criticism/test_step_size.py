@@ -142,7 +142,7 @@ def motors(inductance: float, drives: int = 12, rows: int = 151, step: float = 0
     return pd.concat(frames)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("inductance", "within"), [(0.02, 64), (0.003, 128)])
 def test_parameters_that_a_coarse_step_has_bent_do_not_acquit_it(inductance, within, tmp_path) -> None:
     """At one step a row log p(y) is 341 and 968 nats lower. With the parameters of that fit two steps a row are 4,300
@@ -270,7 +270,7 @@ def test_check_says_the_step_first(turning) -> None:
     assert found.figures["step"]["substeps"] == found.step.suited.substeps > 1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_discover_goes_on_at_the_step_that_suits_and_names_no_effect(turning, tmp_path) -> None:
     found = discover(Turning(), in_continuous_time(Unicycle(), 12, seed=5), in_continuous_time(Unicycle(), 12, seed=6))
     assert str(found).startswith("The program's own time step is too coarse: ")

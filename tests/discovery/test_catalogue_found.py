@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -18,7 +19,11 @@ from steady_ppl.model.problem import Problem
 
 SEEN = [effect for effect in EFFECTS if effect != "coloured_noise"]  # white and coloured are alike at this noise
 DRIVES, ROWS = 12, 81
-pytestmark = pytest.mark.slow
+OF_EACH_KIND = (  # that CI looks for; the others take minutes more, in `make test-all`
+    *("quadratic_drag", "coulomb_friction", "thrust_saturation", "dead_zone", "actuator_lag", "battery_sag"),
+    *("landmark_bias", "clock_offset", "heavy_tails", "process_noise", "lever_arm=0.3", "cubic_stiffness=1.05"),
+    "gain_error:torque=0.1",
+)
 SIZE = 4 * (16 * 100 / (DRIVES * (ROWS - 1))) ** 0.5  # the stored limits are those of 16 drives of 101 rows
 
 
@@ -37,6 +42,12 @@ OTHERS = {  # of the hovercraft and of other programs: four detection limits, or
 }
 
 
+def marked(text: str, *values: str) -> Any:
+    """A test of an effect."""
+    marks = pytest.mark.slow if text in OF_EACH_KIND else pytest.mark.exhaustive
+    return pytest.param(*values, text, marks=marks)
+
+
 def program_called(name: str) -> Program:
     """A fresh one, its noise as it declares it."""
     if name.startswith("hovercraft"):
@@ -53,13 +64,15 @@ def program_called(name: str) -> Program:
     return program
 
 
-@pytest.mark.parametrize("effect", SEEN)
+@pytest.mark.parametrize("effect", [marked(effect) for effect in SEEN])
 def test_it_is_found(effect: str) -> None:
     known = KNOWN.get(effect, ())
     assert_found(owner(known), owner(known), text_of_size(effect, SIZE))
 
 
-@pytest.mark.parametrize(("program", "text"), [(program, text) for program, texts in OTHERS.items() for text in texts])
+@pytest.mark.parametrize(
+    ("program", "text"), [marked(text, program) for program, texts in OTHERS.items() for text in texts]
+)
 def test_it_is_found_in_other_programs(program: str, text: str) -> None:
     assert_found(program_called(program), program_called(program), text)
 

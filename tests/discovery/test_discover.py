@@ -126,7 +126,7 @@ def test_wrong_readings_decide_nothing():
     assert len(counts) == 2 and all(7 <= count <= 9 for count in counts)  # a good one beside a jump may go with it
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_sensor_declared_too_coarse_takes_no_effects_place():
     program, truth = owner(), with_effects(owner(), "quadratic_drag=0.05")
     program.bearing_sd = 2.5 * truth.bearing_sd
@@ -174,7 +174,7 @@ def test_noise_that_is_not_the_declared_is_said_to_be():
     assert "process_noise" not in [finding.variant.effect.name for finding in again.findings]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_sensor_whose_noise_is_learned_is_said_not_to_be_the_declared():
     truth, program = FreeSight(), FreeSight()
     truth.bearing_sd = torch.tensor(0.12)

@@ -110,7 +110,7 @@ def test_drives_are_judged_by_fits_that_have_seen_them_for_the_noise_alone():
     assert float((found.held_out - base.held_out).sum()) > 5
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_fits_begin_at_the_declared_noise_as_well_where_the_program_alone_explains_nothing():
     """A sensor far worse than declared: without it, only process noise beyond all measure explains the drives."""
     truth, program = example("hovercraft"), example("hovercraft")

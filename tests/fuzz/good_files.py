@@ -15,7 +15,7 @@ from bag_drives import drive
 from bag_writing import KINDS, write_bag
 from examples import MODELS
 from small import simulated, steady, written
-from small_studies import written as write_study
+from small_studies import UNFITTED, written as write_study
 from truck_logs import command_log, pose_log, write as write_logs
 
 FEW = ("--guide", "bootstrap", "--particles", "20", "--draws", "3", "--steps", "4", "--set", "validate_every=2")
@@ -84,7 +84,7 @@ class Desk:
         wider = (*SEARCH[:2], "pushed.csv", "--valid", "pushed_too.csv", *SEARCH[5:])
         self.must(*wider, "found", "--json", "found.json")
         assert json.loads((self.good / "found.json").read_text())["effects"]
-        write_study(self.good, model=CART)
+        write_study(self.good, UNFITTED, model=CART)  # without its sizes a study has 64 drives
         self.must("study", "study.toml", "--workers", "1", "--out", "studied")
         self.tidy()
 

@@ -1,7 +1,7 @@
 """A good file is spoiled, and every command that takes it: done, or a line that says why not, and nothing left behind.
 
 pytest tests/fuzz                                             a few mutants of every file, through quick commands
-pytest tests/fuzz -m slow                                     every change of every file, through a command each
+pytest tests/fuzz -m "slow or exhaustive"                     every change of every file, through a command each
 pytest tests/fuzz -m "slow or not slow" --hypothesis-profile long       200 of each, others each time
 """
 
@@ -196,9 +196,9 @@ def test_a_spoiled_file_is_read_or_refused_in_a_line(desk: Desk, kind: Kind, dat
     spoil(desk, kind, data, how, data.draw(st.sampled_from(quick(kind)), "command"))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("kind", "how", "words"), ONCE)
-@few(2)
+@few(1)
 @given(data=st.data())
 def test_every_change_of_every_file(full_desk: Desk, kind: Kind, how: str, words: Words, data: st.DataObject) -> None:
     spoil(full_desk, kind, data, how, data.draw(st.sampled_from(kind.commands), "command") if LONG else words)

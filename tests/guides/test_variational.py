@@ -82,7 +82,7 @@ def test_the_gradient_at_the_exact_posterior_is_that_of_log_p_of_y(uneven) -> No
 @pytest.mark.parametrize("draws", [1, 2])
 def test_every_elbo_is_a_bound(cart, uneven, name: str, draws: int) -> None:
     guide = GUIDES[name](cart, uneven, draws=draws)
-    values = elbos(cart, guide, uneven, 200).detach()
+    values = elbos(cart, guide, uneven, 60).detach()
     exact = kalman(uneven, cart_parameters(cart)).log_likelihood.sum()
     assert values.mean() - 4 * values.std() / math.sqrt(len(values)) <= exact + 1e-6
 
@@ -95,14 +95,14 @@ def pushed(cart, rows: int):
     return for_program(cart, simulate(cart, seed=3, like=table))
 
 
-LONG = pytest.mark.slow
+LONG, LONGER = pytest.mark.slow, pytest.mark.exhaustive
 NEAR = [
     pytest.param(12, "network", 0.5, marks=LONG),
     pytest.param(12, "network, not centred", 0.1, marks=LONG),
     (12, "mean-field", 1.5),
-    pytest.param(101, "network", 8.0, marks=LONG),
-    pytest.param(101, "network, not centred", 16.0, marks=LONG),
-    pytest.param(101, "mean-field", 50.0, marks=LONG),
+    pytest.param(101, "network", 8.0, marks=LONGER),
+    pytest.param(101, "network, not centred", 16.0, marks=LONGER),
+    pytest.param(101, "mean-field", 50.0, marks=LONGER),
 ]
 
 
@@ -152,7 +152,7 @@ def test_the_kl_weight_follows_its_schedule(cart, even) -> None:
     assert guide.refresh(even, 0.25) == {"kl_weight": pytest.approx(0.55)}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", ["network", *(pytest.param(name, marks=LONG) for name in GUIDES if name != "network")])
 def test_past_a_drives_end_there_is_no_divergence(cart, even, name: str) -> None:
     """A longer drive beside a short one changes nothing in what the short one adds."""

@@ -53,7 +53,7 @@ def test_a_jump_that_lasts_is_found_to_the_row(boat, drives):
     assert int(found.left.observed.sum()) == int(drives.observed.sum()) - 17
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("rows", "by"), [(30, 20.0), (60, 5.0), (60, 20.0)])
 def test_a_long_jump_goes_and_the_good_readings_stay(boat, rows, by):
     data = st.for_program(boat, st.simulate(boat, 8, seed=1))

@@ -67,7 +67,7 @@ def exact(program: st.Program, table: st.Trajectories) -> tuple[float, float]:
     return score / information, math.sqrt(1 / information)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", [Drift, Believed, Scaled])
 def test_the_rate_of_a_drift_has_the_posterior_of_a_regression(kind):
     program, draws = kind(), 2000

@@ -72,7 +72,7 @@ def test_a_fit_that_calls_itself_converged_is_at_the_maximum() -> None:
                 assert log_likelihood(program, data, maximum.path) < best + 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("damping", "substeps"), [(0.8, 4), (3.0, 8), (10.0, 16)])
 def test_the_density_of_given_draws_has_the_same_slopes(damping, substeps) -> None:
     """What an M step climbs, by 4,000 draws in ten lots."""

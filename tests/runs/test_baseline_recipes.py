@@ -49,7 +49,10 @@ def learned(name: str, program, train, valid=None, **options):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=pytest.mark.slow if name.startswith(("svi", "fit-tv")) else ()) for name in RECIPES],
+    [
+        pytest.param(name, marks=pytest.mark.exhaustive if name.startswith(("svi ", "fit-tv")) else ())
+        for name in RECIPES
+    ],
 )
 def test_each_beats_hand(name: str) -> None:
     """A vehicle believed to be twice as heavy as it is: its mass is found, and held-out drives are likelier."""
@@ -69,7 +72,7 @@ def test_each_beats_hand(name: str) -> None:
     assert held_out(program, valid) > before
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("known_start", [True, False])
 @pytest.mark.parametrize("name", list(FEW))
 def test_none_of_them_looks_at_the_true_states(name: str, known_start: bool) -> None:

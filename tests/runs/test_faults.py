@@ -191,7 +191,7 @@ def test_a_command_that_is_killed_goes_on_to_the_same_result(desk: Path, name: s
     same_results(desk, name, out)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("room", "some"),
     [  # bytes: less than the largest of the pieces, and less than the first

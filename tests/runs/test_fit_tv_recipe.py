@@ -16,7 +16,7 @@ from steady_ppl.utils.angles import wrap
 FIT_TV = recipe_file("fit-tv")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_fit_tv_differentiates_what_it_finds() -> None:
     """Sharp bearings of a smooth drive: velocities within what a second of thrust changes."""
     program = example("hovercraft")

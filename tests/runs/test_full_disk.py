@@ -62,7 +62,10 @@ def words(command: tuple, work: Path, out: Path) -> list[object]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [0, 2000], ids=["nothing fits", "two kilobytes fit"])
+@pytest.mark.parametrize(
+    "size",
+    [pytest.param(0, id="nothing fits", marks=pytest.mark.exhaustive), pytest.param(2000, id="two kilobytes fit")],
+)
 @pytest.mark.parametrize("name", WRITING)
 def test_a_full_disk_is_one_line_and_leaves_nothing(name: str, size: int, work: Path, tmp_path: Path, capsys) -> None:
     shutil.copy(HOVERCRAFT, tmp_path)

@@ -53,7 +53,7 @@ def test_hand_changes_nothing(tmp_path: Path) -> None:
 # --- steady -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("guide", list(GUIDES))
 def test_steady_finds_a_mass_that_was_wrong_by_far(guide: str) -> None:
     """Believed to be twice as heavy as it is and seen through bearings only; held-out drives must gain as well."""

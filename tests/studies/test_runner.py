@@ -19,7 +19,7 @@ from steady_ppl.studies.runner import require_runnable
 from steady_ppl.studies.table import TABLE, read_results
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_command_computes_what_is_not_there_and_draws_it(tmp_path: Path, capsys):
     file, out = written(tmp_path), tmp_path / "out"
     assert steady("study", file, "--workers", 2, "--out", out) == 0
