@@ -42,11 +42,7 @@ class Finding:
     sd: list[float]  # standard deviation of each number
     interval: list[tuple[float, float]]  # 90 %
     gain: float | None  # nats of held-out log p(y) that it brings
-
-    @property
-    def is_correction(self) -> bool:
-        """Whether it is how large a declared noise is, and says nothing of what is missing."""
-        return self.variant.effect.name in NOISE_SIZES
+    is_correction: bool = False  # whether it is how a declared noise is, and says nothing of what is missing
 
 
 @dataclass(frozen=True)
@@ -71,13 +67,13 @@ def findings(search: Search) -> list[Finding]:
 
 
 def corrections(search: Search) -> list[Finding]:
-    """The factors on declared noise with which the search began."""
+    """Of declared noise, with which the search began."""
     found = list[Finding]()
     for one in search.corrections:
-        factor = float(search.final.coefficient(one.variant))
+        value, effect = float(search.final.coefficient(one.variant)), one.variant.effect
         (sd,) = _spread(search, one.variant).tolist()
-        interval, name = _around(factor, HALF_WIDTH * sd), one.variant.name
-        found.append(Finding(one.variant, "noise", [name], None, [factor], [factor * sd], [interval], one.gain))
+        told = ([value], [sd if effect.null == 0 else value * sd], [_interval(effect, value, sd, 0.0, 0.0)])
+        found.append(Finding(one.variant, effect.verdict, [one.variant.name], None, *told, one.gain, True))
     return found
 
 
@@ -103,6 +99,7 @@ def _finding(search: Search, found: Found) -> Finding:
         sd=(values * spread if is_positive else spread).tolist(),
         interval=[_interval(effect, *told, by_factor) for told in of_each],
         gain=found.candidate.total,
+        is_correction=effect.name in NOISE_SIZES,
     )
 
 
@@ -147,7 +144,7 @@ def _confidence(search: Search, found: Found) -> float:
 def _departure(tested: Tested) -> Finding:
     factor, sd = 1 + float(tested.coefficient[0]), float(tested.sd[0])
     interval, name = _around(factor, HALF_WIDTH * sd / factor), tested.variant.name
-    return Finding(tested.variant, "noise", [name], None, [factor], [sd], [interval], None)
+    return Finding(tested.variant, "noise", [name], None, [factor], [sd], [interval], None, True)
 
 
 def shape_of(search: Search, program: Program) -> Shape | None:

@@ -21,6 +21,7 @@ from steady_ppl.discovery.screening import NOISE_SIZES, is_learned, sizes_of_noi
 from steady_ppl.effects import Variant, attached, catalogue
 from steady_ppl.gaussian.predict import HALF_WIDTH
 from steady_ppl.likelihood.outliers import AS_TAILS, Outliers, find_outliers, too_many
+from steady_ppl.model.program import Program
 from steady_ppl.utils.text import reason_of
 
 MAX_FITS = 6  # without the outliers that were found in the fit before
@@ -28,10 +29,36 @@ WIDE = 3.0  # a factor to begin with where the process noise was fitted many tim
 MIN_FACTOR = 1.25  # by which declared noise must be wrong; a smaller one is tested beside the effects
 
 
+@dataclass(frozen=True)
+class Correction:
+    """A factor on declared standard deviations, or heavy tails, in all fits that follow."""
+
+    variant: Variant
+    gain: float  # nats of held-out log p(y) that it brought
+
+
+class Suited(NamedTuple):
+    """A fitted program with noise that the drives do not contradict."""
+
+    base: Refit
+    corrections: list[Correction]
+
+    @property
+    def tails(self) -> Variant | None:
+        """The heavy tails among the corrections."""
+        return next((one.variant for one in self.corrections if one.variant.effect.form == "tails"), None)
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of all drives, each under the program that was fitted to it."""
+        return sum(float(maximum.log_likelihood.sum()) for maximum in self.base.maxima)
+
+
 class Cleaned(NamedTuple):
     """Fits without outliers."""
 
-    refit: Refit
+    refit: Refit  # as declared
+    suited: Suited
     outliers: list[Outliers]  # of the training and of the validation drives
     whole: Refit  # the fit to all readings
 
@@ -44,19 +71,19 @@ def without_outliers(
 ) -> Cleaned:
     """What `fit` makes of training and validation drives without the outliers that its fits show.
 
-    None is left out where noise with heavy tails, if it is `wanted`, makes all readings likelier.
+    None is left out where they are too many, or where noise with heavy tails, if it is `wanted`, makes all readings
+    likelier; the noise has such tails then.
     """
     none = [Outliers(data, [], torch.zeros_like(data.observed)) for data in (train, valid)]
     found, whole = none, fit(train, valid)
-    refit = whole
+    refit, tails, kept = whole, _tails_of(whole.program, wanted), ""
     for _ in range(MAX_FITS):
         try:
             folds = zip(refit.programs, refit.folds, strict=True)
             more = [find_outliers(fold.fitting(program), fold.path, against_tails=False) for program, fold in folds]
             every = [one.with_more(other) for one, other in zip(found, more, strict=True)]
-            if said := next(filter(None, (too_many(one.data, one.wrong) or one.note for one in every)), ""):
-                return Cleaned(whole, [replace(none[0], note=said), none[1]], whole)
-            if not any(one.found for one in more):
+            kept = next(filter(None, (too_many(one.data, one.wrong) or one.note for one in every)), "")
+            if kept or not any(one.found for one in more):
                 break
             refit, found = fit(*(one.left for one in every)), every
         except Exception as error:  # also of the program's own code
@@ -65,40 +92,31 @@ def without_outliers(
                 found[1],
             ]
             break
-    if refit is not whole and (tails := _with_tails(whole, wanted)) is not None:
-        likely = _log_likelihood(refit, wanted) - sum(one.cost for one in found)
-        if _log_likelihood(tails, wanted) > likely:
-            return Cleaned(whole, [replace(none[0], note=AS_TAILS), none[1]], whole)
-    return Cleaned(refit, found, whole)
+    if not kept:
+        suited = with_suitable_noise(refit, wanted)
+        if refit is whole or tails is None:
+            return Cleaned(refit, suited, found, whole)
+        likely = suited.log_likelihood - sum(one.cost for one in found)
+    with_all = with_suitable_noise(whole, wanted, tails)
+    if not kept and (with_all.tails is None or with_all.log_likelihood <= likely):
+        return Cleaned(refit, suited, found, whole)
+    return Cleaned(whole, with_all, [replace(none[0], note=kept or AS_TAILS), none[1]], whole)
 
 
-def _log_likelihood(fits: Refit, wanted: Callable[[Variant], bool]) -> float:
-    """Of all drives, each under the program that was fitted to it, with suitable noise."""
-    suited, _ = with_suitable_noise(fits, wanted)
-    return sum(float(maximum.log_likelihood.sum()) for maximum in suited.maxima)
+def _tails_of(program: Program, wanted: Callable[[Variant], bool]) -> Variant | None:
+    """Student t measurement noise, where the program has none and it is looked for."""
+    there = {variant.name for variant in attached(program)}
+    able = (effect.variant() for effect in catalogue(program) if effect.form == "tails" and effect.name not in there)
+    return next(filter(wanted, able), None)
 
 
-def _with_tails(base: Refit, wanted: Callable[[Variant], bool]) -> Refit | None:
-    """The program with Student t measurement noise; None where it has that already, or it cannot be fitted."""
-    there = {variant.name for variant in attached(base.program)}
-    for effect in catalogue(base.program):
-        if effect.form == "tails" and effect.name not in there and wanted(variant := effect.variant()):
-            refit = refit_with(base, variant, effect.typical)
-            return None if isinstance(refit, str) else refit
-    return None
-
-
-@dataclass(frozen=True)
-class Correction:
-    """A factor on declared standard deviations, in all fits that follow."""
-
-    variant: Variant
-    gain: float  # nats of held-out log p(y) that it brought
-
-
-def with_suitable_noise(base: Refit, wanted: Callable[[Variant], bool]) -> tuple[Refit, list[Correction]]:
-    """A fitted program with factors on the noise that it declares too wide or too narrow, and these."""
-    own, found, there = base, list[Correction](), {variant.name for variant in attached(base.program)}
+def with_suitable_noise(own: Refit, wanted: Callable[[Variant], bool], tails: Variant | None = None) -> Suited:
+    """A fitted program with `tails`, if they help, and factors on the noise that it declares too wide or too narrow."""
+    base, found, there = own, list[Correction](), {variant.name for variant in attached(own.program)}
+    if tails is not None and isinstance(tailed := refit_with(own, tails, tails.effect.typical), Refit):
+        gain = float((tailed.held_out - own.held_out).sum()) if len(tailed.programs) == len(own.programs) else 0.0
+        if gain > CLEAR_GAIN:
+            base, found = tailed, [Correction(tails, gain)]
     for variant in [one for name in reversed(NOISE_SIZES) for one in sizes_of_noise(base.program, name)]:
         if variant.name in there or not wanted(variant) or is_learned(variant, base.program, base.folds[0]):
             continue
@@ -111,12 +129,13 @@ def with_suitable_noise(base: Refit, wanted: Callable[[Variant], bool]) -> tuple
         if gain > CLEAR_GAIN and abs(math.log(factor)) > math.log(MIN_FACTOR):
             base = refit if refit.converged else _fitted_further(base, refit, variant)
             found.append(Correction(variant, gain))
-    for one in list(found) if len(found) > 1 else []:  # a factor may have stood for one that was added later
+    factors = [one for one in found if one.variant is not tails]
+    for one in factors if len(factors) > 1 else []:  # a factor may have stood for one that was added later
         near_one = abs(math.log(float(base.coefficient(one.variant)))) <= math.log(MIN_FACTOR)
         if near_one and (fewer := without([one], own, base)) is not None:
             base = fewer
             found.remove(one)
-    return base, found
+    return Suited(base, found)
 
 
 def _held_out(refit: Refit) -> float:
@@ -131,13 +150,14 @@ def _fitted_further(base: Refit, refit: Refit, variant: Variant) -> Refit:
 
 
 def needless(corrections: Sequence[Correction], final: Refit, screening: Screening) -> list[Correction]:
-    """Those whose factor may be one beside the effects that were found: what was missing looked like noise."""
+    """Those that may be absent beside the effects that were found: what was missing looked like noise."""
 
-    def may_be_one(correction: Correction) -> bool:
-        factor, sd = final.coefficient(correction.variant), screening.spread_of(final, correction.variant)
-        return abs(math.log(float(factor))) < HALF_WIDTH * float(sd)
+    def may_be_absent(correction: Correction) -> bool:
+        value, sd = final.coefficient(correction.variant), screening.spread_of(final, correction.variant)
+        is_factor = correction.variant.effect.null == 1
+        return abs(math.log(float(value)) if is_factor else float(value)) < HALF_WIDTH * float(sd)
 
-    return [one for one in corrections if may_be_one(one)]
+    return [one for one in corrections if may_be_absent(one)]
 
 
 def without(corrections: Sequence[Correction], as_it_stands: Refit, fitted: Refit) -> Refit | None:

@@ -186,9 +186,9 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
     program = problem.program
     with stages(("fitting the program as it stands", 1), ("comparing time steps", 1), ("", 8)) as begin:
         begin()
-        own, outliers, whole = without_outliers(partial(fit, program), problem.data, valid, settings.corrects)
+        own, suited, outliers, whole = without_outliers(partial(fit, program), problem.data, valid, settings.corrects)
         left, valid = (one.left for one in outliers)
-        base, corrections = with_suitable_noise(own, settings.corrects)
+        (base, corrections), tails = suited, suited.tails
         gained = whole.maxima[0].gained
         begin()
         step = _step_of(base)
@@ -198,7 +198,7 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
             settings = replace(settings, declared=with_substeps(settings.declared, finer))
             program = with_substeps(program, finer)
             own = fit(program, left, valid, nearer)
-            base, corrections = with_suitable_noise(own, settings.corrects)
+            base, corrections = with_suitable_noise(own, settings.corrects, tails)
         begin()
         found = _rounds(Search(own, base, base, step, gained, outliers, corrections), settings)
         if not found.found or found.interrupted:
@@ -209,7 +209,7 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
             if with_found.too_coarse:  # what was found asks for a finer step: sizes are those of that step
                 finer = with_found.suited.substeps
                 own = fit(with_substeps(program, finer), left, valid, with_substeps(own.program, finer))
-                base, corrections = with_suitable_noise(own, settings.corrects)
+                base, corrections = with_suitable_noise(own, settings.corrects, tails)
                 settings = replace(settings, declared=with_substeps(settings.declared, finer))
                 again = _rounds(Search(own, base, base, step, gained, outliers, corrections, with_found), settings)
                 if not again.interrupted:

@@ -29,7 +29,6 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.posterior_moments import Cells, posterior_moments
-from steady_ppl.kernels.graph import NotCompilable
 from steady_ppl.kernels.rows import Slopes, slopes_on_all_rows
 from steady_ppl.likelihood.parameters import Element, moved, on_both_sides
 from steady_ppl.model.handlers import (
@@ -140,9 +139,10 @@ class ReadingDeviations(Deviations):
         half = torch.full_like(mean, 0.5)
         return torch.stack([mean, half, -half])
 
-    def of_slopes(self, slopes: Slopes, sharpness: Tensor) -> Tensor:
-        """Scores of learnable numbers, `(B, P)`, from the slopes of the means and, after them, of the log standard
-        deviations, at `points`; `sharpness` is 1 / the standard deviations, `(rows, B, K)`."""
+    def of_slopes(self, slopes: Slopes, sharpness: Tensor, of_tails: Tensor) -> Tensor:
+        """Scores of learnable numbers, `(B, P)`, from the slopes of the means, after them of the log standard
+        deviations and then of the tails, at `points`; `sharpness` is 1 / the standard deviations, `(rows, B, K)`, and
+        `of_tails` what a change of the tails is worth."""
         rows, drives, count = self.mean.shape
         values, by_row = slopes.values.squeeze(-1), self.mean.new_zeros(len(slopes.values), rows * drives)
         for place, (component, value) in enumerate(zip(slopes.components.tolist(), values, strict=True)):
@@ -151,11 +151,11 @@ class ReadingDeviations(Deviations):
             if component < count:
                 own = (self.at_cells(self.mean, which) * here + (up - down) / 2) * self.at_cells(sharpness, which)
             else:
-                own = self.at_cells(self.excess, which) * here
+                own = self.at_cells(self.excess if component < 2 * count else of_tails, which) * here
             by_row[place, self.cells.row[which]] = own
-        by_drive, of_means = by_row.view(-1, rows, drives).sum(1), slopes.components < count
-        parts = [by_drive[kind].double().t() @ slopes.by_number[kind] for kind in (of_means, ~of_means)]
-        return parts[0] + parts[1]
+        by_drive, kinds = by_row.view(-1, rows, drives).sum(1), slopes.components // count
+        parts = [by_drive[kinds == kind].double().t() @ slopes.by_number[kinds == kind] for kind in range(3)]
+        return parts[0] + parts[1] + parts[2]
 
     def own(self, values: Tensor) -> Tensor:
         """What values at `points`, `(N, 1, K)`, are of each cell's own component at its three points, `(3, M)`."""
@@ -334,13 +334,13 @@ class Measured:
         return self._of_sites(lambda _, fn: unwrapped(fn).scale)
 
     @property
-    def freedom(self) -> Tensor:
-        """Degrees of freedom, `(..., K)`, infinite where the noise is normal."""
+    def tails(self) -> Tensor:
+        """One over the degrees of freedom, `(..., K)`, zero where the noise is normal."""
 
         def of_site(_: str, fn: Any) -> Tensor:
             base = unwrapped(fn)
-            freedom = base.df if isinstance(base, dist.StudentT) else base.scale.new_tensor(torch.inf)
-            return freedom.expand(base.scale.shape)
+            tails = 1 / base.df if isinstance(base, dist.StudentT) else torch.zeros_like(base.scale)
+            return tails.expand(base.scale.shape)
 
         return self._of_sites(of_site)
 
@@ -424,45 +424,44 @@ def of_actuators(program: Program, data: Trajectories, parts: Sequence[Element])
 
 def _of_measurements(program: Program, at: Smoothed, parts: list[Element]) -> Tensor:
     """The parameters' part in what is measured, `(B, P)`."""
-    points, found = at.measurements.points, at.measurements
+    points, found, here = at.measurements.points, at.measurements, measured(program, at.states)
+    of_tails = _of_tails(here, at) if here.heavy_tailed else torch.zeros_like(found.mean)
 
     def readings(state: Tensor) -> Tensor:
         there = measured(program, state)
-        if there.heavy_tailed:
-            raise NotCompilable("the degrees of freedom of a Student t have no slope")
-        return torch.cat([there.reading, there.spread.log().expand(there.reading.shape)], -1)
+        reading = there.reading
+        kinds = [reading, there.spread.log().expand(reading.shape)]
+        return torch.cat([*kinds, there.tails.expand(reading.shape)] if there.heavy_tailed else kinds, -1)
 
     slopes = slopes_on_all_rows(program, "readings", readings, {"state": points}, parts)
     if isinstance(slopes, Slopes):
-        return found.of_slopes(slopes, at.sharpness)
-    scores, here = at.states.new_zeros((at.states.shape[1], len(parts))).double(), measured(program, at.states)
+        return found.of_slopes(slopes, at.sharpness, of_tails)
+    scores = at.states.new_zeros((at.states.shape[1], len(parts))).double()
     at_points, sharpness = measured(program, points), found.at_cells(at.sharpness)
     for index, part in enumerate(parts):
         up, down = on_both_sides(part, lambda: measured(program, at.states))
-        alike = (up.spread == down.spread) & (up.freedom == down.freedom)
+        alike = (up.spread == down.spread) & (up.tails == down.tails)
         if bool((up.shift(down) == 0).all()) and bool(alike.all()):
             continue
         width = 2 * part.step
-        of_spread = found.of_spread((up.spread / down.spread).log() / width)
-        of_tails = (_of_tails(here, up, at) - _of_tails(here, down, at)) / width
+        of_noise = found.of_spread((up.spread / down.spread).log() / width)
+        of_noise = of_noise + (of_tails * (up.tails - down.tails) / width).sum((0, -1))
         up, down = on_both_sides(part, lambda: measured(program, points))
         of_mean = found.of_mean(found.own(at_points.shift(up) - at_points.shift(down)) * sharpness / width)
-        scores[:, index] = of_mean + of_spread + of_tails
+        scores[:, index] = of_mean + of_noise
     return scores
 
 
-def _of_tails(here: Measured, other: Measured, at: Smoothed) -> Tensor:
-    """Posterior mean of the measurements' log-density with the degrees of freedom of `other`, `(B,)`; 0 if normal."""
-    if not bool(torch.isfinite(here.freedom).any()):
-        return at.states.new_zeros(at.states.shape[1])
-    scale = here.spread * at.sharpness
-    freedom = other.freedom.double()
-    mean, sd = at.measurements.mean, at.measurements.variance.clamp(min=0).sqrt()
-    one, two = (_log_student((z / scale.clamp(min=1e-12)).double(), freedom) for z in (mean + sd, mean - sd))
-    return torch.where(at.measurements.present, (one + two) / 2, 0.0).sum((0, -1))
-
-
-def _log_student(z: Tensor, freedom: Tensor) -> Tensor:
-    """Log-density of a Student t of scale one."""
-    half = (freedom + 1) / 2
-    return half.lgamma() - (freedom / 2).lgamma() - freedom.log() / 2 - half * torch.log1p(z.square() / freedom)
+def _of_tails(here: Measured, at: Smoothed) -> Tensor:
+    """What a change of one over the degrees of freedom ν of a Student t is worth, `(T + 1, B, K)`: the posterior mean
+    of the slope of its log-density, zero where the noise is normal."""
+    freedom, (mean, variance) = 1 / here.tails.double(), (at.measurements.mean, at.measurements.variance)
+    size, sd = (here.spread * at.sharpness).clamp(min=1e-12), variance.clamp(min=0).sqrt()
+    constant = torch.special.digamma((freedom + 1) / 2) - torch.special.digamma(freedom / 2) - 1 / freedom
+    slopes = 0.0
+    for z in (mean + sd, mean - sd):
+        squares = (z / size).double().square()
+        varying = (freedom + 1) * squares / (freedom + squares) / freedom - torch.log1p(squares / freedom)
+        slopes = slopes + (constant + varying) / 4
+    is_student = at.measurements.present & (here.tails > 0)
+    return torch.where(is_student, -freedom.square() * slopes, 0.0).to(mean)

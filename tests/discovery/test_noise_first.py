@@ -10,7 +10,7 @@ from pyro.distributions import constraints
 from pyro.nn import PyroParam
 
 import steady_ppl as st
-from steady_ppl.discovery.noise_first import needless, with_suitable_noise, without
+from steady_ppl.discovery.noise_first import needless, with_suitable_noise, without, without_outliers
 from steady_ppl.discovery.refits import first_refit, refit_with
 from steady_ppl.effects import attached, chosen_variant
 from steady_ppl.model.problem import Problem
@@ -85,6 +85,24 @@ def test_what_is_right_stays_as_it_is():
 def test_what_is_withheld_stays_as_it_is():
     own = begun(TooWide())
     assert with_suitable_noise(own, lambda variant: variant.effect.name != "measurement_noise") == (own, [])
+
+
+@pytest.mark.slow
+def test_readings_with_heavy_tails_are_kept_and_the_noise_has_these_tails():
+    cart = Cart()
+    drives = [st.for_program(cart, st.simulate(cart.with_effect("heavy_tails", 0.45), 8, seed=seed)) for seed in (1, 2)]
+
+    def fit(train, valid):
+        return first_refit(Problem(Cart(), train, False), valid, seed=0)
+
+    cleaned = without_outliers(fit, *drives, lambda variant: True)
+    assert cleaned.outliers[0].note and not any(one.cells for one in cleaned.outliers)
+    (tails,) = cleaned.suited.corrections
+    assert tails.variant == cleaned.suited.tails and tails.variant.name == "heavy_tails" and tails.gain > 100
+    assert 0.2 < float(cleaned.suited.base.coefficient(tails.variant)) < 0.49
+    assert [attached(one.program) for one in (cleaned.refit, cleaned.whole)] == [(), ()]
+    screening = type("Screening", (), {"spread_of": lambda self, fitted, one: torch.tensor([0.02])})()
+    assert needless([tails], cleaned.suited.base, screening) == []
 
 
 @pytest.mark.slow
