@@ -9,6 +9,7 @@ import torch
 
 from steady_ppl.discovery import search
 from steady_ppl.discovery.candidates import leaders
+from steady_ppl.discovery.noise_first import Suited
 from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.search import Found
 
@@ -104,8 +105,9 @@ def test_what_was_found_stays_where_finer_time_steps_fail_or_are_interrupted(mon
             raise failure
         return step
 
-    monkeypatch.setattr(search, "without_outliers", lambda *_: (base, 2 * [SimpleNamespace(left=None)], base))
-    monkeypatch.setattr(search, "with_suitable_noise", lambda base, wanted: (base, []))
+    cleaned = (base, Suited(base, []), 2 * [SimpleNamespace(left=None)], base)
+    monkeypatch.setattr(search, "without_outliers", lambda *_: cleaned)
+    monkeypatch.setattr(search, "with_suitable_noise", lambda base, wanted, tails: Suited(base, []))
     monkeypatch.setattr(search, "attached", lambda program: [])
     monkeypatch.setattr(search, "_step_of", looked_at)
     rounds = [search.Round(SimpleNamespace(tests=SimpleNamespace(p_value=0.5, tested=[], critical=0.01)), [], None)]
