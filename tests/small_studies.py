@@ -35,27 +35,11 @@ y = ["log_likelihood"]
 published = {{log_likelihood = {{learned = [[50, -5.0], [60, -4.0]]}}}}
 """
 
-UNFITTED = """
-title = "Nothing is fitted"
-seeds = [1]
-known_start = true
-
-[data]
-simulate = "{model}"
-train = [2, 3]
-valid = 2
-test = 2
-
-[[method]]
-name = "as declared"
-program = "{model}"
-recipe = "hand"
-
-[[method]]
+UNFITTED = f"""{STUDY[: STUDY.index("[[method]]", STUDY.index("recipe"))]}[[method]]
 name = "again"
-program = "{model}"
+program = "{{model}}"
 recipe = "hand"
-settings = {{}}
+settings = {{{{}}}}
 
 [picture]
 x = "data.train"

@@ -198,7 +198,7 @@ def test_a_spoiled_file_is_read_or_refused_in_a_line(desk: Desk, kind: Kind, dat
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize(("kind", "how", "words"), ONCE)
-@few(1)
+@few(2)
 @given(data=st.data())
 def test_every_change_of_every_file(full_desk: Desk, kind: Kind, how: str, words: Words, data: st.DataObject) -> None:
     spoil(full_desk, kind, data, how, data.draw(st.sampled_from(kind.commands), "command") if LONG else words)

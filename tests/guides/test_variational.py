@@ -82,7 +82,7 @@ def test_the_gradient_at_the_exact_posterior_is_that_of_log_p_of_y(uneven) -> No
 @pytest.mark.parametrize("draws", [1, 2])
 def test_every_elbo_is_a_bound(cart, uneven, name: str, draws: int) -> None:
     guide = GUIDES[name](cart, uneven, draws=draws)
-    values = elbos(cart, guide, uneven, 60).detach()
+    values = elbos(cart, guide, uneven, 200).detach()
     exact = kalman(uneven, cart_parameters(cart)).log_likelihood.sum()
     assert values.mean() - 4 * values.std() / math.sqrt(len(values)) <= exact + 1e-6
 
