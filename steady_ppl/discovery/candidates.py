@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import accumulate, combinations, pairwise
@@ -51,6 +51,8 @@ OF_MEASUREMENTS = ("measured", "blur")  # forms of effects that act on one colum
 UNEXPLAINED = "colour"  # the form of effects that imitate whatever is missing, and may enter when nothing else does
 MIN_GAIN_OF_PLACE = 0.3  # nats by which another knee or place has to be likelier
 MAX_COORDINATE_SWEEPS = 4  # along all knees and places in turns, with steps of one size
+MAX_STEPS_OF_PLACE = 4  # in one direction of one of them, one after another
+MAX_NATS_BY_ONE_FOLD = 3.0  # by which one fold may like another place better, to make up for what the other loses
 NOT_SIMULATED = "with it too many simulated drives diverge"
 NEIGHBOUR_SHARE = 0.25  # of the grid's spacing, at which a place's likelihood is compared with its neighbours'
 
@@ -296,23 +298,35 @@ def likelier_places(base: Refit, begun: Fits, at: Variant) -> list[tuple[Variant
     than the one before: `begun` first, which has the effect there and perhaps others that `base` lacks."""
     grid, fits = _grid(base, at), [(at, begun)]
 
-    def score(variant: Variant, fitted: Fits) -> float:
-        return gain_of_fits(base, fitted) + _log_prior(variant, grid)
+    beside = {known.name for known in attached(base.program)}
 
-    def try_all(variants: Iterable[Variant]) -> None:
-        for variant in variants:
-            beside = {known.name for known in attached(base.program)}
-            every = [variant if one.name == at.name else one for one in attached(begun.program)]
-            other = fit_near(base, fits[-1][1], [one for one in every if one.name not in beside])
-            if isinstance(other, Fits) and score(variant, other) > score(*fits[-1]) + MIN_GAIN_OF_PLACE:
-                fits.append((variant, other))
+    def moves_to(variant: Variant) -> bool:
+        """Add the fit at a place if it is likelier than the last."""
+        there, best = fits[-1]
+        more = _log_prior(there, grid) - _log_prior(variant, grid) + MIN_GAIN_OF_PLACE
+        floors = [float(one.log_likelihood.sum()) + more - MAX_NATS_BY_ONE_FOLD for one in best.maxima]
+        every = [variant if one.name == at.name else one for one in attached(begun.program)]
+        other = fit_near(base, best, [one for one in every if one.name not in beside], floors)
+        if isinstance(other, str) or not gain_of_fits(best, other) > more:
+            return False
+        if any(float(one.log_likelihood.sum()) < floor for one, floor in zip(other.maxima, floors, strict=True)):
+            return False  # it may have been given up
+        fits.append((variant, other))
+        return True
 
-    try_all(variant for variant in grid if variant.label != at.label)
+    for variant in grid:
+        if variant.label != at.label:
+            moves_to(variant)
     for share in (0.5, 0.25):
         for _ in range(MAX_COORDINATE_SWEEPS):
             before = len(fits)
             for name in at.profiled:
-                try_all(_neighbours(fits[-1][0], grid, name, share))
+                for side in (0, 1):
+                    steps = 0
+                    while steps < MAX_STEPS_OF_PLACE and moves_to(_neighbours(fits[-1][0], grid, name, share)[side]):
+                        steps += 1
+                    if steps:
+                        break
             if len(fits) == before:
                 break
     return fits

@@ -60,7 +60,7 @@ class Shape:
 
 
 def findings(search: Search) -> list[Finding]:
-    """The effects that were found, the one that brings most first, and then how large the noise is."""
+    """The effects that were found, the one that brings most first, and then what the noise is."""
     found = [_finding(search, one) for one in search.found] + corrections(search)
     found += [_departure(tested) for tested in search.departed]
     return sorted(found, key=lambda finding: (finding.is_correction, -(finding.gain or 0.0)))
@@ -70,9 +70,12 @@ def corrections(search: Search) -> list[Finding]:
     """Of declared noise, with which the search began."""
     found = list[Finding]()
     for one in search.corrections:
-        value, effect = float(search.final.coefficient(one.variant)), one.variant.effect
+        effect = one.variant.effect
+        least, most = effect.between  # beyond which the likelihood is flat
+        value = min(max(float(search.final.coefficient(one.variant)), least), most)
         (sd,) = _spread(search, one.variant).tolist()
-        told = ([value], [sd if effect.null == 0 else value * sd], [_interval(effect, value, sd, 0.0, 0.0)])
+        low, high = _interval(effect, value, sd, 0.0, 0.0)
+        told = ([value], [sd if effect.null == 0 else value * sd], [(max(low, least), min(high, most))])
         found.append(Finding(one.variant, effect.verdict, [one.variant.name], None, *told, one.gain, True))
     return found
 

@@ -71,8 +71,8 @@ def without_outliers(
 ) -> Cleaned:
     """What `fit` makes of training and validation drives without the outliers that its fits show.
 
-    None is left out where they are too many, or where noise with heavy tails, if it is `wanted`, makes all readings
-    likelier; the noise has such tails then.
+    None is left out where they are too many, or where all readings are likelier by noise with heavy tails, if it is
+    `wanted`. Then the noise has such tails, if they help.
     """
     none = [Outliers(data, [], torch.zeros_like(data.observed)) for data in (train, valid)]
     found, whole = none, fit(train, valid)
@@ -116,7 +116,8 @@ def with_suitable_noise(own: Refit, wanted: Callable[[Variant], bool], tails: Va
     if tails is not None and isinstance(tailed := refit_with(own, tails, tails.effect.typical), Refit):
         gain = float((tailed.held_out - own.held_out).sum()) if len(tailed.programs) == len(own.programs) else 0.0
         if gain > CLEAR_GAIN:
-            base, found = tailed, [Correction(tails, gain)]
+            base = tailed if tailed.converged else _fitted_further(own, tailed, tails)
+            found = [Correction(tails, gain)]
     for variant in [one for name in reversed(NOISE_SIZES) for one in sizes_of_noise(base.program, name)]:
         if variant.name in there or not wanted(variant) or is_learned(variant, base.program, base.folds[0]):
             continue
@@ -129,10 +130,9 @@ def with_suitable_noise(own: Refit, wanted: Callable[[Variant], bool], tails: Va
         if gain > CLEAR_GAIN and abs(math.log(factor)) > math.log(MIN_FACTOR):
             base = refit if refit.converged else _fitted_further(base, refit, variant)
             found.append(Correction(variant, gain))
-    factors = [one for one in found if one.variant is not tails]
-    for one in factors if len(factors) > 1 else []:  # a factor may have stood for one that was added later
-        near_one = abs(math.log(float(base.coefficient(one.variant)))) <= math.log(MIN_FACTOR)
-        if near_one and (fewer := without([one], own, base)) is not None:
+    for one in found[:-1]:  # it may have stood for one that was added later
+        is_small = one.variant is tails or abs(math.log(float(base.coefficient(one.variant)))) <= math.log(MIN_FACTOR)
+        if is_small and (fewer := without([one], own, base)) is not None:
             base = fewer
             found.remove(one)
     return Suited(base, found)
@@ -153,9 +153,10 @@ def needless(corrections: Sequence[Correction], final: Refit, screening: Screeni
     """Those that may be absent beside the effects that were found: what was missing looked like noise."""
 
     def may_be_absent(correction: Correction) -> bool:
-        value, sd = final.coefficient(correction.variant), screening.spread_of(final, correction.variant)
-        is_factor = correction.variant.effect.null == 1
-        return abs(math.log(float(value)) if is_factor else float(value)) < HALF_WIDTH * float(sd)
+        effect, value = correction.variant.effect, float(final.coefficient(correction.variant))
+        sd = float(screening.spread_of(final, correction.variant))
+        is_at_its_most = value >= effect.between[1]  # where drives tell no spread
+        return not is_at_its_most and abs(math.log(value) if effect.null == 1 else value) < HALF_WIDTH * sd
 
     return [one for one in corrections if may_be_absent(one)]
 

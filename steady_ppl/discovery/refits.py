@@ -290,10 +290,13 @@ def refit_with(
     return finish(base, attempt_with(base, variant, value, information), threshold)
 
 
-def fit_near(base: Fits, near: Fits, variants: Sequence[Variant]) -> Fits | str:
+def fit_near(
+    base: Fits, near: Fits, variants: Sequence[Variant], floors: Sequence[float] = (-math.inf, -math.inf)
+) -> Fits | str:
     """The program with effects, fitted from where another that shares parameters with it ended, or why it cannot be.
 
-    `near` has one of the `variants` at another knee, width or place, or more of them; `base` has none.
+    `near` has one of the `variants` at another knee, width or place, or more of them; `base` has none. A fit that will
+    not reach the log p(y) of its fold's floor ends on its way.
     """
     try:
         programs = [copy.deepcopy(program) for program in base.programs]
@@ -305,8 +308,8 @@ def fit_near(base: Fits, near: Fits, variants: Sequence[Variant]) -> Fits | str:
             own = program.state_dict()
             program.load_state_dict(own | {name: value for name, value in fitted.state_dict().items() if name in own})
         folds = [fold.wide(program) for program, fold in zip(programs, near.folds, strict=True)]
-        known = _information(near.maxima[0], elements(programs[0]))
-        maxima = [fit() for fit in _fits(near.fitting, programs, folds, known, [-math.inf] * len(folds))]
+        known = [_information(*one) for one in zip(near.maxima, map(elements, programs), strict=True)]
+        maxima = [fit() for fit in _fits(near.fitting, programs, folds, known, floors)]
         folds = [replace(fold, path=maximum.path) for fold, maximum in zip(folds, maxima, strict=True)]
         return Fits(programs, maxima, folds, near.fitting)
     except Exception as error:  # also of the program's own code, on parameters that nobody tried before
@@ -346,7 +349,7 @@ def _refit(
     folds = [fold.wide(program) for program, fold in zip(programs, folds, strict=True)]
     fits: Sequence[Fit | None] = [first, *[None] * (len(folds) - 1)]
     if unwidened is None and threshold == NO_THRESHOLD and first is None and not any(maxima):  # all are made
-        fits = _fits(fitting, programs, folds, information, least)
+        fits = _fits(fitting, programs, folds, [fold.information(information, folds[0]) for fold in folds], least)
     for program, fold, maximum, fit, floor in zip(programs, folds, maxima, fits, least, strict=True):
         anew = None if unwidened is None else _fit_anew(fold.fitting(as_declared(unwidened, program)), floor)
         if anew is not None:
@@ -383,13 +386,12 @@ def _fits(
     fitting: Fitting,
     programs: Sequence[Program],
     folds: Sequence[Fold],
-    information: Tensor | None,
+    informations: Sequence[Tensor | None],
     least: Sequence[float],
 ) -> list[Fit]:
-    """The fits of all folds, to be made in order; `information` is that of the first fold's drives."""
+    """The fits of all folds, to be made in order."""
     problems = [fold.fitting(program) for program, fold in zip(programs, folds, strict=True)]
-    guesses = [fold.information(information, folds[0]) for fold in folds]
-    return fitting.fit_each(problems, [fold.path for fold in folds], guesses, least)
+    return fitting.fit_each(problems, [fold.path for fold in folds], informations, least)
 
 
 def _fit_anew(problem: Problem, floor: float) -> tuple[Program, Maximum] | None:

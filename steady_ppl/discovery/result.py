@@ -69,7 +69,7 @@ class Discovery(Displayed):
 
     Attributes:
         search: everything that was tested and fitted.
-        findings: the effects that are missing, the one that brings most first, and then how large the noise is where
+        findings: the effects that are missing, the one that brings most first, and then what the noise is where
             that was declared otherwise; of effects none where none or a curve is missing.
         shape: the curve where no effect of the catalogue explains the drives.
         next_run: controls that would separate the first class of several members; None where there is none, or where

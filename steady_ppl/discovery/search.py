@@ -411,22 +411,27 @@ def labels(refit: Refit) -> list[str]:
 
 def prune(search: Search) -> None:
     """Drop effects that are not needed beside the others, and let the rivals of each have its place."""
-    for found in list(search.found):
+    for name in [one.candidate.variant.name for one in search.found]:
+        found = next(one for one in search.found if one.candidate.variant.name == name)  # its place may have moved
         without = _without(search, found)
         if isinstance(without, str) or without is found.without:  # beside which it was chosen among the same rivals
             continue
         chosen, least = found.candidate, found.candidate.total - MAX_NATS_OF_RIVAL
         there = {variant.name for variant in attached(without.program)}
-        again = []
+        again, as_it_stands = [], judged(without, chosen.tested, search.final)
         for rival in [chosen, *(c for c in found.candidates if c is not chosen and c.total > least)]:
             imitates = chosen.is_explanation and not rival.is_explanation
             if rival.variant.name not in there and isinstance(rival.refit, Refit) and not imitates:
                 begin = rival.refit.coefficient(rival.variant)
                 refit = refit_with(without, rival.variant, begin, information=search.final.maxima[0])
-                for other in (one for one in search.found if one is not found):
-                    refit = refit if isinstance(refit, str) else _placed(search.base, refit, other.candidate.variant)
-                again.append(at_its_best_place(without, judged(without, rival.tested, refit)))
-        as_it_stands = judged(without, chosen.tested, search.final)
+                one = judged(without, rival.tested, refit)
+                if one.total > as_it_stands.total - MAX_NATS_OF_RIVAL:  # else no knee or place brings it near
+                    one = at_its_best_place(without, one)
+                    for other in (other for other in search.found if other is not found):
+                        if isinstance(one.refit, Refit):
+                            placed = _placed(search.base, one.refit, other.candidate.variant)
+                            one = one if placed is one.refit else judged(without, one.tested, placed)
+                again.append(one)
         if all(c.total < as_it_stands.total for c in again if c.variant.name == chosen.variant.name):
             again = [as_it_stands, *(c for c in again if c.variant.name != chosen.variant.name)]
         needed = partial(_first, lambda c: c.total > TIE_NATS)

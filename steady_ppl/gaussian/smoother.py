@@ -42,13 +42,14 @@ def smooth(
     passes: int = 10,
     tolerance: float = 0.01,
     kernels: bool | None = None,
+    angles: tuple[int, ...] | None = None,
 ) -> Lookahead:
     """Move a path to the mode of the posterior and look ahead along it.
 
     Gauss and Newton's method. A step is halved while its end is worse by more than `MAX_INCREASE` nats, see `_merit`.
 
     Args:
-        problem, observation_weight, kernels: of `linearize`.
+        problem, observation_weight, kernels, angles: of `linearize`.
         path: where to begin; the better, the fewer passes.
         passes: linearisations at most.
         tolerance: stop when no noise moves by more, in standard deviations of its channel.
@@ -58,7 +59,8 @@ def smooth(
     """
     data = problem.data
     with unchanged(problem.program):
-        angles = angles_on_a_circle(problem.program, data, path.states[0, :1])
+        if angles is None:
+            angles = angles_on_a_circle(problem.program, data, path.states[0, :1])
         along = partial(linearize, problem, observation_weight=observation_weight, kernels=kernels, angles=angles)
         if passes == 1:
             return look_ahead(along(path))

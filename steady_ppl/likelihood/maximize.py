@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -37,6 +37,9 @@ from steady_ppl.utils.progress import stages
 PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
 STALLED_PASSES = 30  # linearisations a step once no share of a step was accepted: some path swings about its mode
 MAX_STEPS = 25  # scoring steps of a fit, where nothing else is said
+STEPS_SEEN, STEPS_FORESEEN = 3, 4
+"""A fit is given up after the first, if the second would not do: so many more steps, each of which gains as much as the
+better of the last two did, or as the next one promises."""
 MAX_MOVE = 150  # steps of differences, 1.5 of a logarithm: the most that a number moves at once
 MAX_MOVE_SD = 50.0  # standard deviations, of a number with a unit: it moves as far at once, if that is more
 RIDGE = 1e-3  # added to the information of a number, in that of one with a unit if that is smaller
@@ -84,7 +87,7 @@ def maximise(
         path: of the drives, near their posterior means; found from the measurements when None.
         steps: scoring steps at most.
         precision: stop when another step would gain less, nats.
-        hopeless: give up after six steps where log p(y) would not reach this were it to rise on as it has lately.
+        hopeless: give up where log p(y) will not reach this, see `STEPS_FORESEEN`.
 
     Raises:
         FilterError: the program cannot be smoothed at its initial parameters.
@@ -149,6 +152,7 @@ class Term:
     path: ReferencePath  # near the posterior means of its drives
     parts: list[Element]  # its learnable numbers
     columns: list[int]  # the place of each among all numbers of the objective, counted from 0 without gaps
+    angles: tuple[int, ...] | None = None  # of its linearization, as the program is where the fit begins
 
     @classmethod
     def alone(cls, problem: Problem, path: ReferencePath) -> Term:
@@ -189,7 +193,7 @@ def maximise_sum(
     taken, decrement, passes = 0, 0.0, PASSES
     few_drives = len(here.scores) < 2 * len(information)  # they know too little: what they say is seen twice
     is_small, most = False, here.objective
-    rises = deque[float](maxlen=3)  # of log p(y) by the last steps
+    rises = list[float]()  # of log p(y) by accepted steps
     with stages(*(("", SHARE_THAT_GOES_ON**step) for step in range(steps + 1))) as begin:
         for taken in range(steps + 1):
             begin()
@@ -208,7 +212,8 @@ def maximise_sum(
                 more = 0.5 * float(here.gradient @ seen)
                 if taken == 0 or (more > CONVERGED_DECREMENT and not few_drives):
                     information, move, decrement = own, seen, more
-            behind = taken >= 6 and here.log_likelihood + (steps - taken) * max(0.0, *rises) < hopeless
+            most_left = STEPS_FORESEEN * max(0.0, decrement, *rises[-2:])
+            behind = len(rises) >= STEPS_SEEN and here.log_likelihood + most_left < hopeless
             was_small, is_small = is_small, decrement < precision
             if (is_small and (was_small or not few_drives or taken == 0)) or taken == steps or behind:
                 break
@@ -324,9 +329,10 @@ def _valued(terms: Sequence[Term], passes: int) -> list[LinearizedTerm]:
     for term in terms:
         names = [part.owner for part in term.parts]
         shares = {name: 1 / owners[column] for name, column in zip(names, term.columns, strict=True)}
-        ahead = smooth(term.problem, term.path, passes=passes, tolerance=TOLERANCE)
+        ahead = smooth(term.problem, term.path, passes=passes, tolerance=TOLERANCE, angles=term.angles)
         objective = float(ahead.log_likelihood.sum()) + log_prior(term.problem.program, shares)
-        there = replace(term, path=resting_path(ahead, term.problem.data))
+        rested = resting_path(ahead, term.problem.data)
+        there = replace(term, path=rested, angles=ahead.linearization.angles)
         found.append(LinearizedTerm(there, shares, ahead, objective))
     return found
 

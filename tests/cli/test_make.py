@@ -7,7 +7,7 @@ import shlex
 import site
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -52,55 +52,74 @@ demonstrate(Path("demo"), typer.main.get_command(app), size=Size(train=6, valid=
 """
 
 
-@pytest.mark.slow
-def test_the_wheel_is_enough(tmp_path: Path):
-    """Built and installed, with the dependencies of this environment and nothing of the checkout: what `init` proposes
-    runs in its folder, and so do the demonstration and every command of the README, with fewer steps and draws."""
-    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    subprocess.run([*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", tmp_path, ROOT], check=True)
-    (wheel,) = tmp_path.glob("*.whl")
-    subprocess.run([sys.executable, "-m", "venv", tmp_path / "fresh"], check=True)
-    python = tmp_path / "fresh" / "bin" / "python"
-    (packages,) = (tmp_path / "fresh").glob("lib/python*/site-packages")
-    packages.joinpath("dependencies.pth").write_text("\n".join(site.getsitepackages()) + "\n")
-    subprocess.run([python, "-m", "pip", "--quiet", "install", "--no-deps", "--no-index", wheel], check=True)
+@dataclass(frozen=True)
+class Installed:
+    """The package as its wheel brings it, in an environment of its own."""
 
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    python: Path
 
-    def run(command: str, folder: Path) -> str:
+    def run(self, command: str, folder: Path) -> str:
+        """What a command prints."""
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
         program, *rest = shlex.split(command)
-        arguments = [python.with_name(program), *rest]
+        arguments = [self.python.with_name(program), *rest]
         done = subprocess.run(arguments, cwd=folder, env=environment, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    home = run("python -c 'import steady_ppl; print(steady_ppl.__file__)'", tmp_path)
-    assert home.startswith(str(tmp_path / "fresh")), home
-    said = run("steady init lab", tmp_path)
-    lab = tmp_path / "lab"
-    fast = {"fit": "--steps 4", "check": "--simulations 20", "discover": "--simulations 50"}
+    def run_quickly(self, command: str, folder: Path) -> None:
+        """A command of `steady` with fewer steps and draws; some recipes have no steps, and are quick."""
+        name, *rest = shlex.split(command)
+        more = "" if {"hand", "likelihood"} & set(rest) else FEWER.get(name, FEWER["check"])
+        self.run(f"steady {command} {more}", folder)
 
-    def fewer(words: list[str]) -> str:
-        """What makes a command of the text quick; these recipes have no steps, and are."""
-        return "" if {"hand", "likelihood"} & set(words) else fast.get(words[0], fast["check"])
 
-    for line in (line.strip() for line in said.splitlines() if line.strip().startswith("steady ")):
-        run(f"{line} {fewer(line.split()[1:])}", lab)
+FEWER = {"fit": "--steps 4", "check": "--simulations 20", "discover": "--simulations 50 --only dynamics"}
+FEWER |= {"evaluate": "--rollouts 20", "states": "--draws 10", "report": "--simulations 20"}
+FEWER |= dict.fromkeys(("simulate", "add", "prove", "effects"), "")
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    """With the dependencies of this environment and nothing of the checkout."""
+    folder = tmp_path_factory.mktemp("wheel")
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    subprocess.run([*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", folder, ROOT], check=True)
+    (wheel,) = folder.glob("*.whl")
+    subprocess.run([sys.executable, "-m", "venv", folder / "fresh"], check=True)
+    python = folder / "fresh" / "bin" / "python"
+    (packages,) = (folder / "fresh").glob("lib/python*/site-packages")
+    packages.joinpath("dependencies.pth").write_text("\n".join(site.getsitepackages()) + "\n")
+    subprocess.run([python, "-m", "pip", "--quiet", "install", "--no-deps", "--no-index", wheel], check=True)
+    found = Installed(python)
+    home = found.run("python -c 'import steady_ppl; print(steady_ppl.__file__)'", folder)
+    assert home.startswith(str(folder / "fresh")), home
+    return found
+
+
+@pytest.mark.slow
+def test_the_wheel_is_enough(installed: Installed, tmp_path: Path) -> None:
+    """What `init` proposes runs in its folder."""
+    said, lab = installed.run("steady init lab", tmp_path), tmp_path / "lab"
+    for line in (line.strip() for line in said.splitlines()):
+        if line.startswith("steady "):
+            installed.run_quickly(line.removeprefix("steady "), lab)
     assert (lab / "report.html").stat().st_size < 6_000_000
     assert "effects" in (lab / "runs" / "found" / "discovery.json").read_text()
-    for folder in ("runs", "report.html"):
-        (lab / folder).rename(lab / f"first-{folder}")
-    fast |= {"evaluate": "--rollouts 20", "simulate": "", "add": "", "prove": "", "report": "--simulations 20"}
-    fast |= {"states": "--draws 10", "effects": ""}
-    done = set()
+    installed.run("python -c 'from inference import steady; from models.hovercraft import Hovercraft'", lab)
+
+
+@pytest.mark.exhaustive
+def test_every_command_of_the_readme_runs_from_the_wheel(installed: Installed, tmp_path: Path) -> None:
+    installed.run("steady init lab", tmp_path)
+    lab, done = tmp_path / "lab", set()
     for words in commands(ROOT / "README.md"):
         if words[0] == "demo":
-            run(f"python -c {shlex.quote(SMALL_DEMO)}", lab)
+            installed.run(f"python -c {shlex.quote(SMALL_DEMO)}", lab)
         elif words[0] != "init":
-            run(f"steady {shlex.join(words)} {fewer(words)}", lab)
+            installed.run_quickly(shlex.join(words), lab)
         done.add(words[0])
     assert done >= {"demo", "simulate", "fit", "check", "discover", "add", "prove", "report", "evaluate"}
-    run("python -c 'from inference import steady; from models.hovercraft import Hovercraft'", lab)
 
 
 # --- simulate ---------------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
 def test_a_notebook_runs(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STEADY_QUICK", "1")
     notebook = nbformat.read(file, as_version=4)
-    NotebookClient(notebook, timeout=180, resources={"metadata": {"path": str(file.parent)}}).execute()
+    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(file.parent)}}).execute()
 
 
 def test_there_are_notebooks() -> None:

@@ -33,7 +33,7 @@ def blocks(language: str) -> list[str]:
 
 
 def typed(folder: Path, command: list[str]) -> str:
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=900)
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=1800)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -47,7 +47,7 @@ def test_a_log_becomes_three_tables(folder: Path) -> None:
     assert all(table.measurement_names == ("gps_x", "gps_y", "compass") for table in tables.values())
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_it_ends_with_a_program_that_predicts_better_and_a_page(folder: Path) -> None:
     typed(folder, [sys.executable, "-c", blocks("python")[0]])
     steady = shutil.which("steady", path=str(Path(sys.executable).parent))
