@@ -145,7 +145,7 @@ def test_two_effects_are_both_found():
     assert any("linear_drag" in finding.aliases for finding in found.findings)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_no_effect_explains_is_a_curve():
     found = discovered("yaw_linear_drag=0.12", withheld=["yaw_linear_drag", "yaw_quadratic_drag"])
     assert found.verdict == "other" and found.findings == []
@@ -223,7 +223,7 @@ def test_a_fit_that_has_not_converged_is_said_before_any_ranking(monkeypatch):
     assert found.figures["doubts"] == found.doubts
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_not_knowing_a_knee_is_in_the_coefficients_interval():
     found = discovered("thrust_saturation:knee=0.6=0.8")
     (finding,) = found.findings
@@ -295,7 +295,7 @@ def test_the_prior_of_a_place_is_as_wide_as_its_grid():
     assert _log_prior(least, grid) == pytest.approx(-0.5)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_next_run_tells_what_these_drives_do_not():
     """Steady flight at one speed: what brakes it may go with the velocity or with its square."""
     found = discovered("linear_drag=0.1")
@@ -325,7 +325,7 @@ def test_a_sensor_that_failed_on_all_training_drives_is_no_obstacle():
     assert knots_of(torch.zeros(0), circular=False) is None
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_effect_of_ones_own_is_found():
     def tether(self, state, control, time, step, c):
         return {"yaw": -c * state[..., 2].sin()}

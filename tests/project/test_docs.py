@@ -63,7 +63,7 @@ def test_the_examples_of_a_page_run(name: str, tmp_path: Path, monkeypatch: pyte
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_study_of_the_page_is_computed_and_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With fewer drives and seeds."""
     ((about, text),) = blocks(DOCS / "studies.md", "toml")
