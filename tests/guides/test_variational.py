@@ -97,7 +97,7 @@ def pushed(cart, rows: int):
 
 LONG, LONGER = pytest.mark.slow, pytest.mark.exhaustive
 NEAR = [
-    pytest.param(12, "network", 0.5, marks=LONG),
+    pytest.param(12, "network", 0.5, marks=LONGER),
     pytest.param(12, "network, not centred", 0.1, marks=LONG),
     (12, "mean-field", 1.5),
     pytest.param(101, "network", 8.0, marks=LONGER),

@@ -115,7 +115,7 @@ def test_a_thousand_drives_are_judged_like_four():
     assert (found[:4] - few).abs().max() < 0.2
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_ten_thousand_rows_are_no_other_than_a_thousand():
     """A row's log p(y), by the scatter of twenty drives of a thousand rows; shorter ones feel their unknown start."""
     program = example(TRUTH, torch.float32)
