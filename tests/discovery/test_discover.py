@@ -352,7 +352,7 @@ def test_an_effect_of_ones_own_is_found():
     assert abs(found.findings[0].coefficient[0] - 0.08) < 4 * found.findings[0].sd[0]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_pendulum_lacks_friction_and_a_spring_and_says_so():
     program = example("pendulum", torch.float32)
     found = discovered("coulomb_friction=0.8", "cubic_stiffness=4", program=program)
