@@ -297,16 +297,15 @@ def likelier_places(base: Refit, begun: Fits, at: Variant) -> list[tuple[Variant
     """Knees, widths or places of an effect, on its grid and then between its points, and the fits there, each likelier
     than the one before: `begun` first, which has the effect there and perhaps others that `base` lacks."""
     grid, fits = _grid(base, at), [(at, begun)]
-
     beside = {known.name for known in attached(base.program)}
+    lacking = [one for one in attached(begun.program) if one.name not in beside]
 
     def moves_to(variant: Variant) -> bool:
         """Add the fit at a place if it is likelier than the last."""
         there, best = fits[-1]
         more = _log_prior(there, grid) - _log_prior(variant, grid) + MIN_GAIN_OF_PLACE
         floors = [float(one.log_likelihood.sum()) + more - MAX_NATS_BY_ONE_FOLD for one in best.maxima]
-        every = [variant if one.name == at.name else one for one in attached(begun.program)]
-        other = fit_near(base, best, [one for one in every if one.name not in beside], floors)
+        other = fit_near(base, best, [variant if one.name == at.name else one for one in lacking], floors)
         if isinstance(other, str) or not gain_of_fits(best, other) > more:
             return False
         if any(float(one.log_likelihood.sum()) < floor for one, floor in zip(other.maxima, floors, strict=True)):
@@ -314,20 +313,20 @@ def likelier_places(base: Refit, begun: Fits, at: Variant) -> list[tuple[Variant
         fits.append((variant, other))
         return True
 
+    def walks(name: str, share: float, side: int) -> bool:
+        """Go on to one side for as long as that is likelier; whether it was at all."""
+        steps = 0
+        while steps < MAX_STEPS_OF_PLACE and moves_to(_neighbours(fits[-1][0], grid, name, share)[side]):
+            steps += 1
+        return steps > 0
+
     for variant in grid:
         if variant.label != at.label:
             moves_to(variant)
     for share in (0.5, 0.25):
         for _ in range(MAX_COORDINATE_SWEEPS):
-            before = len(fits)
-            for name in at.profiled:
-                for side in (0, 1):
-                    steps = 0
-                    while steps < MAX_STEPS_OF_PLACE and moves_to(_neighbours(fits[-1][0], grid, name, share)[side]):
-                        steps += 1
-                    if steps:
-                        break
-            if len(fits) == before:
+            moved = [walks(name, share, 0) or walks(name, share, 1) for name in at.profiled]
+            if not any(moved):
                 break
     return fits
 

@@ -347,15 +347,15 @@ def _refit(
 ) -> Refit:
     fitted, found, held_out, judged_folds = list[Program](), list[Maximum](), list[Tensor](), list[Fold]()
     folds = [fold.wide(program) for program, fold in zip(programs, folds, strict=True)]
+    guesses = [fold.information(information, folds[0]) for fold in folds]
     fits: Sequence[Fit | None] = [first, *[None] * (len(folds) - 1)]
     if unwidened is None and threshold == NO_THRESHOLD and first is None and not any(maxima):  # all are made
-        fits = _fits(fitting, programs, folds, [fold.information(information, folds[0]) for fold in folds], least)
-    for program, fold, maximum, fit, floor in zip(programs, folds, maxima, fits, least, strict=True):
+        fits = _fits(fitting, programs, folds, guesses, least)
+    for program, fold, maximum, guess, fit, floor in zip(programs, folds, maxima, guesses, fits, least, strict=True):
         anew = None if unwidened is None else _fit_anew(fold.fitting(as_declared(unwidened, program)), floor)
         if anew is not None:
             floor = max(floor, float(anew[1].log_likelihood.sum()))
         if maximum is None:
-            guess = fold.information(information, folds[0])
             fit = fit or fitting.fit_each([fold.fitting(program)], [fold.path], [guess], [floor])[0]
             maximum = fit()
         held_out_path = fold.held_out_path

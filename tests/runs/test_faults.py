@@ -86,7 +86,7 @@ COMMANDS = {
     "discover": ("discover", HOVERCRAFT, "train.csv", "--valid", "valid.csv", "--known-start", "--simulations", "50"),
     "fit": ("fit", HOVERCRAFT, "train.csv", "--known-start", "--steps", "20", "--set", "validate_every=5"),
 }
-MINUTES = pytest.param("discover", marks=pytest.mark.exhaustive)
+TWENTY_SEARCHES = pytest.param("discover", marks=pytest.mark.exhaustive)
 KEPT = {"discover": ("discovery.json", "parameters.safetensors"), "fit": ("parameters.safetensors", "run.json")}
 
 
@@ -218,7 +218,7 @@ def test_a_search_on_a_disk_that_fills_up_goes_on_when_there_is_room(desk: Path,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name if name != "discover" else MINUTES for name in COMMANDS])
+@pytest.mark.parametrize("name", [name if name != "discover" else TWENTY_SEARCHES for name in COMMANDS])
 def test_twenty_random_kills_change_nothing(desk: Path, name: str) -> None:
     (first, whole), random, caught = undisturbed(desk, name), np.random.default_rng(20), []
     for trial in range(20):
