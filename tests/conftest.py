@@ -17,6 +17,7 @@ settings.register_profile(
 settings.register_profile("long", settings.get_profile("repeated"), derandomize=False, max_examples=200)
 settings.load_profile("repeated")
 
+TOLD_AT_ONCE = 20.0  # seconds of a test or of what it needs
 ONE_JOB = f"""
 title = "One job"
 seeds = [1]
@@ -34,6 +35,22 @@ recipe = "hand"
 x = "data.train"
 y = ["log_likelihood"]
 """
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if not hasattr(config, "workerinput"):
+        config.pluginmanager.register(LongTests(config))
+
+
+class LongTests:
+    """Names a test that takes long when it ends, so that a run that is stopped shows what took its time."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self.config = config
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.duration > TOLD_AT_ONCE:
+            self.config.get_terminal_writer().line(f" {report.duration:.0f}s {report.when} {report.nodeid}")
 
 
 @pytest.fixture(autouse=True)

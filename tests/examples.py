@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import pyro
 import pyro.distributions as dist
+import pytest
 import torch
+from _pytest.mark import ParameterSet
 from torch import Tensor
 
 from steady_ppl import Trajectories, load_program, seeded, simulate, stack
@@ -23,6 +25,13 @@ def example(name: str, dtype: torch.dtype = torch.float64) -> Program:
     file, _, program = name.partition(":")
     source = MODELS / f"{file.removesuffix('.py')}.py"
     return load_program(f"{source}:{program}" if program else source).to(dtype)
+
+
+def each_effect_once_slow(pairs: Sequence[tuple[str, str]]) -> list[ParameterSet]:
+    """Programs and effects as parameters: slow with an effect's first program, exhaustive with the others."""
+    first = {effect: name for name, effect in reversed(pairs)}
+    marks = (pytest.mark.slow if first[effect] == name else pytest.mark.exhaustive for name, effect in pairs)
+    return [pytest.param(*pair, id="-".join(pair), marks=mark) for pair, mark in zip(pairs, marks, strict=True)]
 
 
 def short(name: str, rows: int = 9) -> Program:

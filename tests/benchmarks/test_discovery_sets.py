@@ -154,7 +154,7 @@ def test_rivals_leave_out_what_is_withheld(monkeypatch):
     assert "quadratic_drag" not in ranking.effects and "linear_drag" in ranking.effects
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_rivals_say_can_be_stored():
     pytest.importorskip("pysindy")
     from discovery_rivals import RIVALS, fitted

@@ -11,7 +11,7 @@ from information_bound import information_bound
 from oracles import cart_parameters, kalman
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_bound_of_a_linear_program_is_kalmans() -> None:
     """The gain moves the measurements' mean in proportion: minus the second difference of log p(y) in it is its
     information, whatever was measured, and at a gain of one that of its logarithm, which is what is learned."""

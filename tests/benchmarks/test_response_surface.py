@@ -13,7 +13,7 @@ from steady_ppl import FilterError
 SPACINGS = {"gain": 0.09, "damping": 0.1}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_numbers_end_where_exact_log_p_is_largest_whatever_they_begin_with():
     """The other numbers are held; curvatures are those of the Kalman filter's log p(y)."""
     cart = example("linear_gaussian")
@@ -54,7 +54,7 @@ def test_a_grid_whose_highest_point_is_its_middle_need_not_have_a_top():
     assert not ridge.has_top and ridge.lead.tolist() == [0.0, 0.0]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("spacings", [{"gain": 0.01, "damping": 0.01}, {"gain": 0.09, "damping": 1e6}])
 def test_without_a_top_the_program_is_left_as_it_was(spacings):
     cart = example("linear_gaussian")

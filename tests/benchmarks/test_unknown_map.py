@@ -23,7 +23,7 @@ def few_drives(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(unknown_map, "hov", lambda seed, truth: hov(seed, 2, 2, 2, truth=truth))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_unknown_map_is_learned_beside_the_known_one(monkeypatch: pytest.MonkeyPatch) -> None:
     known, unknown, _ = unknown_map.PROGRAMS["mechanistic"]
     monkeypatch.setitem(unknown_map.PROGRAMS, "mechanistic", (known, unknown, FEW | {"guide": "gaussian"}))

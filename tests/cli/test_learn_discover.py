@@ -228,7 +228,7 @@ def test_an_interrupt_before_the_first_tests_is_said_in_a_line(table, whole, tmp
     assert capsys.readouterr().err == "steady: interrupted\n"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_second_interrupt_ends_at_once_and_leaves_the_journal(table, tmp_path, capsys, monkeypatch):
     run = tmp_path / "run"
     monkeypatch.setattr(search, "screen_program", interrupted_at(2, search.screen_program))
@@ -239,7 +239,7 @@ def test_a_second_interrupt_ends_at_once_and_leaves_the_journal(table, tmp_path,
     assert any((run / "journal").iterdir())
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_comparison_that_fails_takes_no_verdict_away(table, whole, tmp_path, monkeypatch):
     def fails(*_, **__):
         raise FilterError("the drives are odd")

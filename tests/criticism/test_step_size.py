@@ -260,7 +260,7 @@ def test_what_a_finer_step_has_gained_is_kept_where_the_next_one_fails(turning, 
     assert found.gain > 3 and "(fit with --substeps 2)" in found.sentence
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_check_says_the_step_first(turning) -> None:
     program = Turning()
     with seeded(0, "paths"):

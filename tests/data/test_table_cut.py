@@ -58,7 +58,7 @@ def test_what_cannot_be_cut_says_why():
         st.cut(replace(data, labels=("a", "a-1", "b"), lengths=torch.tensor([21, 8, 21])), 1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_looks_at_drives_as_a_whole_refuses_long_ones(tmp_path, capsys):
     rows = MAX_DRIVE_ROWS + 1
     frame = st.to_frame(simulated(trajectories=6, rows=11))

@@ -254,7 +254,7 @@ def test_trajectories_of_one_label_are_not_run_together(tmp_path: Path) -> None:
     assert caught.value.trajectory == "a" and list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_many_drives_take_no_longer_each_than_few() -> None:
     many = np.repeat([f"drive {i}" for i in range(60_000)], 2)
     frame = pd.DataFrame({"trajectory": many, "time": np.tile([0.0, 1.0], 60_000), "u.push": 0.0, "y.range": 1.0})

@@ -138,7 +138,7 @@ def test_a_sensor_declared_too_coarse_takes_no_effects_place():
     assert [one["correction"] for one in found.figures["effects"]] == [False, True]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_effects_are_both_found():
     found = discovered("linear_drag=0.12", "landmark_bias:2=0.08")
     assert {finding.aliases[0] for finding in found.findings} >= {"landmark_bias:bearing_2"}
@@ -159,7 +159,7 @@ def test_what_no_effect_explains_is_a_curve():
     assert curve.get_ydata().tolist() == pytest.approx(list(shape.curve)) and "yaw_rate [rad/s]" in axes.get_xlabel()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_noise_that_is_not_the_declared_is_said_to_be():
     program = owner()
     truth = owner()

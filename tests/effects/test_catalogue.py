@@ -8,7 +8,7 @@ from functools import cache
 import pyro
 import pytest
 import torch
-from examples import MODELS, drives, example, short
+from examples import MODELS, drives, each_effect_once_slow, example, short
 from pyro.infer import Trace_ELBO
 from torch import Tensor
 
@@ -21,6 +21,7 @@ from steady_ppl.model.validate import probe
 PROGRAMS = ("hovercraft", "truck", "pendulum")
 EFFECTS = [(program, effect.name) for program in PROGRAMS for effect in catalogue(example(program))]
 every_effect = pytest.mark.parametrize(("name", "effect"), EFFECTS, ids=["-".join(pair) for pair in EFFECTS])
+slow_on_one_program = pytest.mark.parametrize(("name", "effect"), each_effect_once_slow(EFFECTS))
 
 
 def variants(program, effect: str):
@@ -30,8 +31,7 @@ def variants(program, effect: str):
 # --- each effect ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-@every_effect
+@slow_on_one_program
 def test_without_its_coefficient_the_effect_is_not_there(name: str, effect: str) -> None:
     """The same seed gives the same drives; tails come near the normal's as far as their cap lets them."""
     program = short(name)
@@ -44,8 +44,7 @@ def test_without_its_coefficient_the_effect_is_not_there(name: str, effect: str)
         torch.testing.assert_close(with_it.measurements, plain.measurements, **exact)
 
 
-@pytest.mark.slow
-@every_effect
+@slow_on_one_program
 def test_with_its_typical_coefficient_the_effect_is_felt_by_a_sound_program(name: str, effect: str) -> None:
     program = short(name, rows=40)
     for variant in variants(program, effect)[:1]:

@@ -67,7 +67,7 @@ def test_a_noise_that_is_declared_too_narrow_makes_none(boat, drives):
     assert found_in(narrow, drives).found == []
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_where_a_sensor_reads_anything_nothing_is_called_an_outlier(boat, drives):
     rows = torch.arange(len(drives.time)) % 60 < 10
     wild = moved(drives, *((rows, drive, 0, by) for drive, by in enumerate((40.0, -40.0, 30.0, -50.0))))

@@ -85,7 +85,7 @@ def test_the_rate_of_a_drift_has_the_posterior_of_a_regression(kind):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_program_stays_as_it_is_and_the_same_seed_draws_the_same():
     program = example("hovercraft:HovercraftTruth", torch.float32)
     table = st.simulate(program, 2, seed=1)

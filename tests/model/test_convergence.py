@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from examples import MODELS, example
+from examples import MODELS, each_effect_once_slow, example
 
 from steady_ppl import for_program, seeded, simulate, with_substeps
 from steady_ppl.effects import catalogue, chosen_variant
@@ -43,8 +43,9 @@ MORE: dict[str, dict[str, int]] = {
     "discovered_truck": {"actuator_lag": 2},
 }
 BOUNDLESS = {("discovered_truck", "command_noise")}  # at twice the speeds its noise feeds itself
-QUICK = [("pendulum", "linear_drag"), ("pendulum", "coulomb_friction")]
-EFFECTS = [(name, effect.name) for name in MORE for effect in catalogue(example(name))]
+EFFECTS = [
+    (name, effect.name) for name in MORE for effect in catalogue(example(name)) if (name, effect.name) not in BOUNDLESS
+]
 DRAWS, EVERY = 64, 9
 
 
@@ -95,15 +96,7 @@ def test_explicit_euler_does_not() -> None:
     assert worst(example("paper:PaperHovercraft")) > 0.3
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "effect"),
-    [
-        pytest.param(name, effect, id=f"{name}-{effect}", marks=pytest.mark.slow if (name, effect) not in QUICK else ())
-        for name, effect in EFFECTS
-        if (name, effect) not in BOUNDLESS
-    ],
-)
+@pytest.mark.parametrize(("name", "effect"), each_effect_once_slow(EFFECTS))
 def test_an_effect_converges(name, effect) -> None:
     """With the program's own substeps, or as many times more as are written above."""
     program = example(name)

@@ -129,7 +129,7 @@ class QuietAtRest(Cart):
         return torch.where((time > 2).unsqueeze(-1), 1.0, 0.0).to(time)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_channel_without_noise_in_some_rows_is_simulated_in_substeps() -> None:
     program = QuietAtRest().double()
     fine = simulate(program, 2, seed=1)

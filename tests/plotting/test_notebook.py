@@ -67,7 +67,7 @@ def test_a_check_and_a_proof_show_verdict_picture_and_figures(fits) -> None:
         assert verdict in repr(found) and len(repr(found)) < 600
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_discovery_shows_sentence_picture_and_figures() -> None:
     data = st.simulate(example("hovercraft").with_effect("yaw_bias", 0.3), 10, seed=1)
     found = st.discover(st.Fit(example("hovercraft"), "hand", known_start=True), data, simulations=50)

@@ -22,7 +22,8 @@ PAGES = [*sorted(DOCS.glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md
 RUN = (
     "own-effect",
     "own-recipe",
-    *(pytest.param(name, marks=pytest.mark.slow) for name in ("own-data", "own-program", "own-sensor", "control")),
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("own-data", "own-sensor", "control")),
+    pytest.param("own-program", marks=pytest.mark.exhaustive),
 )
 
 

@@ -7,10 +7,14 @@ import pytest
 from nbclient import NotebookClient
 
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
+LONG = ("2_steady_and_svi", "3_find_the_missing_physics")
+RUN = [
+    pytest.param(file, id=file.stem, marks=pytest.mark.exhaustive if file.stem in LONG else pytest.mark.slow)
+    for file in NOTEBOOKS
+]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("file", NOTEBOOKS, ids=lambda file: file.stem)
+@pytest.mark.parametrize("file", RUN)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_notebook_runs(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STEADY_QUICK", "1")

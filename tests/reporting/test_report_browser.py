@@ -148,7 +148,7 @@ def test_the_keyboard_meets_no_tools_and_every_picture_has_a_name(page):
     assert (tools, unnamed) == ("0", "0") and int(pictures) == 9
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_paper_is_as_wide_as_what_is_drawn_on_it(page, tmp_path):
     script = """
     window.dispatchEvent(new Event("beforeprint"));

@@ -50,7 +50,7 @@ def learned(name: str, program, train, valid=None, **options):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.exhaustive if name.startswith(("svi ", "fit-tv")) else ())
+        pytest.param(name, marks=pytest.mark.exhaustive if name.startswith(("svi", "fit-tv")) else ())
         for name in RECIPES
     ],
 )

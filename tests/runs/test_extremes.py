@@ -139,7 +139,7 @@ def odd(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_run_whose_name_is_no_utf8_is_read_like_any_other(work: Path, odd: Path) -> None:
     table = written(odd / "train\udcfe.csv")
     run = odd / "run\udcfe"

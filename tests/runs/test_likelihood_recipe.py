@@ -31,7 +31,7 @@ def test_it_finds_what_made_the_drives(fitted):
     assert last["log_likelihood"] > first["log_likelihood"] + 1 and fitted.trained.still_rising is None
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_long_training_does_not_get_further(fitted, lighter):
     program = st.load_program(HOVERCRAFT)
     long = find_recipe("steady")(program, lighter[0], known_start=True, steps=150, progress=False).program

@@ -180,7 +180,7 @@ def test_a_folder_of_another_study_is_left_alone(tmp_path: Path):
         run_study(replace(plan, title="Other", jobs=()), out, Local(1))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_files_that_had_changed_are_tried_again_by_the_same_command(tmp_path: Path):
     plan, out = read_plan(written(tmp_path)), tmp_path / "out"
     plan = replace(plan, jobs=plan.jobs[:2])
