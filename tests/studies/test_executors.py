@@ -42,7 +42,7 @@ def fit(program, table, valid=None, *, known_start=False, mark="", deadly=False,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.exhaustive), 2])
 def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(tmp_path: Path, workers: int):
     (tmp_path / "mine.py").write_text(RECIPE.format())
     (tmp_path / "marks").mkdir()
@@ -68,7 +68,7 @@ def test_a_worker_that_dies_takes_nothing_with_it_and_a_deadly_job_is_given_up(t
     assert (tmp_path / "marks" / "7").stat().st_size == begun[7] + 1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_deadly_job_takes_nothing_with_it_and_is_tried_after_the_others(tmp_path: Path):
     (tmp_path / "mine.py").write_text(RECIPE.format())
     (tmp_path / "marks").mkdir()
@@ -123,7 +123,7 @@ def test_one_worker_that_dies_before_it_begins_is_replaced(tmp_path: Path, monke
     assert [row["outcome"] for row in found] == ["done"] * 6 and said == []
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_worker_that_dies_while_it_has_nothing_to_do_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     made: list[executors._Process] = []
 

@@ -25,7 +25,6 @@ from steady_ppl.studies.runner import run_study
 from steady_ppl.studies.table import read_results
 
 pytest.importorskip("distributed", reason="needs dask.distributed: pip install 'steady-ppl[cluster]'")
-pytestmark = pytest.mark.slow
 
 CART, HOVERCRAFT = MODELS / "linear_gaussian.py", MODELS / "hovercraft.py"
 RECIPE = """
@@ -113,6 +112,7 @@ def figures(out: Path) -> pd.DataFrame:
     return found.drop(columns=["seconds", "peak_mib", "fit_seconds"])
 
 
+@pytest.mark.exhaustive
 def test_a_cluster_finds_what_this_machine_finds(tmp_path: Path, dask: Dask):
     file = study(tmp_path, seeds=4, seconds=0.0)
     text = file.read_text()
@@ -127,6 +127,7 @@ def test_a_cluster_finds_what_this_machine_finds(tmp_path: Path, dask: Dask):
     pd.testing.assert_frame_equal(figures(tmp_path / "here"), figures(tmp_path / "there"))
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path: Path, dask: Dask):
     file, out = study(tmp_path, seconds=3.0), tmp_path / "out"
     dask.scheduler()
@@ -142,6 +143,7 @@ def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path: Path, dask: Das
     assert begun_times(tmp_path) == {one: 2 if one == seed else 1 for one in range(1, 7)}  # none but what it was at
 
 
+@pytest.mark.exhaustive
 def test_what_has_come_is_let_go_of(tmp_path: Path, dask: Dask):
     """Or a worker that dies would have all that it has ever found computed again."""
     held = []
@@ -157,6 +159,7 @@ def test_what_has_come_is_let_go_of(tmp_path: Path, dask: Dask):
     assert len(held) == 6 and held[-1] <= 2 and held == sorted(held, reverse=True)
 
 
+@pytest.mark.exhaustive
 def test_a_cluster_without_a_worker_is_said_and_waited_for(tmp_path: Path, dask: Dask, monkeypatch):
     monkeypatch.setattr(clusters, "WORKER_WAIT_SECONDS", 2)
     said, out = list[str](), tmp_path / "out"
@@ -178,6 +181,7 @@ def test_a_cluster_without_a_worker_is_said_and_waited_for(tmp_path: Path, dask:
 DEADLY = RECIPE.replace("time.sleep(seconds)", "time.sleep(seconds)\n    if seed in (1, 5): os._exit(9)")
 
 
+@pytest.mark.exhaustive
 def test_jobs_that_kill_every_worker_are_given_up_and_no_other(tmp_path: Path, dask: Dask):
     """Also not what waits behind them at a worker, which Dask blames as well."""
     file, out = study(tmp_path, seeds=6, seconds=0.2), tmp_path / "out"
@@ -208,6 +212,7 @@ def joining(dask: Dask, path: Path, said: list[str]) -> Callable[[str], None]:
     return hear
 
 
+@pytest.mark.exhaustive
 def test_a_worker_that_joins_late_and_is_unlike_this_machine_is_not_used(tmp_path: Path, dask: Dask):
     said, out = list[str](), tmp_path / "out"
 
@@ -220,6 +225,7 @@ def test_a_worker_that_joins_late_and_is_unlike_this_machine_is_not_used(tmp_pat
     assert "it has steady-ppl 0.0.1 (here " in line and (read_results(out)["outcome"] == "done").all()
 
 
+@pytest.mark.exhaustive
 def test_a_worker_that_joins_late_without_steady_ppl_disturbs_nobody(tmp_path: Path, dask: Dask):
     """Dask ends it with the first job that it cannot load."""
     said, out, other = list[str](), tmp_path / "out", tmp_path / "other" / "steady_ppl"
@@ -248,6 +254,7 @@ os.stat = stat
 """
 
 
+@pytest.mark.exhaustive
 def test_a_worker_that_joins_late_and_sees_other_files_is_not_given_everything(tmp_path: Path, dask: Dask, monkeypatch):
     said, sent, out = list[str](), list[str](), tmp_path / "out"
     send, batch = clusters._Sent.send, Cluster._batch
@@ -266,6 +273,7 @@ def test_a_worker_that_joins_late_and_sees_other_files_is_not_given_everything(t
     assert 1 <= len(sent) - 20 < 8  # 10 to 18 if it did not hold what it is given
 
 
+@pytest.mark.exhaustive
 def test_a_study_goes_on_when_its_scheduler_is_there_again(tmp_path: Path, dask: Dask):
     file, out = study(tmp_path), tmp_path / "out"
     scheduler = dask.scheduler()
@@ -286,6 +294,7 @@ def test_a_study_goes_on_when_its_scheduler_is_there_again(tmp_path: Path, dask:
     assert {seed: times for seed, times in begun_times(tmp_path).items() if seed in kept} == dict.fromkeys(kept, 1)
 
 
+@pytest.mark.slow
 def test_nobody_who_answers_is_one_line(tmp_path: Path, capsys):
     address = f"tcp://127.0.0.1:{free_port()}"
     assert steady("study", study(tmp_path), "--cluster", address, "--out", tmp_path / "out") == 2
@@ -300,6 +309,7 @@ def other_version(folder: Path) -> Path:
     return other.parent
 
 
+@pytest.mark.exhaustive
 def test_workers_that_would_find_something_else_are_refused(tmp_path: Path, dask: Dask, capsys, monkeypatch):
     file, out = study(tmp_path), tmp_path / "out"
     dask.scheduler()
