@@ -16,7 +16,7 @@ from torch import Tensor
 from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead, look_ahead
-from steady_ppl.gaussian.linearize import ReferencePath, angles_on_a_circle, linearize
+from steady_ppl.gaussian.linearize import Linearization, ReferencePath, angles_on_a_circle, linearize
 from steady_ppl.kernels.jit import unchanged
 from steady_ppl.kernels.rows import on_all_rows
 from steady_ppl.model.handlers import KnownStart, Recording, Standardised, joined, normal_moments, parted, running
@@ -30,6 +30,9 @@ from steady_ppl.utils.angles import wrap_angles
 
 MAX_INCREASE = 10.0
 """Nats by which a step may leave a path worse off, see `_merit`: some such steps lead out of a bad place."""
+MAX_RETURN, MIN_SHARE = 0.5, 0.05
+"""Share of the last step that a step may undo, since a path that undoes more swings about its mode; and of a step that
+is gone at least."""
 REST_TOLERANCE = 0.05  # a trajectory is at rest where no noise moves by more, in standard deviations of its channel
 
 
@@ -46,7 +49,8 @@ def smooth(
 ) -> Lookahead:
     """Move a path to the mode of the posterior and look ahead along it.
 
-    Gauss and Newton's method. A step is halved while its end is worse by more than `MAX_INCREASE` nats, see `_merit`.
+    Gauss and Newton's method. A step is halved while its end is worse by more than `MAX_INCREASE` nats, see `_merit`,
+    and shortened where it goes back, see `MAX_RETURN`.
 
     Args:
         problem, observation_weight, kernels, angles: of `linearize`.
@@ -67,6 +71,7 @@ def smooth(
         accepted = path = ReferencePath(path.states, torch.where(data.transitions[..., None], path.noise, 0.0))
         penalty = torch.zeros_like(path.states, dtype=torch.float64)
         most = torch.full((len(data),), torch.inf, dtype=torch.float64, device=path.states.device)
+        last, share = most.new_zeros(()), torch.ones_like(most)
         for index in range(passes):
             ahead = look_ahead(along(path))
             density, defect = _merit(ahead)
@@ -77,11 +82,15 @@ def smooth(
                 break
             moved = ahead.path(data)
             if any_worse:
-                halfway = ReferencePath((accepted.states + path.states) / 2, (accepted.noise + path.noise) / 2)
-                moved = _either(worse, halfway, moved)
+                moved = _either(worse, _between(accepted, path, 0.5), moved)
             change = torch.nan_to_num((moved.noise - path.noise).abs(), nan=0.0).max()  # of what has not blown up
             if not bool(change > tolerance):
                 break
+            step = torch.where(worse[:, None], 0.0, _step(ahead, moved))
+            share = _share_of_step(step, last, share)
+            if bool((share < 1).any()):
+                moved = _between(path, moved, torch.where(worse, 1.0, share))
+            last = share[:, None] * step
             penalty = torch.where(worse[:, None], penalty, _penalty(ahead, moved))
             most = torch.where(worse, most, _cost(density, defect, penalty) + MAX_INCREASE)
             path = moved
@@ -98,16 +107,29 @@ def _merit(ahead: Lookahead) -> tuple[Tensor, Tensor]:
     """
     linear = ahead.linearization
     noise = linear.path.noise.double()
-    gram = linear.start_noise.mT @ linear.start_noise
-    ridge = 1e-12 * gram.diagonal(dim1=-2, dim2=-1) + 1e-24  # a known start has no noise
-    pull = linear.start_noise.mT @ linear.start_offset.unsqueeze(-1)
-    start, _ = torch.linalg.solve_ex(gram + torch.diag_embed(ridge), pull)
+    start = _start_noise(linear, linear.start_offset)
     begins = linear.start_offset - (linear.start_noise @ start).squeeze(-1)
     rows = linear.offset + (linear.noise @ noise.unsqueeze(-1)).squeeze(-1)
     seen = 0.5 * (linear.precision * linear.residual.square()).sum((0, 2)) - linear.log_scale.sum(0)
     drawn = 0.5 * (noise.square().sum((0, 2)) + start.square().sum((1, 2)))
     defect = wrap_angles(torch.cat([begins.unsqueeze(0), rows]), linear.angles).abs()
     return seen + drawn - ahead.log_likelihood, defect
+
+
+def _start_noise(linear: Linearization, offset: Tensor) -> Tensor:
+    """The standard normal noise of the start that moves it by an offset `(B, D)`, `(B, ·, 1)`; none of a known one."""
+    gram = linear.start_noise.mT @ linear.start_noise
+    ridge = 1e-12 * gram.diagonal(dim1=-2, dim2=-1) + 1e-24  # a known start has no noise
+    start, _ = torch.linalg.solve_ex(gram + torch.diag_embed(ridge), linear.start_noise.mT @ offset.unsqueeze(-1))
+    return start
+
+
+def _step(ahead: Lookahead, moved: ReferencePath) -> Tensor:
+    """How far a path is moved, in standard normal noise of its start and of its rows, `(B, ·)`."""
+    linear = ahead.linearization
+    start = _start_noise(linear, (moved.states[0] - linear.path.states[0]).double())
+    rows = (moved.noise - linear.path.noise).double()
+    return torch.cat([start.flatten(1), rows.transpose(0, 1).flatten(1)], -1)
 
 
 def _cost(density: Tensor, defect: Tensor, penalty: Tensor) -> Tensor:
@@ -124,6 +146,19 @@ def _penalty(ahead: Lookahead, moved: ReferencePath) -> Tensor:
     now = linear.measurement.mT @ (linear.precision.unsqueeze(-1) * apart)
     later = ahead.information.unsqueeze(-1) - ahead.precision @ away
     return 2 * (now + later).squeeze(-1).abs()
+
+
+def _share_of_step(step: Tensor, last: Tensor, share: Tensor) -> Tensor:
+    """How much of a step to go, `(B,)`, after the last one, of which a `share` was gone: all of it, or where it goes
+    back by more than `MAX_RETURN` as much as would have left nothing to go back (Barzilai and Borwein 1988)."""
+    bend = 1 / share - (step * last).sum(-1) / last.square().sum(-1).clamp(min=1e-30)
+    return torch.where(bend > 1 + MAX_RETURN, (1 / bend).clamp(min=MIN_SHARE), 1.0)
+
+
+def _between(one: ReferencePath, other: ReferencePath, share: Tensor | float) -> ReferencePath:
+    """A share, one or `(B,)`, of the way from one path to another."""
+    share = torch.as_tensor(share).to(one.states)[..., None]
+    return ReferencePath(torch.lerp(one.states, other.states, share), torch.lerp(one.noise, other.noise, share))
 
 
 def _either(which: Tensor, one: ReferencePath, other: ReferencePath) -> ReferencePath:

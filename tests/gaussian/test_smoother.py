@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 from examples import drives, example
@@ -138,3 +140,20 @@ def test_the_smoother_is_exact_from_any_path(cart, drive, known_start, request):
         excess = exact.latent_mean[2:] - cart.gain * push + cart.damping * velocity
         torch.testing.assert_close(noise[: rows - 1, trajectory, 0], excess / cart.noise, rtol=0, atol=1e-9)
         torch.testing.assert_close(ahead.log_likelihood[trajectory], exact.log_likelihood, rtol=0, atol=1e-10)
+
+
+class Squared(type(example("linear_gaussian"))):
+    """The cart, the square of whose position is measured."""
+
+    def observe(self, state):
+        pyro.sample("position", dist.Normal(state[..., 0].square(), self.measurement_sd))
+
+
+@pytest.mark.parametrize(("known_start", "below"), [(True, 0.8), (True, 1.2), (False, 0.1)])
+def test_a_path_that_swings_about_its_mode_comes_to_rest(known_start, below, even):
+    """Squares that are read below zero bend the posterior more than its linearization knows: whole steps go back by
+    more than they went, for ever."""
+    program = Squared().double().requires_grad_(False)
+    data = replace(even, measurements=torch.full_like(even.measurements, -below))
+    ahead = smooth(Problem(program, data, known_start), near_the_truth(program, even), passes=40, tolerance=1e-6)
+    torch.testing.assert_close(ahead.path(data).noise, ahead.linearization.path.noise, rtol=0, atol=1e-5)
