@@ -46,8 +46,9 @@ def environment(engine: Path, caches: Path) -> dict[str, str]:
     return {**own, **kept, "PYTHONPATH": str(engine), "MPLBACKEND": "Agg"}
 
 
-def measured(words: Sequence[str], folder: Path, environ: Mapping[str, str]) -> Record:
-    """Run Python with these words; seconds by the wall and of the processor, peak memory and what it says at first.
+def measured(words: Sequence[str], folder: Path, environ: Mapping[str, str], *, says: int = 160) -> Record:
+    """Run Python with these words; seconds by the wall and of the processor, peak memory in MiB, and what it `says`: so
+    many letters of it, errors and notes last.
 
     A process counts the memory of the one that starts it as well; this one loads no torch.
     """
@@ -68,7 +69,7 @@ def measured(words: Sequence[str], folder: Path, environ: Mapping[str, str]) -> 
     whole = {"wall": wall, "cpu": used.ru_utime + used.ru_stime, "peak": used.ru_maxrss / MEBI}
     if said.startswith('{"wall"'):  # the part that counts
         return whole | json.loads(said) | {"process": wall}
-    return whole | {"said": " ".join(said.split())[:160]}
+    return whole | {"said": " ".join(f"{said} {complaint}".split())[:says]}
 
 
 def work(
