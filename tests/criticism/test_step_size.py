@@ -282,10 +282,8 @@ def test_discover_goes_on_at_the_step_that_suits_and_names_no_effect(turning, tm
     assert record["substeps"] == found.after.program.substeps
 
 
-@pytest.mark.parametrize(
-    ("count", "excluded"),
-    [pytest.param(6, 0.55, marks=pytest.mark.slow), pytest.param(16, 0.582, marks=pytest.mark.exhaustive)],
-)
+@pytest.mark.exhaustive
+@pytest.mark.parametrize(("count", "excluded"), [(6, 0.55), (16, 0.582)])
 def test_sizes_are_those_of_the_step_at_which_they_rest(count: int, excluded: float) -> None:
     """A yaw drag of .6 1/s on a boat: one explicit step a row makes (1 − exp(−.06)) / .1 = .582 of it."""
     boat = example("gps_boat", torch.float32)

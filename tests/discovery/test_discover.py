@@ -362,7 +362,7 @@ def test_a_pendulum_lacks_friction_and_a_spring_and_says_so():
         assert abs(finding.coefficient[0] - planted) < 4 * finding.sd[0]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_unknown_start_gaps_and_unequal_lengths_do_not_mislead():
     train, valid = tables(with_effects(owner(), "quadratic_drag=0.06"), rows=91)
     found = st.discover(owner(), gappy(train, 1), gappy(valid, 2), simulations=SETS)

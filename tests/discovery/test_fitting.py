@@ -47,7 +47,7 @@ def test_a_fit_never_ends_below_where_it_began() -> None:
     assert all(torch.equal(value, before[name]) for name, value in program.named_parameters())
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_program_whose_linearised_likelihood_is_off_is_fitted_by_draws(monkeypatch) -> None:
     truth = example("paper.py:PaperTruck", torch.float32).with_effect("lever_arm", 0.4)
     truth.noise = torch.tensor([2.0, 1.0, 1.0])

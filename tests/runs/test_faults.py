@@ -86,7 +86,6 @@ COMMANDS = {
     "discover": ("discover", HOVERCRAFT, "train.csv", "--valid", "valid.csv", "--known-start", "--simulations", "50"),
     "fit": ("fit", HOVERCRAFT, "train.csv", "--known-start", "--steps", "20", "--set", "validate_every=5"),
 }
-TWENTY_SEARCHES = pytest.param("discover", marks=pytest.mark.exhaustive)
 KEPT = {"discover": ("discovery.json", "parameters.safetensors"), "fit": ("parameters.safetensors", "run.json")}
 
 
@@ -172,12 +171,11 @@ def same_results(desk: Path, name: str, out: str) -> None:
     assert not any((desk / out / left).exists() for left in ("journal", LOCK, "previous"))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "begun"),
     [
         pytest.param("discover", "journal/000004.safetensors", marks=pytest.mark.slow),
-        ("fit", "checkpoint.safetensors"),
+        pytest.param("fit", "checkpoint.safetensors", marks=pytest.mark.exhaustive),
     ],
 )
 def test_a_command_that_is_killed_goes_on_to_the_same_result(desk: Path, name: str, begun: str) -> None:
@@ -217,8 +215,8 @@ def test_a_search_on_a_disk_that_fills_up_goes_on_when_there_is_room(desk: Path,
     same_results(desk, "discover", out)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [name if name != "discover" else TWENTY_SEARCHES for name in COMMANDS])
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", COMMANDS)
 def test_twenty_random_kills_change_nothing(desk: Path, name: str) -> None:
     (first, whole), random, caught = undisturbed(desk, name), np.random.default_rng(20), []
     for trial in range(20):
