@@ -68,6 +68,7 @@ def test_a_stretch_that_nobody_measured_is_named_and_masked(work: Path, tmp_path
     assert not again.observed[10:26, 1].any() and int((~again.observed).sum()) == 16 * 4
 
 
+@pytest.mark.slow
 def test_wrong_readings_are_named_marked_and_masked(work: Path, tmp_path: Path, capsys):
     data = simulated(trajectories=3, rows=33)
     readings = data.measurements.clone()

@@ -39,6 +39,7 @@ def table(tmp_path_factory):
     return folder / "drives.csv"
 
 
+@pytest.mark.slow
 def test_a_model_is_fitted_searched_and_kept(table, tmp_path, capsys):
     run, figures, picture = tmp_path / "run", tmp_path / "found.json", tmp_path / "found.png"
     given = ("--known-start", "--simulations", 50, "--picture", picture)

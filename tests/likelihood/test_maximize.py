@@ -93,6 +93,7 @@ def test_fits_that_are_made_one_after_another_are_the_same_on_any_cores(count, m
             assert bool((value == other.state_dict()[name]).all())
 
 
+@pytest.mark.slow
 def test_a_fit_says_why_it_had_no_kernels_wherever_it_ran(monkeypatch):
     monkeypatch.setattr(rows, "close", lambda mine, theirs: False)
     programs = [example("linear_gaussian", torch.float32) for _ in range(2)]

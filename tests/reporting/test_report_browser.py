@@ -192,6 +192,7 @@ def test_a_system_of_one_state_is_drawn(tmp_path):
     assert "One state alone has no plane" in dom.split("<script")[0]
 
 
+@pytest.mark.slow
 def test_a_screenshot_is_kept(page):
     kept = Path(environ.get("OUT", Path(__file__).parents[2] / "out")) / "report.png"
     kept.parent.mkdir(parents=True, exist_ok=True)
