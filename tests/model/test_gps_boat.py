@@ -22,7 +22,7 @@ def test_its_sensors_have_biases_of_their_own_and_nothing_of_bearings():
     assert {f"sensor_bias:{name}" for name in ("gps_x", "gps_y", "compass")} <= listed
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_all_that_brakes_a_boat_is_named_from_gps_and_compass_and_nothing_else_is_left():
     truth = st.load_program(f"{MODELS / 'gps_boat.py'}:GpsBoatTruth")
     train, valid = (st.simulate(truth, 8, seed=seed).without_truth() for seed in (1, 2))
