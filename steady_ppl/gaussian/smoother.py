@@ -30,9 +30,8 @@ from steady_ppl.utils.angles import wrap_angles
 
 MAX_INCREASE = 10.0
 """Nats by which a step may leave a path worse off, see `_merit`: some such steps lead out of a bad place."""
-MAX_RETURN, MIN_SHARE = 0.5, 0.05
-"""Share of the last step that a step may undo, since a path that undoes more swings about its mode; and of a step that
-is gone at least."""
+MAX_RETURN = 0.5  # share of a whole step that the next may undo: where it undoes more, a path swings about its mode
+MIN_SHARE = 0.05  # of a step, to which it is shortened at most
 REST_TOLERANCE = 0.05  # a trajectory is at rest where no noise moves by more, in standard deviations of its channel
 
 
@@ -50,7 +49,7 @@ def smooth(
     """Move a path to the mode of the posterior and look ahead along it.
 
     Gauss and Newton's method. A step is halved while its end is worse by more than `MAX_INCREASE` nats, see `_merit`,
-    and shortened where it goes back, see `MAX_RETURN`.
+    and shortened where the next would undo it, see `MAX_RETURN`.
 
     Args:
         problem, observation_weight, kernels, angles: of `linearize`.
@@ -86,12 +85,12 @@ def smooth(
             change = torch.nan_to_num((moved.noise - path.noise).abs(), nan=0.0).max()  # of what has not blown up
             if not bool(change > tolerance):
                 break
-            step = torch.where(worse[:, None], 0.0, _step(ahead, moved))
-            share = _share_of_step(step, last, share)
-            if bool((share < 1).any()):
-                moved = _between(path, moved, torch.where(worse, 1.0, share))
-            last = share[:, None] * step
             penalty = torch.where(worse[:, None], penalty, _penalty(ahead, moved))
+            step = _step(ahead, moved)
+            share = torch.where(worse, 1.0, _share_of_step(step, last, share))  # what is halved begins anew
+            if bool((share < 1).any()):
+                moved = _between(path, moved, share)
+            last = torch.where(worse[:, None], 0.0, share[:, None] * step)
             most = torch.where(worse, most, _cost(density, defect, penalty) + MAX_INCREASE)
             path = moved
         return look_ahead(along(accepted)) if any_worse else ahead
@@ -149,8 +148,11 @@ def _penalty(ahead: Lookahead, moved: ReferencePath) -> Tensor:
 
 
 def _share_of_step(step: Tensor, last: Tensor, share: Tensor) -> Tensor:
-    """How much of a step to go, `(B,)`, after the last one, of which a `share` was gone: all of it, or where it goes
-    back by more than `MAX_RETURN` as much as would have left nothing to go back (Barzilai and Borwein 1988)."""
+    """The share of a step to go, `(B,)`, after the last one, of which a `share` was gone.
+
+    Where whole steps would undo more than `MAX_RETURN` of each other, it is the share that leaves nothing to undo, by
+    the secant of the two (Barzilai and Borwein 1988); else it is one.
+    """
     bend = 1 / share - (step * last).sum(-1) / last.square().sum(-1).clamp(min=1e-30)
     return torch.where(bend > 1 + MAX_RETURN, (1 / bend).clamp(min=MIN_SHARE), 1.0)
 

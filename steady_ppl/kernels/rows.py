@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from steady_ppl.errors import ProgramError
 from steady_ppl.kernels.chains import Chain, discard_chain, run_chain
 from steady_ppl.kernels.codegen import SIMD_LANES
-from steady_ppl.kernels.jit import Method, Number, close, compiled, discard
+from steady_ppl.kernels.jit import Method, Number, close, compiled, discard, diverged
 from steady_ppl.utils.context import bound
 
 COMPARED_EVERY = 16  # of a program's runs on all rows; the first two are compared as well
@@ -191,12 +191,15 @@ def _computed(
 def _differs(
     program: nn.Module, run: Hashable, function: Callable[..., Tensor], arguments: Mapping[str, Tensor], values: Tensor
 ) -> bool:
-    """Whether a function's values differ from torch's, as far as this run of its is compared."""
+    """Whether a function's values differ from torch's, as far as this run of its is compared. A run whose rows have all
+    diverged does not count."""
     runs = _RUNS.setdefault(program, Counter())
-    runs[run] += 1
-    if runs[run] > 2 and runs[run] % COMPARED_EVERY != 0:
+    if runs[run] >= 2 and (runs[run] + 1) % COMPARED_EVERY != 0:
+        runs[run] += 1
         return False
-    return not close(_subsample(values), function(*(_subsample(value) for value in arguments.values())))
+    mine, theirs = _subsample(values), function(*(_subsample(value) for value in arguments.values()))
+    runs[run] += not bool(diverged(mine, theirs).all())
+    return not close(mine, theirs)
 
 
 def _in_steps(

@@ -158,8 +158,8 @@ class CompiledFilter:
         flat = [sites[site].expand(*size, *sites[site].shape[2:]).reshape(*size, -1) for site in self.methods.sizes]
         future = proposal.future(moved, *(at_row(one, seen) for one in proposal.rows))
         density = torch.stack([self.plain.log_density(seen, moved).expand(size), future.float()], -1)
-        pairs = [(moved, plain), (values, torch.cat(flat, -1)), (ratio, expected.float())]
-        pairs += list(zip(self.log_density(seen, moved).unbind(-1), density.unbind(-1), strict=True))
+        pairs = [(moved, plain), (values, torch.cat(flat, -1)), (ratio.unsqueeze(-1), expected.float().unsqueeze(-1))]
+        pairs += list(zip(self.log_density(seen, moved).split(1, -1), density.split(1, -1), strict=True))
         return all(close(mine, theirs.expand_as(mine)) for mine, theirs in pairs)
 
 

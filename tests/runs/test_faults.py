@@ -194,7 +194,7 @@ def test_a_command_that_is_killed_goes_on_to_the_same_result(desk: Path, name: s
 @pytest.mark.parametrize(
     ("room", "some"),
     [  # bytes: less than the largest of the pieces, and less than the first
-        pytest.param(20_000, True, marks=pytest.mark.slow, id="some"),
+        pytest.param(20_000, True, id="some"),
         pytest.param(4_000, False, id="none"),
     ],
 )
