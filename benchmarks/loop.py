@@ -46,9 +46,10 @@ def environment(engine: Path, caches: Path) -> dict[str, str]:
     return {**own, **kept, "PYTHONPATH": str(engine), "MPLBACKEND": "Agg"}
 
 
-def measured(words: Sequence[str], folder: Path, environ: Mapping[str, str], *, says: int = 160) -> Record:
-    """Run Python with these words; seconds by the wall and of the processor, peak memory in MiB, and what it `says`: so
-    many letters of it, errors and notes last.
+def measured(words: Sequence[str], folder: Path, environ: Mapping[str, str], *, whole_output: bool = False) -> Record:
+    """Run Python with these words: seconds by the wall and of the processor, peak memory in MiB, what it says at first.
+
+    With `whole_output` it is all that it says, and `noted` has what came on stderr.
 
     A process counts the memory of the one that starts it as well; this one loads no torch.
     """
@@ -69,7 +70,9 @@ def measured(words: Sequence[str], folder: Path, environ: Mapping[str, str], *, 
     whole = {"wall": wall, "cpu": used.ru_utime + used.ru_stime, "peak": used.ru_maxrss / MEBI}
     if said.startswith('{"wall"'):  # the part that counts
         return whole | json.loads(said) | {"process": wall}
-    return whole | {"said": " ".join(f"{said} {complaint}".split())[:says]}
+    if whole_output:
+        return whole | {"said": said, "noted": complaint}
+    return whole | {"said": " ".join(said.split())[:160]}
 
 
 def work(
