@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pyro
 import pyro.distributions as dist
 import pytest
 import torch
-from _pytest.mark import ParameterSet
 from torch import Tensor
 
 from steady_ppl import Trajectories, load_program, seeded, simulate, stack
@@ -27,7 +27,7 @@ def example(name: str, dtype: torch.dtype = torch.float64) -> Program:
     return load_program(f"{source}:{program}" if program else source).to(dtype)
 
 
-def each_effect_once_slow(pairs: Sequence[tuple[str, str]]) -> list[ParameterSet]:
+def each_effect_once_slow(pairs: Sequence[tuple[str, str]]) -> list[Any]:
     """Programs and effects as parameters: slow with an effect's first program, exhaustive with the others."""
     first = {effect: name for name, effect in reversed(pairs)}
     marks = (pytest.mark.slow if first[effect] == name else pytest.mark.exhaustive for name, effect in pairs)

@@ -138,7 +138,7 @@ def test_a_sensor_declared_too_coarse_takes_no_effects_place():
     assert [one["correction"] for one in found.figures["effects"]] == [False, True]
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_two_effects_are_both_found():
     found = discovered("linear_drag=0.12", "landmark_bias:2=0.08")
     assert {finding.aliases[0] for finding in found.findings} >= {"landmark_bias:bearing_2"}

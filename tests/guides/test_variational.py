@@ -98,8 +98,8 @@ def pushed(cart, rows: int):
 LONG, LONGER = pytest.mark.slow, pytest.mark.exhaustive
 NEAR = [
     pytest.param(12, "network", 0.5, marks=LONGER),
-    pytest.param(12, "network, not centred", 0.1, marks=LONGER),
-    (12, "mean-field", 1.5),
+    pytest.param(12, "network, not centred", 0.1, marks=LONG),
+    pytest.param(12, "mean-field", 1.5, marks=LONGER),
     pytest.param(101, "network", 8.0, marks=LONGER),
     pytest.param(101, "network, not centred", 16.0, marks=LONGER),
     pytest.param(101, "mean-field", 50.0, marks=LONGER),

@@ -71,7 +71,7 @@ def test_fit_tv_learns_no_map_that_only_true_starts_would_fix() -> None:
     fit(type("Surveyed", (UnknownMap, vehicle), {"surveyed": (0, 2)})(), table, steps=1, progress=False)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_a_wrong_map_is_mended_from_bearings_and_known_starts() -> None:
     program = load_program(UNKNOWN)
     truth = load_program(HOVERCRAFT)

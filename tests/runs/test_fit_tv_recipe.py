@@ -31,7 +31,7 @@ def test_fit_tv_differentiates_what_it_finds() -> None:
     assert float(away[..., :2].abs().median()) < 0.02 and float(away[..., 3:5].abs().median()) < 0.1
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_fit_tv_bridges_gaps_and_uneven_steps() -> None:
     """Poses of a steady motion, at uneven times, some of them missing: its velocity everywhere."""
     program = example("hovercraft")

@@ -309,7 +309,7 @@ def other_version(folder: Path) -> Path:
     return other.parent
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_workers_that_would_find_something_else_are_refused(tmp_path: Path, dask: Dask, capsys, monkeypatch):
     file, out = study(tmp_path), tmp_path / "out"
     dask.scheduler()
