@@ -70,6 +70,21 @@ def test_every_trajectory_may_have_an_observation_weight_of_its_own():
     torch.testing.assert_close(plain.log_density(2, states), weights * once)
 
 
+@pytest.mark.parametrize("error", [0.0, 1.0])
+def test_a_trajectory_without_a_density_hides_no_error_of_the_others(error, monkeypatch):
+    program = single("hovercraft")
+    torch.manual_seed(1)
+    machine, _, states = both(program, drives(program, 3, 6))
+    impossible = torch.tensor([-math.inf, 0.0, 0.0])
+    for owner, away in (
+        (CompiledFilter, torch.stack([impossible + error, torch.zeros(3)], -1)),
+        (Stepping, impossible),
+    ):
+        own = owner.log_density
+        monkeypatch.setattr(owner, "log_density", lambda self, *given, own=own, away=away: own(self, *given) + away)
+    assert machine.agrees(states) == (error == 0)
+
+
 def test_parameters_that_move_are_read_afresh():
     program = single("hovercraft.py:HovercraftTruth")
     data = drives(program, 2, 5)
