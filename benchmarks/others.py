@@ -30,7 +30,7 @@ from resumable import Record, digest, run
 RESULT = Path(__file__).parent / "results" / "others.jsonl"
 MAX_CPU, MAX_MEMORY = 300.0, 2048.0  # seconds and MiB that MRCLAM's search may take
 MAX_SD = 5.0  # kg, of EMPS's mass: less says nothing
-PROGRESS = re.compile(r"steady: [^…]*… [\w ]+ gone by(, about [\w ]+ (left|to end))?\s*")
+PROGRESS = re.compile(r"steady: [^…]*… [\w ]+ gone by(, about (to end|[\w ]+ left))?\s*")
 MASS = """
 import sys
 from steady_ppl import Fit, for_program, read_table, seeded
@@ -167,7 +167,7 @@ CASES = {
     "stiff": Case({"fit": "fit stiff.py drives.csv --out {out}/fit"}, _says("the model itself diverges at this step")),
     "sentinel": Case(FIT_CART, _says("-9999")),
     "epoch_ns": Case(FIT_CART, _says("nanoseconds")),
-    "header_blanks": Case(FIT_CART, _says("LinearGaussian(")),
+    "header_blanks": Case(FIT_CART, _says("Cart(")),
     "units_row": Case(FIT_CART, _says("row of units")),
     "degrees": Case({"fit": f"fit {ROOT}/models/gps_boat.py drives.csv --out {{out}}/fit"}, _says("degrees")),
 }
