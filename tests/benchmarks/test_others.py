@@ -72,7 +72,8 @@ def test_a_vehicle_that_lacks_nothing_has_no_curve_either() -> None:
 
 
 def test_progress_is_no_answer() -> None:
-    said = "steady: scoring steps … 2 min gone by, about 4 min left steady: finding paths … 14 s gone by, about to end steady: done"
+    said = "steady: scoring steps … 2 min gone by, about 4 min left steady: finding paths … 14 s gone by, about to end"
+    said += " steady: drawing states … 20 s gone by steady: done"
     assert others.PROGRESS.sub("", said) == "steady: done"
 
 
