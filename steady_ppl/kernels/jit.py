@@ -314,10 +314,11 @@ def _names_of(kind: type[nn.Module]) -> list[tuple[int, list[str]]]:
 
 
 def diverged(mine: Tensor, theirs: Tensor) -> Tensor:
-    """Rows, `(..., 1)` bool, that tell nothing of a kernel, for some component overflows in one order of operations and
-    not in another."""
+    """Rows, `(..., 1)` bool, that tell nothing of a kernel: some component overflows both ways, and may do so otherwise
+    in another order of operations."""
     large = torch.finfo(theirs.dtype).max ** 0.5
-    return ((theirs.abs() > large) | (theirs.isnan() & (mine.abs() > large))).any(-1, keepdim=True)
+    both = ~(mine.abs() <= large) & ~(theirs.abs() <= large)  # also no number
+    return (both & ~(mine.isnan() & theirs.isnan())).any(-1, keepdim=True)
 
 
 def close(mine: Tensor, theirs: Tensor) -> bool:
@@ -329,6 +330,7 @@ def close(mine: Tensor, theirs: Tensor) -> bool:
     mine, theirs = mine[tells], theirs[tells]
     if not mine.numel():
         return True
-    scale = torch.where(theirs.isnan(), 0.0, theirs).abs().amax(0)
-    same = (mine - theirs).abs() <= 1e-4 * (theirs.abs() + scale) + 1e-7
+    finite = torch.isfinite(theirs)
+    scale = torch.where(finite, theirs, 0.0).abs().amax(0)
+    same = finite & ((mine - theirs).abs() <= 1e-4 * (theirs.abs() + scale) + 1e-7)
     return float((same | (mine.isnan() & theirs.isnan())).float().mean()) > 0.98

@@ -245,6 +245,8 @@ def test_numbers_agree_in_the_scale_of_their_component():
     assert close(small, small) and close(small * (1 + 1e-5), small) and not close(small, other)
     missing = torch.tensor([[math.nan, 1.0], [2e-5, -math.inf]])
     assert close(missing, missing.clone()) and not close(small, missing)
+    impossible = torch.tensor([[1e-5, -math.inf], [2e-5, 2.0]])
+    assert not close(small, impossible) and not close(impossible, small)
     large = torch.tensor([[1e34, 1e11]] * 60 + [[1.0, 2.0]] * 8)
     overflown = torch.tensor([[math.nan, 3.0]] * 60 + [[1.0, 2.0]] * 8)
     assert close(overflown, large) and close(large, overflown)
