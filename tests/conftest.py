@@ -18,23 +18,6 @@ settings.register_profile("long", settings.get_profile("repeated"), derandomize=
 settings.load_profile("repeated")
 
 TOLD_AT_ONCE = 20.0  # seconds of a test or of what it needs
-ONE_JOB = f"""
-title = "One job"
-seeds = [1]
-known_start = true
-[data]
-simulate = "{HOVERCRAFT}"
-train = 2
-valid = 2
-test = 2
-[[method]]
-name = "as declared"
-program = "{HOVERCRAFT}"
-recipe = "hand"
-[picture]
-x = "data.train"
-y = ["log_likelihood"]
-"""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -70,15 +53,13 @@ def _kernels_of_the_tests(tmp_path_factory: pytest.TempPathFactory):
 
 @pytest.fixture(scope="session")
 def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Tables, a run of each of two recipes, and a study of one job."""
+    """Tables, and a run of each of two recipes."""
     folder = tmp_path_factory.mktemp("work")
     written(folder / "train.csv")
     written(folder / "valid.parquet", simulated(trajectories=2, rows=33, seed=1))
     written(folder / "test.csv", simulated(trajectories=5, rows=13, seed=2))
     assert steady("fit", HOVERCRAFT, folder / "train.csv", "--recipe", "hand", "--out", folder / "hand") == 0
     assert steady("fit", HOVERCRAFT, folder / "train.csv", "--out", folder / "steady", *FEW) == 0
-    (folder / "study.toml").write_text(ONE_JOB)
-    assert steady("study", folder / "study.toml", "--workers", 1, "--out", folder / "study") == 0
     return folder
 
 

@@ -45,6 +45,31 @@ WRITING = {
     "report": ("report", "{work}/hand", "{work}/valid.parquet", "--simulations", 20, "--out", "{out}/report.html"),
 }
 
+ONE_JOB = f"""
+title = "One job"
+seeds = [1]
+known_start = true
+[data]
+simulate = "{HOVERCRAFT}"
+train = 2
+valid = 2
+test = 2
+[[method]]
+name = "as declared"
+program = "{HOVERCRAFT}"
+recipe = "hand"
+[picture]
+x = "data.train"
+y = ["log_likelihood"]
+"""
+
+
+@pytest.fixture(scope="module")
+def studied(work: Path) -> None:
+    """A study of one job beside the tables and runs."""
+    (work / "study.toml").write_text(ONE_JOB)
+    assert steady("study", work / "study.toml", "--workers", 1, "--out", work / "study") == 0
+
 
 @contextmanager
 def full_beyond(size: int) -> Iterator[None]:
@@ -62,6 +87,7 @@ def words(command: tuple, work: Path, out: Path) -> list[object]:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("studied")
 @pytest.mark.parametrize(
     "size",
     [pytest.param(0, id="nothing fits", marks=pytest.mark.exhaustive), pytest.param(2000, id="two kilobytes fit")],
@@ -127,6 +153,7 @@ def locked(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("studied")
 @pytest.mark.parametrize("name", [name for name in WRITING if name != "add"])
 def test_a_folder_that_cannot_be_written_is_one_line(name: str, work: Path, locked: Path, capsys) -> None:
     capsys.readouterr()
