@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from small import steady
 from inference import steady as recipe
 from steady_ppl import Fit, Joint, UsageError, load_program, simulate
 from steady_ppl.effects import attached, chosen_variant, record
+from steady_ppl.effects.attach import SD_OF_LOG_FACTOR
 from steady_ppl.guides.base import true_paths
 from steady_ppl.model.handlers import Recording, Replaying
 from steady_ppl.model.substeps import acting_controls, sample_row
@@ -93,6 +95,15 @@ def test_the_prior_of_a_coefficient_counts_in_the_joint_density() -> None:
 
     expected = torch.distributions.Cauchy(0.0, 1.0).log_prob(torch.tensor([0.0, 0.7]))
     torch.testing.assert_close(torch.stack([density(0.0), density(0.7)]), expected.double())
+
+
+def test_a_factor_is_likeliest_at_one_and_as_likely_at_ten_as_at_a_tenth() -> None:
+    program = short("hovercraft").with_effect("process_noise:yaw")
+    (prior,) = (program.priors[name] for name in program.priors)
+    density = prior.log_prob(torch.tensor([0.1, 0.9, 1.0, 1.1, 10.0]))
+    assert int(density.argmax()) == 2
+    torch.testing.assert_close(density[0], density[4])
+    assert density[2] - density[0] == pytest.approx(math.log(10) ** 2 / (2 * SD_OF_LOG_FACTOR**2), abs=1e-5)
 
 
 def test_a_class_lists_its_effects(tmp_path: Path) -> None:
