@@ -18,6 +18,7 @@ from steady_ppl.discovery.candidates import (
     CLEAR_GAIN,
     NEAR_FAMILY_LEVEL,
     TIE_NATS,
+    UNEXPLAINED,
     Candidate,
     Screening,
     at_its_best_place,
@@ -364,7 +365,7 @@ def _with_places_of(final: Refit, found: Sequence[Found]) -> list[Found]:
 
 def _refits(now: Refit, screening: Screening, first: bool, candidates: list[Candidate]) -> list[Candidate]:
     """Fits of what the tests point at; each is added to `candidates` as it ends, whatever happens to the next."""
-    chosen = leaders(screening.tests, first)
+    chosen = sorted(leaders(screening.tests, first), key=lambda tested: tested.variant.effect.form == UNEXPLAINED)
     with stages(*((f"fitting with {tested.variant.label}", 1) for tested in chosen)) as begin:
         for fit in attempts(now, chosen, screening):
             begin()
@@ -376,8 +377,9 @@ def _refits(now: Refit, screening: Screening, first: bool, candidates: list[Cand
 
 
 def _threshold(candidates: Sequence[Candidate]) -> Threshold:
-    """What the next candidate must reach on the first fold, given those that were fitted."""
-    fits = [c.refit for c in candidates if isinstance(c.refit, Refit)]
+    """What the next candidate must reach on the first fold, given those that were fitted. What loses on the drives
+    kept from it, or imitates whatever is missing, says nothing of what can be reached."""
+    fits = [c.refit for c in candidates if isinstance(c.refit, Refit) and c.is_explanation and c.total > 0]
     drives = [float(fit.maxima[0].log_likelihood.sum()) for fit in fits]
     held_out = [float(fit.held_out_alone[: len(fit.folds[0].held_out)].sum()) for fit in fits]
     return Threshold(max(drives, default=-math.inf) - MAX_NATS_BEHIND, max(held_out, default=-math.inf) - TIE_NATS)

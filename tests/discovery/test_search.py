@@ -80,6 +80,34 @@ def test_coloured_noise_enters_where_nothing_else_is_significant(monkeypatch, to
     assert [one.candidate.name for one in found.found] == ([expected] if expected else [])
 
 
+def test_what_loses_or_imitates_sets_no_bar_for_what_is_fitted_after_it(monkeypatch):
+    """A coloured noise that explained the drives it was fitted to had all physical effects given up after one fold."""
+
+    def fitted(name, drives, held_out, explains=True):
+        one = Chosen(name, held_out, explains)
+        path, alone = SimpleNamespace(log_likelihood=torch.tensor([drives])), torch.tensor([held_out])
+        for attribute, value in (
+            ("maxima", [path]),
+            ("held_out_alone", alone),
+            ("folds", [SimpleNamespace(held_out=[0])]),
+        ):
+            object.__setattr__(one.refit, attribute, value)
+        return one
+
+    drag, broken = fitted("drag", 100.0, 90.0), fitted("broken", 1e6, -1e6)
+    coloured = fitted("coloured", 900.0, 800.0, explains=False)
+    bar = search._threshold([coloured, broken, drag])
+    assert bar == search._threshold([drag]) and bar.drives == pytest.approx(100.0 - search.MAX_NATS_BEHIND)
+    seen, forms = [], {"coloured": "colour", "drag": "push"}
+    tested = [
+        SimpleNamespace(variant=SimpleNamespace(label=n, effect=SimpleNamespace(form=f))) for n, f in forms.items()
+    ]
+    monkeypatch.setattr(search, "leaders", lambda tests, first: tested)
+    monkeypatch.setattr(search, "attempts", lambda now, chosen, screening: seen.extend(chosen) or [])
+    assert search._refits(None, SimpleNamespace(tests=None), True, []) == []
+    assert [one.variant.label for one in seen] == ["drag", "coloured"]
+
+
 def test_a_knee_is_moved_beside_what_is_added_after_it(monkeypatch):
     knee, moved, later = (Chosen(name, 10.0, profiled={name: 1.0}) for name in ("knee", "moved", "later"))
     knee.tested = SimpleNamespace(at=lambda variant: variant)
