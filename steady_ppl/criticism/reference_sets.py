@@ -95,7 +95,7 @@ def _block(problem: Problem, starts: Tensor, channels: int, horizons: Sequence[i
             return {}, {}
         kept = whole.repeat_interleave(len(problem.data)).nonzero().flatten()
         copies, sets = copies.subset(kept), int(whole.sum())
-        tracked = track(copies, ReferencePath(near.states[:, kept], near.noise[:, kept]), passes=1)
+        tracked = track(copies, near.subset(kept), passes=1)
     again = copies.data
     simulated = predict(program, again, tracked, horizons, bands=[1])
     errors, scores = residuals(program, again, tracked, simulated[1], sets), directions(program, again, tracked)
@@ -116,9 +116,8 @@ def _tracked(problem: Problem, truth: ReferencePath) -> tuple[ReferencePath, Tra
     far = ~((tracked.noise - near.noise).abs().amax((0, 2)) <= REST_TOLERANCE) | _starts_elsewhere(tracked, near)
     if bool(far.any()):
         index = far.nonzero().flatten()
-        begin = ReferencePath(truth.states[:, index], truth.noise[:, index])
-        path = smooth(problem.subset(index), begin, passes=MAX_LINEARISATIONS).linearization.path
-        near.states[:, index], near.noise[:, index] = path.states, path.noise
+        path = smooth(problem.subset(index), truth.subset(index), passes=MAX_LINEARISATIONS).linearization.path
+        near = near.with_subset(index, path)
         tracked = track(problem, near, passes=1)
     return near, tracked
 

@@ -15,7 +15,6 @@ from steady_ppl.effects import Variant
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.lanes import LANES
-from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import simulate_again
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood.parameters import Element
@@ -271,7 +270,7 @@ def simulate_scores(
 
     def score(index: Tensor) -> Output:
         part = replace(problem, data=drives.subset(index))
-        ahead = smooth(part, ReferencePath(path.states[:, index], path.noise[:, index]), passes=2)
+        ahead = smooth(part, path.subset(index), passes=2)
         own, found = scores_along(part, ahead, parts, columns)
         each = [
             own.new_full((len(index), column.size), math.nan) if isinstance(one, str) else one

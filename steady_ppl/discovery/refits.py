@@ -18,7 +18,7 @@ from steady_ppl.effects import Variant, attach, attached, coefficient
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path
-from steady_ppl.likelihood.maximize import Maximum, fit_by_likelihood, maximise, refit_outliers
+from steady_ppl.likelihood.maximize import Maximum, completed, fit_by_likelihood, maximise, refit_outliers
 from steady_ppl.likelihood.parameters import Element, elements, values_of
 from steady_ppl.likelihood.scores import widens
 from steady_ppl.model.problem import Problem
@@ -255,7 +255,7 @@ def begin(base: Refit, attempts: Sequence[Attempt | str], threshold: Threshold =
     folds = [base.folds[0].wide(one.programs[0]) for one in able]
     problems = [fold.fitting(one.programs[0]) for fold, one in zip(folds, able, strict=True)]
     floors = [_floor(base.maxima[0], threshold)] * len(able)
-    known = [one.information for one in able]
+    known = [_guess(base.maxima[0], one.information) for one in able]
     fits = iter(base.fitting.fit_each(problems, [fold.path for fold in folds], known, floors))
     return [replace(one, first=next(fits)) if isinstance(one, Attempt) else one for one in attempts]
 
@@ -265,7 +265,11 @@ def finish(base: Refit, attempt: Attempt | str, threshold: Threshold = NO_THRESH
     if isinstance(attempt, str):
         return attempt
     least = [_floor(base.maxima[0], threshold), *(_floor(maximum) for maximum in base.maxima[1:])]
-    given = (attempt.programs, base.folds, [None] * len(attempt.programs), attempt.information)
+    shares = [
+        None if (one := attempt.information) is None else fold.information(one, base.folds[0]) for fold in base.folds
+    ]
+    guesses = [_guess(maximum, share) for maximum, share in zip(base.maxima, shares, strict=True)]
+    given = (attempt.programs, base.folds, [None] * len(attempt.programs), guesses)
     try:
         return _refit(*given, least, threshold, base.unwidened, base.fitting, attempt.first)
     except Exception as error:  # also of the program's own code, on parameters that nobody tried before
@@ -338,7 +342,7 @@ def _refit(
     programs: list[Program],
     folds: list[Fold],
     maxima: Sequence[Maximum | None] = (None, None),
-    information: Tensor | None = None,
+    guesses: Sequence[Tensor | None] = (None, None),
     least: Sequence[float] = (-math.inf, -math.inf),
     threshold: Threshold = NO_THRESHOLD,
     unwidened: Program | None = None,
@@ -347,7 +351,6 @@ def _refit(
 ) -> Refit:
     fitted, found, held_out, judged_folds = list[Program](), list[Maximum](), list[Tensor](), list[Fold]()
     folds = [fold.wide(program) for program, fold in zip(programs, folds, strict=True)]
-    guesses = [fold.information(information, folds[0]) for fold in folds]
     fits: Sequence[Fit | None] = [first, *[None] * (len(folds) - 1)]
     if unwidened is None and threshold == NO_THRESHOLD and first is None and not any(maxima):  # all are made
         fits = _fits(fitting, programs, folds, guesses, least)
@@ -399,6 +402,14 @@ def _fit_anew(problem: Problem, floor: float) -> tuple[Program, Maximum] | None:
     with suppress(FilterError):
         return problem.program, maximise(problem, hopeless=floor)
     return None
+
+
+def _guess(without: Maximum, with_effect: Tensor | None) -> Tensor | None:
+    """The information on a fold's drives, from that of the fit without the effect and, where it is known, that of all
+    numbers by what the program would do."""
+    if not len(without.information):
+        return with_effect
+    return without.information if with_effect is None else completed(without.information, with_effect)
 
 
 def _information(maximum: Maximum, parts: Sequence[Element]) -> Tensor | None:

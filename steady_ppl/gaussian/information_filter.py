@@ -121,7 +121,16 @@ class Lookahead:
 
     def path(self, data: Trajectories) -> ReferencePath:
         """The posterior mean as a path to linearise along."""
-        return ReferencePath.of_means(*self.means(), data)
+        has_tails = self.linearization.path.variance is not None
+        return ReferencePath.of_means(*self.means(), data, self.sensed_variance() if has_tails else None)
+
+    def sensed_variance(self) -> Tensor:
+        """Posterior variance of what each measurement sees, to first order, `(T + 1, B, K)`; zero if missing."""
+        seen = self.linearization.precision > 0
+        by_state, states = self.linearization.measurement[seen], self._tensor(self.covariances_in_lanes()[0])
+        rows, drives, _ = seen.nonzero(as_tuple=True)
+        across = (states[rows, drives] @ by_state.unsqueeze(-1)).squeeze(-1)
+        return torch.zeros_like(self.linearization.precision).masked_scatter(seen, (across * by_state).sum(-1))
 
     def means_in_lanes(self) -> tuple[Array, Array]:
         """The means, of the states less the path's: `(T + 1, blocks, D, 1, LANES)`; and `(T, blocks, C, 1, LANES)`."""

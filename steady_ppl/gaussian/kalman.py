@@ -52,7 +52,7 @@ class Tracked:
 
     def path(self, data: Trajectories) -> ReferencePath:
         """The posterior mean as a path to linearise along."""
-        return ReferencePath.of_means(self.smoothed, self.noise, data)
+        return ReferencePath.of_means(self.smoothed, self.noise, data, self.linearization.path.variance)
 
     def variances_ahead(self, horizon: int) -> Tensor:
         """Variances of measurements predicted `horizon` rows ahead, `(T + 1 − horizon, B, K)`; NaN where missing."""

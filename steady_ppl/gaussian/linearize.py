@@ -9,6 +9,7 @@ residual r(x) for every measurement. Around a path of states x̄ and noise ε̄,
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -23,11 +24,14 @@ from steady_ppl.kernels.codegen import SIMD_LANES
 from steady_ppl.kernels.rows import ROWS_WORTH_COMPILING, derivatives, on_all_rows
 from steady_ppl.model.handlers import (
     NEEDS_NORMAL,
+    AtMean,
     Observing,
     Recording,
     Standardised,
     draw_starts,
+    is_heavy_tailed,
     joined,
+    parted,
     residual,
     running,
     tangent_normal,
@@ -45,15 +49,47 @@ class ReferencePath:
 
     states: Tensor  # (T + 1, B, D)
     noise: Tensor  # (T, B, C), in standard deviations of the channels
+    variance: Tensor | None = None
+    """Of what each measurement sees, given all measurements, (T + 1, B, K); None of programs without Student t."""
 
     @classmethod
-    def of_means(cls, states: Tensor, noise: Tensor, data: Trajectories) -> ReferencePath:
+    def of_means(
+        cls, states: Tensor, noise: Tensor, data: Trajectories, variance: Tensor | None = None
+    ) -> ReferencePath:
         """Posterior means as a path to linearise along, the padding filled with the first row."""
         kind = data.controls.dtype
         return cls(
             states=torch.where(data.rows[..., None], states, states[:1]).to(kind),
             noise=torch.where(data.transitions[..., None], noise, 0.0).to(kind),
+            variance=None if variance is None else variance.to(kind),
         )
+
+    def subset(self, index: Tensor | Sequence[int]) -> ReferencePath:
+        """Of some trajectories."""
+        variance = None if self.variance is None else self.variance[:, index]
+        return ReferencePath(self.states[:, index], self.noise[:, index], variance)
+
+    def with_subset(self, index: Tensor | Sequence[int], other: ReferencePath) -> ReferencePath:
+        """With some trajectories of another path, `other` being those alone."""
+
+        def replaced(values: Tensor, others: Tensor) -> Tensor:
+            values = values.clone()
+            values[:, index] = others.to(values)
+            return values
+
+        variance = None
+        if self.variance is not None and other.variance is not None:
+            variance = replaced(self.variance, other.variance)
+        return ReferencePath(replaced(self.states, other.states), replaced(self.noise, other.noise), variance)
+
+    def for_sensors(self, program: Program) -> ReferencePath:
+        """With variances, zero if unknown, for a program with Student t, and without for any other."""
+        if not has_heavy_tails(program, self.states[:1, :1]):
+            return replace(self, variance=None)
+        if self.variance is not None:
+            return self
+        zero = self.states.new_zeros((*self.states.shape[:2], len(program.measurements)))
+        return replace(self, variance=zero)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +171,9 @@ def linearize(
     start_offset, start_noise = (part.double() for part in _start(problem, states[0]))
     start_turn = torch.zeros_like(start_offset)
     start_turn[:, angles] = (start_offset - wrap(start_offset))[:, angles]
-    seen = linearize_sensors(program, data, states, observation_weight=observation_weight, kernels=kernels)
+    seen = linearize_sensors(
+        program, data, states, path.variance, observation_weight=observation_weight, kernels=kernels
+    )
     both = vars(seen) | {"in_plain_torch": in_plain_torch or seen.in_plain_torch}
     return Linearization(
         path=path,
@@ -155,15 +193,19 @@ def linearize_sensors(
     program: Program,
     data: Trajectories,
     states: Tensor,
+    variance: Tensor | None = None,
     *,
     observation_weight: float = 1.0,
     kernels: bool | None = None,
 ) -> Sensors:
-    """The part of `linearize` that is about what is measured, around states `(T + 1, B, D)`.
+    """The part of `linearize` that is about what is measured, around states `(T + 1, B, D)`; see
+    `ReferencePath.variance`.
 
     Rows without a measurement are left out, unless hardly any has one.
     """
     given = {"state": states, "measurement": data.measurements, "observed": data.observed}
+    if variance is not None:
+        given["variance"] = variance
     measure, count = partial(_residuals, program), data.measurements.shape[-1]
     if kernels is None:
         kernels = states[..., 0].numel() >= ROWS_WORTH_COMPILING
@@ -218,16 +260,27 @@ def require_linear(problem: Problem, what: str, advice: str = "") -> None:
         raise UsageError(f"{what}: {why.removesuffix(NEEDS_NORMAL)}{advice}")
 
 
-def _residuals(program: Program, state: Tensor, measurement: Tensor, observed: Tensor) -> Tensor:
+@torch.no_grad()
+def has_heavy_tails(program: Program, state: Tensor) -> bool:
+    """Whether some measurement is a Student t; looked at from states `(..., D)`."""
+    with running(*state.shape[:-1]), Recording() as seen, AtMean():
+        program.observe(state)
+    return any(is_heavy_tailed(fn) for fn in seen.distributions.values())
+
+
+def _residuals(
+    program: Program, state: Tensor, measurement: Tensor, observed: Tensor, variance: Tensor | None = None
+) -> Tensor:
     """Residuals and, beside them, log standard deviations and log-densities at residual zero, `(..., 3 K)`; where the
     noise is not normal, of the normal that touches it."""
     residuals, log_sds, heights = {}, {}, {}
     with running(*state.shape[:-1]):
         with Recording() as seen, Observing(measurement, observed):
             program.observe(state)
+        known = {} if variance is None else parted(variance, seen.distributions)
         for site, fn in seen.distributions.items():
             residuals[site] = residual(fn, seen.observed[site])
-            sd, heights[site] = tangent_normal(fn, residuals[site], site)
+            sd, heights[site] = tangent_normal(fn, residuals[site], site, known.get(site))
             log_sds[site] = sd.log()
     parts = (joined(values, seen.distributions, state.shape[:-1]) for values in (residuals, log_sds, heights))
     return torch.cat(list(parts), -1)

@@ -7,6 +7,7 @@ Roweis 1999).
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -62,12 +63,13 @@ def smooth(
     """
     data = problem.data
     with unchanged(problem.program):
+        path = path.for_sensors(problem.program)
         if angles is None:
             angles = angles_on_a_circle(problem.program, data, path.states[0, :1])
         along = partial(linearize, problem, observation_weight=observation_weight, kernels=kernels, angles=angles)
         if passes == 1:
             return look_ahead(along(path))
-        accepted = path = ReferencePath(path.states, torch.where(data.transitions[..., None], path.noise, 0.0))
+        accepted = path = replace(path, noise=torch.where(data.transitions[..., None], path.noise, 0.0))
         penalty = torch.zeros_like(path.states, dtype=torch.float64)
         most = torch.full((len(data),), torch.inf, dtype=torch.float64, device=path.states.device)
         last, share = most.new_zeros(()), torch.ones_like(most)
@@ -158,15 +160,20 @@ def _share_of_step(step: Tensor, last: Tensor, share: Tensor) -> Tensor:
 
 
 def _between(one: ReferencePath, other: ReferencePath, share: Tensor | float) -> ReferencePath:
-    """A share, one or `(B,)`, of the way from one path to another."""
+    """A share, one or `(B,)`, of the way from one path to another, with the variances of the other."""
     share = torch.as_tensor(share).to(one.states)[..., None]
-    return ReferencePath(torch.lerp(one.states, other.states, share), torch.lerp(one.noise, other.noise, share))
+    states, noise = torch.lerp(one.states, other.states, share), torch.lerp(one.noise, other.noise, share)
+    return ReferencePath(states, noise, other.variance)
 
 
 def _either(which: Tensor, one: ReferencePath, other: ReferencePath) -> ReferencePath:
     """Some trajectories of one path and the rest of another."""
     chosen = which[:, None]
-    return ReferencePath(torch.where(chosen, one.states, other.states), torch.where(chosen, one.noise, other.noise))
+    states, noise = torch.where(chosen, one.states, other.states), torch.where(chosen, one.noise, other.noise)
+    variance = None
+    if one.variance is not None and other.variance is not None:
+        variance = torch.where(chosen, one.variance, other.variance)
+    return ReferencePath(states, noise, variance)
 
 
 def find_and_smooth(
@@ -235,8 +242,7 @@ def find_path(
     ahead = smooth(copies, path, observation_weight=observation_weight, passes=passes)
     likely = torch.nan_to_num(ahead.log_likelihood, nan=-torch.inf).view(len(tempering), len(data))
     chosen = likely.argmax(0) * len(data) + torch.arange(len(data), device=likely.device)
-    best = ahead.linearization.path  # whose likelihood is known; a step further may be too far
-    return ReferencePath(best.states[:, chosen], best.noise[:, chosen])
+    return ahead.linearization.path.subset(chosen)  # whose likelihood is known; a step further may be too far
 
 
 @torch.no_grad()

@@ -86,7 +86,7 @@ class LinearizedGuide(PathGuide):
         found = resting_path(ahead, part)
         better = ahead.log_likelihood > (-torch.inf if known is None else known[trajectories])  # not where it is a nan
         if kept := better.nonzero().flatten().tolist():
-            self.remember(ReferencePath(found.states[:, kept], found.noise[:, kept]), part.subset(kept))
+            self.remember(found.subset(kept), part.subset(kept))
 
     def _smooth(self, data: Trajectories, progress: float) -> Lookahead:
         path = ReferencePath(self._recall("states", data), self._recall("noise", data))

@@ -4,7 +4,9 @@ For programs of some dozens of learnable numbers with normal noise. System ident
 method; its predictor is the linearised program (Ljung 1999, System Identification, section 7.4).
 
 Steps solve the information matrix against the score. It begins as the cross products of the drives' scores (Berndt,
-Hall, Hall and Hausman 1974) unless it is known, and learns on the way (Broyden, Fletcher, Goldfarb and Shanno).
+Hall, Hall and Hausman 1974) unless it is known, and learns on the way (Broyden, Fletcher, Goldfarb and Shanno). Where
+that says that the maximum is reached, the observed information is found, by differences of scores, and steps go on with
+it: cross products of a program that lacks something may be twenty times as large, and then a fit seems to have ended.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.kernels.rows import kernel_failures, note_failures
-from steady_ppl.likelihood.parameters import Element, elements, on_both_sides, set_values, values_of
+from steady_ppl.likelihood.parameters import Element, elements, moved, on_both_sides, set_values, values_of
 from steady_ppl.likelihood.scores import parameter_scores, smoothed, widens
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
@@ -35,12 +37,18 @@ from steady_ppl.utils.journal import journaled
 from steady_ppl.utils.progress import stages
 
 PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
+MAX_OBSERVED = 24  # learnable numbers: of more the information stays as scoring steps have it
+OBSERVED_SHARES = (0.01, 100.0)  # of the cross products, between which what is observed is believed
+MAX_NATS_OF_INFORMATION = 10.0  # gained, beyond which the information at the beginning may not hold at the end
 STALLED_PASSES = 30  # linearisations a step once no share of a step was accepted: some path swings about its mode
 MAX_STEPS = 25  # scoring steps of a fit, where nothing else is said
 STEPS_SEEN, STEPS_FORESEEN = 3, 4
 """A fit is given up after the first, if the second would not do: so many more steps, each of which gains as much as the
 better of the last two did, or as the next one promises."""
 MAX_MOVE = 150  # steps of differences, 1.5 of a logarithm: the most that a number moves at once
+MAX_WIDENED, SHARE_OF_SLOPE = 16.0, 0.7
+"""A move that was cut short may be twice as long the next time, up to so many times as long, where the objective rose
+by more than this share of what its slope foresaw."""
 MAX_MOVE_SD = 50.0  # standard deviations, of a number with a unit: it moves as far at once, if that is more
 RIDGE = 1e-3  # added to the information of a number, in that of one with a unit if that is smaller
 SHARE_AGAINST_SCORE = 1 / 3
@@ -128,7 +136,8 @@ def output_of(program: Program, find: Callable[[], Maximum]) -> Output:
     finally:
         note_failures(why)
     tensors = {name: getattr(found, name) for name in ("log_likelihood", "information")}
-    tensors |= {"states": found.path.states, "noise": found.path.noise}
+    path = {"states": found.path.states, "noise": found.path.noise, "variance": found.path.variance}
+    tensors |= {name: value for name, value in path.items() if value is not None}
     tensors |= {f"program/{name}": value for name, value in program.state_dict().items()}
     values = {name: getattr(found, name) for name in ("objective", "names", "steps", "decrement", "gained")}
     return tensors, {"found": values, "in plain torch": why}
@@ -139,7 +148,7 @@ def kept_maximum(program: Program, compute: Computation) -> Maximum:
     tensors, values = journaled(compute)
     note_failures(values["in plain torch"])
     program.load_state_dict({name: tensors[f"program/{name}"] for name in program.state_dict()})
-    path = ReferencePath(tensors["states"], tensors["noise"])
+    path = ReferencePath(tensors["states"], tensors["noise"], tensors.get("variance"))
     found = {**values["found"], "names": tuple(values["found"]["names"])}
     return Maximum(log_likelihood=tensors["log_likelihood"], information=tensors["information"], path=path, **found)
 
@@ -183,16 +192,19 @@ def maximise_sum(
     for at in here.terms:
         require_found(at.ahead, at.term.problem)
     began = [at.objective for at in here.terms]
-    is_given = information is not None
-    information = _by_cross_products(here) if information is None else _regularised(information, here.has_unit)
+    is_near = information is not None  # to where it is known
+    if information is None or len(information) < len(here.gradient):
+        own = _by_cross_products(here)
+        information = own if information is None else completed(information, own)
+    information = _regularised(information, here.has_unit)
     reach, is_open = torch.zeros_like(here.gradient), torch.zeros_like(here.has_unit)
     for term in terms:
         reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
         is_open[term.columns] = torch.tensor([part.has_unit and not part.is_effect for part in term.parts]).bool()
     reach = torch.where(is_open, torch.maximum(reach, MAX_MOVE_SD * information.diagonal().rsqrt()), reach)
-    taken, decrement, passes = 0, 0.0, PASSES
+    taken, decrement, passes, widened = 0, 0.0, PASSES, 1.0
     few_drives = len(here.scores) < 2 * len(information)  # they know too little: what they say is seen twice
-    is_small, most = False, here.objective
+    is_small, is_observed, most = False, len(information) > MAX_OBSERVED or len(terms) > 1, here.objective
     rises = list[float]()  # of log p(y) by accepted steps
     with stages(*(("", SHARE_THAT_GOES_ON**step) for step in range(steps + 1))) as begin:
         for taken in range(steps + 1):
@@ -206,21 +218,26 @@ def maximise_sum(
                     "the likeliest parameters cannot be found: the drives do not tell them apart (singular)"
                 )
             decrement = 0.5 * float(here.gradient @ move)
-            if is_given and decrement < precision:  # by what was known elsewhere: seen here as well?
-                is_given, own = False, _by_cross_products(here)
-                seen, _ = torch.linalg.solve_ex(own, here.gradient)
-                more = 0.5 * float(here.gradient @ seen)
-                if taken == 0 or (more > CONVERGED_DECREMENT and not few_drives):
-                    information, move, decrement = own, seen, more
+            is_far = not is_near or taken == 0 or here.objective - sum(began) > MAX_NATS_OF_INFORMATION
+            if decrement < precision and is_far and not is_observed:
+                is_observed, information = True, observed(here.terms[0].term, _by_cross_products(here))
+                move = torch.linalg.solve(information, here.gradient)
+                decrement = 0.5 * float(here.gradient @ move)
             most_left = STEPS_FORESEEN * max(0.0, decrement, *rises[-2:])
             behind = len(rises) >= STEPS_SEEN and here.log_likelihood + most_left < hopeless
             was_small, is_small = is_small, decrement < precision
-            if (is_small and (was_small or not few_drives or taken == 0)) or taken == steps or behind:
+            if (is_small and (is_observed or was_small or not few_drives or taken == 0)) or taken == steps or behind:
                 break
-            move = move * min(1.0, 1 / max(1e-9, float((move.abs() / reach).max())))
+            length = float((move.abs() / reach).max())
+            move = move * min(1.0, widened / max(1e-9, length))
             against = move * here.gradient < 0
             move = torch.where(against, move.clamp(-SHARE_AGAINST_SCORE * reach, SHARE_AGAINST_SCORE * reach), move)
             share, there = _line_search(here, move, passes, most - MAX_DECREASE)
+            risen = -math.inf if there is None else there.objective - here.objective
+            if share < 1:
+                widened = 1.0
+            elif length > widened and risen > SHARE_OF_SLOPE * float(here.gradient @ move):
+                widened = min(2 * widened, MAX_WIDENED)
             if there is not None:
                 information = _bfgs_update(information, share * move, here.gradient - there.gradient)
                 rises.append(there.log_likelihood - here.log_likelihood)
@@ -270,6 +287,34 @@ def _by_cross_products(here: LinearizedObjective) -> Tensor:
     by_drive = here.scores - here.scores.mean(0)
     information = by_drive.T @ by_drive
     return _regularised(information + 0.1 * torch.diag(information.diagonal()), here.has_unit)
+
+
+def completed(known: Tensor, wide: Tensor) -> Tensor:
+    """The information of numbers of which it is `known` for the first ones, and elsewhere `wide` for all."""
+    count = len(known)
+    through = torch.linalg.lstsq(wide[:count, :count], wide[:count, count:]).solution
+    rest = wide[count:, count:] - wide[count:, :count] @ through  # what is told of the others beside the first ones
+    across = known @ through
+    return torch.cat([torch.cat([known, across], 1), torch.cat([across.T, rest + through.T @ across], 1)])
+
+
+def observed(term: Term, crossed: Tensor) -> Tensor:
+    """Minus the second derivatives of an objective where its program is, `(P, P)`, by differences of scores over what
+    cross products take for a standard deviation; these themselves where the program diverges."""
+    here = linearised([term])
+    (there,), found = here.terms, torch.empty_like(crossed)
+    for part, column, own in zip(term.parts, term.columns, crossed.diagonal().tolist(), strict=True):
+        step = min(own**-0.5, MAX_MOVE * part.step)
+        with moved(part, step):
+            found[column] = (here.gradient - linearised([there.term]).gradient) / step
+    if not bool(torch.isfinite(found).all()):
+        return crossed
+    root = torch.linalg.cholesky(crossed)
+    within = torch.linalg.solve_triangular(
+        root, torch.linalg.solve_triangular(root, found + found.T, upper=False).T, upper=False
+    )
+    shares, turn = torch.linalg.eigh(within / 2)
+    return (root @ turn * shares.clamp(*OBSERVED_SHARES)) @ (root @ turn).T
 
 
 def _regularised(information: Tensor, has_unit: Tensor) -> Tensor:
@@ -433,10 +478,8 @@ def refit_outliers(problem: Problem, maximum: Maximum, steps: int = MAX_STEPS) -
         better = there.log_likelihood > maximum.log_likelihood[outliers] + 1
         if not bool(better.any()):
             break
-        states, noise = maximum.path.states.clone(), maximum.path.noise.clone()
-        found = resting_path(there, part.data)
-        states[:, outliers[better]], noise[:, outliers[better]] = found.states[:, better], found.noise[:, better]
-        again = maximise(problem, ReferencePath(states, noise), steps=steps)
+        found = resting_path(there, part.data).subset(better)
+        again = maximise(problem, maximum.path.with_subset(outliers[better], found), steps=steps)
         maximum = replace(again, gained=again.objective + (maximum.gained - maximum.objective))
     return maximum
 

@@ -129,8 +129,7 @@ def find_outliers(problem: Problem, path: ReferencePath, *, against_tails: bool 
         if not len(active):
             break
         part = Problem(problem.program, data.subset(active).without(wrong[:, active]), problem.known_start)
-        near = ReferencePath(path.states[:, active], path.noise[:, active])
-        robust = _Robust.declared(smooth(part, near)).with_sd(own.sd)
+        robust = _Robust.declared(smooth(part, path.subset(active))).with_sd(own.sd)
         best = _best_runs(robust, part.data, log_range, units, by_chance)
         for place, run in best.items():
             drive = int(active[place])
@@ -249,8 +248,9 @@ class _Robust:
         index, linear = torch.full((copies,), drive), self.linear
         first = {name: getattr(linear, name)[index] for name in ("start_offset", "start_turn", "start_noise")}
         rows = ("residual", "measurement", "precision", "log_scale", "offset", "state", "noise")
-        path = ReferencePath(linear.path.states[:, index], linear.path.noise[:, index])
-        return replace(linear, path=path, **first, **{name: getattr(linear, name)[:, index] for name in rows})
+        return replace(
+            linear, path=linear.path.subset(index), **first, **{name: getattr(linear, name)[:, index] for name in rows}
+        )
 
     def gain_of_tails(self) -> float:
         """Nats by which a Student t is better than the robust normal on residuals given all other cells."""

@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
-import pyro.distributions as dist
 import torch
 from torch import Tensor
 
@@ -35,6 +34,7 @@ from steady_ppl.model.handlers import (
     AtMean,
     Recording,
     as_vector,
+    is_heavy_tailed,
     location,
     normal_moments,
     residual,
@@ -339,7 +339,7 @@ class Measured:
 
         def of_site(_: str, fn: Any) -> Tensor:
             base = unwrapped(fn)
-            tails = 1 / base.df if isinstance(base, dist.StudentT) else torch.zeros_like(base.scale)
+            tails = 1 / base.df if is_heavy_tailed(base) else torch.zeros_like(base.scale)
             return tails.expand(base.scale.shape)
 
         return self._of_sites(of_site)
@@ -347,7 +347,7 @@ class Measured:
     @property
     def heavy_tailed(self) -> bool:
         """Whether some site is a Student t."""
-        return any(isinstance(unwrapped(fn), dist.StudentT) for fn in self.distributions.values())
+        return any(map(is_heavy_tailed, self.distributions.values()))
 
 
 @torch.no_grad()
@@ -453,15 +453,12 @@ def _of_measurements(program: Program, at: Smoothed, parts: list[Element]) -> Te
 
 
 def _of_tails(here: Measured, at: Smoothed) -> Tensor:
-    """What a change of one over the degrees of freedom ν of a Student t is worth, `(T + 1, B, K)`: the posterior mean
-    of the slope of its log-density, zero where the noise is normal."""
+    """What a change of one over the degrees of freedom ν of a Student t is worth, `(T + 1, B, K)`: the slope of its
+    log-density at the root of the mean square, where a normal touches it; zero where the noise is normal."""
     freedom, (mean, variance) = 1 / here.tails.double(), (at.measurements.mean, at.measurements.variance)
-    size, sd = (here.spread * at.sharpness).clamp(min=1e-12), variance.clamp(min=0).sqrt()
+    size = (here.spread * at.sharpness).clamp(min=1e-12)
+    squares = ((mean.square() + variance.clamp(min=0)) / size.square()).double()
     constant = torch.special.digamma((freedom + 1) / 2) - torch.special.digamma(freedom / 2) - 1 / freedom
-    slopes = 0.0
-    for z in (mean + sd, mean - sd):
-        squares = (z / size).double().square()
-        varying = (freedom + 1) * squares / (freedom + squares) / freedom - torch.log1p(squares / freedom)
-        slopes = slopes + (constant + varying) / 4
+    varying = (freedom + 1) * squares / (freedom + squares) / freedom - torch.log1p(squares / freedom)
     is_student = at.measurements.present & (here.tails > 0)
-    return torch.where(is_student, -freedom.square() * slopes, 0.0).to(mean)
+    return torch.where(is_student, -freedom.square() * (constant + varying) / 2, 0.0).to(mean)

@@ -238,21 +238,26 @@ def normal_moments(fn: Any, site: str) -> tuple[Tensor, Tensor]:
     return base.loc, base.scale
 
 
-def tangent_normal(fn: Any, residual: Tensor, site: str) -> tuple[Tensor, Tensor]:
+def tangent_normal(fn: Any, residual: Tensor, site: str, variance: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return standard deviation and log-density at residual zero, each as `residual`, of the normal that touches a
-    measurement site's log-density at a residual from below, with the same slope.
+    measurement site's log-density from below, with the same slope, at a residual of a `variance`.
 
-    A normal is its own; a Student t's is wider the farther out it is touched (Lange, Little and Taylor 1989). Any other
-    site is a ProgramError.
+    A normal is its own; a Student t's is wider the farther out it is touched (Lange, Little and Taylor 1989): at the
+    root of the mean square, for there the bound of its mean is largest. Any other site is a ProgramError.
     """
     base = unwrapped(fn)
     if not isinstance(base, dist.StudentT) or fn.event_dim > 1:
         _, sd = normal_moments(fn, site)
         return sd, -sd.log() - 0.5 * math.log(2 * math.pi)
-    squares = (residual / base.scale).square()
-    sd = base.scale * ((base.df + squares) / (base.df + 1)).sqrt()
-    density = dist.StudentT(base.df, torch.zeros_like(residual), base.scale).log_prob(residual)
-    return sd, density + 0.5 * (residual / sd).square()
+    squares = residual.square() if variance is None else residual.square() + variance
+    sd = ((base.df * base.scale.square() + squares) / (base.df + 1)).sqrt()
+    density = dist.StudentT(base.df, torch.zeros_like(residual), base.scale).log_prob(squares.sqrt())
+    return sd, density + 0.5 * squares / sd.square()
+
+
+def is_heavy_tailed(fn: Any) -> bool:
+    """Whether a site is a Student t."""
+    return isinstance(unwrapped(fn), dist.StudentT)
 
 
 def as_vector(value: Tensor, event_dim: int) -> Tensor:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from steady_ppl import Program, ProgramError, seeded, stack
 from steady_ppl.gaussian.linearize import Linearization, ReferencePath, linearize, why_not_linear
+from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.model.handlers import Standardised, running
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.substeps import advance
@@ -326,6 +327,21 @@ def test_a_student_t_sensor_is_linearised_by_the_normal_that_touches_it():
     elsewhere = linear.residual + torch.linspace(-3, 3, 31)[:, None, None, None]
     below = linear.log_scale[..., None] - 0.5 * linear.precision * elsewhere**2
     assert bool((below <= exact.log_prob(elsewhere) + 1e-6).all())
+
+
+def test_a_student_t_is_touched_at_the_root_of_the_mean_square_of_a_path_that_was_smoothed():
+    program = HeavyTailedSensor().double().requires_grad_(False)
+    data = drives(program, 2, 6)
+    problem = Problem(program, data)
+    ahead = smooth(problem, near_the_truth(program, data), passes=50, tolerance=1e-9)
+    linear, (states, *_) = ahead.linearization, ahead.covariances()
+    squares = (linear.residual.square() + states[..., :1, 0]) / float(program.measurement_sd) ** 2
+    precision = (3.0 + 1) / (3.0 + squares) / float(program.measurement_sd) ** 2
+    torch.testing.assert_close(linear.precision, torch.where(data.observed, precision, 0.0))
+    few = [1]
+    again = linear.path.with_subset(few, linear.path.subset(few))
+    assert all(map(torch.equal, vars(again).values(), vars(linear.path).values()))
+    assert linear.path.for_sensors(example("linear_gaussian")).variance is None
 
 
 def test_a_known_start_needs_no_normal_prior():

@@ -20,14 +20,17 @@ from steady_ppl.gaussian.smoother import find_path, smooth
 from steady_ppl.kernels import jit, rows
 from steady_ppl.likelihood.maximize import (
     MAX_DECREASE,
+    MAX_STEPS,
     STEPS_SEEN,
     Term,
     maximise,
     maximise_each,
     maximise_sum,
+    posterior_score,
     refit_outliers,
     widen_noise,
 )
+from steady_ppl.likelihood.parameter_posterior import observed_information
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
 from steady_ppl.utils import cores
@@ -184,6 +187,28 @@ def test_a_fit_that_begins_with_too_much_information_does_not_end_at_once(cart):
     problem = Problem(far, data, True)
     (again,) = maximise_sum([Term.alone(problem, find_path(problem))], information=1e4 * maximum.information, steps=60)
     assert again.objective == pytest.approx(maximum.objective, abs=0.1)
+
+
+def test_a_program_that_lacks_something_is_fitted_to_the_end_and_knows_how_sharp_it_is(cart):
+    """Cross products of such a program's scores are many times its information: fits seemed to have ended."""
+    program, data, _ = cart
+    pushed = replace(data, controls=data.controls + torch.sin(torch.arange(30.0).double())[:, None])
+    problem = Problem(copy.deepcopy(program), pushed, True)
+    maximum = maximise(problem, precision=1e-3)
+    parts = elements(problem.program)
+    expected = observed_information(problem, maximum.path, parts)
+    torch.testing.assert_close(maximum.information, expected, rtol=0.15, atol=0.02 * float(expected.diagonal().max()))
+    left = posterior_score(problem, maximum.path)
+    assert 0.5 * float(left @ torch.linalg.solve(expected, left)) < 0.01
+
+
+def test_a_number_that_begins_far_off_is_reached_in_steps_that_grow(cart):
+    program, data, maximum = cart
+    one = copy.deepcopy(program).with_effect("acceleration_bias", 8.0)
+    problem = Problem(one, data, True)
+    found = maximise(problem)
+    assert found.converged and found.steps < MAX_STEPS  # 25 did not suffice
+    assert found.objective == pytest.approx(maximum.objective, abs=4)
 
 
 @pytest.mark.slow
