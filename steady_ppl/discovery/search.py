@@ -18,7 +18,6 @@ from steady_ppl.discovery.candidates import (
     CLEAR_GAIN,
     NEAR_FAMILY_LEVEL,
     TIE_NATS,
-    UNEXPLAINED,
     Candidate,
     Screening,
     at_its_best_place,
@@ -365,7 +364,7 @@ def _with_places_of(final: Refit, found: Sequence[Found]) -> list[Found]:
 
 def _refits(now: Refit, screening: Screening, first: bool, candidates: list[Candidate]) -> list[Candidate]:
     """Fits of what the tests point at; each is added to `candidates` as it ends, whatever happens to the next."""
-    chosen = sorted(leaders(screening.tests, first), key=lambda tested: tested.variant.effect.form == UNEXPLAINED)
+    chosen = sorted(leaders(screening.tests, first), key=lambda tested: tested.variant.effect.verdict == "noise")
     with stages(*((f"fitting with {tested.variant.label}", 1) for tested in chosen)) as begin:
         for fit in attempts(now, chosen, screening):
             begin()

@@ -61,6 +61,13 @@ class Cells(NamedTuple):
         """Which cells are those of one component."""
         return slice(self.ends[index], self.ends[index + 1])
 
+    def of_components(self, components: Tensor) -> tuple[Tensor, Tensor]:
+        """The cells of `components`, one after another: the place of each in these, and which it is, `(N,)`."""
+        ends = torch.tensor(self.ends, device=components.device)
+        first, count = ends[components], ends[components + 1] - ends[components]
+        place = torch.repeat_interleave(count)
+        return place, first[place] + torch.arange(len(place), device=place.device) - (count.cumsum(0) - count)[place]
+
     @property
     def total(self) -> int:
         """How many points there are."""

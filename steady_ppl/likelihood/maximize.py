@@ -40,7 +40,7 @@ PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest
 MAX_OBSERVED = 24  # learnable numbers: of more the information stays as scoring steps have it
 OBSERVED_SHARES = (0.01, 100.0)  # of the cross products, between which what is observed is believed
 MAX_NATS_OF_INFORMATION = 10.0  # gained, beyond which the information at the beginning may not hold at the end
-STALLED_PASSES = 30  # linearisations a step once no share of a step was accepted: some path swings about its mode
+STALLED_PASSES = 15  # linearisations a step once no share of a step was accepted: some path swings about its mode
 MAX_STEPS = 25  # scoring steps of a fit, where nothing else is said
 STEPS_SEEN, STEPS_FORESEEN = 3, 4
 """A fit is given up after the first, if the second would not do: so many more steps, each of which gains as much as the
@@ -242,11 +242,16 @@ def maximise_sum(
                 information = _bfgs_update(information, share * move, here.gradient - there.gradient)
                 rises.append(there.log_likelihood - here.log_likelihood)
                 here, most = there, max(most, there.objective)
+                if passes == STALLED_PASSES and risen < CONVERGED_DECREMENT:
+                    break
             elif passes == STALLED_PASSES:
                 break
             else:
                 passes = STALLED_PASSES
-                here = linearised([at.term for at in here.terms], passes)
+                further = linearised([at.term for at in here.terms], passes)
+                if not bool(torch.isfinite(further.gradient).all()):  # a path diverges on its way to its mode
+                    break
+                here = further
                 information, most = _by_cross_products(here), here.objective
                 rises.append(math.inf)  # along other paths
     return [

@@ -143,19 +143,16 @@ class ReadingDeviations(Deviations):
         """Scores of learnable numbers, `(B, P)`, from the slopes of the means, after them of the log standard
         deviations and then of the tails, at `points`; `sharpness` is 1 / the standard deviations, `(rows, B, K)`, and
         `of_tails` what a change of the tails is worth."""
-        rows, drives, count = self.mean.shape
-        values, by_row = slopes.values.squeeze(-1), self.mean.new_zeros(len(slopes.values), rows * drives)
-        for place, (component, value) in enumerate(zip(slopes.components.tolist(), values, strict=True)):
-            which = self.cells.of_component(component % count)
-            here, up, down = value[self.cells.points[:, which]]
-            if component < count:
-                own = (self.at_cells(self.mean, which) * here + (up - down) / 2) * self.at_cells(sharpness, which)
-            else:
-                own = self.at_cells(self.excess if component < 2 * count else of_tails, which) * here
-            by_row[place, self.cells.row[which]] = own
-        by_drive, kinds = by_row.view(-1, rows, drives).sum(1), slopes.components // count
-        parts = [by_drive[kinds == kind].double().t() @ slopes.by_number[kinds == kind] for kind in range(3)]
-        return parts[0] + parts[1] + parts[2]
+        _, drives, count = self.mean.shape
+        place, cell = self.cells.of_components(slopes.components % count)
+        here, up, down = slopes.values.squeeze(-1)[place, self.cells.points[:, cell]]
+        mean, sharp, excess, tails = (self.at_cells(one)[cell] for one in (self.mean, sharpness, self.excess, of_tails))
+        kind = (slopes.components // count)[place]
+        own = torch.where(kind == 1, excess, tails) * here
+        own = torch.where(kind == 0, (mean * here + (up - down) / 2) * sharp, own)
+        by_drive = own.new_zeros(len(slopes.values) * drives, dtype=torch.float64)
+        by_drive.index_add_(0, place * drives + self.cells.row[cell] % drives, own.double())
+        return by_drive.view(-1, drives).t() @ slopes.by_number
 
     def own(self, values: Tensor) -> Tensor:
         """What values at `points`, `(N, 1, K)`, are of each cell's own component at its three points, `(3, M)`."""
@@ -455,10 +452,13 @@ def _of_measurements(program: Program, at: Smoothed, parts: list[Element]) -> Te
 def _of_tails(here: Measured, at: Smoothed) -> Tensor:
     """What a change of one over the degrees of freedom ν of a Student t is worth, `(T + 1, B, K)`: the slope of its
     log-density at the root of the mean square, where a normal touches it; zero where the noise is normal."""
-    freedom, (mean, variance) = 1 / here.tails.double(), (at.measurements.mean, at.measurements.variance)
-    size = (here.spread * at.sharpness).clamp(min=1e-12)
-    squares = ((mean.square() + variance.clamp(min=0)) / size.square()).double()
+    found, own = at.measurements, at.measurements.present & (here.tails > 0)
+    freedom, size = (
+        1 / here.tails[own].double(),
+        (here.spread.expand(own.shape)[own] * at.sharpness[own]).clamp(min=1e-12),
+    )
+    squares = ((found.mean[own].square() + found.variance[own].clamp(min=0)) / size.square()).double()
     constant = torch.special.digamma((freedom + 1) / 2) - torch.special.digamma(freedom / 2) - 1 / freedom
     varying = (freedom + 1) * squares / (freedom + squares) / freedom - torch.log1p(squares / freedom)
-    is_student = at.measurements.present & (here.tails > 0)
-    return torch.where(is_student, -freedom.square() * (constant + varying) / 2, 0.0).to(mean)
+    slopes = (-freedom.square() * (constant + varying) / 2).to(found.mean)
+    return torch.zeros_like(found.mean).masked_scatter(own, slopes)

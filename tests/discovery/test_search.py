@@ -98,9 +98,9 @@ def test_what_loses_or_imitates_sets_no_bar_for_what_is_fitted_after_it(monkeypa
     coloured = fitted("coloured", 900.0, 800.0, explains=False)
     bar = search._threshold([coloured, broken, drag])
     assert bar == search._threshold([drag]) and bar.drives == pytest.approx(100.0 - search.MAX_NATS_BEHIND)
-    seen, forms = [], {"coloured": "colour", "drag": "push"}
+    seen, kinds = [], {"coloured": "noise", "drag": "dynamics"}
     tested = [
-        SimpleNamespace(variant=SimpleNamespace(label=n, effect=SimpleNamespace(form=f))) for n, f in forms.items()
+        SimpleNamespace(variant=SimpleNamespace(label=n, effect=SimpleNamespace(verdict=k))) for n, k in kinds.items()
     ]
     monkeypatch.setattr(search, "leaders", lambda tests, first: tested)
     monkeypatch.setattr(search, "attempts", lambda now, chosen, screening: seen.extend(chosen) or [])
