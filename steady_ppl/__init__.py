@@ -7,7 +7,7 @@ from typing import Any
 
 import lazy_loader
 
-from steady_ppl.utils import hooks
+from steady_ppl.utils import context
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
@@ -30,4 +30,4 @@ def _with_effect(program: Any, effect: Any, value: Any = None, **options: Any) -
     return with_effect(program, effect, value, **options)
 
 
-hooks.html, hooks.attach_listed, hooks.with_effect = _html, _attach_listed, _with_effect
+context.html, context.attach_listed, context.with_effect = _html, _attach_listed, _with_effect

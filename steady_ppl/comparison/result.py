@@ -11,7 +11,7 @@ from torch import Tensor
 from steady_ppl.comparison.scores import BANDED_HORIZONS, COVERAGE, RESAMPLES, Change, Key, ProgramScores, paired
 from steady_ppl.effects import attached
 from steady_ppl.model.program import error_indices
-from steady_ppl.utils.hooks import Displayed
+from steady_ppl.utils.context import Displayed
 from steady_ppl.utils.text import TEXT_WIDTH, aligned, figure, with_unit
 
 NAME_COLUMNS = 20  # characters of a row's name

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from steady_ppl.gaussian.kalman import Tracked, track
-from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import Prediction, on_a_circle, predict
 from steady_ppl.model.handlers import Recording, Standardised, as_event, joined, normal_moments, running
 from steady_ppl.model.interventions import Transforming
@@ -91,7 +90,7 @@ def constant_velocity(problem: Problem, tracked: Tracked, horizons: Sequence[int
     best: tuple[float, ConstantVelocity, Tracked] | None = None
     for multiple in NOISE_MULTIPLES:
         coasting = kind(program, multiple * sizes)
-        start = ReferencePath(path.states, (values / (multiple * sizes)).to(values.dtype))
+        start = replace(path, noise=(values / (multiple * sizes)).to(values.dtype))
         found = track(replace(problem, program=coasting), start, passes=3)
         likely = float(found.log_likelihood.sum())
         if math.isfinite(likely) and (best is None or likely > best[0]):

@@ -18,7 +18,7 @@ from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.predict import HALF_WIDTH, Prediction
 from steady_ppl.likelihood.outliers import Outliers
 from steady_ppl.model.program import Program, unit_of
-from steady_ppl.utils.hooks import Displayed
+from steady_ppl.utils.context import Displayed
 from steady_ppl.utils.text import aligned, figure, with_unit
 
 MAX_FINDINGS_SHOWN = 8  # findings in the table

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from steady_ppl.errors import DataError
-from steady_ppl.utils.hooks import Displayed
+from steady_ppl.utils.context import Displayed
 
 MAX_STEP_RATIO = 1.25  # ratio of the drives' steps up to which they count as one
 

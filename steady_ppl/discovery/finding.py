@@ -136,8 +136,7 @@ def _spread(search: Search, variant: Variant) -> np.ndarray:
 
 def _confidence(search: Search, found: Found) -> float:
     """Posterior probability of the class; a curve is less likely before than a candidate, or than none."""
-    rivals = [c for c in found.candidates if c.is_explanation or not found.candidate.is_explanation]
-    totals = {c.variant.name: c.total for c in rivals if isinstance(c.refit, Refit)}
+    totals = {c.variant.name: c.total for c in found.rivals if isinstance(c.refit, Refit)}
     totals[found.candidate.variant.name] = found.candidate.total  # its knee may have moved
     curve = max((c.total for c in search.curves if isinstance(c.refit, Refit)), default=-math.inf)
     others = [0.0, found.candidate.total + curve - search.gain - MIN_GAIN_OF_CURVE]

@@ -28,7 +28,8 @@ from steady_ppl.gaussian.smoother import require_found, resting_path, smooth
 from steady_ppl.guides.base import Constant
 from steady_ppl.guides.linearized import LookaheadGuide
 from steady_ppl.likelihood.evidence import neglected
-from steady_ppl.likelihood.maximize import Maximum, Term, kept_maximum, maximise_each, maximise_sum, output_of
+from steady_ppl.likelihood.maximize import Maximum, kept_maximum, maximise_each, maximise_sum, output_of
+from steady_ppl.likelihood.objective import Term
 from steady_ppl.likelihood.parameters import Element, elements, moved, set_values, values_of
 from steady_ppl.likelihood.scores import channel_moments, substep_spreads
 from steady_ppl.model.problem import Problem

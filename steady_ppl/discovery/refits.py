@@ -18,7 +18,7 @@ from steady_ppl.effects import Variant, attach, attached, coefficient
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path
-from steady_ppl.likelihood.maximize import Maximum, completed, fit_by_likelihood, maximise, refit_outliers
+from steady_ppl.likelihood.maximize import Information, Maximum, fit_by_likelihood, maximise, refit_outliers
 from steady_ppl.likelihood.parameters import Element, elements, values_of
 from steady_ppl.likelihood.scores import widens
 from steady_ppl.model.problem import Problem
@@ -55,10 +55,6 @@ class Fold:
         own = (with_states_of(program, self.drives), with_states_of(program, self.path))
         others = (with_states_of(program, self.held_out), with_states_of(program, self.held_out_path))
         return Fold(*own, *others, self.known_start)
-
-    def information(self, of_first: Tensor | None, first: Fold) -> Tensor | None:
-        """What these drives tell, by what those of the first fold do."""
-        return None if of_first is None else len(self.drives) / len(first.drives) * of_first
 
 
 @dataclass(frozen=True)
@@ -221,7 +217,7 @@ class Attempt:
     """A program with an effect, where its fits begin."""
 
     programs: list[Program]  # one a fold
-    information: Tensor | None  # of the first fold's drives, the coefficient last
+    information: Tensor | Information | None  # of the first fold's drives, the coefficient last
     first: Fit | None = None  # the fit to these drives; None where it is made in its turn
 
 
@@ -238,7 +234,9 @@ def attempt_with(
     try:
         programs = [attach(copy.deepcopy(program), variant, value) for program in base.programs]
         if isinstance(information, Maximum):
-            information = _information(information, elements(programs[0]))
+            known = _information(information, elements(programs[0]))
+            names = tuple(part.name for part in elements(programs[0]))
+            return Attempt(programs, None if known is None else Information(known, names))
         return Attempt(programs, information)
     except Exception as error:  # also of the program's own code, on parameters that nobody tried before
         return reason_of(error)
@@ -255,7 +253,7 @@ def begin(base: Refit, attempts: Sequence[Attempt | str], threshold: Threshold =
     folds = [base.folds[0].wide(one.programs[0]) for one in able]
     problems = [fold.fitting(one.programs[0]) for fold, one in zip(folds, able, strict=True)]
     floors = [_floor(base.maxima[0], threshold)] * len(able)
-    known = [_guess(base.maxima[0], one.information) for one in able]
+    known = [_guess(base.maxima[0], one.information, base.folds[0], base.folds[0]) for one in able]
     fits = iter(base.fitting.fit_each(problems, [fold.path for fold in folds], known, floors))
     return [replace(one, first=next(fits)) if isinstance(one, Attempt) else one for one in attempts]
 
@@ -265,10 +263,8 @@ def finish(base: Refit, attempt: Attempt | str, threshold: Threshold = NO_THRESH
     if isinstance(attempt, str):
         return attempt
     least = [_floor(base.maxima[0], threshold), *(_floor(maximum) for maximum in base.maxima[1:])]
-    shares = [
-        None if (one := attempt.information) is None else fold.information(one, base.folds[0]) for fold in base.folds
-    ]
-    guesses = [_guess(maximum, share) for maximum, share in zip(base.maxima, shares, strict=True)]
+    pairs = zip(base.maxima, base.folds, strict=True)
+    guesses = [_guess(maximum, attempt.information, fold, base.folds[0]) for maximum, fold in pairs]
     given = (attempt.programs, base.folds, [None] * len(attempt.programs), guesses)
     try:
         return _refit(*given, least, threshold, base.unwidened, base.fitting, attempt.first)
@@ -342,7 +338,7 @@ def _refit(
     programs: list[Program],
     folds: list[Fold],
     maxima: Sequence[Maximum | None] = (None, None),
-    guesses: Sequence[Tensor | None] = (None, None),
+    guesses: Sequence[Tensor | Information | None] = (None, None),
     least: Sequence[float] = (-math.inf, -math.inf),
     threshold: Threshold = NO_THRESHOLD,
     unwidened: Program | None = None,
@@ -389,7 +385,7 @@ def _fits(
     fitting: Fitting,
     programs: Sequence[Program],
     folds: Sequence[Fold],
-    informations: Sequence[Tensor | None],
+    informations: Sequence[Tensor | Information | None],
     least: Sequence[float],
 ) -> list[Fit]:
     """The fits of all folds, to be made in order."""
@@ -404,12 +400,19 @@ def _fit_anew(problem: Problem, floor: float) -> tuple[Program, Maximum] | None:
     return None
 
 
-def _guess(without: Maximum, with_effect: Tensor | None) -> Tensor | None:
-    """The information on a fold's drives, from that of the fit without the effect and, where it is known, that of all
-    numbers by what the program would do."""
-    if not len(without.information):
-        return with_effect
-    return without.information if with_effect is None else completed(without.information, with_effect)
+def _guess(
+    without: Maximum, known: Tensor | Information | None, fold: Fold, first: Fold
+) -> Tensor | Information | None:
+    """The information on a fold's drives before a fit with an effect.
+
+    That of the fit without it, completed by what is `known` on the first fold's drives of all numbers; or what a fit
+    that learned them all knows.
+    """
+    share = len(fold.drives) / len(first.drives)
+    if isinstance(known, Information):
+        return known.times(share)
+    rest = None if known is None else share * known
+    return Information(without.information, without.names, rest) if len(without.information) else rest
 
 
 def _information(maximum: Maximum, parts: Sequence[Element]) -> Tensor | None:

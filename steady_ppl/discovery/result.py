@@ -17,8 +17,8 @@ from steady_ppl.discovery.search import Search
 from steady_ppl.errors import RunError
 from steady_ppl.runs.fit import Fit
 from steady_ppl.runs.folder import DISCOVERY
+from steady_ppl.utils.context import Displayed
 from steady_ppl.utils.files import read_json
-from steady_ppl.utils.hooks import Displayed
 from steady_ppl.utils.schema import BOOL, LINES, NUMBER, TEXT, Paired, count, mismatch
 from steady_ppl.utils.text import TEXT_WIDTH, aligned, figure
 

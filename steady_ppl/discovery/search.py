@@ -109,10 +109,15 @@ class Found:
     without: Refit  # the program without it
 
     @property
+    def rivals(self) -> list[Candidate]:
+        """Those that may be what the best stands for: what imitates anything is no rival of an explanation."""
+        return [c for c in self.candidates if c.is_explanation or not self.candidate.is_explanation]
+
+    @property
     def aliases(self) -> list[Candidate]:
         """Those that these drives cannot tell from the best, itself first, wherever its knee is."""
         best = self.candidate
-        close = [c for c in self.candidates if c.total >= best.total - TIE_NATS and not c.against_its_sign]
+        close = [c for c in self.rivals if c.total >= best.total - TIE_NATS and not c.against_its_sign]
         return [best, *(c for c in close if c is not best and c.variant.name != best.variant.name)]
 
 
@@ -378,7 +383,10 @@ def _refits(now: Refit, screening: Screening, first: bool, candidates: list[Cand
 def _threshold(candidates: Sequence[Candidate]) -> Threshold:
     """What the next candidate must reach on the first fold, given those that were fitted. What loses on the drives
     kept from it, or imitates whatever is missing, says nothing of what can be reached."""
-    fits = [c.refit for c in candidates if isinstance(c.refit, Refit) and c.is_explanation and c.total > 0]
+    return _bar([c.refit for c in candidates if isinstance(c.refit, Refit) and c.is_explanation and c.total > 0])
+
+
+def _bar(fits: Sequence[Refit]) -> Threshold:
     drives = [float(fit.maxima[0].log_likelihood.sum()) for fit in fits]
     held_out = [float(fit.held_out_alone[: len(fit.folds[0].held_out)].sum()) for fit in fits]
     return Threshold(max(drives, default=-math.inf) - MAX_NATS_BEHIND, max(held_out, default=-math.inf) - TIE_NATS)
@@ -390,7 +398,7 @@ def _curves(search: Search) -> list[Candidate]:
     named, threshold = None, NO_THRESHOLD
     if search.found:
         named = judged(base, search.found[0].candidate.tested, search.final)
-        threshold = replace(_threshold([named]), stops_early=True)
+        threshold = replace(_bar([search.final]), stops_early=True)
 
     def multiplies(one: Tested | Candidate) -> bool:
         return bool(one.variant.options.get("times"))

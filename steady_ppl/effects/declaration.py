@@ -65,7 +65,7 @@ class Effect:
         occurs: on which machines it is met, in a line.
         function: how it acts.
         typical: a coefficient that is clearly felt; `(k,)` values for a vector.
-        limit: magnitudes beyond this are hardly physical; the prior's scale.
+        limit: magnitudes beyond this are hardly physical; the scale of the prior, but for a factor on noise.
         sign: of the coefficient where physics fixes it, else 0.
         null: the coefficient at which the effect is absent.
         components: names of a vector coefficient's components.
@@ -75,7 +75,7 @@ class Effect:
             knees, widths or places.
         profiled: the arguments among these that are knees, widths or places.
         by_factor: those of the profiled that are positive and uncertain by a factor; choices are spaced by ratios.
-        prior: of the coefficient, a Pyro distribution; a wide-tailed Cauchy of scale `limit` about its absence if None.
+        prior: of the coefficient, a Pyro distribution; if None a Cauchy of scale `limit`, of a factor a log-normal.
         lacks: why it does not apply to a program, or None.
     """
 

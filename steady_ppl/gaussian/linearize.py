@@ -150,7 +150,7 @@ def linearize(
     """Differentiate the program along a path, all trajectories and times at once.
 
     Args:
-        problem: its program's channel noise normal, its measurements normal or wrapped normal, components independent.
+        problem: its channel noise normal, its measurements normal or Student t, wrapped or not, components independent.
         observation_weight: tempers the observations.
         kernels: differentiate by kernels where they can serve; None: if there are rows enough, see `on_all_rows`.
         angles: `Linearization.angles`, where they are known.
@@ -204,8 +204,9 @@ def linearize_sensors(
     Rows without a measurement are left out, unless hardly any has one.
     """
     given = {"state": states, "measurement": data.measurements, "observed": data.observed}
+    name = "measure"
     if variance is not None:
-        given["variance"] = variance
+        given["variance"], name = variance, "measure at mean squares"
     measure, count = partial(_residuals, program), data.measurements.shape[-1]
     if kernels is None:
         kernels = states[..., 0].numel() >= ROWS_WORTH_COMPILING
@@ -213,7 +214,7 @@ def linearize_sensors(
     looks_everywhere = bool(seen.all()) or int(seen.sum()) < SIMD_LANES
     if not looks_everywhere:
         given = {name: values.flatten(0, 1)[seen].unsqueeze(1) for name, values in given.items()}
-    measured, (by,), in_plain_torch = on_all_rows(program, "measure", measure, given, ("state",), kernels, count)
+    measured, (by,), in_plain_torch = on_all_rows(program, name, measure, given, ("state",), kernels, count)
     residuals, log_sd, log_density = measured.chunk(3, -1)
     by_measured = -by[..., :count, :]
     observed = given["observed"] & torch.isfinite(by_measured.sum(-1))  # where one stands a bearing has no derivative

@@ -89,7 +89,9 @@ class LinearizedGuide(PathGuide):
             self.remember(found.subset(kept), part.subset(kept))
 
     def _smooth(self, data: Trajectories, progress: float) -> Lookahead:
-        path = ReferencePath(self._recall("states", data), self._recall("noise", data))
+        has_tails = all(f"variance/{label}" in self.memory for label in data.labels)
+        variance = self._recall("variance", data) if has_tails else None
+        path = ReferencePath(self._recall("states", data), self._recall("noise", data), variance)
         weight, kernels = self.tempering(progress), data.time.numel() >= GUIDE_ROWS_WORTH_COMPILING
         problem = Problem(self.program, data, self.known_start)
         return smooth(problem, path, observation_weight=weight, passes=self.passes, kernels=kernels)
@@ -106,6 +108,8 @@ class LinearizedGuide(PathGuide):
             self.memory.setdefault(f"searched/{label}", torch.tensor(0.0, dtype=torch.float64))
             self.memory[f"states/{label}"] = path.states[:, i]
             self.memory[f"noise/{label}"] = path.noise[:, i]
+            if path.variance is not None:
+                self.memory[f"variance/{label}"] = path.variance[:, i]
 
 
 class GaussianGuide(LinearizedGuide):

@@ -4,17 +4,16 @@ For programs of some dozens of learnable numbers with normal noise. System ident
 method; its predictor is the linearised program (Ljung 1999, System Identification, section 7.4).
 
 Steps solve the information matrix against the score. It begins as the cross products of the drives' scores (Berndt,
-Hall, Hall and Hausman 1974) unless it is known, and learns on the way (Broyden, Fletcher, Goldfarb and Shanno). Where
-that says that the maximum is reached, the observed information is found, by differences of scores, and steps go on with
-it: cross products of a program that lacks something may be twenty times as large, and then a fit seems to have ended.
+Hall, Hall and Hausman 1974) unless it is known, and learns on the way (Broyden, Fletcher, Goldfarb and Shanno). Cross
+products of a program that lacks something may be twenty times its information, and a fit would seem to have ended. So
+where a maximum seems to be reached, the information is observed by differences of scores, and steps go on with it.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -28,27 +27,26 @@ from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.kernels.rows import kernel_failures, note_failures
-from steady_ppl.likelihood.parameters import Element, elements, moved, on_both_sides, set_values, values_of
-from steady_ppl.likelihood.scores import parameter_scores, smoothed, widens
+from steady_ppl.likelihood.objective import PASSES, STALLED_PASSES, LinearizedObjective, Term, linearised, tried
+from steady_ppl.likelihood.parameters import elements, moved, set_values, values_of
+from steady_ppl.likelihood.scores import smoothed, widens
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 from steady_ppl.utils.cores import Computation, Output, in_batches, one_thread
 from steady_ppl.utils.journal import journaled
 from steady_ppl.utils.progress import stages
 
-PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
 MAX_OBSERVED = 24  # learnable numbers: of more the information stays as scoring steps have it
-OBSERVED_SHARES = (0.01, 100.0)  # of the cross products, between which what is observed is believed
+OBSERVED_SHARES = (0.01, 100.0)  # of what is known, within which what is observed is believed
 MAX_NATS_OF_INFORMATION = 10.0  # gained, beyond which the information at the beginning may not hold at the end
-STALLED_PASSES = 15  # linearisations a step once no share of a step was accepted: some path swings about its mode
 MAX_STEPS = 25  # scoring steps of a fit, where nothing else is said
 STEPS_SEEN, STEPS_FORESEEN = 3, 4
 """A fit is given up after the first, if the second would not do: so many more steps, each of which gains as much as the
 better of the last two did, or as the next one promises."""
 MAX_MOVE = 150  # steps of differences, 1.5 of a logarithm: the most that a number moves at once
 MAX_WIDENED, SHARE_OF_SLOPE = 16.0, 0.7
-"""A move that was cut short may be twice as long the next time, up to so many times as long, where the objective rose
-by more than this share of what its slope foresaw."""
+"""A move that was cut short may be twice as long the next time, and so on up to the first.
+It has to raise the objective by more than the second of what its slope foresaw."""
 MAX_MOVE_SD = 50.0  # standard deviations, of a number with a unit: it moves as far at once, if that is more
 RIDGE = 1e-3  # added to the information of a number, in that of one with a unit if that is smaller
 SHARE_AGAINST_SCORE = 1 / 3
@@ -107,7 +105,7 @@ def maximise(
 def maximise_each(
     problems: Sequence[Problem],
     paths: Sequence[ReferencePath],
-    informations: Sequence[Tensor | None],
+    informations: Sequence[Tensor | Information | None],
     hopeless: Sequence[float],
 ) -> list[Callable[[], Maximum]]:
     """Calls of `maximise` for several programs, to be made in this order; where cores are free the next ones begin. A
@@ -154,26 +152,47 @@ def kept_maximum(program: Program, compute: Computation) -> Maximum:
 
 
 @dataclass(frozen=True)
-class Term:
-    """What a program adds to an objective. Programs whose `columns` name the same place have this number in common."""
+class Information:
+    """What is known of the information before a fit."""
 
-    problem: Problem  # its program's parameters are moved in place
-    path: ReferencePath  # near the posterior means of its drives
-    parts: list[Element]  # its learnable numbers
-    columns: list[int]  # the place of each among all numbers of the objective, counted from 0 without gaps
-    angles: tuple[int, ...] | None = None  # of its linearization, as the program is where the fit begins
+    matrix: Tensor  # (N, N), of some numbers
+    names: tuple[str, ...]  # of these
+    rest: Tensor | None = None  # (P, P), of all numbers, by which the matrix is completed; None: their cross products
 
-    @classmethod
-    def alone(cls, problem: Problem, path: ReferencePath) -> Term:
-        parts = elements(problem.program)
-        return cls(problem, path, parts, list(range(len(parts))))
+    def completed(self, names: Sequence[str], own: Tensor) -> Tensor:
+        """For all numbers, `(P, P)`; `own` are cross products. What is no number is left to these.
+
+        The other numbers depend on the known ones as `rest` says, and have what it tells of them beside those.
+        """
+        wide = own if self.rest is None else self.rest
+        known = [names.index(name) for name in self.names]
+        others = [index for index in range(len(names)) if index not in known]
+        size = wide.diagonal().clamp(min=1e-30).rsqrt()
+        scaled = size * wide * size[:, None]
+        inverse = torch.linalg.pinv(scaled[known][:, known].nan_to_num(), hermitian=True)
+        through = inverse @ scaled[known][:, others]
+        found = torch.empty_like(wide)
+        within = size[known] * self.matrix * size[known][:, None]
+        across = within @ through
+        found[torch.tensor(known)[:, None], known] = within
+        if others:
+            beside = scaled[others][:, others] - scaled[others][:, known] @ through
+            found[torch.tensor(known)[:, None], others] = across
+            found[torch.tensor(others)[:, None], known] = across.T
+            found[torch.tensor(others)[:, None], others] = beside + through.T @ across
+        found = found / size / size[:, None]
+        return found if bool(torch.isfinite(found).all()) else own
+
+    def times(self, share: float) -> Information:
+        """That of a share of the drives."""
+        return replace(self, matrix=share * self.matrix, rest=None if self.rest is None else share * self.rest)
 
 
 @torch.no_grad()
 def maximise_sum(
     terms: Sequence[Term],
     *,
-    information: Tensor | None = None,
+    information: Tensor | Information | None = None,
     steps: int = MAX_STEPS,
     precision: float = 0.02,
     hopeless: float = -math.inf,
@@ -193,10 +212,9 @@ def maximise_sum(
         require_found(at.ahead, at.term.problem)
     began = [at.objective for at in here.terms]
     is_near = information is not None  # to where it is known
-    if information is None or len(information) < len(here.gradient):
-        own = _by_cross_products(here)
-        information = own if information is None else completed(information, own)
-    information = _regularised(information, here.has_unit)
+    if isinstance(information, Information):
+        information = information.completed([part.name for part in terms[0].parts], _by_cross_products(here))
+    information = _by_cross_products(here) if information is None else _regularised(information, here.has_unit)
     reach, is_open = torch.zeros_like(here.gradient), torch.zeros_like(here.has_unit)
     for term in terms:
         reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
@@ -204,29 +222,38 @@ def maximise_sum(
     reach = torch.where(is_open, torch.maximum(reach, MAX_MOVE_SD * information.diagonal().rsqrt()), reach)
     taken, decrement, passes, widened = 0, 0.0, PASSES, 1.0
     few_drives = len(here.scores) < 2 * len(information)  # they know too little: what they say is seen twice
-    is_small, is_observed, most = False, len(information) > MAX_OBSERVED or len(terms) > 1, here.objective
+    may_observe, is_observed = len(terms) == 1 and len(information) <= MAX_OBSERVED, False
+    is_small, is_over, most = False, False, here.objective
     rises = list[float]()  # of log p(y) by accepted steps
     with stages(*(("", SHARE_THAT_GOES_ON**step) for step in range(steps + 1))) as begin:
         for taken in range(steps + 1):
             begin()
             move, singular = torch.linalg.solve_ex(information, here.gradient)
             if not singular and not float(here.gradient @ move) >= 0:  # it has ceased to be positive
-                information = _by_cross_products(here)
+                information, is_near, is_observed = _by_cross_products(here), False, False
                 move, singular = torch.linalg.solve_ex(information, here.gradient)
             if singular:
                 raise FilterError(
                     "the likeliest parameters cannot be found: the drives do not tell them apart (singular)"
                 )
             decrement = 0.5 * float(here.gradient @ move)
-            is_far = not is_near or taken == 0 or here.objective - sum(began) > MAX_NATS_OF_INFORMATION
-            if decrement < precision and is_far and not is_observed:
-                is_observed, information = True, observed(here.terms[0].term, _by_cross_products(here))
+            if decrement < precision and len(terms) == 1 and not is_observed:
+                if is_near and not few_drives:  # what was given may be too much
+                    own = _by_cross_products(here)
+                    more = 0.5 * float(here.gradient @ torch.linalg.solve(own, here.gradient))
+                    if taken == 0 or more > CONVERGED_DECREMENT:
+                        information, is_near = own, False
+                is_far = not is_near or taken == 0 or here.objective - sum(began) > MAX_NATS_OF_INFORMATION
+                if is_far and may_observe:
+                    information, is_observed = observed(here.terms[0].term, information, passes), True
                 move = torch.linalg.solve(information, here.gradient)
                 decrement = 0.5 * float(here.gradient @ move)
+            is_sure = is_observed or (is_near and len(information) <= MAX_OBSERVED)
             most_left = STEPS_FORESEEN * max(0.0, decrement, *rises[-2:])
             behind = len(rises) >= STEPS_SEEN and here.log_likelihood + most_left < hopeless
             was_small, is_small = is_small, decrement < precision
-            if (is_small and (is_observed or was_small or not few_drives or taken == 0)) or taken == steps or behind:
+            is_over |= is_small and (is_sure or was_small or not few_drives or taken == 0)
+            if is_over or taken == steps or behind:
                 break
             length = float((move.abs() / reach).max())
             move = move * min(1.0, widened / max(1e-9, length))
@@ -242,8 +269,7 @@ def maximise_sum(
                 information = _bfgs_update(information, share * move, here.gradient - there.gradient)
                 rises.append(there.log_likelihood - here.log_likelihood)
                 here, most = there, max(most, there.objective)
-                if passes == STALLED_PASSES and risen < CONVERGED_DECREMENT:
-                    break
+                is_over = passes == STALLED_PASSES and risen < CONVERGED_DECREMENT
             elif passes == STALLED_PASSES:
                 break
             else:
@@ -251,8 +277,10 @@ def maximise_sum(
                 further = linearised([at.term for at in here.terms], passes)
                 if not bool(torch.isfinite(further.gradient).all()):  # a path diverges on its way to its mode
                     break
-                here = further
-                information, most = _by_cross_products(here), here.objective
+                here, most = further, further.objective
+                information, is_near, is_observed = _by_cross_products(here), False, may_observe
+                if may_observe:
+                    information = observed(here.terms[0].term, information, passes)
                 rises.append(math.inf)  # along other paths
     return [
         Maximum(
@@ -279,7 +307,7 @@ def _line_search(
     while share > 0.01:
         for term, values in zip(terms, before, strict=True):
             set_values(term.parts, values + share * move[term.columns])
-        if (there := _tried(terms, passes, least)) is not None:
+        if (there := tried(terms, passes, least)) is not None:
             return share, there
         share /= 3
     for term, values in zip(terms, before, strict=True):
@@ -294,31 +322,23 @@ def _by_cross_products(here: LinearizedObjective) -> Tensor:
     return _regularised(information + 0.1 * torch.diag(information.diagonal()), here.has_unit)
 
 
-def completed(known: Tensor, wide: Tensor) -> Tensor:
-    """The information of numbers of which it is `known` for the first ones, and elsewhere `wide` for all."""
-    count = len(known)
-    through = torch.linalg.lstsq(wide[:count, :count], wide[:count, count:]).solution
-    rest = wide[count:, count:] - wide[count:, :count] @ through  # what is told of the others beside the first ones
-    across = known @ through
-    return torch.cat([torch.cat([known, across], 1), torch.cat([across.T, rest + through.T @ across], 1)])
+def observed(term: Term, known: Tensor, passes: int = PASSES) -> Tensor:
+    """Minus the second derivatives of an objective where its program is, `(P, P)`, by differences of scores.
 
-
-def observed(term: Term, crossed: Tensor) -> Tensor:
-    """Minus the second derivatives of an objective where its program is, `(P, P)`, by differences of scores over what
-    cross products take for a standard deviation; these themselves where the program diverges."""
-    here = linearised([term])
-    (there,), found = here.terms, torch.empty_like(crossed)
-    for part, column, own in zip(term.parts, term.columns, crossed.diagonal().tolist(), strict=True):
-        step = min(own**-0.5, MAX_MOVE * part.step)
+    Each number is moved by what `known` takes for its standard deviation. What is observed is believed within
+    `OBSERVED_SHARES` of what is known, and not at all where the program diverges or `known` is not positive.
+    """
+    here = linearised([term], passes)
+    (there,), found = here.terms, torch.empty_like(known)
+    for part, column, own in zip(term.parts, term.columns, known.diagonal().tolist(), strict=True):
+        step = min(max(own**-0.5, part.step), MAX_MOVE * part.step)
         with moved(part, step):
-            found[column] = (here.gradient - linearised([there.term]).gradient) / step
-    if not bool(torch.isfinite(found).all()):
-        return crossed
-    root = torch.linalg.cholesky(crossed)
-    within = torch.linalg.solve_triangular(
-        root, torch.linalg.solve_triangular(root, found + found.T, upper=False).T, upper=False
-    )
-    shares, turn = torch.linalg.eigh(within / 2)
+            found[column] = (here.gradient - linearised([there.term], passes).gradient) / step
+    root, failed = torch.linalg.cholesky_ex(known)
+    if failed or not bool(torch.isfinite(found).all()):
+        return known
+    half = torch.linalg.solve_triangular(root, found + found.T, upper=False).T
+    shares, turn = torch.linalg.eigh(torch.linalg.solve_triangular(root, half, upper=False) / 2)
     return (root @ turn * shares.clamp(*OBSERVED_SHARES)) @ (root @ turn).T
 
 
@@ -326,107 +346,6 @@ def _regularised(information: Tensor, has_unit: Tensor) -> Tensor:
     own = information.diagonal()
     of_unit = torch.where(own > 0, own.clamp(max=1.0), 1.0)  # nothing is known of a number that tells nothing
     return information + torch.diag(1e-6 * own + RIDGE * torch.where(has_unit, of_unit, 1.0))
-
-
-@dataclass(frozen=True)
-class LinearizedTerm:
-    """A term's objective where its program is."""
-
-    term: Term  # along the path that its drives have here
-    shares: dict[str, float]  # in the log prior of parameters, which other terms may have in common with it
-    ahead: Lookahead
-    objective: float
-
-
-@dataclass(frozen=True)
-class LinearizedObjective:
-    """A sum of terms where their programs are."""
-
-    terms: list[LinearizedTerm]
-    scores: Tensor  # (B, P), of the drives of all terms
-    gradient: Tensor  # (P,)
-    has_unit: Tensor  # (P,) bool, see `Element`
-
-    @property
-    def objective(self) -> float:
-        return sum(term.objective for term in self.terms)
-
-    @property
-    def log_likelihood(self) -> float:
-        return sum(float(term.ahead.log_likelihood.sum()) for term in self.terms)
-
-
-def linearised(terms: Sequence[Term], passes: int = PASSES) -> LinearizedObjective:
-    """The objective of programs where they are, with its scores; not finite where one diverges."""
-    return _scored(_valued(terms, passes))
-
-
-def _tried(terms: Sequence[Term], passes: int, least: float) -> LinearizedObjective | None:
-    """None where the step went too far: the objective falls below `least`, or a program diverges there."""
-    try:
-        found = _valued(terms, passes)
-        broken = any(bool(term.ahead.is_broken.any()) for term in found)
-        if broken or not sum(term.objective for term in found) >= least:
-            return None
-        here = _scored(found)
-    except FilterError:
-        return None
-    return here if bool(torch.isfinite(here.gradient).all()) else None
-
-
-def _valued(terms: Sequence[Term], passes: int) -> list[LinearizedTerm]:
-    found, owners = [], Counter(column for term in terms for column in term.columns)
-    for term in terms:
-        names = [part.owner for part in term.parts]
-        shares = {name: 1 / owners[column] for name, column in zip(names, term.columns, strict=True)}
-        ahead = smooth(term.problem, term.path, passes=passes, tolerance=TOLERANCE, angles=term.angles)
-        objective = float(ahead.log_likelihood.sum()) + log_prior(term.problem.program, shares)
-        rested = resting_path(ahead, term.problem.data)
-        there = replace(term, path=rested, angles=ahead.linearization.angles)
-        found.append(LinearizedTerm(there, shares, ahead, objective))
-    return found
-
-
-def _scored(found: list[LinearizedTerm]) -> LinearizedObjective:
-    columns, by_drive = {column for at in found for column in at.term.columns}, []
-    gradient, has_unit = torch.zeros(len(columns), dtype=torch.float64), torch.zeros(len(columns), dtype=torch.bool)
-    for at in found:
-        has_unit[at.term.columns] = torch.tensor([part.has_unit for part in at.term.parts], dtype=torch.bool)
-        program, data = at.term.problem.program, at.term.problem.data
-        own = parameter_scores(program, data, smoothed(at.ahead, data), at.term.parts)
-        gradient[at.term.columns] += own.sum(0) + _slope_of_prior(program, at.term.parts, at.shares)
-        wide = own.new_zeros((len(own), len(gradient)))
-        wide[:, at.term.columns] = own
-        by_drive.append(wide)
-    return LinearizedObjective(found, torch.cat(by_drive), gradient, has_unit)
-
-
-def posterior_score(problem: Problem, path: ReferencePath) -> Tensor:
-    """The slope of log p(y) and the log prior where the program is, `(P,)`, along the best path near `path`.
-
-    Raises:
-        FilterError: the program diverges there.
-    """
-    return linearised([Term.alone(problem, path)], STALLED_PASSES).gradient
-
-
-def _slope_of_prior(program: Program, parts: list[Element], shares: dict[str, float]) -> Tensor:
-    """Of the log prior in the unconstrained space, without the Jacobian: for the parameter's own mode, `(P,)`."""
-    slope = torch.zeros(len(parts), dtype=torch.float64)
-    for index, part in enumerate(parts):
-        if part.owner in program.priors:
-            up, down = on_both_sides(part, lambda: log_prior(program, shares))
-            slope[index] = (up - down) / (2 * part.step)
-    return slope
-
-
-def log_prior(program: Program, shares: Mapping[str, float] | None = None) -> float:
-    """Of the parameters that have one, of their own values; of some only a share."""
-    shares = shares or {}
-    return sum(
-        shares.get(name, 1.0) * float(prior.log_prob(getattr(program, name)).sum())
-        for name, prior in program.priors.items()
-    )
 
 
 def _bfgs_update(information: Tensor, step: Tensor, fall: Tensor) -> Tensor:

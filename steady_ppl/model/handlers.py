@@ -240,10 +240,10 @@ def normal_moments(fn: Any, site: str) -> tuple[Tensor, Tensor]:
 
 def tangent_normal(fn: Any, residual: Tensor, site: str, variance: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return standard deviation and log-density at residual zero, each as `residual`, of the normal that touches a
-    measurement site's log-density from below, with the same slope, at a residual of a `variance`.
+    measurement site's log-density from below, with the same slope.
 
-    A normal is its own; a Student t's is wider the farther out it is touched (Lange, Little and Taylor 1989): at the
-    root of the mean square, for there the bound of its mean is largest. Any other site is a ProgramError.
+    A normal is its own; a Student t's is wider the farther out it is touched (Lange, Little and Taylor 1989). That is
+    where the square is `residual`² + `variance`, there the bound of its mean is best. Any other site is a ProgramError.
     """
     base = unwrapped(fn)
     if not isinstance(base, dist.StudentT) or fn.event_dim > 1:

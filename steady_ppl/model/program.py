@@ -18,7 +18,7 @@ from pyro.nn import PyroModule, PyroParam, PyroSample
 from torch import Tensor
 
 from steady_ppl.errors import DataError, ProgramError
-from steady_ppl.utils import hooks
+from steady_ppl.utils import context
 
 if TYPE_CHECKING:
     from steady_ppl.data.trajectories import Trajectories
@@ -40,7 +40,7 @@ def _with_listed_effects(init: Callable[..., None]) -> Callable[..., None]:
             if outermost:
                 self.__dict__.pop("_begun", None)
         if outermost and self.effects:
-            hooks.attach_listed(self)
+            context.attach_listed(self)
 
     wrapped.attaches_effects = True  # type: ignore[attr-defined]
     return wrapped
@@ -250,7 +250,7 @@ class Program(PyroModule):
         self, effect: object, value: float | Sequence[float] | Tensor | None = None, **where: object
     ) -> Program:
         """A copy with a physical effect added, its coefficient a learnable parameter; see `effects.attach`."""
-        return hooks.with_effect(self, effect, value, **where)
+        return context.with_effect(self, effect, value, **where)
 
     def example_controls(self, time: Tensor) -> Tensor:
         """Controls of simulated drives, `(rows, trajectories, U)` at times `(rows, trajectories)`; zero by default."""

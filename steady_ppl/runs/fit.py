@@ -24,9 +24,9 @@ from steady_ppl.model.substeps import is_count
 from steady_ppl.runs.export import Dynamics
 from steady_ppl.runs.folder import FINISHED, PARAMETERS, POSTERIOR, RUN_RECORD, read_record, run_folder, write_record
 from steady_ppl.training.loop import Trained
+from steady_ppl.utils.context import Displayed
 from steady_ppl.utils.cores import one_thread
 from steady_ppl.utils.files import whole_file
-from steady_ppl.utils.hooks import Displayed
 from steady_ppl.utils.tensor_files import read_tensors, write_tensors
 
 if TYPE_CHECKING:

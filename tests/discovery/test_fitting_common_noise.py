@@ -23,7 +23,8 @@ from steady_ppl.discovery.refits import Threshold, first_refit, refit_with
 from steady_ppl.effects import chosen_variant, coefficient
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path, smooth
-from steady_ppl.likelihood.maximize import Term, maximise, maximise_sum
+from steady_ppl.likelihood.maximize import maximise, maximise_sum
+from steady_ppl.likelihood.objective import Term
 from steady_ppl.likelihood.parameters import elements, values_of
 from steady_ppl.model.problem import Problem
 

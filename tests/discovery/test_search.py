@@ -20,14 +20,16 @@ def test_a_class_begins_with_what_was_chosen():
     class Stub:
         against_its_sign = False
 
-        def __init__(self, name, total):
-            self.variant, self.total = SimpleNamespace(name=name), total
+        def __init__(self, name, total, explains=True):
+            self.variant, self.total, self.is_explanation = SimpleNamespace(name=name), total, explains
 
     named = {"more": 10.5, "chosen": 10.0, "near": 8.5, "far": 7.0}
     more, chosen, near, far = (Stub(*pair) for pair in named.items())
     elsewhere = Stub("chosen", 9.9)  # itself, at another knee
-    found = Found(chosen, [more, chosen, elsewhere, near, far], None)
-    assert found.aliases == [chosen, more, near]
+    coloured = Stub("coloured", 900.0, explains=False)
+    found = Found(chosen, [coloured, more, chosen, elsewhere, near, far], None)
+    assert found.aliases == [chosen, more, near] and coloured not in found.rivals
+    assert Found(coloured, [coloured, more], None).rivals == [coloured, more]
 
 
 @pytest.mark.parametrize("first", [True, False])

@@ -338,10 +338,24 @@ def test_a_student_t_is_touched_at_the_root_of_the_mean_square_of_a_path_that_wa
     squares = (linear.residual.square() + states[..., :1, 0]) / float(program.measurement_sd) ** 2
     precision = (3.0 + 1) / (3.0 + squares) / float(program.measurement_sd) ** 2
     torch.testing.assert_close(linear.precision, torch.where(data.observed, precision, 0.0))
-    few = [1]
-    again = linear.path.with_subset(few, linear.path.subset(few))
-    assert all(map(torch.equal, vars(again).values(), vars(linear.path).values()))
+    other = ReferencePath(*(values + 1 for values in vars(linear.path).values()))
+    for name, values in vars(linear.path.with_subset([1], other.subset([1]))).items():
+        assert torch.equal(values[:, 0], getattr(linear.path, name)[:, 0])
+        assert torch.equal(values[:, 1], getattr(other, name)[:, 1])
     assert linear.path.for_sensors(example("linear_gaussian")).variance is None
+
+
+def test_kernels_of_a_student_t_sensor_take_a_path_with_variances_and_one_without():
+    """They have one argument more or less: with one kernel for both the process died."""
+    program = example("linear_gaussian", torch.float32).with_effect("heavy_tails", 0.3).requires_grad_(False)
+    data = drives(program, 40, 30)
+    found = near_the_truth(program, data)
+    sure = ReferencePath(found.states.float(), found.noise.float())
+    path = sure.for_sensors(program)
+    found = [linearize(Problem(program, data), one, kernels=True) for one in (sure, path, sure, sure, path)]
+    assert all(one.in_plain_torch is None for one in found)
+    for one in found[1:]:
+        torch.testing.assert_close(one.precision, found[0].precision)
 
 
 def test_a_known_start_needs_no_normal_prior():

@@ -22,14 +22,14 @@ from steady_ppl.likelihood.maximize import (
     MAX_DECREASE,
     MAX_STEPS,
     STEPS_SEEN,
-    Term,
+    Information,
     maximise,
     maximise_each,
     maximise_sum,
-    posterior_score,
     refit_outliers,
     widen_noise,
 )
+from steady_ppl.likelihood.objective import Term, posterior_score
 from steady_ppl.likelihood.parameter_posterior import observed_information
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
@@ -132,7 +132,7 @@ def test_a_wrong_slope_does_not_lead_further_and_further_down(cart, monkeypatch)
     program, data, maximum = cart
     own = copy.deepcopy(program)
     wrong = torch.tensor([40.0, -40.0, 30.0, 30.0], dtype=torch.float64)
-    monkeypatch.setattr("steady_ppl.likelihood.maximize._slope_of_prior", lambda program, parts, shares: wrong)
+    monkeypatch.setattr("steady_ppl.likelihood.objective._slope_of_prior", lambda program, parts, shares: wrong)
     ended = maximise(Problem(own, data, True))
     assert ended.objective > maximum.objective - 2.1 * MAX_DECREASE  # once more along paths at rest
 
@@ -185,8 +185,27 @@ def test_a_fit_that_begins_with_too_much_information_does_not_end_at_once(cart):
     for part, by in zip(elements(far), (0.2, -0.2, 0.1, -0.1), strict=True):
         part.move(by)
     problem = Problem(far, data, True)
-    (again,) = maximise_sum([Term.alone(problem, find_path(problem))], information=1e4 * maximum.information, steps=60)
+    terms = [Term.alone(problem, find_path(problem))]
+    (again,) = maximise_sum(terms, information=1e4 * maximum.information, steps=60)
     assert again.objective == pytest.approx(maximum.objective, abs=0.1)
+
+
+def test_nor_does_one_of_so_many_numbers_that_none_is_observed(cart, monkeypatch):
+    monkeypatch.setattr("steady_ppl.likelihood.maximize.MAX_OBSERVED", 0)
+    test_a_fit_that_begins_with_too_much_information_does_not_end_at_once(cart)
+
+
+def test_information_of_some_numbers_is_completed_wherever_they_stand():
+    wide = torch.tensor([[4e6, 1e3, 2.0], [1e3, 1.0, 1e-3], [2.0, 1e-3, 9e-6]], dtype=torch.float64)
+    names = ["large", "new", "small"]
+    known = Information(wide[[0, 2]][:, [0, 2]], ("large", "small"))
+    torch.testing.assert_close(known.completed(names, wide), wide)
+    half = Information(known.matrix / 2, known.names, wide).completed(names, 7 * wide)
+    assert bool((torch.linalg.eigvalsh(half / wide.diagonal().sqrt() / wide.diagonal().sqrt()[:, None]) > 0).all())
+    torch.testing.assert_close(half[[0, 2]][:, [0, 2]], known.matrix / 2)
+    inverse, before = torch.linalg.inv(half), torch.linalg.inv(wide)
+    assert inverse[1, 1] == pytest.approx(float(before[1, 1]), rel=0.7)  # what is told of it beside the others stays
+    assert torch.equal(Information(known.matrix * torch.nan, known.names).completed(names, wide), wide)
 
 
 def test_a_program_that_lacks_something_is_fitted_to_the_end_and_knows_how_sharp_it_is(cart):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import steady_ppl
-from steady_ppl.utils import hooks
+from steady_ppl.utils import context
 
 STUB = Path(steady_ppl.__file__).with_suffix(".pyi")
 
@@ -37,4 +37,4 @@ def test_importing_the_package_loads_no_torch() -> None:
 
 
 def test_the_root_says_what_lower_packages_call_of_higher_ones() -> None:
-    assert hooks.__annotations__.keys() <= vars(hooks).keys() and hooks.html is not repr
+    assert context.__annotations__.keys() <= vars(context).keys() and context.html is not repr

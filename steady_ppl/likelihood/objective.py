@@ -1,0 +1,142 @@
+"""A program's objective, log p(y) and log prior, where the program is, and its slopes; or the sum of several programs'.
+
+Log p(y) is that of the program linearised along its posterior means, which go with it: see `gaussian.smoother`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from steady_ppl.errors import FilterError
+from steady_ppl.gaussian.information_filter import Lookahead
+from steady_ppl.gaussian.linearize import ReferencePath
+from steady_ppl.gaussian.smoother import resting_path, smooth
+from steady_ppl.likelihood.parameters import Element, elements, on_both_sides
+from steady_ppl.likelihood.scores import parameter_scores, smoothed
+from steady_ppl.model.problem import Problem
+from steady_ppl.model.program import Program
+
+PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
+STALLED_PASSES = 15  # linearisations a step once no share of a step was accepted: some path swings about its mode
+
+
+@dataclass(frozen=True)
+class Term:
+    """What a program adds to an objective. Programs whose `columns` name the same place have this number in common."""
+
+    problem: Problem  # its program's parameters are moved in place
+    path: ReferencePath  # near the posterior means of its drives
+    parts: list[Element]  # its learnable numbers
+    columns: list[int]  # the place of each among all numbers of the objective, counted from 0 without gaps
+    angles: tuple[int, ...] | None = None  # of its linearization, as the program is where the fit begins
+
+    @classmethod
+    def alone(cls, problem: Problem, path: ReferencePath) -> Term:
+        parts = elements(problem.program)
+        return cls(problem, path, parts, list(range(len(parts))))
+
+
+@dataclass(frozen=True)
+class LinearizedTerm:
+    """A term's objective where its program is."""
+
+    term: Term  # along the path that its drives have here
+    shares: dict[str, float]  # in the log prior of parameters, which other terms may have in common with it
+    ahead: Lookahead
+    objective: float
+
+
+@dataclass(frozen=True)
+class LinearizedObjective:
+    """A sum of terms where their programs are."""
+
+    terms: list[LinearizedTerm]
+    scores: Tensor  # (B, P), of the drives of all terms
+    gradient: Tensor  # (P,)
+    has_unit: Tensor  # (P,) bool, see `Element`
+
+    @property
+    def objective(self) -> float:
+        return sum(term.objective for term in self.terms)
+
+    @property
+    def log_likelihood(self) -> float:
+        return sum(float(term.ahead.log_likelihood.sum()) for term in self.terms)
+
+
+def linearised(terms: Sequence[Term], passes: int = PASSES) -> LinearizedObjective:
+    """The objective of programs where they are, with its scores; not finite where one diverges."""
+    return _scored(_valued(terms, passes))
+
+
+def tried(terms: Sequence[Term], passes: int, least: float) -> LinearizedObjective | None:
+    """None where the step went too far: the objective falls below `least`, or a program diverges there."""
+    try:
+        found = _valued(terms, passes)
+        broken = any(bool(term.ahead.is_broken.any()) for term in found)
+        if broken or not sum(term.objective for term in found) >= least:
+            return None
+        here = _scored(found)
+    except FilterError:
+        return None
+    return here if bool(torch.isfinite(here.gradient).all()) else None
+
+
+def _valued(terms: Sequence[Term], passes: int) -> list[LinearizedTerm]:
+    found, owners = [], Counter(column for term in terms for column in term.columns)
+    for term in terms:
+        names = [part.owner for part in term.parts]
+        shares = {name: 1 / owners[column] for name, column in zip(names, term.columns, strict=True)}
+        ahead = smooth(term.problem, term.path, passes=passes, tolerance=TOLERANCE, angles=term.angles)
+        objective = float(ahead.log_likelihood.sum()) + log_prior(term.problem.program, shares)
+        rested = resting_path(ahead, term.problem.data)
+        there = replace(term, path=rested, angles=ahead.linearization.angles)
+        found.append(LinearizedTerm(there, shares, ahead, objective))
+    return found
+
+
+def _scored(found: list[LinearizedTerm]) -> LinearizedObjective:
+    columns, by_drive = {column for at in found for column in at.term.columns}, []
+    gradient, has_unit = torch.zeros(len(columns), dtype=torch.float64), torch.zeros(len(columns), dtype=torch.bool)
+    for at in found:
+        has_unit[at.term.columns] = torch.tensor([part.has_unit for part in at.term.parts], dtype=torch.bool)
+        program, data = at.term.problem.program, at.term.problem.data
+        own = parameter_scores(program, data, smoothed(at.ahead, data), at.term.parts)
+        gradient[at.term.columns] += own.sum(0) + _slope_of_prior(program, at.term.parts, at.shares)
+        wide = own.new_zeros((len(own), len(gradient)))
+        wide[:, at.term.columns] = own
+        by_drive.append(wide)
+    return LinearizedObjective(found, torch.cat(by_drive), gradient, has_unit)
+
+
+def posterior_score(problem: Problem, path: ReferencePath) -> Tensor:
+    """The slope of log p(y) and the log prior where the program is, `(P,)`, along the best path near `path`.
+
+    Raises:
+        FilterError: the program diverges there.
+    """
+    return linearised([Term.alone(problem, path)], STALLED_PASSES).gradient
+
+
+def _slope_of_prior(program: Program, parts: list[Element], shares: dict[str, float]) -> Tensor:
+    """Of the log prior in the unconstrained space, without the Jacobian: for the parameter's own mode, `(P,)`."""
+    slope = torch.zeros(len(parts), dtype=torch.float64)
+    for index, part in enumerate(parts):
+        if part.owner in program.priors:
+            up, down = on_both_sides(part, lambda: log_prior(program, shares))
+            slope[index] = (up - down) / (2 * part.step)
+    return slope
+
+
+def log_prior(program: Program, shares: Mapping[str, float] | None = None) -> float:
+    """Of the parameters that have one, of their own values; of some only a share."""
+    shares = shares or {}
+    return sum(
+        shares.get(name, 1.0) * float(prior.log_prob(getattr(program, name)).sum())
+        for name, prior in program.priors.items()
+    )
