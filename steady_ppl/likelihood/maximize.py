@@ -248,7 +248,7 @@ def maximise_sum(
                     information, is_observed = observed(here.terms[0].term, information, passes), True
                 move = torch.linalg.solve(information, here.gradient)
                 decrement = 0.5 * float(here.gradient @ move)
-            is_sure = is_observed or (is_near and len(information) <= MAX_OBSERVED)
+            is_sure = is_observed or (is_near and may_observe)
             most_left = STEPS_FORESEEN * max(0.0, decrement, *rises[-2:])
             behind = len(rises) >= STEPS_SEEN and here.log_likelihood + most_left < hopeless
             was_small, is_small = is_small, decrement < precision
