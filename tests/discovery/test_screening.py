@@ -53,6 +53,15 @@ def test_what_is_missing_is_first_with_its_coefficient():
     assert 4 < quantiles < 5.5
 
 
+def test_the_fitted_parameters_own_score_is_taken_as_it_is():
+    """Where log p(y) is biased so are the sets' scores: with heavy tails every good fit was called one at a bound."""
+    drives, simulated = scores_of(1, 6)[0], scores_of(400, 5)
+    drives[:, :PARAMETERS] -= drives[:, :PARAMETERS].mean(0)  # at the maximum
+    simulated[..., :PARAMETERS] += 3.0
+    statistic, count = screen(drives, simulated, PARAMETERS, columns()).fitted
+    assert statistic == pytest.approx(0.0, abs=1e-6) and count == PARAMETERS
+
+
 def test_what_fitted_parameters_explain_is_projected_out():
     """A candidate whose scores are the parameters' mixed is untestable; moving a parameter changes nothing."""
     simulated, drives = scores_of(400, 5), scores_of(1, 6)[0]
