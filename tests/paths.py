@@ -44,8 +44,3 @@ def at_rest(program, data) -> tuple[Smoothed, ReferencePath]:
     """What scores need of it, and the path of the means."""
     ahead, path = settled(program, data)
     return smoothed(ahead, data), path
-
-
-def of(path: ReferencePath, trajectories: list[int]) -> ReferencePath:
-    """The path of some trajectories."""
-    return ReferencePath(path.states[:, trajectories], path.noise[:, trajectories])

@@ -32,10 +32,11 @@ from steady_ppl.discovery.refits import (
 from steady_ppl.discovery.screening import FAMILY_LEVEL, Screened, Tested, departures, screen
 from steady_ppl.effects import Effect, Sizes, Variant, attached, catalogue
 from steady_ppl.errors import FilterError
+from steady_ppl.gaussian.linearize import has_heavy_tails
 from steady_ppl.gaussian.smoother import smooth
 from steady_ppl.likelihood.parameter_posterior import ridged_inverse
 from steady_ppl.likelihood.parameters import Element, elements
-from steady_ppl.likelihood.scores import measured, smoothed, typical_spreads
+from steady_ppl.likelihood.scores import smoothed, typical_spreads
 from steady_ppl.model.program import Program
 from steady_ppl.utils.journal import journaled
 from steady_ppl.utils.random import seeded
@@ -151,7 +152,7 @@ def screen_program(
     away = departures(declared, now, parts)
     away = [one for one in away if one.variant.name not in there and wanted(one.variant.effect)]
     there |= {departure.variant.name for departure in away}
-    tailed = measured(program, fold.path.states[:1, :1]).heavy_tailed  # as it stands
+    tailed = has_heavy_tails(program, fold.path.states[:1, :1])  # as it stands
     effects = [e for e in catalogue(program) if wanted(e) and not (tailed and e.form == "tails")]
     sizes = Sizes(program, seen)
     variants = [sizes.of(v) for effect in effects for v in effect.variants(program, seen) if v.name not in there]

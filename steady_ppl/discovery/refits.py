@@ -234,9 +234,7 @@ def attempt_with(
     try:
         programs = [attach(copy.deepcopy(program), variant, value) for program in base.programs]
         if isinstance(information, Maximum):
-            known = _information(information, elements(programs[0]))
-            names = tuple(part.name for part in elements(programs[0]))
-            return Attempt(programs, None if known is None else Information(known, names))
+            return Attempt(programs, _information(information, elements(programs[0])))
         return Attempt(programs, information)
     except Exception as error:  # also of the program's own code, on parameters that nobody tried before
         return reason_of(error)
@@ -410,17 +408,18 @@ def _guess(
     """
     share = len(fold.drives) / len(first.drives)
     if isinstance(known, Information):
-        return known.times(share)
+        return replace(known, matrix=share * known.matrix)
     rest = None if known is None else share * known
     return Information(without.information, without.names, rest) if len(without.information) else rest
 
 
-def _information(maximum: Maximum, parts: Sequence[Element]) -> Tensor | None:
+def _information(maximum: Maximum, parts: Sequence[Element]) -> Information | None:
     """Of learnable numbers, as a fit in which they and perhaps others were learned left it; None if some were not."""
-    if not {part.name for part in parts} <= set(maximum.names):
+    names = tuple(part.name for part in parts)
+    if not set(names) <= set(maximum.names):
         return None
-    index = [maximum.names.index(part.name) for part in parts]
-    return maximum.information[index][:, index]
+    index = [maximum.names.index(name) for name in names]
+    return Information(maximum.information[index][:, index], names)
 
 
 def _coefficients(programs: Sequence[Program], variant: Variant) -> list[Tensor]:

@@ -109,7 +109,7 @@ def screen(
     sums = simulated.sum(1)
     bias = sums.mean(0)
     apart = simulated - simulated.mean(0)  # of each drive among the sets
-    rest_of_fit = observed.sum(0)[:fitted]  # as it is: where log p(y) is biased, so are the sets' scores
+    own_score = observed.sum(0)[:fitted]  # as it is: where log p(y) is biased, so are the sets' scores
     information = torch.einsum("sbi,sbj->ij", apart, apart) / (len(apart) - 1)
     scores = torch.cat([(observed.sum(0) - bias).unsqueeze(0), sums - bias])
     own, rest = slice(0, fitted), slice(fitted, None)
@@ -146,7 +146,7 @@ def screen(
         curves=sorted(curves, key=lambda test: -test.evidence),
         p_value=(1 + float((family[1:] <= family[0]).sum())) / len(family),
         critical=critical,
-        fitted=(float(rest_of_fit @ inverse @ rest_of_fit), fitted),
+        fitted=(float(own_score @ inverse @ own_score), fitted),
         correlations=_largest_canonical_correlations(left, [test.place for test in tests]),
         information=information,
     )

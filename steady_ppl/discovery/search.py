@@ -387,6 +387,7 @@ def _threshold(candidates: Sequence[Candidate]) -> Threshold:
 
 
 def _bar(fits: Sequence[Refit]) -> Threshold:
+    """What is so far behind these fits on the first fold that it is hardly worth another."""
     drives = [float(fit.maxima[0].log_likelihood.sum()) for fit in fits]
     held_out = [float(fit.held_out_alone[: len(fit.folds[0].held_out)].sum()) for fit in fits]
     return Threshold(max(drives, default=-math.inf) - MAX_NATS_BEHIND, max(held_out, default=-math.inf) - TIE_NATS)

@@ -153,7 +153,7 @@ def kept_maximum(program: Program, compute: Computation) -> Maximum:
 
 @dataclass(frozen=True)
 class Information:
-    """What is known of the information before a fit."""
+    """What is known of the information before a fit of one program."""
 
     matrix: Tensor  # (N, N), of some numbers
     names: tuple[str, ...]  # of these
@@ -164,6 +164,8 @@ class Information:
 
         The other numbers depend on the known ones as `rest` says, and have what it tells of them beside those.
         """
+        if tuple(names) == self.names:
+            return self.matrix
         wide = own if self.rest is None else self.rest
         known = [names.index(name) for name in self.names]
         others = [index for index in range(len(names)) if index not in known]
@@ -171,21 +173,13 @@ class Information:
         scaled = size * wide * size[:, None]
         inverse = torch.linalg.pinv(scaled[known][:, known].nan_to_num(), hermitian=True)
         through = inverse @ scaled[known][:, others]
-        found = torch.empty_like(wide)
         within = size[known] * self.matrix * size[known][:, None]
         across = within @ through
-        found[torch.tensor(known)[:, None], known] = within
-        if others:
-            beside = scaled[others][:, others] - scaled[others][:, known] @ through
-            found[torch.tensor(known)[:, None], others] = across
-            found[torch.tensor(others)[:, None], known] = across.T
-            found[torch.tensor(others)[:, None], others] = beside + through.T @ across
-        found = found / size / size[:, None]
+        beside = scaled[others][:, others] - scaled[others][:, known] @ through
+        blocks = torch.cat([torch.cat([within, across], 1), torch.cat([across.T, beside + through.T @ across], 1)])
+        back = torch.tensor([*known, *others]).argsort()
+        found = blocks[back][:, back] / size / size[:, None]
         return found if bool(torch.isfinite(found).all()) else own
-
-    def times(self, share: float) -> Information:
-        """That of a share of the drives."""
-        return replace(self, matrix=share * self.matrix, rest=None if self.rest is None else share * self.rest)
 
 
 @torch.no_grad()

@@ -231,11 +231,10 @@ class _Robust:
     @cached_property
     def z(self) -> Tensor:
         """Residuals given all other cells, in their own standard deviations, `(T + 1, B, K)`; zero where missing."""
-        linear, (means, _), (states, *_) = self.linear, self.ahead.means(), self.ahead.covariances()
+        linear, (means, _) = self.linear, self.ahead.means()
         away = (means - linear.path.states).double()
         apart = linear.residual - (linear.measurement @ away.unsqueeze(-1)).squeeze(-1)
-        known = ((linear.measurement @ states) * linear.measurement).sum(-1)
-        left = (1 - linear.precision * known).clamp(min=1e-9)
+        left = (1 - linear.precision * self.ahead.sensed_variance()).clamp(min=1e-9)
         return torch.where(linear.precision > 0, apart * (linear.precision / left).sqrt(), 0.0)
 
     @property
@@ -248,9 +247,8 @@ class _Robust:
         index, linear = torch.full((copies,), drive), self.linear
         first = {name: getattr(linear, name)[index] for name in ("start_offset", "start_turn", "start_noise")}
         rows = ("residual", "measurement", "precision", "log_scale", "offset", "state", "noise")
-        return replace(
-            linear, path=linear.path.subset(index), **first, **{name: getattr(linear, name)[:, index] for name in rows}
-        )
+        of_rows = {name: getattr(linear, name)[:, index] for name in rows}
+        return replace(linear, path=linear.path.subset(index), **first, **of_rows)
 
     def gain_of_tails(self) -> float:
         """Nats by which a Student t is better than the robust normal on residuals given all other cells."""

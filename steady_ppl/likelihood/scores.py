@@ -453,10 +453,8 @@ def _of_tails(here: Measured, at: Smoothed) -> Tensor:
     """What a change of one over the degrees of freedom ν of a Student t is worth, `(T + 1, B, K)`: the slope of its
     log-density at the root of the mean square, where a normal touches it; zero where the noise is normal."""
     found, own = at.measurements, at.measurements.present & (here.tails > 0)
-    freedom, size = (
-        1 / here.tails[own].double(),
-        (here.spread.expand(own.shape)[own] * at.sharpness[own]).clamp(min=1e-12),
-    )
+    freedom = 1 / here.tails[own].double()
+    size = (here.spread.expand(own.shape)[own] * at.sharpness[own]).clamp(min=1e-12)
     squares = ((found.mean[own].square() + found.variance[own].clamp(min=0)) / size.square()).double()
     constant = torch.special.digamma((freedom + 1) / 2) - torch.special.digamma(freedom / 2) - 1 / freedom
     varying = (freedom + 1) * squares / (freedom + squares) / freedom - torch.log1p(squares / freedom)

@@ -54,7 +54,7 @@ def test_what_is_missing_is_first_with_its_coefficient():
 
 
 def test_the_fitted_parameters_own_score_is_taken_as_it_is():
-    """Where log p(y) is biased so are the sets' scores: with heavy tails every good fit was called one at a bound."""
+    """Where log p(y) is biased so are the sets' scores, which is no fault of the fit."""
     drives, simulated = scores_of(1, 6)[0], scores_of(400, 5)
     drives[:, :PARAMETERS] -= drives[:, :PARAMETERS].mean(0)  # at the maximum
     simulated[..., :PARAMETERS] += 3.0

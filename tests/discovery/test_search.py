@@ -83,7 +83,7 @@ def test_coloured_noise_enters_where_nothing_else_is_significant(monkeypatch, to
 
 
 def test_what_loses_or_imitates_sets_no_bar_for_what_is_fitted_after_it(monkeypatch):
-    """A coloured noise that explained the drives it was fitted to had all physical effects given up after one fold."""
+    """Else a coloured noise that explains the drives it was fitted to has all physical effects given up."""
 
     def fitted(name, drives, held_out, explains=True):
         one = Chosen(name, held_out, explains)

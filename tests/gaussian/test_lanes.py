@@ -67,8 +67,9 @@ def test_each_trajectory_is_as_it_is_alone(name: str, count: int) -> None:
     path = anywhere(program, data)
     together = found(program, data, path)
     for index in {0, 7 % count, count - 1}:
-        own = ReferencePath(*(part[:, index : index + 1] for part in (path.states, path.noise)))
-        for part, alone in zip(together, found(program, data.subset(torch.tensor([index])), own), strict=True):
+        for part, alone in zip(
+            together, found(program, data.subset(torch.tensor([index])), path.subset([index])), strict=True
+        ):
             torch.testing.assert_close(part[index], alone[0], rtol=1e-7, atol=1e-9)
 
 

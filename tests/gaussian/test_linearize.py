@@ -346,7 +346,7 @@ def test_a_student_t_is_touched_at_the_root_of_the_mean_square_of_a_path_that_wa
 
 
 def test_kernels_of_a_student_t_sensor_take_a_path_with_variances_and_one_without():
-    """They have one argument more or less: with one kernel for both the process died."""
+    """They have one argument more or less, and a kernel each."""
     program = example("linear_gaussian", torch.float32).with_effect("heavy_tails", 0.3).requires_grad_(False)
     data = drives(program, 40, 30)
     found = near_the_truth(program, data)

@@ -11,7 +11,7 @@ import pytest
 import torch
 from examples import drives, example
 from oracles import CartPosterior, cart_parameters
-from paths import anywhere, at_its_mode, near_the_truth, of
+from paths import anywhere, at_its_mode, near_the_truth
 
 from steady_ppl import for_program, seeded, simulate
 from steady_ppl.gaussian.linearize import ReferencePath
@@ -96,7 +96,7 @@ def test_a_path_smooths_alike_alone_and_padded_whatever_its_padding_holds(hoverc
     path = ReferencePath(path.states + 0.2, path.noise)
     together = smooth(Problem(hovercraft, bearings, True), path, passes=3, tolerance=0)
     path.noise[rows - 1 :, short] = 0.0
-    alone = smooth(Problem(hovercraft, bearings.subset([short]), True), of(path, [short]), passes=3, tolerance=0)
+    alone = smooth(Problem(hovercraft, bearings.subset([short]), True), path.subset([short]), passes=3, tolerance=0)
     torch.testing.assert_close(together.log_likelihood[[short]], alone.log_likelihood, rtol=0, atol=1e-9)
 
 
@@ -118,7 +118,7 @@ def test_a_found_path_on_the_cart_is_the_exact_mean(cart, uneven):
 def test_one_trajectory_that_blows_up_does_not_stop_the_passes_of_the_others(hovercraft, bearings):
     path = at_its_mode(hovercraft, bearings).linearization.path
     far = replace(path, states=path.states + torch.tensor([0.3, -0.3, 0.1, 0.0, 0.0, 0.0]).double())
-    alone = smooth(Problem(hovercraft, bearings.subset([1, 2]), True), of(far, [1, 2]), passes=4, tolerance=1e-9)
+    alone = smooth(Problem(hovercraft, bearings.subset([1, 2]), True), far.subset([1, 2]), passes=4, tolerance=1e-9)
     far.states[:, 0] = torch.nan
     together = smooth(Problem(hovercraft, bearings, True), far, passes=4, tolerance=1e-9)
     assert not torch.isfinite(together.log_likelihood[0])

@@ -209,7 +209,7 @@ def test_information_of_some_numbers_is_completed_wherever_they_stand():
 
 
 def test_a_program_that_lacks_something_is_fitted_to_the_end_and_knows_how_sharp_it_is(cart):
-    """Cross products of such a program's scores are many times its information: fits seemed to have ended."""
+    """Cross products of such a program's scores are many times its information: by these a fit would end early."""
     program, data, _ = cart
     pushed = replace(data, controls=data.controls + torch.sin(torch.arange(30.0).double())[:, None])
     problem = Problem(copy.deepcopy(program), pushed, True)
@@ -226,7 +226,7 @@ def test_a_number_that_begins_far_off_is_reached_in_steps_that_grow(cart):
     one = copy.deepcopy(program).with_effect("acceleration_bias", 8.0)
     problem = Problem(one, data, True)
     found = maximise(problem)
-    assert found.converged and found.steps < MAX_STEPS  # 25 did not suffice
+    assert found.converged and found.steps < MAX_STEPS
     assert found.objective == pytest.approx(maximum.objective, abs=4)
 
 

@@ -38,7 +38,7 @@ def test_a_linear_program_has_its_kalman_filters_scores():
 
 
 def test_a_linear_program_with_tails_has_the_slopes_of_its_own_log_likelihood():
-    """Its measurements are touched where their mean squares are: elsewhere the noise and its tails had other slopes."""
+    """For its measurements are touched where their mean squares are."""
     program = example("linear_gaussian").with_effect("heavy_tails", 0.4).requires_grad_(True)
     data = drives(program, 5, 30, gaps=True)
     problem, parts = Problem(program, data, True), elements(program)
