@@ -18,6 +18,8 @@ from steady_ppl.discovery.search import MIN_GAIN_OF_CURVE, Found, Search
 from steady_ppl.effects import Effect, Variant, attached
 from steady_ppl.gaussian.predict import HALF_WIDTH, simulate_again
 from steady_ppl.gaussian.smoother import smooth
+from steady_ppl.likelihood.maximize import observed
+from steady_ppl.likelihood.objective import Term
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, unit_of
@@ -122,7 +124,7 @@ def _around(value: float, by: float) -> tuple[float, float]:
 
 
 def _spread(search: Search, variant: Variant) -> np.ndarray:
-    """See `Screening.spread_of`; where an interrupt came before its program was tested, by its own fit."""
+    """See `Screening.spread_of`; where an interrupt came before its program was tested, by what is observed there."""
     screening, final = search.rounds[-1].screening, search.final
     (there,) = [known for known in attached(final.program) if known.name == variant.name]
     if any(part.owner == there.parameter for part in screening.parameters):
@@ -131,7 +133,9 @@ def _spread(search: Search, variant: Variant) -> np.ndarray:
     if len(information) < len(parts):  # fits by draws tell none: that of its own test
         (tested,) = [one.candidate.tested for one in search.found if one.candidate.variant.name == variant.name]
         return math.sqrt(final.first_share) * tested.sd
-    return spread_of(final, variant, parts, information).numpy()
+    fold = final.folds[0]
+    seen = observed(Term.alone(fold.fitting(final.program), fold.path), information)
+    return spread_of(final, variant, parts, seen).numpy()
 
 
 def _confidence(search: Search, found: Found) -> float:

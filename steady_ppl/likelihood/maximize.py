@@ -37,6 +37,7 @@ from steady_ppl.utils.journal import journaled
 from steady_ppl.utils.progress import stages
 
 MAX_OBSERVED = 24  # learnable numbers: of more the information stays as scoring steps have it
+SHARE_OF_SD = 0.1  # by which a number is moved; scores bend along more of that of a noise
 OBSERVED_SHARES = (0.01, 100.0)  # of what is known, within which what is observed is believed
 MAX_NATS_OF_INFORMATION = 10.0  # gained, beyond which the information at the beginning may not hold at the end
 MAX_STEPS = 25  # scoring steps of a fit, where nothing else is said
@@ -162,7 +163,8 @@ class Information:
     def completed(self, names: Sequence[str], own: Tensor) -> Tensor:
         """For all numbers, `(P, P)`; `own` are cross products. What is no number is left to these.
 
-        The other numbers depend on the known ones as `rest` says, and have what it tells of them beside those.
+        The other numbers depend on the known ones as `rest` says, each in its standard deviations, and have what it
+        tells of them beside those.
         """
         if tuple(names) == self.names:
             return self.matrix
@@ -173,6 +175,7 @@ class Information:
         scaled = size * wide * size[:, None]
         inverse = torch.linalg.pinv(scaled[known][:, known].nan_to_num(), hermitian=True)
         through = inverse @ scaled[known][:, others]
+        size[known] = self.matrix.diagonal().clamp(min=1e-30).rsqrt()
         within = size[known] * self.matrix * size[known][:, None]
         across = within @ through
         beside = scaled[others][:, others] - scaled[others][:, known] @ through
@@ -205,7 +208,7 @@ def maximise_sum(
     for at in here.terms:
         require_found(at.ahead, at.term.problem)
     began = [at.objective for at in here.terms]
-    is_near = information is not None  # to where it is known
+    is_known, known_at = information is not None, here.objective
     if isinstance(information, Information):
         information = information.completed([part.name for part in terms[0].parts], _by_cross_products(here))
     information = _by_cross_products(here) if information is None else _regularised(information, here.has_unit)
@@ -216,7 +219,7 @@ def maximise_sum(
     reach = torch.where(is_open, torch.maximum(reach, MAX_MOVE_SD * information.diagonal().rsqrt()), reach)
     taken, decrement, passes, widened = 0, 0.0, PASSES, 1.0
     few_drives = len(here.scores) < 2 * len(information)  # they know too little: what they say is seen twice
-    may_observe, is_observed = len(terms) == 1 and len(information) <= MAX_OBSERVED, False
+    may_observe = len(terms) == 1 and len(information) <= MAX_OBSERVED
     is_small, is_over, most = False, False, here.objective
     rises = list[float]()  # of log p(y) by accepted steps
     with stages(*(("", SHARE_THAT_GOES_ON**step) for step in range(steps + 1))) as begin:
@@ -224,25 +227,24 @@ def maximise_sum(
             begin()
             move, singular = torch.linalg.solve_ex(information, here.gradient)
             if not singular and not float(here.gradient @ move) >= 0:  # it has ceased to be positive
-                information, is_near, is_observed = _by_cross_products(here), False, False
+                information, is_known = _by_cross_products(here), False
                 move, singular = torch.linalg.solve_ex(information, here.gradient)
             if singular:
                 raise FilterError(
                     "the likeliest parameters cannot be found: the drives do not tell them apart (singular)"
                 )
             decrement = 0.5 * float(here.gradient @ move)
-            if decrement < precision and len(terms) == 1 and not is_observed:
-                if is_near and not few_drives:  # what was given may be too much
-                    own = _by_cross_products(here)
-                    more = 0.5 * float(here.gradient @ torch.linalg.solve(own, here.gradient))
-                    if taken == 0 or more > CONVERGED_DECREMENT:
-                        information, is_near = own, False
-                is_far = not is_near or taken == 0 or here.objective - sum(began) > MAX_NATS_OF_INFORMATION
-                if is_far and may_observe:
-                    information, is_observed = observed(here.terms[0].term, information, passes), True
-                move = torch.linalg.solve(information, here.gradient)
-                decrement = 0.5 * float(here.gradient @ move)
-            is_sure = is_observed or (is_near and may_observe)
+            if decrement < precision and len(terms) == 1:
+                is_far = here.objective - known_at > MAX_NATS_OF_INFORMATION
+                if not is_known or is_far or taken == 0 or _tells_more(here, few_drives):
+                    if is_known and not few_drives:
+                        information = _by_cross_products(here)
+                    if may_observe:
+                        information = observed(here.terms[0].term, information, passes)
+                    is_known, known_at = may_observe, here.objective
+                    move = torch.linalg.solve(information, here.gradient)
+                    decrement = 0.5 * float(here.gradient @ move)
+            is_sure = is_known and may_observe
             most_left = STEPS_FORESEEN * max(0.0, decrement, *rises[-2:])
             behind = len(rises) >= STEPS_SEEN and here.log_likelihood + most_left < hopeless
             was_small, is_small = is_small, decrement < precision
@@ -272,9 +274,10 @@ def maximise_sum(
                 if not bool(torch.isfinite(further.gradient).all()):  # a path diverges on its way to its mode
                     break
                 here, most = further, further.objective
-                information, is_near, is_observed = _by_cross_products(here), False, may_observe
+                information, is_known = _by_cross_products(here), may_observe
                 if may_observe:
                     information = observed(here.terms[0].term, information, passes)
+                    known_at = here.objective
                 rises.append(math.inf)  # along other paths
     return [
         Maximum(
@@ -316,16 +319,25 @@ def _by_cross_products(here: LinearizedObjective) -> Tensor:
     return _regularised(information + 0.1 * torch.diag(information.diagonal()), here.has_unit)
 
 
+def _tells_more(here: LinearizedObjective, few_drives: bool) -> bool:
+    """Whether by cross products a step gains what a converged fit may not; few drives tell of each number alone."""
+    own, score = _by_cross_products(here), here.gradient
+    if few_drives:
+        return bool((score.square() > CONVERGED_DECREMENT * own.diagonal()).any())
+    return 0.5 * float(score @ torch.linalg.solve(own, score)) > CONVERGED_DECREMENT
+
+
+@torch.no_grad()
 def observed(term: Term, known: Tensor, passes: int = PASSES) -> Tensor:
     """Minus the second derivatives of an objective where its program is, `(P, P)`, by differences of scores.
 
-    Each number is moved by what `known` takes for its standard deviation. What is observed is believed within
+    Each number is moved by a tenth of what `known` takes for its standard deviation. What is observed is believed within
     `OBSERVED_SHARES` of what is known, and not at all where the program diverges or `known` is not positive.
     """
     here = linearised([term], passes)
     (there,), found = here.terms, torch.empty_like(known)
     for part, column, own in zip(term.parts, term.columns, known.diagonal().tolist(), strict=True):
-        step = min(max(own**-0.5, part.step), MAX_MOVE * part.step)
+        step = min(SHARE_OF_SD * own**-0.5, MAX_MOVE * part.step)
         with moved(part, step):
             found[column] = (here.gradient - linearised([there.term], passes).gradient) / step
     root, failed = torch.linalg.cholesky_ex(known)

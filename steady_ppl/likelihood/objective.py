@@ -137,6 +137,6 @@ def log_prior(program: Program, shares: Mapping[str, float] | None = None) -> fl
     """Of the parameters that have one, of their own values; of some only a share."""
     shares = shares or {}
     return sum(
-        shares.get(name, 1.0) * float(prior.log_prob(getattr(program, name)).sum())
+        shares.get(name, 1.0) * float(prior.log_prob(getattr(program, name)).sum().detach())
         for name, prior in program.priors.items()
     )

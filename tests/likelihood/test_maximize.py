@@ -26,6 +26,7 @@ from steady_ppl.likelihood.maximize import (
     maximise,
     maximise_each,
     maximise_sum,
+    observed,
     refit_outliers,
     widen_noise,
 )
@@ -206,6 +207,25 @@ def test_information_of_some_numbers_is_completed_wherever_they_stand():
     inverse, before = torch.linalg.inv(half), torch.linalg.inv(wide)
     assert inverse[1, 1] == pytest.approx(float(before[1, 1]), rel=0.7)  # what is told of it beside the others stays
     assert torch.equal(Information(known.matrix * torch.nan, known.names).completed(names, wide), wide)
+
+
+def test_a_number_of_which_the_rest_knows_nothing_lends_no_information_to_the_others():
+    """A noise that is at nothing on one half of the drives and is not on the other."""
+    wide = torch.tensor([[6e-9, -1e-4], [-1e-4, 2e3]], dtype=torch.float64)
+    known = Information(torch.tensor([[7.0]], dtype=torch.float64), ("vanished",), wide)
+    assert float(known.completed(["vanished", "new"], wide)[1, 1]) == pytest.approx(2e3, rel=0.1)
+
+
+def test_what_is_observed_is_symmetric_also_of_a_noise_and_a_number_that_moves_the_paths():
+    program = example("hovercraft").with_effect("yaw_bias", 0.1)
+    data = drives(program, 4, 41)
+    maximum = maximise(Problem(program, data, True))
+    parts = elements(program)
+    noise, bias = (next(i for i, part in enumerate(parts) if part.name == name) for name in ("noise[2]", "yaw_bias"))
+    seen = observed(Term.alone(Problem(program, data, True), maximum.path), maximum.information)
+    size = math.sqrt(float(seen[noise, noise] * seen[bias, bias]))
+    expected = observed_information(Problem(program, data, True), maximum.path, parts)
+    assert abs(float(seen[noise, bias] - expected[noise, bias])) < 0.1 * size
 
 
 def test_a_program_that_lacks_something_is_fitted_to_the_end_and_knows_how_sharp_it_is(cart):
