@@ -331,8 +331,8 @@ def _tells_more(here: LinearizedObjective, few_drives: bool) -> bool:
 def observed(term: Term, known: Tensor, passes: int = PASSES) -> Tensor:
     """Minus the second derivatives of an objective where its program is, `(P, P)`, by differences of scores.
 
-    Each number is moved by a tenth of what `known` takes for its standard deviation. What is observed is believed within
-    `OBSERVED_SHARES` of what is known, and not at all where the program diverges or `known` is not positive.
+    Each number is moved by a tenth of what `known` takes for its standard deviation. What is observed is believed
+    within `OBSERVED_SHARES` of what is known, and not at all where the program diverges or `known` is not positive.
     """
     here = linearised([term], passes)
     (there,), found = here.terms, torch.empty_like(known)
