@@ -96,6 +96,10 @@ def means(program, state=STATE, control=THRUSTS, time=3.0) -> torch.Tensor:
     return torch.stack([found[channel] for channel in program.channel_names]).detach()
 
 
+def limited(value: float, most: float) -> float:
+    return value / (1 + (value / most) ** 4) ** 0.25
+
+
 @pytest.mark.parametrize(
     ("effect", "value", "pushes"),
     [
@@ -122,8 +126,8 @@ def means(program, state=STATE, control=THRUSTS, time=3.0) -> torch.Tensor:
             0.2,
             (-0.2 * FORWARD * math.exp(-1 / 8), -0.2 * LATERAL * math.exp(-1 / 8), 0),
         ),
-        ("acceleration_limit", 0.5, (0.5 - 1.3 / 1.5, 0, 0)),
-        ("acceleration_limit:yaw", 0.2, (0, 0, 0.5 / 1.5 - 0.2)),
+        ("acceleration_limit", 0.5, (limited(1.3 / 1.5, 0.5) - 1.3 / 1.5, 0, 0)),
+        ("acceleration_limit:yaw", 0.2, (0, 0, 0.5 / 1.5 - limited(0.5 / 1.5, 0.2))),
         ("thrust_asymmetry", 0.2, (0.2 * 0.4 / 1.5, 0, 0.2 * 0.4 / 1.5)),  # the right one pulls to the left
         (
             "speed_dependent_gain",
@@ -142,6 +146,15 @@ def test_a_hovercraft_is_pushed_as_the_equation_says(effect: str, value, pushes:
     program = example("hovercraft")
     got = means(program.with_effect(effect, value)) - means(program)
     torch.testing.assert_close(got, torch.tensor(pushes, dtype=torch.float64), rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("most", [1e-9, 0.5, 1e9])
+def test_a_limit_is_never_passed_and_far_from_it_nothing_is_lost(most: float) -> None:
+    program = example("hovercraft")
+    forward = float(means(program.with_effect("acceleration_limit", most))[0])
+    whole = float(means(program)[0])
+    assert 0 < forward <= most and forward <= whole
+    assert forward == pytest.approx(most if most < 1e-3 else limited(whole, most), rel=1e-9)
 
 
 def test_a_wind_carries_what_is_at_rest_and_stops_when_it_moves_along() -> None:
