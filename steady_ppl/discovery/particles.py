@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ NEGLIGIBLE_NATS = 1.0  # by which a filter may rank otherwise before it is asked
 Choice = Callable[[Sequence[Candidate]], Candidate | None]  # of candidates, best first
 
 
-@dataclass
+@dataclass(frozen=True)
 class ParticleJudge:
     """Log p(y) of held-out drives by a filter that looks ahead, for candidates of a program `now`.
 
@@ -27,7 +27,6 @@ class ParticleJudge:
     """
 
     now: Refit
-    without: dict[int, Tensor | None] = field(default_factory=dict)  # what is neglected of `now`, by the seed
 
     def chosen(self, candidates: Sequence[Candidate], choose: Choice) -> tuple[Candidate | None, list[Candidate]]:
         """The candidate that is chosen when it has been confirmed, and all of them, best first."""
@@ -56,15 +55,23 @@ class ParticleJudge:
         return replace(candidate, gain=candidate.gain + more, is_confirmed=True)
 
     def _more(self, refit: Refit, seed: int) -> Tensor | None:
-        if seed not in self.without:
-            try:
-                self.without[seed] = _neglected(self.now, seed)
-            except FilterError:
-                self.without[seed] = None
-        without = self.without[seed]
-        return None if without is None else _neglected(refit, seed) - without
+        try:
+            without = _neglected(self.now, seed)
+        except FilterError:
+            return None
+        return _neglected(refit, seed) - without
 
 
 def _neglected(refit: Refit, seed: int) -> Tensor:
-    judges = zip(refit.judges.programs, refit.folds, strict=True)
-    return torch.cat([neglected_along(fold.judging(p), fold.held_out_path, seed=seed) for p, fold in judges])
+    """Of all held-out drives, nats; filters of one refit and seed are asked once."""
+    if seed not in refit.neglected:
+        judges = zip(refit.judges.programs, refit.folds, strict=True)
+        try:
+            found = [neglected_along(fold.judging(p), fold.held_out_path, seed=seed) for p, fold in judges]
+            refit.neglected[seed] = torch.cat(found)
+        except FilterError as error:
+            refit.neglected[seed] = error
+    told = refit.neglected[seed]
+    if isinstance(told, FilterError):
+        raise told
+    return told

@@ -39,7 +39,7 @@ class Fake:
 
 def refit(name: str, fitting=BY_LIKELIHOOD) -> SimpleNamespace:
     fold = SimpleNamespace(judging=lambda program: program, held_out_path=None)
-    return SimpleNamespace(judges=SimpleNamespace(programs=[name]), folds=[fold], fitting=fitting)
+    return SimpleNamespace(judges=SimpleNamespace(programs=[name]), folds=[fold], fitting=fitting, neglected={})
 
 
 def first(ranked):
