@@ -274,10 +274,7 @@ def maximise_sum(
                 if not bool(torch.isfinite(further.gradient).all()):  # a path diverges on its way to its mode
                     break
                 here, most = further, further.objective
-                information, is_known = _by_cross_products(here), may_observe
-                if may_observe:
-                    information = observed(here.terms[0].term, information, passes)
-                    known_at = here.objective
+                information, is_known = _by_cross_products(here), False
                 rises.append(math.inf)  # along other paths
     return [
         Maximum(
