@@ -7,7 +7,7 @@ is held-out log p(y), each drive judged by a program that was fitted without it,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -216,7 +216,8 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
                 own = fit(with_substeps(program, finer), left, valid, with_substeps(own.program, finer))
                 base, corrections = with_suitable_noise(own, settings.corrects, tails)
                 settings = replace(settings, declared=with_substeps(settings.declared, finer))
-                again = _rounds(Search(own, base, base, step, gained, outliers, corrections, with_found), settings)
+                fresh = Search(own, base, base, step, gained, outliers, corrections, with_found)
+                again = _rounds(_begun_with(found, fresh, settings), settings)
                 if not again.interrupted:
                     return again
                 found.interrupt(FINER)
@@ -225,6 +226,44 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
         except Exception as error:  # also of the program's own code, in steps that nobody tried before
             found.notes.append(f"what was found was not looked at in finer time steps: {reason_of(error)}")
     return found
+
+
+def _begun_with(earlier: Search, fresh: Search, settings: Settings) -> Search:
+    """A search at a finer step that begins with what an earlier one found, each effect among its rivals there.
+
+    Every effect is tested anew. Where none of those that were found is needed, the search begins with nothing.
+    """
+    found, now, screening = list[Found](), fresh.base, settings.screen(fresh.base, 0)
+    tests = {tested.variant.name: tested for tested in screening.tests.tested}
+    for one in earlier.found:
+        again = [_fitted_again(now, c, tests) for c in _rivals(one) if c.variant.name not in _names(now)]
+        best, again = ParticleJudge(now).chosen(again, partial(_first, lambda c: c.total > TIE_NATS))
+        if best is not None:
+            assert isinstance(best.refit, Refit)
+            found, now = [*found, Found(best, again, now)], best.refit
+    if not found or screening.tests.p_value > FAMILY_LEVEL:
+        return fresh
+    first = Round(screening, found[0].candidates, found[0].candidate)
+    return replace(fresh, final=now, rounds=[first], found=found)
+
+
+def _rivals(found: Found) -> list[Candidate]:
+    """An effect and what was nearly as good in its place."""
+    best = found.candidate
+    near = [c for c in found.rivals if c is not best and c.total > best.total - MAX_NATS_OF_RIVAL]
+    return [c for c in (best, *near) if isinstance(c.refit, Refit)]
+
+
+def _fitted_again(now: Refit, candidate: Candidate, tests: Mapping[str, Tested]) -> Candidate:
+    """Beside other effects at another step, from where it was."""
+    assert isinstance(candidate.refit, Refit)
+    variant, begin = candidate.variant, candidate.refit.coefficient(candidate.variant)
+    tested = tests[variant.name].at(variant) if variant.name in tests else candidate.tested
+    return at_its_best_place(now, judged(now, tested, refit_with(now, variant, begin)))
+
+
+def _names(refit: Refit) -> set[str]:
+    return {variant.name for variant in attached(refit.program)}
 
 
 def _step_of(refit: Refit, **watched: Any) -> StepCheck:
@@ -276,8 +315,8 @@ def _add_all(found: Search, settings: Settings) -> None:
     """Test, fit and add one effect after another."""
     shares = [(said, 0.5**index) for index in range(MAX_ROUNDS) for said in ("testing every effect", "")]
     with stages(*shares) as begin_part:
-        earlier = list(found.found)
-        for index in range(MAX_ROUNDS):
+        earlier = found.found[:-1]
+        for index in range(len(found.rounds), MAX_ROUNDS):
             begin_part()
             try:
                 screening = settings.screen(found.final, index)
