@@ -148,9 +148,10 @@ def neglected_along(problem: Problem, path: ReferencePath, seed: int = 0) -> Ten
 
 
 def _neglected(problem: Problem, ahead: Lookahead, particles: int = 200, seed: int = 0) -> Tensor:
-    known = problem.known_start
+    """Kernels are worth compiling: a program is asked of several folds and seeds."""
+    given: dict[str, Any] = {"known_start": problem.known_start, "particles": particles, "kernels": True}
     with seeded(seed, "judge"):
-        return neglected(problem.program, problem.data, known_start=known, particles=particles, ahead=ahead)
+        return neglected(problem.program, problem.data, ahead=ahead, **given)
 
 
 @dataclass(frozen=True)

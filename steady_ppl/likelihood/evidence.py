@@ -69,7 +69,13 @@ def choose_filter(
 
 
 def neglected(
-    program: Program, data: Trajectories, *, known_start: bool, particles: int = 200, ahead: Lookahead | None = None
+    program: Program,
+    data: Trajectories,
+    *,
+    known_start: bool,
+    particles: int = 200,
+    ahead: Lookahead | None = None,
+    kernels: bool | None = None,
 ) -> Tensor:
     """What the linearised program neglects: log p(y) by the filter that looks ahead, less the linearised program's,
     `(B,)` nats, with the filter's Monte-Carlo error.
@@ -83,11 +89,11 @@ def neglected(
         known_start: the first state is certain.
         particles: of the filter, for each trajectory.
         ahead: of these drives; found from the measurements when None.
+        kernels: see `particle_filter`.
     """
     ahead = ahead or find_and_smooth(Problem(program, data, known_start))
-    filtered = particle_filter(
-        program, data, particles=particles, known_start=known_start, proposal=Twist(ahead), keep_history=False
-    )
+    given: dict[str, Any] = {"particles": particles, "known_start": known_start, "kernels": kernels}
+    filtered = particle_filter(program, data, **given, proposal=Twist(ahead), keep_history=False)
     return filtered.log_likelihood - ahead.log_likelihood
 
 
