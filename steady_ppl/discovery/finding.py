@@ -18,8 +18,7 @@ from steady_ppl.discovery.search import MIN_GAIN_OF_CURVE, Found, Search
 from steady_ppl.effects import Effect, Variant, attached
 from steady_ppl.gaussian.predict import HALF_WIDTH, simulate_again
 from steady_ppl.gaussian.smoother import smooth
-from steady_ppl.likelihood.maximize import observed
-from steady_ppl.likelihood.objective import Term
+from steady_ppl.likelihood.objective import Term, observed
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, unit_of

@@ -27,8 +27,19 @@ from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import find_path, require_found, resting_path, smooth
 from steady_ppl.kernels.rows import kernel_failures, note_failures
-from steady_ppl.likelihood.objective import PASSES, STALLED_PASSES, LinearizedObjective, Term, linearised, tried
-from steady_ppl.likelihood.parameters import elements, moved, set_values, values_of
+from steady_ppl.likelihood.objective import (
+    MAX_MOVE,
+    PASSES,
+    STALLED_PASSES,
+    LinearizedObjective,
+    Term,
+    by_cross_products,
+    linearised,
+    observed,
+    regularised,
+    tried,
+)
+from steady_ppl.likelihood.parameters import elements, set_values, values_of
 from steady_ppl.likelihood.scores import smoothed, widens
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
@@ -37,19 +48,15 @@ from steady_ppl.utils.journal import journaled
 from steady_ppl.utils.progress import stages
 
 MAX_OBSERVED = 24  # learnable numbers: of more the information stays as scoring steps have it
-SHARE_OF_SD = 0.1  # by which a number is moved; scores bend along more of that of a noise
-OBSERVED_SHARES = (0.01, 100.0)  # of what is known, within which what is observed is believed
 MAX_NATS_OF_INFORMATION = 10.0  # gained, beyond which the information at the beginning may not hold at the end
 MAX_STEPS = 25  # scoring steps of a fit, where nothing else is said
 STEPS_SEEN, STEPS_FORESEEN = 3, 4
 """A fit is given up after the first, if the second would not do: so many more steps, each of which gains as much as the
 better of the last two did, or as the next one promises."""
-MAX_MOVE = 150  # steps of differences, 1.5 of a logarithm: the most that a number moves at once
 MAX_WIDENED, SHARE_OF_SLOPE = 16.0, 0.7
 """A move that was cut short may be twice as long the next time, and so on up to the first.
 It has to raise the objective by more than the second of what its slope foresaw."""
 MAX_MOVE_SD = 50.0  # standard deviations, of a number with a unit: it moves as far at once, if that is more
-RIDGE = 1e-3  # added to the information of a number, in that of one with a unit if that is smaller
 SHARE_AGAINST_SCORE = 1 / 3
 """Of that, for a number whose own score points the other way: noise or a friction that is driven to nothing early has
 no score there, and a fit cannot return."""
@@ -185,6 +192,74 @@ class Information:
         return found if bool(torch.isfinite(found).all()) else own
 
 
+@dataclass
+class _Curvature:
+    """The information of a fit on its way: given, seen by cross products, learned by steps or observed."""
+
+    matrix: Tensor  # (P, P)
+    is_known: bool  # whether it was given or observed, and is not the drives' cross products
+    known_at: float  # the objective where it was
+    may_observe: bool  # by differences of scores
+    few_drives: bool  # of fewer than two a number: their cross products know too little
+
+    @classmethod
+    def of_fit(cls, here: LinearizedObjective, given: Tensor | Information | None) -> _Curvature:
+        """At its beginning."""
+        matrix = own = by_cross_products(here)
+        if given is not None:
+            names = [part.name for part in here.terms[0].term.parts]
+            whole = given.completed(names, own) if isinstance(given, Information) else given
+            matrix = regularised(whole, here.has_unit)
+        may_observe = len(here.terms) == 1 and len(matrix) <= MAX_OBSERVED
+        return cls(matrix, given is not None, here.objective, may_observe, len(here.scores) < 2 * len(matrix))
+
+    def step(self, here: LinearizedObjective) -> tuple[Tensor, float]:
+        """To where the maximum seems to be, and what it gains, nats.
+
+        Raises:
+            FilterError: the drives do not tell the numbers apart.
+        """
+        move, singular = torch.linalg.solve_ex(self.matrix, here.gradient)
+        if not singular and not float(here.gradient @ move) >= 0:  # it has ceased to be positive
+            self.forget(here)
+            move, singular = torch.linalg.solve_ex(self.matrix, here.gradient)
+        if singular:
+            raise FilterError("the likeliest parameters cannot be found: the drives do not tell them apart (singular)")
+        return move, 0.5 * float(here.gradient @ move)
+
+    def forget(self, here: LinearizedObjective) -> None:
+        self.matrix, self.is_known = by_cross_products(here), False
+
+    def check(self, here: LinearizedObjective, passes: int, *, begins: bool) -> bool:
+        """Look again where a fit seems to rest, if what is known may be too much; whether it was looked at."""
+        is_far = here.objective - self.known_at > MAX_NATS_OF_INFORMATION
+        if self.is_known and not (begins or is_far or self._is_denied(here)):
+            return False
+        if self.is_known and not self.few_drives:
+            self.matrix = by_cross_products(here)
+        if self.may_observe:
+            self.matrix = observed(here.terms[0].term, self.matrix, passes)
+        self.is_known, self.known_at = self.may_observe, here.objective
+        return True
+
+    def _is_denied(self, here: LinearizedObjective) -> bool:
+        """Whether by cross products a step gains what a converged fit may not; few drives tell of each number alone."""
+        own, score = by_cross_products(here), here.gradient
+        if self.few_drives:
+            return bool((score.square() > CONVERGED_DECREMENT * own.diagonal()).any())
+        return 0.5 * float(score @ torch.linalg.solve(own, score)) > CONVERGED_DECREMENT
+
+    def learn(self, step: Tensor, fall: Tensor) -> None:
+        """The BFGS update with `fall` of the score along `step`, damped where that is too small (Powell)."""
+        through = self.matrix @ step
+        expected, seen = float(step @ through), float(step @ fall)
+        if seen < 0.2 * expected:
+            share = 0.8 * expected / (expected - seen)
+            fall = share * fall + (1 - share) * through
+            seen = float(step @ fall)
+        self.matrix = self.matrix - torch.outer(through, through) / expected + torch.outer(fall, fall) / seen
+
+
 @torch.no_grad()
 def maximise_sum(
     terms: Sequence[Term],
@@ -207,48 +282,23 @@ def maximise_sum(
     here = linearised(terms)
     for at in here.terms:
         require_found(at.ahead, at.term.problem)
-    began = [at.objective for at in here.terms]
-    is_known, known_at = information is not None, here.objective
-    if isinstance(information, Information):
-        information = information.completed([part.name for part in terms[0].parts], _by_cross_products(here))
-    information = _by_cross_products(here) if information is None else _regularised(information, here.has_unit)
-    reach, is_open = torch.zeros_like(here.gradient), torch.zeros_like(here.has_unit)
-    for term in terms:
-        reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
-        is_open[term.columns] = torch.tensor([part.has_unit and not part.is_effect for part in term.parts]).bool()
-    reach = torch.where(is_open, torch.maximum(reach, MAX_MOVE_SD * information.diagonal().rsqrt()), reach)
+    began, most = [at.objective for at in here.terms], here.objective
+    curvature = _Curvature.of_fit(here, information)
+    reach = _reach(terms, curvature.matrix)
     taken, decrement, passes, widened = 0, 0.0, PASSES, 1.0
-    few_drives = len(here.scores) < 2 * len(information)  # they know too little: what they say is seen twice
-    may_observe = len(terms) == 1 and len(information) <= MAX_OBSERVED
-    is_small, is_over, most = False, False, here.objective
+    is_small, is_over = False, False
     rises = list[float]()  # of log p(y) by accepted steps
     with stages(*(("", SHARE_THAT_GOES_ON**step) for step in range(steps + 1))) as begin:
         for taken in range(steps + 1):
             begin()
-            move, singular = torch.linalg.solve_ex(information, here.gradient)
-            if not singular and not float(here.gradient @ move) >= 0:  # it has ceased to be positive
-                information, is_known = _by_cross_products(here), False
-                move, singular = torch.linalg.solve_ex(information, here.gradient)
-            if singular:
-                raise FilterError(
-                    "the likeliest parameters cannot be found: the drives do not tell them apart (singular)"
-                )
-            decrement = 0.5 * float(here.gradient @ move)
-            if decrement < precision and len(terms) == 1:
-                is_far = here.objective - known_at > MAX_NATS_OF_INFORMATION
-                if not is_known or is_far or taken == 0 or _tells_more(here, few_drives):
-                    if is_known and not few_drives:
-                        information = _by_cross_products(here)
-                    if may_observe:
-                        information = observed(here.terms[0].term, information, passes)
-                    is_known, known_at = may_observe, here.objective
-                    move = torch.linalg.solve(information, here.gradient)
-                    decrement = 0.5 * float(here.gradient @ move)
-            is_sure = is_known and may_observe
+            move, decrement = curvature.step(here)
+            if decrement < precision and len(terms) == 1 and curvature.check(here, passes, begins=taken == 0):
+                move, decrement = curvature.step(here)
+            is_sure = curvature.is_known and curvature.may_observe
             most_left = STEPS_FORESEEN * max(0.0, decrement, *rises[-2:])
             behind = len(rises) >= STEPS_SEEN and here.log_likelihood + most_left < hopeless
             was_small, is_small = is_small, decrement < precision
-            is_over |= is_small and (is_sure or was_small or not few_drives or taken == 0)
+            is_over |= is_small and (is_sure or was_small or not curvature.few_drives or taken == 0)
             if is_over or taken == steps or behind:
                 break
             length = float((move.abs() / reach).max())
@@ -262,7 +312,7 @@ def maximise_sum(
             elif length > widened and risen > SHARE_OF_SLOPE * float(here.gradient @ move):
                 widened = min(2 * widened, MAX_WIDENED)
             if there is not None:
-                information = _bfgs_update(information, share * move, here.gradient - there.gradient)
+                curvature.learn(share * move, here.gradient - there.gradient)
                 rises.append(there.log_likelihood - here.log_likelihood)
                 here, most = there, max(most, there.objective)
                 is_over = passes == STALLED_PASSES and risen < CONVERGED_DECREMENT
@@ -274,7 +324,7 @@ def maximise_sum(
                 if not bool(torch.isfinite(further.gradient).all()):  # a path diverges on its way to its mode
                     break
                 here, most = further, further.objective
-                information, is_known = _by_cross_products(here), False
+                curvature.forget(here)
                 rises.append(math.inf)  # along other paths
     return [
         Maximum(
@@ -282,13 +332,22 @@ def maximise_sum(
             objective=at.objective,
             path=at.term.path,
             names=tuple(part.name for part in at.term.parts),
-            information=information[at.term.columns][:, at.term.columns],
+            information=curvature.matrix[at.term.columns][:, at.term.columns],
             steps=taken,
             decrement=decrement,
             gained=at.objective - before,
         )
         for at, before in zip(here.terms, began, strict=True)
     ]
+
+
+def _reach(terms: Sequence[Term], information: Tensor) -> Tensor:
+    """The most that each number moves at once, `(P,)`."""
+    reach, is_open = torch.zeros_like(information[0]), torch.zeros(len(information), dtype=torch.bool)
+    for term in terms:
+        reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
+        is_open[term.columns] = torch.tensor([part.has_unit and not part.is_effect for part in term.parts]).bool()
+    return torch.where(is_open, torch.maximum(reach, MAX_MOVE_SD * information.diagonal().rsqrt()), reach)
 
 
 def _line_search(
@@ -307,59 +366,6 @@ def _line_search(
     for term, values in zip(terms, before, strict=True):
         set_values(term.parts, values)
     return 0.0, None
-
-
-def _by_cross_products(here: LinearizedObjective) -> Tensor:
-    """The information by the cross products of the drives' scores."""
-    by_drive = here.scores - here.scores.mean(0)
-    information = by_drive.T @ by_drive
-    return _regularised(information + 0.1 * torch.diag(information.diagonal()), here.has_unit)
-
-
-def _tells_more(here: LinearizedObjective, few_drives: bool) -> bool:
-    """Whether by cross products a step gains what a converged fit may not; few drives tell of each number alone."""
-    own, score = _by_cross_products(here), here.gradient
-    if few_drives:
-        return bool((score.square() > CONVERGED_DECREMENT * own.diagonal()).any())
-    return 0.5 * float(score @ torch.linalg.solve(own, score)) > CONVERGED_DECREMENT
-
-
-@torch.no_grad()
-def observed(term: Term, known: Tensor, passes: int = PASSES) -> Tensor:
-    """Minus the second derivatives of an objective where its program is, `(P, P)`, by differences of scores.
-
-    Each number is moved by a tenth of what `known` takes for its standard deviation. What is observed is believed
-    within `OBSERVED_SHARES` of what is known, and not at all where the program diverges or `known` is not positive.
-    """
-    here = linearised([term], passes)
-    (there,), found = here.terms, torch.empty_like(known)
-    for part, column, own in zip(term.parts, term.columns, known.diagonal().tolist(), strict=True):
-        step = min(SHARE_OF_SD * own**-0.5, MAX_MOVE * part.step)
-        with moved(part, step):
-            found[column] = (here.gradient - linearised([there.term], passes).gradient) / step
-    root, failed = torch.linalg.cholesky_ex(known)
-    if failed or not bool(torch.isfinite(found).all()):
-        return known
-    half = torch.linalg.solve_triangular(root, found + found.T, upper=False).T
-    shares, turn = torch.linalg.eigh(torch.linalg.solve_triangular(root, half, upper=False) / 2)
-    return (root @ turn * shares.clamp(*OBSERVED_SHARES)) @ (root @ turn).T
-
-
-def _regularised(information: Tensor, has_unit: Tensor) -> Tensor:
-    own = information.diagonal()
-    of_unit = torch.where(own > 0, own.clamp(max=1.0), 1.0)  # nothing is known of a number that tells nothing
-    return information + torch.diag(1e-6 * own + RIDGE * torch.where(has_unit, of_unit, 1.0))
-
-
-def _bfgs_update(information: Tensor, step: Tensor, fall: Tensor) -> Tensor:
-    """The BFGS update with `fall` of the score along `step`, damped where no positive curvature is seen (Powell)."""
-    through = information @ step
-    expected, seen = float(step @ through), float(step @ fall)
-    if seen < 0.2 * expected:
-        share = 0.8 * expected / (expected - seen)
-        fall = share * fall + (1 - share) * through
-        seen = float(step @ fall)
-    return information - torch.outer(through, through) / expected + torch.outer(fall, fall) / seen
 
 
 @one_thread()

@@ -1,4 +1,5 @@
-"""A program's objective, log p(y) and log prior, where the program is, and its slopes; or the sum of several programs'.
+"""A program's objective, log p(y) and log prior, where the program is, its slopes and its curvature; or the sum of
+several programs'.
 
 Log p(y) is that of the program linearised along its posterior means, which go with it: see `gaussian.smoother`.
 """
@@ -16,13 +17,17 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import resting_path, smooth
-from steady_ppl.likelihood.parameters import Element, elements, on_both_sides
+from steady_ppl.likelihood.parameters import Element, elements, moved, on_both_sides
 from steady_ppl.likelihood.scores import parameter_scores, smoothed
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
 
 PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
 STALLED_PASSES = 15  # linearisations a step once no share of a step was accepted: some path swings about its mode
+MAX_MOVE = 150  # steps of differences, 1.5 of a logarithm: the most that a number moves at once
+SHARE_OF_SD = 0.1  # by which a number is moved; scores bend along more of that of a noise
+OBSERVED_SHARES = (0.01, 100.0)  # of what is known, within which what is observed is believed
+RIDGE = 1e-3  # added to the information of a number, in that of one with a unit if that is smaller
 
 
 @dataclass(frozen=True)
@@ -112,6 +117,40 @@ def _scored(found: list[LinearizedTerm]) -> LinearizedObjective:
         wide[:, at.term.columns] = own
         by_drive.append(wide)
     return LinearizedObjective(found, torch.cat(by_drive), gradient, has_unit)
+
+
+def by_cross_products(here: LinearizedObjective) -> Tensor:
+    """The information by the cross products of the drives' scores."""
+    by_drive = here.scores - here.scores.mean(0)
+    information = by_drive.T @ by_drive
+    return regularised(information + 0.1 * torch.diag(information.diagonal()), here.has_unit)
+
+
+@torch.no_grad()
+def observed(term: Term, known: Tensor, passes: int = PASSES) -> Tensor:
+    """Minus the second derivatives of an objective where its program is, `(P, P)`, by differences of scores.
+
+    Each number is moved by a tenth of what `known` takes for its standard deviation. What is observed is believed
+    within `OBSERVED_SHARES` of what is known, and not at all where the program diverges or `known` is not positive.
+    """
+    here = linearised([term], passes)
+    (there,), found = here.terms, torch.empty_like(known)
+    for part, column, own in zip(term.parts, term.columns, known.diagonal().tolist(), strict=True):
+        step = min(SHARE_OF_SD * own**-0.5, MAX_MOVE * part.step)
+        with moved(part, step):
+            found[column] = (here.gradient - linearised([there.term], passes).gradient) / step
+    root, failed = torch.linalg.cholesky_ex(known)
+    if failed or not bool(torch.isfinite(found).all()):
+        return known
+    half = torch.linalg.solve_triangular(root, found + found.T, upper=False).T
+    shares, turn = torch.linalg.eigh(torch.linalg.solve_triangular(root, half, upper=False) / 2)
+    return (root @ turn * shares.clamp(*OBSERVED_SHARES)) @ (root @ turn).T
+
+
+def regularised(information: Tensor, has_unit: Tensor) -> Tensor:
+    own = information.diagonal()
+    of_unit = torch.where(own > 0, own.clamp(max=1.0), 1.0)  # nothing is known of a number that tells nothing
+    return information + torch.diag(1e-6 * own + RIDGE * torch.where(has_unit, of_unit, 1.0))
 
 
 def posterior_score(problem: Problem, path: ReferencePath) -> Tensor:

@@ -25,8 +25,8 @@ from steady_ppl.data.trajectories import Trajectories
 from steady_ppl.errors import FilterError, require
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import smooth
-from steady_ppl.likelihood.maximize import MAX_MOVE, maximise
-from steady_ppl.likelihood.objective import PASSES, TOLERANCE, Term, linearised, log_prior, posterior_score
+from steady_ppl.likelihood.maximize import maximise
+from steady_ppl.likelihood.objective import MAX_MOVE, PASSES, TOLERANCE, Term, linearised, log_prior, posterior_score
 from steady_ppl.likelihood.parameters import Element, elements, on_both_sides, set_values, values_of
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program

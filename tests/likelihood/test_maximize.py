@@ -26,11 +26,10 @@ from steady_ppl.likelihood.maximize import (
     maximise,
     maximise_each,
     maximise_sum,
-    observed,
     refit_outliers,
     widen_noise,
 )
-from steady_ppl.likelihood.objective import Term, posterior_score
+from steady_ppl.likelihood.objective import Term, observed, posterior_score
 from steady_ppl.likelihood.parameter_posterior import observed_information
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
