@@ -31,6 +31,7 @@ from steady_ppl.discovery.refits import (
 )
 from steady_ppl.discovery.screening import FAMILY_LEVEL, Screened, Tested, departures, screen
 from steady_ppl.effects import Effect, Sizes, Variant, attached, catalogue
+from steady_ppl.effects.attach import SD_OF_LOG_FACTOR
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.linearize import has_heavy_tails
 from steady_ppl.gaussian.smoother import smooth
@@ -68,14 +69,20 @@ class Screening:
 
     def spread_of(self, fitted: Refit, variant: Variant) -> Tensor:
         """See the function `spread_of`, for an effect of the fitted program that was tested."""
-        return spread_of(fitted, variant, self.parameters, self.information[""])
+        prior = SD_OF_LOG_FACTOR**-2 if variant.effect.null == 1 else 0.0  # of the others it is wide
+        return spread_of(fitted, variant, self.parameters, self.information[""], prior)
 
 
-def spread_of(fitted: Refit, variant: Variant, parts: Sequence[Element], information: Tensor) -> Tensor:
+def spread_of(
+    fitted: Refit, variant: Variant, parts: Sequence[Element], information: Tensor, prior: float = 0.0
+) -> Tensor:
     """Standard deviations `(k,)` of an effect of a program, of a fit to all drives: of the coefficient as it is
-    learned, of a factor its logarithm. `information` is that of the first fold's drives on the numbers `parts`."""
+    learned, of a factor its logarithm. `information` is that of the first fold's drives on the numbers `parts`, and
+    `prior` that of the coefficient's prior."""
     (there,) = [known for known in attached(fitted.program) if known.name == variant.name]
     index = [i for i, part in enumerate(parts) if part.owner == there.parameter]
+    information = information.clone()
+    information[index, index] += fitted.first_share * prior
     return (fitted.first_share * ridged_inverse(information).diagonal()[index]).clamp(min=0).sqrt()
 
 

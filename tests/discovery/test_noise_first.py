@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from examples import example
 from pyro.distributions import constraints
 from pyro.nn import PyroParam
 
 import steady_ppl as st
+from steady_ppl.discovery.candidates import Screening
 from steady_ppl.discovery.noise_first import needless, with_suitable_noise, without, without_outliers
 from steady_ppl.discovery.refits import first_refit, refit_with
 from steady_ppl.effects import attached, chosen_variant
+from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
 
 SD = 0.05
@@ -117,3 +122,17 @@ def test_what_was_an_effect_all_along_is_no_noise():
     assert [one.name for one in attached(alone.program)] == [variant.name]
     assert float(alone.coefficient(variant)) == pytest.approx(0.3, abs=0.05)
     assert without([correction], own, base) is None
+
+
+@pytest.mark.parametrize(("told", "sd"), [(0.0, 1.0), (100.0, 0.0705)])
+def test_a_factor_of_which_the_drives_tell_nothing_is_as_uncertain_as_its_prior(told, sd):
+    """Half of the drives have an information of 100 on its logarithm, so that all have 200."""
+    program = example("hovercraft").with_effect("measurement_noise", 0.05)
+    parts = elements(program)
+    (variant,) = attached(program)
+    own = [told if part.owner == variant.parameter else 1.0 for part in parts]
+    information = torch.diag(torch.tensor(own, dtype=torch.float64))
+    fitted = SimpleNamespace(program=program, first_share=0.5)
+    (spread,) = Screening(None, parts, {"": information}).spread_of(fitted, variant).tolist()
+    assert spread == pytest.approx(sd, rel=0.01)
+    assert float(information.diagonal().sum()) == pytest.approx(told + len(parts) - 1)
