@@ -1,8 +1,9 @@
 """What a search amounts to: an effect with its class, confidence and interval, or a curve; and what to drive next."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from steady_ppl.discovery.search import MIN_GAIN_OF_CURVE, Found, Search
 from steady_ppl.effects import Effect, Variant, attached
 from steady_ppl.gaussian.predict import HALF_WIDTH, simulate_again
 from steady_ppl.gaussian.smoother import smooth
+from steady_ppl.likelihood.maximize import MAX_OBSERVED
 from steady_ppl.likelihood.objective import Term, observed
 from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
@@ -62,29 +64,30 @@ class Shape:
 
 def findings(search: Search) -> list[Finding]:
     """The effects that were found, the one that brings most first, and then what the noise is."""
-    found = [_finding(search, one) for one in search.found] + corrections(search)
+    spread = _Spreads(search)
+    found = [_finding(search, one, spread(one.candidate.variant)) for one in search.found]
+    found += corrections(search, spread)
     found += [_departure(tested) for tested in search.departed]
     return sorted(found, key=lambda finding: (finding.is_correction, -(finding.gain or 0.0)))
 
 
-def corrections(search: Search) -> list[Finding]:
+def corrections(search: Search, spread: Callable[[Variant], np.ndarray] | None = None) -> list[Finding]:
     """Of declared noise, with which the search began."""
-    found = list[Finding]()
+    found, spread = list[Finding](), spread or _Spreads(search)
     for one in search.corrections:
         effect = one.variant.effect
         least, most = effect.between  # beyond which the likelihood is flat
         value = min(max(float(search.final.coefficient(one.variant)), least), most)
-        (sd,) = _spread(search, one.variant).tolist()
+        (sd,) = spread(one.variant).tolist()
         low, high = _interval(effect, value, sd, 0.0, 0.0)
         told = ([value], [sd if effect.null == 0 else value * sd], [(max(low, least), min(high, most))])
         found.append(Finding(one.variant, effect.verdict, [one.variant.name], None, *told, one.gain, True))
     return found
 
 
-def _finding(search: Search, found: Found) -> Finding:
+def _finding(search: Search, found: Found, spread: np.ndarray) -> Finding:
     variant, effect = found.candidate.variant, found.candidate.variant.effect
     values = search.final.coefficient(variant).flatten().double().numpy()
-    spread = _spread(search, variant)
     is_positive = effect.null != 0  # and learned as its logarithm
     places = np.zeros_like(spread)
     if variant.profiled:
@@ -122,19 +125,37 @@ def _around(value: float, by: float) -> tuple[float, float]:
     return value * math.exp(-by), value * math.exp(by)
 
 
-def _spread(search: Search, variant: Variant) -> np.ndarray:
-    """See `Screening.spread_of`; where an interrupt came before its program was tested, by what is observed there."""
-    screening, final = search.rounds[-1].screening, search.final
-    (there,) = [known for known in attached(final.program) if known.name == variant.name]
-    if any(part.owner == there.parameter for part in screening.parameters):
-        return screening.spread_of(final, variant).numpy()
-    parts, information = elements(final.program), final.maxima[0].information
-    if len(information) < len(parts):  # fits by draws tell none: that of its own test
-        (tested,) = [one.candidate.tested for one in search.found if one.candidate.variant.name == variant.name]
-        return math.sqrt(final.first_share) * tested.sd
-    fold = final.folds[0]
-    seen = observed(Term.alone(fold.fitting(final.program), fold.path), information)
-    return spread_of(final, variant, parts, seen).numpy()
+class _Spreads:
+    """See `Screening.spread_of`. Where the program that was found has not been tested, by what is observed there."""
+
+    def __init__(self, search: Search) -> None:
+        self.search = search
+
+    def __call__(self, variant: Variant) -> np.ndarray:
+        screening, final = self.search.rounds[-1].screening, self.search.final
+        (there,) = [known for known in attached(final.program) if known.name == variant.name]
+        if any(part.owner == there.parameter for part in screening.parameters):
+            return screening.spread_of(final, variant).numpy()
+        parts = elements(final.program)
+        if len(final.maxima[0].information) < len(parts):  # fits by draws tell none: that of its own test
+            (tested,) = [
+                one.candidate.tested for one in self.search.found if one.candidate.variant.name == variant.name
+            ]
+            return math.sqrt(final.first_share) * tested.sd
+        return spread_of(final, variant, parts, self._observed).numpy()
+
+    @cached_property
+    def _observed(self) -> Tensor:
+        """The information; where it cannot be observed, as the fit has it."""
+        final, fold = self.search.final, self.search.final.folds[0]
+        known = final.maxima[0].information
+        if len(known) > MAX_OBSERVED:
+            return known
+        try:
+            seen = observed(Term.alone(fold.fitting(final.program), fold.path), known)
+        except Exception:  # also of the program's own code, on parameters that nobody tried before
+            return known
+        return known if seen is None else seen
 
 
 def _confidence(search: Search, found: Found) -> float:

@@ -70,8 +70,8 @@ def _neglected(refit: Refit, seed: int) -> Tensor:
             found = [neglected_along(fold.judging(p), fold.held_out_path, seed=seed) for p, fold in judges]
             refit.neglected[seed] = torch.cat(found)
         except FilterError as error:
-            refit.neglected[seed] = error
+            refit.neglected[seed] = str(error)
     told = refit.neglected[seed]
-    if isinstance(told, FilterError):
-        raise told
+    if isinstance(told, str):
+        raise FilterError(told)
     return told

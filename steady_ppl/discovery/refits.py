@@ -102,7 +102,7 @@ class Refit(Fits):
     held_out: Tensor  # log p(y) of each drive under the judge not fitted to it, (B,); of one fold where given up
     held_out_alone: Tensor  # the same under the programs that were fitted to one fold alone
     unwidened: Program | None = None  # before its fit made its noise many times wider: fits begin there as well
-    neglected: dict[int, Tensor | FilterError] = field(default_factory=dict, init=False, repr=False, compare=False)
+    neglected: dict[int, Tensor | str] = field(default_factory=dict, init=False, repr=False, compare=False)
     """What the linearised log p(y) neglects of each held-out drive, nats, or why no filter follows it, by its seed."""
 
     def coefficient(self, variant: Variant) -> Tensor:

@@ -7,7 +7,7 @@ is held-out log p(y), each drive judged by a program that was fitted without it,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -217,7 +217,7 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
                 base, corrections = with_suitable_noise(own, settings.corrects, tails)
                 settings = replace(settings, declared=with_substeps(settings.declared, finer))
                 fresh = Search(own, base, base, step, gained, outliers, corrections, with_found)
-                again = _rounds(_begun_with(found, fresh, settings), settings)
+                again = _rounds(fresh, settings, carried=found.found)
                 if not again.interrupted:
                     return again
                 found.interrupt(FINER)
@@ -228,64 +228,29 @@ def search(problem: Problem, valid: Trajectories, settings: Settings) -> Search:
     return found
 
 
-def _begun_with(earlier: Search, fresh: Search, settings: Settings) -> Search:
-    """A search at a finer step that begins with what an earlier one found, each effect among its rivals there.
-
-    Every effect is tested anew. Where none of those that were found is needed, the search begins with nothing.
-    """
-    found, now, screening = list[Found](), fresh.base, settings.screen(fresh.base, 0)
-    tests = {tested.variant.name: tested for tested in screening.tests.tested}
-    for one in earlier.found:
-        again = [_fitted_again(now, c, tests) for c in _rivals(one) if c.variant.name not in _names(now)]
-        best, again = ParticleJudge(now).chosen(again, partial(_first, lambda c: c.total > TIE_NATS))
-        if best is not None:
-            assert isinstance(best.refit, Refit)
-            found, now = [*found, Found(best, again, now)], best.refit
-    if not found or screening.tests.p_value > FAMILY_LEVEL:
-        return fresh
-    first = Round(screening, found[0].candidates, found[0].candidate)
-    return replace(fresh, final=now, rounds=[first], found=found)
-
-
-def _rivals(found: Found) -> list[Candidate]:
-    """An effect and what was nearly as good in its place."""
-    best = found.candidate
-    near = [c for c in found.rivals if c is not best and c.total > best.total - MAX_NATS_OF_RIVAL]
-    return [c for c in (best, *near) if isinstance(c.refit, Refit)]
-
-
-def _fitted_again(now: Refit, candidate: Candidate, tests: Mapping[str, Tested]) -> Candidate:
-    """Beside other effects at another step, from where it was."""
-    assert isinstance(candidate.refit, Refit)
-    variant, begin = candidate.variant, candidate.refit.coefficient(candidate.variant)
-    tested = tests[variant.name].at(variant) if variant.name in tests else candidate.tested
-    return at_its_best_place(now, judged(now, tested, refit_with(now, variant, begin)))
-
-
-def _names(refit: Refit) -> set[str]:
-    return {variant.name for variant in attached(refit.program)}
-
-
 def _step_of(refit: Refit, **watched: Any) -> StepCheck:
     """A program that was fitted to the first fold beside itself at finer steps, on these drives."""
     given = (refit.program, refit.folds[0].drives, refit.maxima[0])
     return check_step(*given, known_start=refit.folds[0].known_start, finest=MAX_SUBSTEPS_OF_FIT, **watched)
 
 
-def _rounds(found: Search, settings: Settings) -> Search:
-    """Test, fit and add until nothing is left, or until an interrupt (Ctrl-C) after the first tests."""
+def _rounds(found: Search, settings: Settings, carried: Sequence[Found] = ()) -> Search:
+    """Test, fit and add until nothing is left, or until an interrupt (Ctrl-C) after the first tests.
+
+    What was found at a coarser step and is `carried` is added after the first round, as far as it is needed.
+    """
     with stages(("", 6), ("looking again", 1), ("fitting curves", 1)) as begin:
         doing = LOOKING
         try:
             begin()
-            _add_all(found, settings)
+            _add_all(found, settings, carried)
             doing = "looking again at what was found"
             begin()
             if len(found.found) > 1:
                 _look_again(found, settings)
             doing = "fitting curves"
             begin()
-            if len(found.rounds) > 1 and not found.rounds[1].nothing_found and not found.curves:
+            if found.found and not found.curves and (len(found.found) > 1 or not found.rounds[1].nothing_found):
                 found.curves = _curves(found)
             if found.found:
                 _drop_corrections(found, settings)
@@ -311,17 +276,17 @@ def _drop_corrections(found: Search, settings: Settings) -> None:
     found.rounds, found.final, found.corrections = [*found.rounds, last], final, kept
 
 
-def _add_all(found: Search, settings: Settings) -> None:
+def _add_all(found: Search, settings: Settings, carried: Sequence[Found]) -> None:
     """Test, fit and add one effect after another."""
     shares = [(said, 0.5**index) for index in range(MAX_ROUNDS) for said in ("testing every effect", "")]
     with stages(*shares) as begin_part:
-        earlier = found.found[:-1]
-        for index in range(len(found.rounds), MAX_ROUNDS):
+        earlier = list(found.found)
+        for index in range(MAX_ROUNDS):
             begin_part()
             try:
                 screening = settings.screen(found.final, index)
             except Exception as error:
-                if index == 0:
+                if index == 0 or (index == 1 and carried):  # no tests of a program that is left
                     raise
                 taken_back = found.found[-1]
                 found.found, found.final = earlier, taken_back.without
@@ -331,6 +296,36 @@ def _add_all(found: Search, settings: Settings) -> None:
             earlier = list(found.found)
             if not _add_best(found, screening, index):
                 break
+            if index == 0:
+                _carry(found, carried)
+
+
+def _carry(found: Search, carried: Sequence[Found]) -> None:
+    """Add effects of another search that are needed beside the first one here, each or a rival that it had there."""
+    for one in carried:
+        there, rivals = {variant.name for variant in attached(found.final.program)}, _rivals(one)
+        if found.is_full or one.candidate.variant.name in there:
+            continue
+        again = [_fitted_again(found.final, c) for c in rivals if c.variant.name not in there]
+        best, again = ParticleJudge(found.final).chosen(again, partial(_first, lambda c: c.total > TIE_NATS))
+        if best is not None:
+            assert isinstance(best.refit, Refit)
+            found.found, found.final = [*found.found, Found(best, again, found.final)], best.refit
+
+
+def _rivals(found: Found) -> list[Candidate]:
+    """An effect and what was nearly as good in its place."""
+    best = found.candidate
+    near = [c for c in found.rivals if c is not best and c.total > best.total - MAX_NATS_OF_RIVAL]
+    return [c for c in (best, *near) if isinstance(c.refit, Refit)]
+
+
+def _fitted_again(now: Refit, candidate: Candidate) -> Candidate:
+    """Beside other effects, from where it was."""
+    assert isinstance(candidate.refit, Refit)
+    begin = candidate.refit.coefficient(candidate.variant)
+    again = judged(now, candidate.tested, refit_with(now, candidate.variant, begin))
+    return at_its_best_place(now, again)
 
 
 def _look_again(found: Search, settings: Settings) -> None:

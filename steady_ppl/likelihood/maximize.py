@@ -198,7 +198,7 @@ class _Curvature:
 
     matrix: Tensor  # (P, P)
     is_known: bool  # whether it was given or observed, and is not the drives' cross products
-    known_at: float  # the objective where it was
+    known_at: float  # the objective where it became known
     may_observe: bool  # by differences of scores
     few_drives: bool  # of fewer than two a number: their cross products know too little
 
@@ -231,15 +231,15 @@ class _Curvature:
         self.matrix, self.is_known = by_cross_products(here), False
 
     def check(self, here: LinearizedObjective, passes: int, *, begins: bool) -> bool:
-        """Look again where a fit seems to rest, if what is known may be too much; whether it was looked at."""
+        """Look again where a fit seems to rest, if what is known may be too much. Returns whether it looked."""
         is_far = here.objective - self.known_at > MAX_NATS_OF_INFORMATION
         if self.is_known and not (begins or is_far or self._is_denied(here)):
             return False
         if self.is_known and not self.few_drives:
             self.matrix = by_cross_products(here)
-        if self.may_observe:
-            self.matrix = observed(here.terms[0].term, self.matrix, passes)
-        self.is_known, self.known_at = self.may_observe, here.objective
+        seen = observed(here.terms[0].term, self.matrix, passes) if self.may_observe else None
+        self.matrix = self.matrix if seen is None else seen
+        self.is_known, self.known_at = seen is not None, here.objective
         return True
 
     def _is_denied(self, here: LinearizedObjective) -> bool:
@@ -343,7 +343,8 @@ def maximise_sum(
 
 def _reach(terms: Sequence[Term], information: Tensor) -> Tensor:
     """The most that each number moves at once, `(P,)`."""
-    reach, is_open = torch.zeros_like(information[0]), torch.zeros(len(information), dtype=torch.bool)
+    reach = torch.zeros(len(information), dtype=torch.float64)
+    is_open = torch.zeros(len(information), dtype=torch.bool)
     for term in terms:
         reach[term.columns] = torch.tensor([MAX_MOVE * part.step for part in term.parts], dtype=torch.float64)
         is_open[term.columns] = torch.tensor([part.has_unit and not part.is_effect for part in term.parts]).bool()

@@ -17,7 +17,7 @@ from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.information_filter import Lookahead
 from steady_ppl.gaussian.linearize import ReferencePath
 from steady_ppl.gaussian.smoother import resting_path, smooth
-from steady_ppl.likelihood.parameters import Element, elements, moved, on_both_sides
+from steady_ppl.likelihood.parameters import Element, elements, moved, on_both_sides, values_of
 from steady_ppl.likelihood.scores import parameter_scores, smoothed
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program
@@ -25,7 +25,8 @@ from steady_ppl.model.program import Program
 PASSES, TOLERANCE = 3, 0.03  # linearisations a step, and when paths are at rest, in standard deviations of the noise
 STALLED_PASSES = 15  # linearisations a step once no share of a step was accepted: some path swings about its mode
 MAX_MOVE = 150  # steps of differences, 1.5 of a logarithm: the most that a number moves at once
-SHARE_OF_SD = 0.1  # by which a number is moved; scores bend along more of that of a noise
+SHARE_OF_SD = 0.1  # by which a number is moved: over a whole standard deviation the score of a noise bends
+LEAST_SHARE = 1e-6  # of a number, by which it is moved at least: single precision has seven digits
 OBSERVED_SHARES = (0.01, 100.0)  # of what is known, within which what is observed is believed
 RIDGE = 1e-3  # added to the information of a number, in that of one with a unit if that is smaller
 
@@ -127,21 +128,25 @@ def by_cross_products(here: LinearizedObjective) -> Tensor:
 
 
 @torch.no_grad()
-def observed(term: Term, known: Tensor, passes: int = PASSES) -> Tensor:
+def observed(term: Term, known: Tensor, passes: int = PASSES) -> Tensor | None:
     """Minus the second derivatives of an objective where its program is, `(P, P)`, by differences of scores.
 
     Each number is moved by a tenth of what `known` takes for its standard deviation. What is observed is believed
-    within `OBSERVED_SHARES` of what is known, and not at all where the program diverges or `known` is not positive.
+    within `OBSERVED_SHARES` of what is known. None where the program diverges or `known` is not positive.
     """
+    root, failed = torch.linalg.cholesky_ex(known)
+    if failed:
+        return None
     here = linearised([term], passes)
     (there,), found = here.terms, torch.empty_like(known)
     for part, column, own in zip(term.parts, term.columns, known.diagonal().tolist(), strict=True):
-        step = min(SHARE_OF_SD * own**-0.5, MAX_MOVE * part.step)
-        with moved(part, step):
+        before = float(values_of([part]))
+        by = min(max(SHARE_OF_SD * own**-0.5, LEAST_SHARE * abs(before)), MAX_MOVE * part.step)
+        with moved(part, by):
+            step = float(values_of([part])) - before  # in the parameter's own precision
             found[column] = (here.gradient - linearised([there.term], passes).gradient) / step
-    root, failed = torch.linalg.cholesky_ex(known)
-    if failed or not bool(torch.isfinite(found).all()):
-        return known
+    if not bool(torch.isfinite(found).all()):
+        return None
     half = torch.linalg.solve_triangular(root, found + found.T, upper=False).T
     shares, turn = torch.linalg.eigh(torch.linalg.solve_triangular(root, half, upper=False) / 2)
     return (root @ turn * shares.clamp(*OBSERVED_SHARES)) @ (root @ turn).T

@@ -20,7 +20,7 @@ from steady_ppl.discovery import discover as module
 from steady_ppl.discovery.candidates import _axis, _log_prior, _neighbours, variance_of_places
 from steady_ppl.discovery.curves import knots_of
 from steady_ppl.discovery.discover import COMPARING, NOT_CONVERGED, _afterwards, _note_of_one_drive, _searched
-from steady_ppl.discovery.finding import _interval, _spread, next_run
+from steady_ppl.discovery.finding import _interval, _Spreads, next_run
 from steady_ppl.discovery.search import Search
 from steady_ppl.effects import Effect, chosen_variant, parsed
 from steady_ppl.effects.registry import _EFFECTS, register
@@ -488,14 +488,14 @@ def test_an_interrupt_after_the_search_leaves_it_complete():
     assert search.interrupted == COMPARING
 
 
-def test_the_sd_of_an_effect_whose_program_was_not_tested_is_that_of_its_fit(dragged):
+def test_the_sd_of_an_effect_whose_program_was_not_tested_is_what_is_observed_there(dragged):
     (finding,) = dragged.findings
     untested = replace(dragged.search, rounds=dragged.search.rounds[:1])
-    assert _spread(untested, finding.variant) == pytest.approx(finding.sd, rel=0.3)
+    assert _Spreads(untested)(finding.variant) == pytest.approx(finding.sd, rel=0.3)
     maximum = replace(dragged.search.final.maxima[0], information=torch.zeros(0, 0))
     by_draws = replace(untested, final=replace(dragged.search.final, maxima=[maximum]))
     tested = dragged.search.found[0].candidate.tested
-    assert _spread(by_draws, finding.variant) == pytest.approx(tested.sd * dragged.search.final.first_share**0.5)
+    assert _Spreads(by_draws)(finding.variant) == pytest.approx(tested.sd * dragged.search.final.first_share**0.5)
 
 
 @pytest.mark.parametrize(

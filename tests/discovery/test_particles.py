@@ -115,3 +115,22 @@ def test_a_likelihood_that_no_gaussian_could_reach_is_refused():
     assert beyond.is_broken.tolist() == [False, True, False]
     with pytest.raises(FilterError, match="trajectory 2: .* is larger than its sensors allow"):
         require_found(beyond, problem)
+
+
+def test_filters_of_one_refit_are_asked_once_by_all_judges(monkeypatch):
+    asked = []
+
+    def along(program, path, seed):
+        asked.append((program, seed))
+        if program == "broken":
+            raise FilterError("every weight is zero")
+        return torch.full((2,), 0.1)
+
+    monkeypatch.setattr(particles, "neglected_along", along)
+    monkeypatch.setattr(particles, "Refit", SimpleNamespace)
+    now, broken = refit("now"), refit("broken")
+    for _ in range(2):
+        good = ParticleJudge(now).confirm(Fake("a", torch.full((2,), 3.0), refit("a"), is_confirmed=False))
+        bad = ParticleJudge(now).confirm(Fake("b", torch.full((2,), 3.0), broken, is_confirmed=False))
+        assert good.total == 6.0 and bad.refit == "no particle filter follows the drives: every weight is zero"
+    assert sorted(asked) == [("a", 0), ("a", 0), ("broken", 0), ("now", 0)]

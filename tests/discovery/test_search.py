@@ -152,33 +152,52 @@ def test_what_was_found_stays_where_finer_time_steps_fail_or_are_interrupted(mon
         assert found.is_complete
 
 
-def begun_at_a_finer_step(monkeypatch, totals, p_value=0.001):
-    """The search that begins with a drag and a bias, by the nats that each effect brings at the finer step. The drag
-    had a rival that was near and one that was far."""
-    drag, near, far, bias = (Chosen(*told) for told in (("drag", 30.0), ("near", 25.0), ("far", 9.0), ("bias", 20.0)))
-    tests = SimpleNamespace(p_value=p_value, critical=0.01, tested=[])
-    settings, screened = search.Settings(declared=None), []
-    monkeypatch.setattr(search.Settings, "screen", lambda *at: screened.append(at[1:]) or SimpleNamespace(tests=tests))
-    monkeypatch.setattr(search, "_fitted_again", lambda now, one, tests: Chosen(one.name, totals[one.name]))
-    monkeypatch.setattr(search, "_names", lambda refit: set())
-    earlier = search.Search(None, None, None, None, 0.0, found=[Found(drag, [drag, near, far], None)])
-    earlier.found.append(Found(bias, [bias], None))
-    fresh = search.Search("own", "base", "base", "step", 0.0)
-    begun = search._begun_with(earlier, fresh, settings)
-    assert screened == [("base", 0)]
-    return begun, fresh
+@pytest.mark.parametrize(
+    ("totals", "added"),
+    [
+        ({"drag": 10.0, "near": 28.0, "far": 99.0, "bias": 1.0}, [("near", ["near", "drag"])]),
+        ({"drag": 10.0, "near": 9.0, "bias": 5.0}, [("drag", ["drag", "near"]), ("bias", ["bias"])]),
+        ({"drag": 0.0, "near": 1.0, "bias": 0.0}, []),
+    ],
+)
+def test_what_was_found_at_a_coarser_step_is_fitted_among_its_rivals_there(monkeypatch, totals, added):
+    drag, near, far, bias, lag = (
+        Chosen(*told) for told in (("drag", 30.0), ("near", 25.0), ("far", 9.0), ("bias", 20.0), ("lag", 40.0))
+    )
+    monkeypatch.setattr(search, "_fitted_again", lambda now, one: Chosen(one.name, totals[one.name]))
+    monkeypatch.setattr(search, "attached", lambda program: [SimpleNamespace(name="lag")])
+    monkeypatch.setattr(Refit, "program", None)
+    base = object.__new__(Refit)
+    here = search.Search(base, base, base, None, 0.0)
+    carried = [Found(lag, [lag], None), Found(drag, [drag, near, far], None), Found(bias, [bias], None)]
+    final = here.final
+    search._carry(here, carried)
+    assert [(one.candidate.name, [c.name for c in one.candidates]) for one in here.found] == added
+    assert here.final is (here.found[-1].candidate.refit if added else final)
+    befores = [final, *(one.candidate.refit for one in here.found)]
+    assert all(one.without is before for one, before in zip(here.found, befores, strict=False))
 
 
-def test_at_a_finer_step_what_was_found_is_fitted_among_its_rivals_of_the_coarser_one(monkeypatch):
-    begun, _ = begun_at_a_finer_step(monkeypatch, {"drag": 10.0, "near": 28.0, "far": 99.0, "bias": 1.0})
-    (found,) = begun.found  # the bias brings nothing there
-    assert found.candidate.name == "near" and [one.name for one in found.candidates] == ["near", "drag"]
-    assert found.without == "base" and begun.final is found.candidate.refit
-    (first,) = begun.rounds
-    assert first.chosen is found.candidate and first.candidates is found.candidates
+@pytest.mark.parametrize("carried", [[], ["something"]])
+def test_without_tests_of_what_was_carried_the_search_at_a_finer_step_fails(monkeypatch, carried):
+    """An ordinary search takes back what was added last: its last tests are of the program that is left."""
 
+    def screen(settings, now, index):
+        if index:
+            raise RuntimeError("the tide is out")
+        return SimpleNamespace(tests=None)
 
-@pytest.mark.parametrize(("totals", "p_value"), [({"drag": 0.0, "near": 1.0, "bias": 0.0}, 0.001), ({}, 0.5)])
-def test_where_nothing_of_it_is_left_the_search_begins_anew(monkeypatch, totals, p_value):
-    begun, fresh = begun_at_a_finer_step(monkeypatch, {"drag": 9.0, "near": 0.0, "bias": 9.0} | totals, p_value)
-    assert begun is fresh and not begun.found and not begun.rounds
+    def add(found, screening, index):
+        found.found = [Found(SimpleNamespace(variant=SimpleNamespace(label="drag")), [], "base")]
+        return True
+
+    monkeypatch.setattr(search.Settings, "screen", screen)
+    monkeypatch.setattr(search, "_add_best", add)
+    monkeypatch.setattr(search, "_carry", lambda found, carried: None)
+    found = search.Search(None, "base", "base", None, 0.0)
+    if carried:
+        with pytest.raises(RuntimeError, match="tide"):
+            search._add_all(found, search.Settings(declared=None), carried)
+    else:
+        search._add_all(found, search.Settings(declared=None), carried)
+        assert found.taken_back == {"drag": "RuntimeError: the tide is out"} and found.final == "base"

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from steady_ppl import Joint, TruthGuide, channel_means, for_program, load_program, simulate
 from steady_ppl.effects import attached, catalogue, chosen_variant
+from steady_ppl.effects.catalogue.forces import _limited
 from steady_ppl.likelihood.evidence import log_likelihood
 from steady_ppl.model.handlers import Recording
 from steady_ppl.model.validate import probe
@@ -148,13 +149,26 @@ def test_a_hovercraft_is_pushed_as_the_equation_says(effect: str, value, pushes:
     torch.testing.assert_close(got, torch.tensor(pushes, dtype=torch.float64), rtol=1e-6, atol=1e-7)
 
 
-@pytest.mark.parametrize("most", [1e-9, 0.5, 1e9])
-def test_a_limit_is_never_passed_and_far_from_it_nothing_is_lost(most: float) -> None:
-    program = example("hovercraft")
-    forward = float(means(program.with_effect("acceleration_limit", most))[0])
-    whole = float(means(program)[0])
-    assert 0 < forward <= most and forward <= whole
-    assert forward == pytest.approx(most if most < 1e-3 else limited(whole, most), rel=1e-9)
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("most", [1e-20, 1e-9, 0.5, 1e9, math.inf])
+def test_a_limit_is_never_passed_and_has_a_slope_on_both_sides(most: float, side: float) -> None:
+    value = torch.tensor(side * 1.3, requires_grad=True)
+    c = torch.tensor(most, requires_grad=True)
+    limited_to = _limited(value, c)
+    limited_to.backward()
+    found = limited_to.item()
+    assert abs(found) <= most and found * side > 0
+    expected = most if most < 1e-3 else 1.3 if most > 1e3 else limited(1.3, most)
+    assert found == pytest.approx(side * expected, rel=1e-6)
+    slopes = (0.0, side) if most < 1e-3 else (1.0, 0.0)
+    if most != 0.5:
+        assert [float(value.grad), float(c.grad)] == pytest.approx(slopes, abs=1e-6)
+
+
+def test_where_nothing_is_asked_for_a_limit_takes_nothing() -> None:
+    value = torch.zeros((), requires_grad=True)
+    _limited(value, torch.tensor(0.5)).backward()
+    assert float(value.grad) == 1
 
 
 def test_a_wind_carries_what_is_at_rest_and_stops_when_it_moves_along() -> None:

@@ -208,6 +208,19 @@ def test_information_of_some_numbers_is_completed_wherever_they_stand():
     assert torch.equal(Information(known.matrix * torch.nan, known.names).completed(names, wide), wide)
 
 
+def test_a_program_that_learns_nothing_is_at_its_maximum():
+    program = example("linear_gaussian").requires_grad_(False)
+    maximum = maximise(Problem(program, drives(program, 3, 10), True))
+    assert maximum.steps == 0 and maximum.names == () and maximum.converged
+
+
+def test_information_that_is_not_positive_is_not_taken_for_observed(cart):
+    program, data, maximum = cart
+    term = Term.alone(Problem(program, data, True), maximum.path)
+    assert observed(term, -maximum.information) is None
+    assert observed(term, torch.zeros_like(maximum.information)) is None
+
+
 def test_a_number_of_which_the_rest_knows_nothing_lends_no_information_to_the_others():
     """A noise that is at nothing on one half of the drives and is not on the other."""
     wide = torch.tensor([[6e-9, -1e-4], [-1e-4, 2e3]], dtype=torch.float64)

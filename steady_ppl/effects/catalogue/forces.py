@@ -364,7 +364,7 @@ def sticky_patch(self: Program, state: Tensor, *_: Tensor, c: Tensor, x: Any, y:
 
 @_on_any("m/s²", typical=0.6, limit=10.0, sign=1, null=math.inf, probes=(0.1, 0.2, 0.4, 0.8, 1.6, 3.2), choices=_limits)
 def acceleration_limit(self: Program, state: Tensor, *_: Tensor, c: Tensor, channels: Names, mean: Means) -> Pushes:
-    r"""a → a / (1 + |a/c|⁴)^¼, which stays below c
+    r"""a → a / (1 + |a/c|⁴)^¼, so that |a| ≤ c
 
     equation: a \to a\,(1 + |a / c|^4)^{-1/4}
     feels: never jumps off the line, whatever it is told
@@ -375,7 +375,6 @@ def acceleration_limit(self: Program, state: Tensor, *_: Tensor, c: Tensor, chan
 
 def _limited(value: Tensor, most: Tensor) -> Tensor:
     """A value that stays within a limit, rounded where it reaches it, so that linearisations on both sides agree."""
-    ratio = value.abs() / most
-    larger = ratio.clamp(min=1.0)
-    one, other = (1 / larger).square(), (ratio / larger).square()
-    return value / larger / (one.square() + other.square()).sqrt().sqrt()
+    within = torch.minimum(torch.maximum(value, -most), most)
+    share = within.abs() / torch.maximum(value.abs(), most)
+    return within / (1 + share.square().square()).sqrt().sqrt()
