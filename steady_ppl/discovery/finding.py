@@ -25,6 +25,7 @@ from steady_ppl.likelihood.parameters import elements
 from steady_ppl.model.problem import Problem
 from steady_ppl.model.program import Program, unit_of
 from steady_ppl.utils.random import seeded
+from steady_ppl.utils.text import reason_of
 
 MAX_LOG_SD = 2.0  # of a factor: beyond it nothing is known but the sign
 MAX_LOG_RATIO = 100.0  # of an interval's ends: nothing is known beyond it, and it is a number
@@ -153,9 +154,13 @@ class _Spreads:
             return known
         try:
             seen = observed(Term.alone(fold.fitting(final.program), fold.path), known)
-        except Exception:  # also of the program's own code, on parameters that nobody tried before
+            why = "" if seen is not None else "it diverges beside what was found"
+        except Exception as error:  # also of the program's own code, on parameters that nobody tried before
+            seen, why = None, reason_of(error)
+        if seen is None:
+            self.search.notes.append(f"intervals are by the slopes of the fit, whose curvature cannot be seen: {why}")
             return known
-        return known if seen is None else seen
+        return seen
 
 
 def _confidence(search: Search, found: Found) -> float:

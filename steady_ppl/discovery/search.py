@@ -460,12 +460,10 @@ def prune(search: Search) -> None:
         without = _without(search, found)
         if isinstance(without, str) or without is found.without:  # beside which it was chosen among the same rivals
             continue
-        chosen, least = found.candidate, found.candidate.total - MAX_NATS_OF_RIVAL
-        there = {variant.name for variant in attached(without.program)}
+        chosen, there = found.candidate, {variant.name for variant in attached(without.program)}
         again, as_it_stands = [], judged(without, chosen.tested, search.final)
-        for rival in [chosen, *(c for c in found.candidates if c is not chosen and c.total > least)]:
-            imitates = chosen.is_explanation and not rival.is_explanation
-            if rival.variant.name not in there and isinstance(rival.refit, Refit) and not imitates:
+        for rival in _rivals(found):
+            if rival.variant.name not in there and isinstance(rival.refit, Refit):
                 begin = rival.refit.coefficient(rival.variant)
                 refit = refit_with(without, rival.variant, begin, information=search.final.maxima[0])
                 one = judged(without, rival.tested, refit)

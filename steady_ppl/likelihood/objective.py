@@ -153,6 +153,7 @@ def observed(term: Term, known: Tensor, passes: int = PASSES) -> Tensor | None:
 
 
 def regularised(information: Tensor, has_unit: Tensor) -> Tensor:
+    """An information `(P, P)` with a little of its diagonal and `RIDGE` added, so that it can be inverted."""
     own = information.diagonal()
     of_unit = torch.where(own > 0, own.clamp(max=1.0), 1.0)  # nothing is known of a number that tells nothing
     return information + torch.diag(1e-6 * own + RIDGE * torch.where(has_unit, of_unit, 1.0))

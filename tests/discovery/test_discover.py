@@ -498,6 +498,22 @@ def test_the_sd_of_an_effect_whose_program_was_not_tested_is_what_is_observed_th
     assert _Spreads(by_draws)(finding.variant) == pytest.approx(tested.sd * dragged.search.final.first_share**0.5)
 
 
+@pytest.mark.parametrize("failure", [None, ZeroDivisionError("of the program's own")])
+def test_where_nothing_can_be_observed_a_note_says_whose_intervals_these_are(dragged, monkeypatch, failure):
+    def observed(*_):
+        if failure:
+            raise failure
+
+    monkeypatch.setattr("steady_ppl.discovery.finding.observed", observed)
+    (finding,) = dragged.findings
+    untested = replace(dragged.search, rounds=dragged.search.rounds[:1], notes=[])
+    spread = _Spreads(untested)
+    assert spread(finding.variant).tolist() == spread(finding.variant).tolist()
+    assert (spread(finding.variant) > 0).all()
+    (note,) = untested.notes
+    assert note.endswith("ZeroDivisionError: of the program's own" if failure else "it diverges beside what was found")
+
+
 @pytest.mark.parametrize(
     ("error", "raised"),
     [
