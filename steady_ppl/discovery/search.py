@@ -7,7 +7,7 @@ is held-out log p(y), each drive judged by a program that was fitted without it,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -27,8 +27,8 @@ from steady_ppl.discovery.candidates import (
     likelier_places,
     screen_program,
 )
+from steady_ppl.discovery.judges import MIN_GAIN_OF_CURVE, CurveJudge, ParticleJudge
 from steady_ppl.discovery.noise_first import Correction, needless, with_suitable_noise, without, without_outliers
-from steady_ppl.discovery.particles import ParticleJudge
 from steady_ppl.discovery.refits import (
     NO_THRESHOLD,
     Fits,
@@ -49,7 +49,6 @@ from steady_ppl.utils.journal import close_journal
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.text import reason_of
 
-MIN_GAIN_OF_CURVE = 3.0  # nats by which a curve must be better than named effects
 MAX_NATS_BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
 MAX_NATS_OF_RIVAL = 12.0  # nats behind the best in its round, with which one is fitted again beside other effects
 SAME_MAXIMUM = 0.2  # nats within which fits from two starts have ended at the same place
@@ -246,7 +245,7 @@ def _rounds(found: Search, settings: Settings, carried: Sequence[Found] = ()) ->
             _add_all(found, settings, carried)
             doing = "looking again at what was found"
             begin()
-            if len(found.found) > 1:
+            if len(found.found) > 1 and _names(found.found) != _names(carried):  # else it was done there
                 _look_again(found, settings)
             doing = "fitting curves"
             begin()
@@ -259,6 +258,10 @@ def _rounds(found: Search, settings: Settings, carried: Sequence[Found] = ()) ->
                 raise KeyboardInterrupt(NOTHING_TESTED) from stop
             found.interrupt(doing)
     return found
+
+
+def _names(found: Sequence[Found]) -> set[str]:
+    return {one.candidate.variant.name for one in found}
 
 
 def _drop_corrections(found: Search, settings: Settings) -> None:
@@ -277,7 +280,8 @@ def _drop_corrections(found: Search, settings: Settings) -> None:
 
 
 def _add_all(found: Search, settings: Settings, carried: Sequence[Found]) -> None:
-    """Test, fit and add one effect after another."""
+    """Test, fit and add one effect after another; at first of what is `carried` alone."""
+    near = {rival.variant.name for one in carried for rival in _rivals(one)}
     shares = [(said, 0.5**index) for index in range(MAX_ROUNDS) for said in ("testing every effect", "")]
     with stages(*shares) as begin_part:
         earlier = list(found.found)
@@ -294,7 +298,7 @@ def _add_all(found: Search, settings: Settings, carried: Sequence[Found]) -> Non
                 break
             begin_part()
             earlier = list(found.found)
-            if not _add_best(found, screening, index):
+            if not _add_best(found, screening, index, near if index == 0 and carried else None):
                 break
             if index == 0:
                 _carry(found, carried)
@@ -309,8 +313,7 @@ def _carry(found: Search, carried: Sequence[Found]) -> None:
         again = [_fitted_again(found.final, c) for c in rivals if c.variant.name not in there]
         best, again = ParticleJudge(found.final).chosen(again, partial(_first, lambda c: c.total > TIE_NATS))
         if best is not None:
-            assert isinstance(best.refit, Refit)
-            found.found, found.final = [*found.found, Found(best, again, found.final)], best.refit
+            _add(found, best, again)
 
 
 def _rivals(found: Found) -> list[Candidate]:
@@ -342,34 +345,50 @@ def _look_again(found: Search, settings: Settings) -> None:
         found.found, found.final = before, final
 
 
-def _add_best(found: Search, screening: Screening, index: int) -> bool:
-    """Fit what the tests of a round point at and add the best, if it brings enough; whether anything was added."""
+def _add_best(found: Search, screening: Screening, index: int, near: Collection[str] | None = None) -> bool:
+    """Fit what the tests of a round point at and add the best, if it brings enough; whether anything was added.
+
+    `near` names the effects that alone are fitted beside what the tests put first; None: all are.
+    """
     found.rounds.append(Round(screening, [], None))
     if found.rounds[-1].nothing_found or found.is_full or index == MAX_ROUNDS - 1:
         return False
-    judge, critical = ParticleJudge(found.final), screening.tests.critical
-    fitted = _refits(found.final, screening, index == 0, found.rounds[-1].candidates)
-    best, candidates = judge.chosen(fitted, partial(_first, lambda c: c.significant(critical)))
-    if index == 0 and best is None:
+    judge, curve = ParticleJudge(found.final), CurveJudge(found.final, screening)
+    chosen = leaders(screening.tests, index == 0)
+    chosen = [tested for tested in chosen if near is None or tested is chosen[0] or tested.variant.name in near]
+
+    def is_enough(candidate: Candidate) -> bool:
+        return candidate.significant(screening.tests.critical) and (index == 0 or curve.admits(candidate))
+
+    fitted = _refits(found.final, chosen, screening, found.rounds[-1].candidates)
+    best, candidates = judge.chosen(fitted, partial(_first, is_enough))
+    if index == 0 and (best is None or not (best.is_explanation or curve.tested is None)):
         found.curves = _curves(found)
-        if found.curve is None and not found.departed:  # neither can be what the tests found
-            near = partial(_first, lambda c: c.total > TIE_NATS and c.tested.p_value <= NEAR_FAMILY_LEVEL)
-            best, candidates = judge.chosen(candidates, near)
+        if found.curve is not None:
+            best = None
+        elif best is None and not found.departed:  # neither can be what the tests found
+            nearly = partial(_first, lambda c: c.total > TIE_NATS and c.tested.p_value <= NEAR_FAMILY_LEVEL)
+            best, candidates = judge.chosen(candidates, nearly)
     found.rounds[-1] = Round(screening, candidates, best)
     if best is None:
         return False
+    _add(found, best, candidates)
+    return True
+
+
+def _add(found: Search, best: Candidate, candidates: list[Candidate]) -> None:
+    """Add an effect, and move the knees and places of the earlier ones to where they are likeliest beside it."""
     assert isinstance(best.refit, Refit)
     # in one assignment, here and below: no interrupt comes between effects and the program that has them
     found.found, found.final = [*found.found, Found(best, candidates, found.final)], best.refit
     for one in found.found[:-1]:
         _place_again(found, one)
-    return True
 
 
 def _first(is_enough: Callable[[Candidate], bool], ranked: Sequence[Candidate]) -> Candidate | None:
     """The best candidate that brings enough, one that explains something before one that does not."""
-    able = [c for c in ranked if c.is_judged and not c.against_its_sign and is_enough(c)]
-    return min(able, key=lambda c: not c.is_explanation, default=None)
+    able = sorted((c for c in ranked if c.is_judged and not c.against_its_sign), key=lambda c: not c.is_explanation)
+    return next((c for c in able if is_enough(c)), None)
 
 
 def _place_again(search: Search, found: Found) -> None:
@@ -401,9 +420,9 @@ def _with_places_of(final: Refit, found: Sequence[Found]) -> list[Found]:
     return [moved(one) for one in found]
 
 
-def _refits(now: Refit, screening: Screening, first: bool, candidates: list[Candidate]) -> list[Candidate]:
+def _refits(now: Refit, chosen: Sequence[Tested], screening: Screening, candidates: list[Candidate]) -> list[Candidate]:
     """Fits of what the tests point at; each is added to `candidates` as it ends, whatever happens to the next."""
-    chosen = sorted(leaders(screening.tests, first), key=lambda tested: tested.variant.effect.verdict == "noise")
+    chosen = sorted(chosen, key=lambda tested: tested.variant.effect.verdict == "noise")
     with stages(*((f"fitting with {tested.variant.label}", 1) for tested in chosen)) as begin:
         for fit in attempts(now, chosen, screening):
             begin()
@@ -490,8 +509,10 @@ def _without(search: Search, found: Found) -> Refit | str:
     """The program with the other effects, fitted one by one or from the fit of all, whichever is likelier: a fit that
     has stopped early makes an effect look needed."""
     others = [other.candidate for other in search.found if other is not found]
-    was_so = set(labels(found.without)) - set(labels(search.base)) == {other.variant.label for other in others}
-    afresh = found.without if was_so else _with_all(search.base, others)
+    there = set(labels(found.without)) - set(labels(search.base))
+    begun = there <= {other.variant.label for other in others}
+    later = [other for other in others if other.variant.label not in there] if begun else others
+    afresh = _with_all(found.without if begun else search.base, later)
     near = fit_near(search.base, search.final, [other.variant for other in others])
     if isinstance(afresh, str) or isinstance(near, str):
         return afresh if isinstance(near, str) else judged_fits(near)

@@ -76,7 +76,7 @@ class Chosen:
 def test_coloured_noise_enters_where_nothing_else_is_significant(monkeypatch, totals, expected):
     candidates = [Chosen(name, *told) for name, told in totals.items()]
     monkeypatch.setattr(search, "_refits", lambda *_: candidates)
-    screening = SimpleNamespace(tests=SimpleNamespace(p_value=0.0, critical=0.01))
+    screening = SimpleNamespace(tests=SimpleNamespace(p_value=0.0, critical=0.01, tested=[]))
     found = search.Search(None, base=None, final=None, step=None, gained=0.0)
     assert search._add_best(found, screening, 1) == (expected is not None)
     assert [one.candidate.name for one in found.found] == ([expected] if expected else [])
@@ -104,9 +104,8 @@ def test_what_loses_or_imitates_sets_no_bar_for_what_is_fitted_after_it(monkeypa
     tested = [
         SimpleNamespace(variant=SimpleNamespace(label=n, effect=SimpleNamespace(verdict=k))) for n, k in kinds.items()
     ]
-    monkeypatch.setattr(search, "leaders", lambda tests, first: tested)
     monkeypatch.setattr(search, "attempts", lambda now, chosen, screening: seen.extend(chosen) or [])
-    assert search._refits(None, SimpleNamespace(tests=None), True, []) == []
+    assert search._refits(None, tested, SimpleNamespace(tests=None), []) == []
     assert [one.variant.label for one in seen] == ["drag", "coloured"]
 
 
@@ -123,6 +122,32 @@ def test_a_knee_is_moved_beside_what_is_added_after_it(monkeypatch):
     found = search.Search(None, base=None, final=later.refit, step=None, gained=0.0, found=[first])
     search._place_again(found, first)
     assert found.final is moved.refit and found.found[0].candidate.tested is final
+
+
+def test_what_is_carried_has_its_earlier_knees_moved_beside_it(monkeypatch):
+    """Else what they leave at a wrong knee looks like something else: a sensor's scale, in a linear drive's log."""
+    friction, drag = Chosen("friction", 30.0), Chosen("drag", 20.0)
+    asked = []
+    monkeypatch.setattr(search, "_fitted_again", lambda now, one: one)
+    monkeypatch.setattr(search, "_place_again", lambda found, one: asked.append((one.candidate.name, len(found.found))))
+    monkeypatch.setattr(search, "attached", lambda program: [])
+    monkeypatch.setattr(Refit, "program", None)
+    base = object.__new__(Refit)
+    here = search.Search(base, base, base, None, 0.0)
+    search._carry(here, [Found(friction, [friction], None), Found(drag, [drag], None)])
+    assert asked == [("friction", 2)]
+
+
+@pytest.mark.parametrize(("near", "expected"), [(None, ["lag", "drag", "wind"]), ({"drag"}, ["lag", "drag"])])
+def test_at_a_finer_step_only_what_came_near_is_fitted_first_and_what_its_tests_put_first(monkeypatch, near, expected):
+    tested = [SimpleNamespace(variant=SimpleNamespace(name=name)) for name in ("lag", "drag", "wind")]
+    seen = []
+    monkeypatch.setattr(search, "leaders", lambda tests, first: tested)
+    monkeypatch.setattr(search, "_refits", lambda now, chosen, *_: seen.extend(chosen) or [])
+    screening = SimpleNamespace(tests=SimpleNamespace(p_value=0.0, critical=0.01, tested=[]))
+    found = search.Search(None, base=None, final=None, step=None, gained=0.0)
+    assert not search._add_best(found, screening, 1, near)
+    assert [one.variant.name for one in seen] == expected
 
 
 @pytest.mark.parametrize("failure", [RuntimeError("the tide is out"), KeyboardInterrupt()])
@@ -178,7 +203,7 @@ def test_what_was_found_at_a_coarser_step_is_fitted_among_its_rivals_there(monke
     assert all(one.without is before for one, before in zip(here.found, befores, strict=False))
 
 
-@pytest.mark.parametrize("carried", [[], ["something"]])
+@pytest.mark.parametrize("carried", [[], [Found(SimpleNamespace(is_explanation=True, refit=None), [], None)]])
 def test_without_tests_of_what_was_carried_the_search_at_a_finer_step_fails(monkeypatch, carried):
     """An ordinary search takes back what was added last: its last tests are of the program that is left."""
 
@@ -187,7 +212,8 @@ def test_without_tests_of_what_was_carried_the_search_at_a_finer_step_fails(monk
             raise RuntimeError("the tide is out")
         return SimpleNamespace(tests=None)
 
-    def add(found, screening, index):
+    def add(found, screening, index, near):
+        assert near == (set() if carried else None)
         found.found = [Found(SimpleNamespace(variant=SimpleNamespace(label="drag")), [], "base")]
         return True
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 from examples import drives, example
 
-from steady_ppl.discovery import particles
-from steady_ppl.discovery.particles import ParticleJudge
+from steady_ppl.discovery import judges
+from steady_ppl.discovery.judges import ParticleJudge
 from steady_ppl.discovery.refits import BY_DRAWS, BY_LIKELIHOOD
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path, require_found, smooth
@@ -57,8 +57,8 @@ def ranking(monkeypatch, neglected: dict[str, float], now=BY_LIKELIHOOD, choose=
             raise FilterError("every weight is zero")
         return torch.full((2,), neglected.get(program, 0.0) / 2)
 
-    monkeypatch.setattr(particles, "neglected_along", along)
-    monkeypatch.setattr(particles, "Refit", SimpleNamespace)
+    monkeypatch.setattr(judges, "neglected_along", along)
+    monkeypatch.setattr(judges, "Refit", SimpleNamespace)
     each = [Fake(name, torch.full((2,), gain / 2), refit(name)) for name, gain in (("b", 6.0), ("a", 9.0), ("c", -3.0))]
     best, found = ParticleJudge(refit("now", now)).chosen(each, choose)
     assert len(asked) == len(set(asked))
@@ -126,11 +126,52 @@ def test_filters_of_one_refit_are_asked_once_by_all_judges(monkeypatch):
             raise FilterError("every weight is zero")
         return torch.full((2,), 0.1)
 
-    monkeypatch.setattr(particles, "neglected_along", along)
-    monkeypatch.setattr(particles, "Refit", SimpleNamespace)
+    monkeypatch.setattr(judges, "neglected_along", along)
+    monkeypatch.setattr(judges, "Refit", SimpleNamespace)
     now, broken = refit("now"), refit("broken")
     for _ in range(2):
         good = ParticleJudge(now).confirm(Fake("a", torch.full((2,), 3.0), refit("a"), is_confirmed=False))
         bad = ParticleJudge(now).confirm(Fake("b", torch.full((2,), 3.0), broken, is_confirmed=False))
         assert good.total == 6.0 and bad.refit == "no particle filter follows the drives: every weight is zero"
     assert sorted(asked) == [("a", 0), ("a", 0), ("broken", 0), ("now", 0)]
+
+
+@pytest.mark.parametrize(
+    ("change", "admitted"),
+    [
+        ({}, False),
+        ({"p_value": 0.5}, True),  # no curve is found
+        ({"evidence": 15.0}, True),  # of which the tests tell little more
+        ({"correlation": 0.95}, True),  # the curve is the same effect, with what it leaves
+        ({"gain": 16.9}, True),  # and brings as much
+        ({"gain": 17.1}, False),
+        ({"explains": False}, False),
+        ({"explains": False, "p_value": 0.5}, True),
+    ],
+)
+def test_what_brings_less_than_a_curve_of_another_kind_is_not_admitted(monkeypatch, change, admitted):
+    """A saturation, where the rest of a friction goes with the velocity."""
+    told = {"p_value": 1e-20, "evidence": 40.0, "correlation": 0.4, "gain": 100.0, "explains": True} | change
+
+    def tested(name, is_curve, statistic, p_value, evidence=0.0):
+        variant = SimpleNamespace(name=name)
+        given = {"is_curve": is_curve, "statistic": statistic, "p_value": p_value, "evidence": evidence}
+        return SimpleNamespace(variant=variant, **given)
+
+    curve = tested("curve", True, 90.0, told["p_value"], told["evidence"])
+    saturation = tested("saturation", False, 19.0, 1e-5)
+    correlations = torch.tensor([[1.0, told["correlation"]], [told["correlation"], 1.0]])
+    tests = SimpleNamespace(tested=[curve, saturation], critical=0.01, correlations=correlations)
+    fits = []
+
+    def attempts(now, chosen, screening):
+        assert chosen == [curve]
+        return [lambda threshold: fits.append(now) or SimpleNamespace(total=told["gain"])]
+
+    monkeypatch.setattr(judges, "attempts", attempts)
+    monkeypatch.setattr(judges.ParticleJudge, "confirm", lambda self, candidate: candidate)
+    judge = judges.CurveJudge("now", SimpleNamespace(tests=tests))
+    given = {"tested": saturation, "variant": saturation.variant, "total": 14.0, "is_explanation": told["explains"]}
+    for _ in range(2):
+        assert judge.admits(SimpleNamespace(**given)) == admitted
+    assert fits == ["now"] * (not change or "gain" in change)

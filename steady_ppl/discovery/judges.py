@@ -1,18 +1,21 @@
-"""What a particle filter says of candidates that the linearised programs' log p(y) ranks: it has the last word."""
+"""Who has the last word on candidates that the linearised programs' log p(y) ranks: a particle filter, which says what
+that neglects, and a curve, which says whether what is left is of another kind."""
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from steady_ppl.discovery.candidates import Candidate
+from steady_ppl.discovery.candidates import CLEAR_GAIN, MIN_ALIAS_CORRELATION, Candidate, Screening, attempts
 from steady_ppl.discovery.fitting import neglected_along
-from steady_ppl.discovery.refits import BY_LIKELIHOOD, Refit
+from steady_ppl.discovery.refits import BY_LIKELIHOOD, NO_THRESHOLD, Refit
 from steady_ppl.errors import FilterError
 from steady_ppl.utils.text import reason_of
 
+MIN_GAIN_OF_CURVE = 3.0  # nats by which a curve must be better than named effects
 NEGLIGIBLE_NATS = 1.0  # by which a filter may rank otherwise before it is asked once more, and from then on believed
 
 Choice = Callable[[Sequence[Candidate]], Candidate | None]  # of candidates, best first
@@ -75,3 +78,37 @@ def _neglected(refit: Refit, seed: int) -> Tensor:
     if isinstance(told, str):
         raise FilterError(told)
     return told
+
+
+class CurveJudge:
+    """Whether a candidate of a program `now` may be added, where the tests tell far more of a curve.
+
+    What is left may go with a variable with which the candidate has nothing to do. Where such a curve brings more, what
+    is missing most has no name: it bends whatever is fitted beside it, and a small gain is no evidence.
+    """
+
+    def __init__(self, now: Refit, screening: Screening) -> None:
+        self.now, self.screening, tests = now, screening, screening.tests
+        best = next((tested for tested in tests.tested if tested.is_curve), None)
+        self.tested = best if best is not None and best.p_value <= tests.critical else None
+
+    @cached_property
+    def gain(self) -> float:
+        """Held-out log p(y) of the program with the curve above that of the program, nats; only where it is tested."""
+        assert self.tested is not None
+        (fit,) = attempts(self.now, [self.tested], self.screening)
+        return ParticleJudge(self.now).confirm(fit(NO_THRESHOLD)).total
+
+    def admits(self, candidate: Candidate) -> bool:
+        """Whether a candidate is like the curve or as good as it."""
+        if self.tested is None:
+            return True
+        if not candidate.is_explanation:
+            return False
+        tests = self.screening.tests
+        order = [tested.variant.name for tested in tests.tested]
+        places = order.index(self.tested.variant.name), order.index(candidate.variant.name)
+        is_alike = float(tests.correlations[places]) > MIN_ALIAS_CORRELATION
+        if is_alike or self.tested.evidence < candidate.tested.statistic / 2 + CLEAR_GAIN:
+            return True
+        return self.gain <= candidate.total + MIN_GAIN_OF_CURVE
