@@ -5,6 +5,11 @@ programs of some dozens of learnable numbers with normal noise: seconds where gr
 has too many numbers for it, and nothing but the numbers' fewness keeps it from explaining noise.
 """
 
+import copy
+from contextlib import suppress
+
+import torch
+
 from steady_ppl import (
     FilterError,
     Fit,
@@ -17,12 +22,16 @@ from steady_ppl import (
     seeded,
     why_not_linear,
 )
+from steady_ppl.errors import require
 from steady_ppl.kernels.rows import fallback_notes, kernel_failures
 from steady_ppl.likelihood.parameter_posterior import undetermined
+from steady_ppl.likelihood.parameters import elements, set_values, values_of
 from steady_ppl.model.problem import Problem
 from steady_ppl.utils.progress import stages
 
 from .steady import doubts
+
+MIN_GAIN_OF_START = 1.0  # nats by which a fit from another start must be likelier
 
 
 def fit(
@@ -32,6 +41,7 @@ def fit(
     *,
     known_start: bool = False,
     steps: int = 25,
+    starts: int = 1,
     validation_particles: int | None = None,
     seed: int = 0,
 ) -> Fit:
@@ -43,6 +53,7 @@ def fit(
         valid: held-out drives.
         known_start: the first row's true state is given.
         steps: scoring steps at most.
+        starts: fits; those after the first begin elsewhere, and the likeliest is kept.
         validation_particles: N of the filter that judges the held-out drives, see `Validation.suited`.
         seed: of the search for paths.
 
@@ -50,7 +61,9 @@ def fit(
         UsageError: a program that cannot be linearised, or a network.
         FilterError: the drives cannot be smoothed.
     """
-    settings = {"known_start": known_start, "steps": steps, "validation_particles": validation_particles, "seed": seed}
+    settings = {"known_start": known_start, "steps": steps, "starts": starts}
+    settings |= {"validation_particles": validation_particles, "seed": seed}
+    require(starts >= 1, "starts", repr(starts), "at least 1")
     data = for_program(program, table).without_truth(keep_start=known_start)
     reason = why_not_linear(program, data, known_start=known_start)
     if reason:
@@ -74,8 +87,18 @@ def fit(
         except FilterError as error:
             notes.append(f"as declared, the program cannot follow the held-out drives: {error}")
         begin()
-        with seeded(seed, "paths"), kernel_failures() as why:
-            maximum = fit_by_likelihood(program, data, known_start=known_start, steps=steps)
+        declared = copy.deepcopy(program)
+        with kernel_failures() as why:
+            with seeded(seed, "paths"):
+                maximum = fit_by_likelihood(program, data, known_start=known_start, steps=steps)
+            for start in range(1, starts):
+                with seeded(seed, "start", start), suppress(FilterError):  # it cannot follow the drives from there
+                    other = elsewhere(declared, program)
+                    found = fit_by_likelihood(other, data, known_start=known_start, steps=steps)
+                    if (more := found.objective - maximum.objective) > MIN_GAIN_OF_START:
+                        notes.append(f"start {start + 1} ended {more:.2g} nats above those before it")
+                        program.load_state_dict(other.state_dict())
+                        maximum = found
         notes += fallback_notes(why)
         begin()
         judge(maximum.steps)
@@ -90,3 +113,14 @@ def fit(
     notes += validation.notes + doubtful
     trained = Trained(history, kept=maximum.steps)
     return Fit(program, "likelihood", settings, seed=seed, known_start=known_start, trained=trained, notes=notes)
+
+
+def elsewhere(declared, fitted):
+    """A copy of the program as declared, from whose numbers those of a fit are taken apart at random: each is about as
+    far from where the fit ended as where it began, and a logarithm by a half at least."""
+    program = copy.deepcopy(declared)
+    parts = elements(program)
+    began, ended = values_of(parts), values_of(elements(fitted))
+    least = torch.tensor([0.0 if part.has_unit else 0.5 for part in parts], dtype=torch.float64)
+    set_values(parts, ended + torch.randn_like(ended) * torch.maximum((began - ended).abs(), least))
+    return program

@@ -47,6 +47,7 @@ MAX_PLACES_OF_SENSOR_EFFECT = 2  # measurements at which one effect is refitted:
 TIE_NATS = 2.0  # of held-out log p(y) within which two candidates cannot be told apart
 CLEAR_GAIN = 10.0  # nats of held-out log p(y) for which a test need only be near the family's level
 NEAR_FAMILY_LEVEL = FAMILY_LEVEL / 5  # p-value of a single test that is near it
+MAX_NATS_BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
 MIN_STATISTIC_TO_RETRY = 20.0  # statistic of a test from which a fit that gains nothing has gone astray
 LINEAR_FORMS = ("push", "command", "history", "measured", "viewpoint")  # of effects in proportion to the coefficient
 OF_MEASUREMENTS = ("measured", "blur")  # forms of effects that act on one column or on a few
@@ -258,6 +259,13 @@ def judged(now: Refit, tested: Tested, refit: Refit | str) -> Candidate:
     alone = refit.held_out_alone - now.held_out_alone[: len(refit.held_out_alone)]
     given_up = len(refit.programs) < len(now.programs)
     return Candidate(tested, refit, alone if given_up else refit.held_out - now.held_out, alone)
+
+
+def bar_of(fits: Sequence[Refit]) -> Threshold:
+    """What is so far behind these fits on the first fold that it is hardly worth another."""
+    drives = [float(fit.maxima[0].log_likelihood.sum()) for fit in fits]
+    held_out = [float(fit.held_out_alone[: len(fit.folds[0].held_out)].sum()) for fit in fits]
+    return Threshold(max(drives, default=-math.inf) - MAX_NATS_BEHIND, max(held_out, default=-math.inf) - TIE_NATS)
 
 
 def gain_of_fits(now: Fits, refit: Fits, folds: int | None = None) -> float:

@@ -155,9 +155,10 @@ def over_state(
 
 
 def over_reading(self: Any, state: Tensor, measured: Tensor, c: Tensor, chosen: Any, circular: Any, knots: Any) -> Any:
-    """A curve that adds to measurements, of what they read."""
-    change = height(measured, knots, circular, c)
-    return measured + change * torch.tensor([float(name in chosen) for name in self.measurement_names]).to(measured)
+    """A curve that adds to measurements, of what they read; of one of many, the others cost a kernel nothing."""
+    order = self.measurement_names
+    read = measured if len(chosen) > 1 else measured[..., order.index(chosen[0]), None]
+    return measured + height(read, knots, circular, c) * torch.tensor([float(n in chosen) for n in order]).to(measured)
 
 
 def _effect(form: str, variable: str, knots: Sequence[float], spread: float, unit: str, circular: bool) -> Effect:

@@ -4,14 +4,14 @@ that neglects, and a curve, which says whether what is left is of another kind."
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from steady_ppl.discovery.candidates import CLEAR_GAIN, MIN_ALIAS_CORRELATION, Candidate, Screening, attempts
+from steady_ppl.discovery.candidates import CLEAR_GAIN, MIN_ALIAS_CORRELATION, Candidate, Screening, attempts, bar_of
 from steady_ppl.discovery.fitting import neglected_along
-from steady_ppl.discovery.refits import BY_LIKELIHOOD, NO_THRESHOLD, Refit
+from steady_ppl.discovery.refits import BY_LIKELIHOOD, Refit
+from steady_ppl.discovery.screening import Tested
 from steady_ppl.errors import FilterError
 from steady_ppl.utils.text import reason_of
 
@@ -91,13 +91,7 @@ class CurveJudge:
         self.now, self.screening, tests = now, screening, screening.tests
         best = next((tested for tested in tests.tested if tested.is_curve), None)
         self.tested = best if best is not None and best.p_value <= tests.critical else None
-
-    @cached_property
-    def gain(self) -> float:
-        """Held-out log p(y) of the program with the curve above that of the program, nats; only where it is tested."""
-        assert self.tested is not None
-        (fit,) = attempts(self.now, [self.tested], self.screening)
-        return ParticleJudge(self.now).confirm(fit(NO_THRESHOLD)).total
+        self.curve: Candidate | None = None  # the program with it, once it was asked for
 
     def admits(self, candidate: Candidate) -> bool:
         """Whether a candidate is like the curve or as good as it."""
@@ -111,4 +105,12 @@ class CurveJudge:
         is_alike = float(tests.correlations[places]) > MIN_ALIAS_CORRELATION
         if is_alike or self.tested.evidence < candidate.tested.statistic / 2 + CLEAR_GAIN:
             return True
-        return self.gain <= candidate.total + MIN_GAIN_OF_CURVE
+        curve = self.curve = self.curve or self._fitted(self.tested, candidate)
+        return not curve.is_judged or curve.total <= candidate.total + MIN_GAIN_OF_CURVE
+
+    def _fitted(self, tested: Tested, beside: Candidate) -> Candidate:
+        """The program with the curve, given up where it stays far behind the best candidate."""
+        assert isinstance(beside.refit, Refit)
+        threshold = replace(bar_of([beside.refit]), stops_early=True)
+        (fit,) = attempts(self.now, [tested], self.screening, threshold)
+        return ParticleJudge(self.now).confirm(fit(threshold))

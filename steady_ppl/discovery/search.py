@@ -6,7 +6,6 @@ is held-out log p(y), each drive judged by a program that was fitted without it,
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,10 +17,12 @@ from steady_ppl.discovery.candidates import (
     CLEAR_GAIN,
     NEAR_FAMILY_LEVEL,
     TIE_NATS,
+    UNEXPLAINED,
     Candidate,
     Screening,
     at_its_best_place,
     attempts,
+    bar_of,
     judged,
     leaders,
     likelier_places,
@@ -49,7 +50,6 @@ from steady_ppl.utils.journal import close_journal
 from steady_ppl.utils.progress import stages
 from steady_ppl.utils.text import reason_of
 
-MAX_NATS_BEHIND = 25.0  # nats behind the best on the drives of a fold, with which a candidate is hardly worth another
 MAX_NATS_OF_RIVAL = 12.0  # nats behind the best in its round, with which one is fitted again beside other effects
 SAME_MAXIMUM = 0.2  # nats within which fits from two starts have ended at the same place
 MIN_NATS_OF_DIVERGENCE = 25.0  # nats above every fit that it is a part of, from which a fit is not to be believed
@@ -356,6 +356,8 @@ def _add_best(found: Search, screening: Screening, index: int, near: Collection[
     judge, curve = ParticleJudge(found.final), CurveJudge(found.final, screening)
     chosen = leaders(screening.tests, index == 0)
     chosen = [tested for tested in chosen if near is None or tested is chosen[0] or tested.variant.name in near]
+    if index and curve.tested is not None:  # which lets nothing in that imitates whatever is missing
+        chosen = [tested for tested in chosen if tested.variant.effect.form != UNEXPLAINED]
 
     def is_enough(candidate: Candidate) -> bool:
         return candidate.significant(screening.tests.critical) and (index == 0 or curve.admits(candidate))
@@ -436,14 +438,7 @@ def _refits(now: Refit, chosen: Sequence[Tested], screening: Screening, candidat
 def _threshold(candidates: Sequence[Candidate]) -> Threshold:
     """What the next candidate must reach on the first fold, given those that were fitted. What loses on the drives
     kept from it, or imitates whatever is missing, says nothing of what can be reached."""
-    return _bar([c.refit for c in candidates if isinstance(c.refit, Refit) and c.is_explanation and c.total > 0])
-
-
-def _bar(fits: Sequence[Refit]) -> Threshold:
-    """What is so far behind these fits on the first fold that it is hardly worth another."""
-    drives = [float(fit.maxima[0].log_likelihood.sum()) for fit in fits]
-    held_out = [float(fit.held_out_alone[: len(fit.folds[0].held_out)].sum()) for fit in fits]
-    return Threshold(max(drives, default=-math.inf) - MAX_NATS_BEHIND, max(held_out, default=-math.inf) - TIE_NATS)
+    return bar_of([c.refit for c in candidates if isinstance(c.refit, Refit) and c.is_explanation and c.total > 0])
 
 
 def _curves(search: Search) -> list[Candidate]:
@@ -452,7 +447,7 @@ def _curves(search: Search) -> list[Candidate]:
     named, threshold = None, NO_THRESHOLD
     if search.found:
         named = judged(base, search.found[0].candidate.tested, search.final)
-        threshold = replace(_bar([search.final]), stops_early=True)
+        threshold = replace(bar_of([search.final]), stops_early=True)
 
     def multiplies(one: Tested | Candidate) -> bool:
         return bool(one.variant.options.get("times"))

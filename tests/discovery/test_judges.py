@@ -12,7 +12,7 @@ from examples import drives, example
 
 from steady_ppl.discovery import judges
 from steady_ppl.discovery.judges import ParticleJudge
-from steady_ppl.discovery.refits import BY_DRAWS, BY_LIKELIHOOD
+from steady_ppl.discovery.refits import BY_DRAWS, BY_LIKELIHOOD, Refit, Threshold
 from steady_ppl.errors import FilterError
 from steady_ppl.gaussian.smoother import find_path, require_found, smooth
 from steady_ppl.model.problem import Problem
@@ -145,13 +145,15 @@ def test_filters_of_one_refit_are_asked_once_by_all_judges(monkeypatch):
         ({"correlation": 0.95}, True),  # the curve is the same effect, with what it leaves
         ({"gain": 16.9}, True),  # and brings as much
         ({"gain": 17.1}, False),
+        ({"gain": 17.1, "is_judged": False}, True),  # given up on its way
         ({"explains": False}, False),
         ({"explains": False, "p_value": 0.5}, True),
     ],
 )
 def test_what_brings_less_than_a_curve_of_another_kind_is_not_admitted(monkeypatch, change, admitted):
     """A saturation, where the rest of a friction goes with the velocity."""
-    told = {"p_value": 1e-20, "evidence": 40.0, "correlation": 0.4, "gain": 100.0, "explains": True} | change
+    told = {"p_value": 1e-20, "evidence": 40.0, "correlation": 0.4, "gain": 100.0, "explains": True}
+    told |= {"is_judged": True} | change
 
     def tested(name, is_curve, statistic, p_value, evidence=0.0):
         variant = SimpleNamespace(name=name)
@@ -164,14 +166,17 @@ def test_what_brings_less_than_a_curve_of_another_kind_is_not_admitted(monkeypat
     tests = SimpleNamespace(tested=[curve, saturation], critical=0.01, correlations=correlations)
     fits = []
 
-    def attempts(now, chosen, screening):
-        assert chosen == [curve]
-        return [lambda threshold: fits.append(now) or SimpleNamespace(total=told["gain"])]
+    def attempts(now, chosen, screening, threshold):
+        assert chosen == [curve] and threshold.stops_early
+        fitted = SimpleNamespace(total=told["gain"], is_judged=told["is_judged"])
+        return [lambda threshold: fits.append(now) or fitted]
 
     monkeypatch.setattr(judges, "attempts", attempts)
     monkeypatch.setattr(judges.ParticleJudge, "confirm", lambda self, candidate: candidate)
+    monkeypatch.setattr(judges, "bar_of", lambda fits: Threshold(1.0))
     judge = judges.CurveJudge("now", SimpleNamespace(tests=tests))
-    given = {"tested": saturation, "variant": saturation.variant, "total": 14.0, "is_explanation": told["explains"]}
+    given = {"tested": saturation, "variant": saturation.variant, "refit": object.__new__(Refit)}
+    given |= {"total": 14.0, "is_explanation": told["explains"]}
     for _ in range(2):
         assert judge.admits(SimpleNamespace(**given)) == admitted
     assert fits == ["now"] * (not change or "gain" in change)

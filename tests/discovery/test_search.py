@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from steady_ppl.discovery import search
-from steady_ppl.discovery.candidates import leaders
+from steady_ppl.discovery.candidates import MAX_NATS_BEHIND, leaders
 from steady_ppl.discovery.noise_first import Suited
 from steady_ppl.discovery.refits import Refit
 from steady_ppl.discovery.search import Found
@@ -99,7 +99,7 @@ def test_what_loses_or_imitates_sets_no_bar_for_what_is_fitted_after_it(monkeypa
     drag, broken = fitted("drag", 100.0, 90.0), fitted("broken", 1e6, -1e6)
     coloured = fitted("coloured", 900.0, 800.0, explains=False)
     bar = search._threshold([coloured, broken, drag])
-    assert bar == search._threshold([drag]) and bar.drives == pytest.approx(100.0 - search.MAX_NATS_BEHIND)
+    assert bar == search._threshold([drag]) and bar.drives == pytest.approx(100.0 - MAX_NATS_BEHIND)
     seen, kinds = [], {"coloured": "noise", "drag": "dynamics"}
     tested = [
         SimpleNamespace(variant=SimpleNamespace(label=n, effect=SimpleNamespace(verdict=k))) for n, k in kinds.items()

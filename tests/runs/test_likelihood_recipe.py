@@ -5,8 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pyro
+import pyro.distributions as dist
 import pytest
+import torch
 from examples import MODELS, HeavyTailed
+from pyro.distributions import constraints
+from pyro.nn import PyroParam
 from small import HOVERCRAFT, steady, written
 
 import steady_ppl as st
@@ -29,6 +34,42 @@ def test_it_finds_what_made_the_drives(fitted):
     first, last = fitted.trained.history
     assert first["step"] == 0 and last["step"] == fitted.trained.kept
     assert last["log_likelihood"] > first["log_likelihood"] + 1 and fitted.trained.still_rising is None
+
+
+class Wheel(st.Program):
+    """A wheel that turns at a constant rate; how high a mark on its rim is seen to be."""
+
+    states = ("turned [rad]",)
+    controls = ("nothing",)
+    measurements = ("height [m]",)
+    channels = ("turned [rad/s]",)
+    step, duration = 0.1, 10.0
+
+    def __init__(self, rate: float = 1.0) -> None:
+        super().__init__()
+        self.rate = PyroParam(torch.tensor(rate), constraints.positive)
+
+    def initial(self):
+        return pyro.sample("start", dist.Normal(torch.zeros(1), 0.01).to_event(1))
+
+    def transition(self, state, control, time, step):
+        drawn = pyro.sample("turned", dist.Normal(self.rate + 0 * control[..., 0], 0.01))
+        return st.stack(state[..., 0] + step * drawn)
+
+    def observe(self, state):
+        pyro.sample("height", dist.Normal(state.sin(), 0.1).to_event(1))
+
+
+def test_of_several_starts_the_likeliest_is_kept():
+    """Slow waves fit a fast one in many places, each better than its neighbours."""
+    table = st.simulate(Wheel(2.2), 2, seed=3)
+    ends = [find_recipe("likelihood")(Wheel(1.0), table, starts=starts, seed=1) for starts in (1, 12)]
+    alone, several = (float(fit.program.rate.detach()) for fit in ends)
+    assert abs(alone - 2.2) > 0.3 and abs(several - 2.2) < 0.02
+    assert any("nats above those before it" in note for note in ends[1].notes)
+    assert ends[1].settings["starts"] == 12
+    with pytest.raises(st.UsageError, match="starts is 0: it must be at least 1"):
+        find_recipe("likelihood")(Wheel(1.0), table, starts=0)
 
 
 @pytest.mark.exhaustive
