@@ -29,6 +29,7 @@ from resumable import Record, digest, run
 
 RESULT = Path(__file__).parent / "results" / "others.jsonl"
 MAX_CPU, MAX_MEMORY = 300.0, 2048.0  # seconds and MiB that MRCLAM's search may take
+MAX_MILLIVOLTS = 5.5  # of Silverbox's free run on the multisine
 MAX_SD = 5.0  # kg, of EMPS's mass: less says nothing
 PROGRESS = re.compile(r"steady: [^…]*… [\w ]+ gone by(, about (to end|[\w ]+ left))?\s*")
 MASS = """
@@ -43,6 +44,32 @@ with seeded(0, "paths"):
 share = float(ridged_inverse(found.information).diagonal()[found.names.index("mass")].sqrt())
 print(mass, mass * share)
 """
+FREE = """
+import sys
+from dataclasses import replace
+import torch
+from steady_ppl import Fit, for_program, read_table, roll_out, seeded
+from steady_ppl.gaussian.smoother import find_path, smooth
+from steady_ppl.likelihood.scores import measured
+from steady_ppl.model.handlers import AtMean
+from steady_ppl.model.problem import Problem
+from steady_ppl.model.substeps import acting_controls
+WINDOW = 50
+program = Fit.load(sys.argv[1]).program
+data = for_program(program, read_table(sys.argv[2]))
+begun = replace(data.with_rows(lambda values: values[: WINDOW + 1]), lengths=data.lengths.clamp(max=WINDOW + 1))
+problem = Problem(program, begun)
+with seeded(0, "paths"), torch.no_grad():
+    start = smooth(problem, find_path(problem)).path(begun).states[-1]
+    given = (part[WINDOW:-1].unsqueeze(1) for part in (acting_controls(program, data)[: len(data.time)], data.elapsed))
+    run = roll_out(program, start[None, None], *given, data.steps[WINDOW:].unsqueeze(1), handler=AtMean())
+    readings = measured(program, torch.cat([state[0] for state in run])).reading
+seen = data.observed[WINDOW + 1 :]
+print(float((readings - data.measurements[WINDOW + 1 :])[seen].square().mean().sqrt()))
+"""
+"""How far a fit's measurements are from those of a table without noise and without looking, from the state that the
+first 50 rows of each trajectory tell (the window of the published comparisons)."""
+SCRIPTS = {"mass": MASS, "free": FREE}
 DISCOVER = "{train} --valid {valid} {simulations} --out {out}/after --json {out}/discover.json"
 
 
@@ -88,6 +115,8 @@ def _silverbox(said: Said) -> Iterator[Asked]:
     kinds = {one["effect"]: one["kind"] for one in found["candidates"]}
     noise = [name for name in effects if kinds.get(name) == "noise"]
     yield Asked("no noise among what was found", ", ".join(noise) or "none", bool(effects) and not noise)
+    error = 1000 * float(said["free"].split()[0])
+    yield Asked(f"free run of validation pieces ≤ {MAX_MILLIVOLTS} mV", f"{error:.2f} mV", error <= MAX_MILLIVOLTS)
 
 
 def _emps(said: Said) -> Iterator[Asked]:
@@ -146,6 +175,7 @@ def _says(text: str) -> Callable[[Said], Iterator[Asked]]:
 
 
 FIT_CART = {"fit": "fit ../cart.py drives.csv --recipe likelihood --out {out}/fit"}
+RUN_FREE = "free {out}/after {valid}"
 CASES = {
     "exact_unicycle": Case({"discover": f"discover unicycle.py {DISCOVER}"}, _unicycle),
     "victoria_park": Case(
@@ -157,9 +187,11 @@ CASES = {
         _victoria_park,
     ),
     "mrclam": Case({"discover": f"discover robot.py {DISCOVER}"}, _mrclam, is_limited=True),
-    "silverbox": Case({"discover": f"discover silverbox.py {DISCOVER}"}, _silverbox),
-    "silverbox_rescaled": Case({"discover": f"discover slow.py {DISCOVER}"}, _silverbox, "slow_{}.csv"),
-    "emps": Case({"discover": f"discover emps.py {DISCOVER}", "mass": "python {out}/after {train}"}, _emps),
+    "silverbox": Case({"discover": f"discover silverbox.py {DISCOVER}", "free": RUN_FREE}, _silverbox),
+    "silverbox_rescaled": Case(
+        {"discover": f"discover slow.py {DISCOVER}", "free": RUN_FREE}, _silverbox, "slow_{}.csv"
+    ),
+    "emps": Case({"discover": f"discover emps.py {DISCOVER}", "mass": "mass {out}/after {train}"}, _emps),
     "short_drives": Case({"fit": "fit cart.py drives.csv --recipe likelihood --out {out}/fit"}, _short_drives),
     "product": Case(
         {"fit": "fit product.py drives.csv --recipe likelihood --out {out}/fit"}, _says("product of torque and gain")
@@ -182,7 +214,8 @@ def work(name: str, cases: str, simulations: int | None) -> Record:
         tables = {one: case.tables.format(one) for one in ("train", "valid")}
         for step, command in case.commands.items():
             words = command.format(simulations=sets, out=out, **tables).split()
-            told = ["-c", MASS, *words[1:]] if words[0] == "python" else ["-m", "steady_ppl.cli.main", *words]
+            script, rest = SCRIPTS.get(words[0]), words[1:]
+            told = ["-c", script, *rest] if script else ["-m", "steady_ppl.cli.main", *words]
             try:
                 done = measured(told, Path(cases) / name, environ, whole_output=True)
             except RuntimeError as error:
