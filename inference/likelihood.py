@@ -6,7 +6,6 @@ has too many numbers for it, and nothing but the numbers' fewness keeps it from 
 """
 
 import copy
-from contextlib import suppress
 
 import torch
 
@@ -28,6 +27,7 @@ from steady_ppl.likelihood.parameter_posterior import undetermined
 from steady_ppl.likelihood.parameters import elements, set_values, values_of
 from steady_ppl.model.problem import Problem
 from steady_ppl.utils.progress import stages
+from steady_ppl.utils.text import reason_of
 
 from .steady import doubts
 
@@ -92,13 +92,17 @@ def fit(
             with seeded(seed, "paths"):
                 maximum = fit_by_likelihood(program, data, known_start=known_start, steps=steps)
             for start in range(1, starts):
-                with seeded(seed, "start", start), suppress(FilterError):  # it cannot follow the drives from there
-                    other = elsewhere(declared, program)
-                    found = fit_by_likelihood(other, data, known_start=known_start, steps=steps)
-                    if (more := found.objective - maximum.objective) > MIN_GAIN_OF_START:
-                        notes.append(f"start {start + 1} ended {more:.2g} nats above those before it")
-                        program.load_state_dict(other.state_dict())
-                        maximum = found
+                other = elsewhere(declared, program, maximum.information, (seed, "start", start))
+                try:
+                    with seeded(seed, "paths", start):
+                        found = fit_by_likelihood(other, data, known_start=known_start, steps=steps)
+                except Exception as error:  # also of the program's own code, at numbers that nobody tried before
+                    notes.append(f"start {start + 1} came to nothing: {reason_of(error)}")
+                    continue
+                if (more := found.objective - maximum.objective) > MIN_GAIN_OF_START:
+                    notes.append(f"start {start + 1} ended {more:.2g} nats above those before it")
+                    program.load_state_dict(other.state_dict())
+                    maximum = found
         notes += fallback_notes(why)
         begin()
         judge(maximum.steps)
@@ -115,12 +119,18 @@ def fit(
     return Fit(program, "likelihood", settings, seed=seed, known_start=known_start, trained=trained, notes=notes)
 
 
-def elsewhere(declared, fitted):
-    """A copy of the program as declared, from whose numbers those of a fit are taken apart at random: each is about as
-    far from where the fit ended as where it began, and a logarithm by a half at least."""
+def elsewhere(declared, fitted, information, key):
+    """A copy of the program as declared, with numbers at random about where a fit ended.
+
+    A logarithm moves by as much as the fit moved it, from .5 to 3. A number with a unit moves as far, or by ten of its
+    standard deviations.
+    """
     program = copy.deepcopy(declared)
     parts = elements(program)
-    began, ended = values_of(parts), values_of(elements(fitted))
-    least = torch.tensor([0.0 if part.has_unit else 0.5 for part in parts], dtype=torch.float64)
-    set_values(parts, ended + torch.randn_like(ended) * torch.maximum((began - ended).abs(), least))
+    has_unit = torch.tensor([part.has_unit for part in parts])
+    ended, sd = values_of(elements(fitted)), information.diagonal().clamp(min=1e-12).rsqrt()
+    moved = (values_of(parts) - ended).abs()
+    size = torch.where(has_unit, torch.maximum(moved, 10 * sd), moved.clamp(0.5, 3.0))
+    with seeded(*key):
+        set_values(parts, ended + size * torch.randn_like(size))
     return program

@@ -239,19 +239,12 @@ def _notes(found: Search) -> list[str]:
     if found.is_full:
         notes.append(f"the search stops at {MAX_EFFECTS} effects: add them, fit, and discover again from there")
     if not found.is_complete and not found.cut_short:
-        notes.append(f"something is left that no effect of the catalogue brings: {_what_is_left(found)}")
+        first = found.rounds[-1].screening.tests.tested[0]
+        most = f", most of all one of a curve ({first.variant.at})" if first.is_curve else ""
+        notes.append(f"something is left: the tests were not quiet at the end{most}")
     notes += [f"{one.candidate.variant.label}: {said}" for one in found.found if (said := _note_of_one_drive(one))]
     symptoms = [one.variant.label for one in found.rounds[0].candidates if one.against_its_sign and one.total > 0]
     return notes + [f"{label} would help with a sign that physics rules out: a symptom" for label in symptoms]
-
-
-def _what_is_left(found: Search) -> str:
-    """What the last tests point at, where that is a curve."""
-    tests = found.rounds[-1].screening.tests
-    options = tests.tested[0].variant.options if tests.tested[0].is_curve else {}
-    if "channel" not in options:
-        return "the tests were not quiet at the end"
-    return f"the tests see most of it in {options['channel']}, as a curve of {options['variable']}"
 
 
 def _not_wrong_after_all(found: Search) -> list[str]:

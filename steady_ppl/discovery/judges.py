@@ -1,5 +1,7 @@
-"""Who has the last word on candidates that the linearised programs' log p(y) ranks: a particle filter, which says what
-that neglects, and a curve, which says whether what is left is of another kind."""
+"""Who has the last word on candidates that the linearised programs' log p(y) ranks.
+
+A particle filter says what that neglects. A curve says whether what is left is of another kind.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -8,14 +10,15 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from steady_ppl.discovery.candidates import CLEAR_GAIN, MIN_ALIAS_CORRELATION, Candidate, Screening, attempts, bar_of
+from steady_ppl.discovery.candidates import MIN_ALIAS_CORRELATION, Candidate, Screening, attempts, bar_of
 from steady_ppl.discovery.fitting import neglected_along
-from steady_ppl.discovery.refits import BY_LIKELIHOOD, Refit
-from steady_ppl.discovery.screening import Tested
+from steady_ppl.discovery.refits import BY_LIKELIHOOD, NO_THRESHOLD, Refit
 from steady_ppl.errors import FilterError
 from steady_ppl.utils.text import reason_of
 
 MIN_GAIN_OF_CURVE = 3.0  # nats by which a curve must be better than named effects
+CLEAR_EVIDENCE = 10.0  # nats by which the tests must tell more of a curve than of an effect to deny it
+MAX_RATIO_OF_CURVE = 2.0  # of what a curve brings and an effect of another kind that is added all the same
 NEGLIGIBLE_NATS = 1.0  # by which a filter may rank otherwise before it is asked once more, and from then on believed
 
 Choice = Callable[[Sequence[Candidate]], Candidate | None]  # of candidates, best first
@@ -83,34 +86,52 @@ def _neglected(refit: Refit, seed: int) -> Tensor:
 class CurveJudge:
     """Whether a candidate of a program `now` may be added, where the tests tell far more of a curve.
 
-    What is left may go with a variable with which the candidate has nothing to do. Where such a curve brings more, what
-    is missing most has no name: it bends whatever is fitted beside it, and a small gain is no evidence.
+    What is left may go with a variable with which the candidate has nothing to do. Where such a curve brings far more,
+    what is missing most has no name: it bends whatever is fitted beside it, and a small gain is no evidence.
     """
 
     def __init__(self, now: Refit, screening: Screening) -> None:
         self.now, self.screening, tests = now, screening, screening.tests
         best = next((tested for tested in tests.tested if tested.is_curve), None)
         self.tested = best if best is not None and best.p_value <= tests.critical else None
-        self.curve: Candidate | None = None  # the program with it, once it was asked for
+        self.refused: dict[str, str] = {}  # candidates that were not admitted, by their label, and why
+        self._curve: Candidate | None = None  # the program with the curve, once it was fitted to the end
+        self._ahead: set[str] = set()  # candidates beside which its fit was given up
 
     def admits(self, candidate: Candidate) -> bool:
-        """Whether a candidate is like the curve or as good as it."""
+        """Whether a candidate is like the curve or brings half as much; if it imitates whatever is missing, whether the
+        curve brings nothing."""
         if self.tested is None:
             return True
-        if not candidate.is_explanation:
-            return False
-        tests = self.screening.tests
-        order = [tested.variant.name for tested in tests.tested]
-        places = order.index(self.tested.variant.name), order.index(candidate.variant.name)
-        is_alike = float(tests.correlations[places]) > MIN_ALIAS_CORRELATION
-        if is_alike or self.tested.evidence < candidate.tested.statistic / 2 + CLEAR_GAIN:
-            return True
-        curve = self.curve = self.curve or self._fitted(self.tested, candidate)
-        return not curve.is_judged or curve.total <= candidate.total + MIN_GAIN_OF_CURVE
+        if candidate.is_explanation:
+            tests = self.screening.tests
+            order = [tested.variant.name for tested in tests.tested]
+            places = order.index(self.tested.variant.name), order.index(candidate.variant.name)
+            is_alike = float(tests.correlations[places]) > MIN_ALIAS_CORRELATION
+            if is_alike or self.tested.evidence < candidate.tested.statistic / 2 + CLEAR_EVIDENCE:
+                return True
+        label, gain = candidate.variant.label, self._gain(candidate)
+        most = max(MIN_GAIN_OF_CURVE, MAX_RATIO_OF_CURVE * candidate.total * candidate.is_explanation)
+        if gain > most:
+            brings = f"it brings {candidate.total:.0f} nats, a curve ({self.tested.variant.at}) {gain:.0f}"
+            self.refused[label] = f"{label} is not added: {brings}"
+        return gain <= most
 
-    def _fitted(self, tested: Tested, beside: Candidate) -> Candidate:
-        """The program with the curve, given up where it stays far behind the best candidate."""
-        assert isinstance(beside.refit, Refit)
-        threshold = replace(bar_of([beside.refit]), stops_early=True)
-        (fit,) = attempts(self.now, [tested], self.screening, threshold)
-        return ParticleJudge(self.now).confirm(fit(threshold))
+    def _gain(self, beside: Candidate) -> float:
+        """Held-out log p(y) of the program with the curve above that of the program, nats; minus infinity where it
+        cannot be fitted, or stays so far behind a candidate that explains something that it was given up."""
+        label = beside.variant.label
+        if self._curve is None and label in self._ahead:
+            return -math.inf
+        if self._curve is None:
+            assert self.tested is not None and isinstance(beside.refit, Refit)
+            threshold = NO_THRESHOLD
+            if beside.is_explanation:
+                threshold = replace(bar_of([beside.refit]), stops_early=True)
+            (fit,) = attempts(self.now, [self.tested], self.screening, threshold)
+            curve = ParticleJudge(self.now).confirm(fit(threshold))
+            if not curve.is_judged:
+                self._ahead.add(label)
+                return -math.inf
+            self._curve = curve
+        return self._curve.total

@@ -245,7 +245,7 @@ def _rounds(found: Search, settings: Settings, carried: Sequence[Found] = ()) ->
             _add_all(found, settings, carried)
             doing = "looking again at what was found"
             begin()
-            if len(found.found) > 1 and _names(found.found) != _names(carried):  # else it was done there
+            if len(found.found) > 1:
                 _look_again(found, settings)
             doing = "fitting curves"
             begin()
@@ -258,10 +258,6 @@ def _rounds(found: Search, settings: Settings, carried: Sequence[Found] = ()) ->
                 raise KeyboardInterrupt(NOTHING_TESTED) from stop
             found.interrupt(doing)
     return found
-
-
-def _names(found: Sequence[Found]) -> set[str]:
-    return {one.candidate.variant.name for one in found}
 
 
 def _drop_corrections(found: Search, settings: Settings) -> None:
@@ -280,7 +276,7 @@ def _drop_corrections(found: Search, settings: Settings) -> None:
 
 
 def _add_all(found: Search, settings: Settings, carried: Sequence[Found]) -> None:
-    """Test, fit and add one effect after another; at first of what is `carried` alone."""
+    """Test, fit and add one effect after another; at first what is `carried`."""
     near = {rival.variant.name for one in carried for rival in _rivals(one)}
     shares = [(said, 0.5**index) for index in range(MAX_ROUNDS) for said in ("testing every effect", "")]
     with stages(*shares) as begin_part:
@@ -305,8 +301,9 @@ def _add_all(found: Search, settings: Settings, carried: Sequence[Found]) -> Non
 
 
 def _carry(found: Search, carried: Sequence[Found]) -> None:
-    """Add effects of another search that are needed beside the first one here, each or a rival that it had there."""
-    for one in carried:
+    """Add effects of another search that explain something and are needed beside the first one here, each or a rival
+    that it had there."""
+    for one in (one for one in carried if one.candidate.is_explanation):
         there, rivals = {variant.name for variant in attached(found.final.program)}, _rivals(one)
         if found.is_full or one.candidate.variant.name in there:
             continue
@@ -348,34 +345,50 @@ def _look_again(found: Search, settings: Settings) -> None:
 def _add_best(found: Search, screening: Screening, index: int, near: Collection[str] | None = None) -> bool:
     """Fit what the tests of a round point at and add the best, if it brings enough; whether anything was added.
 
-    `near` names the effects that alone are fitted beside what the tests put first; None: all are.
+    `near` names the effects that are fitted before others, beside what the tests put first; None: all are.
     """
     found.rounds.append(Round(screening, [], None))
     if found.rounds[-1].nothing_found or found.is_full or index == MAX_ROUNDS - 1:
         return False
     judge, curve = ParticleJudge(found.final), CurveJudge(found.final, screening)
-    chosen = leaders(screening.tests, index == 0)
-    chosen = [tested for tested in chosen if near is None or tested is chosen[0] or tested.variant.name in near]
-    if index and curve.tested is not None:  # which lets nothing in that imitates whatever is missing
-        chosen = [tested for tested in chosen if tested.variant.effect.form != UNEXPLAINED]
+    candidates, best = list[Candidate](), None
 
     def is_enough(candidate: Candidate) -> bool:
         return candidate.significant(screening.tests.critical) and (index == 0 or curve.admits(candidate))
 
-    fitted = _refits(found.final, chosen, screening, found.rounds[-1].candidates)
-    best, candidates = judge.chosen(fitted, partial(_first, is_enough))
-    if index == 0 and (best is None or not (best.is_explanation or curve.tested is None)):
-        found.curves = _curves(found)
-        if found.curve is not None:
-            best = None
-        elif best is None and not found.departed:  # neither can be what the tests found
-            nearly = partial(_first, lambda c: c.total > TIE_NATS and c.tested.p_value <= NEAR_FAMILY_LEVEL)
-            best, candidates = judge.chosen(candidates, nearly)
+    groups = _groups(leaders(screening.tests, index == 0), near)
+    for group in groups:
+        if index == 0 and group is groups[-1]:
+            found.curves = _curves(found)
+            if found.curve is not None:
+                break
+        candidates += _refits(found.final, group, screening, found.rounds[-1].candidates)
+        best, candidates = judge.chosen(candidates, partial(_first, is_enough))
+        if best is not None:
+            break
+    if index == 0 and best is None and found.curve is None and not found.departed:  # neither is what the tests found
+        nearly = partial(_first, lambda c: c.total > TIE_NATS and c.tested.p_value <= NEAR_FAMILY_LEVEL)
+        best, candidates = judge.chosen(candidates, nearly)
+    found.notes += curve.refused.values()
     found.rounds[-1] = Round(screening, candidates, best)
     if best is None:
         return False
     _add(found, best, candidates)
     return True
+
+
+def _groups(chosen: Sequence[Tested], near: Collection[str] | None) -> list[list[Tested]]:
+    """What is fitted first, and what only where nothing before it is enough: effects that are neither `near` nor what
+    the tests put first, and then what imitates whatever is missing."""
+    first, later, imitating = groups = [list[Tested](), list[Tested](), list[Tested]()]
+    for tested in chosen:
+        if tested.variant.effect.form == UNEXPLAINED:
+            imitating.append(tested)
+        elif near is None or tested.variant.name in near or not first:
+            first.append(tested)
+        else:
+            later.append(tested)
+    return groups
 
 
 def _add(found: Search, best: Candidate, candidates: list[Candidate]) -> None:
@@ -424,15 +437,15 @@ def _with_places_of(final: Refit, found: Sequence[Found]) -> list[Found]:
 
 def _refits(now: Refit, chosen: Sequence[Tested], screening: Screening, candidates: list[Candidate]) -> list[Candidate]:
     """Fits of what the tests point at; each is added to `candidates` as it ends, whatever happens to the next."""
-    chosen = sorted(chosen, key=lambda tested: tested.variant.effect.verdict == "noise")
+    chosen, begun = sorted(chosen, key=lambda tested: tested.variant.effect.verdict == "noise"), len(candidates)
     with stages(*((f"fitting with {tested.variant.label}", 1) for tested in chosen)) as begin:
         for fit in attempts(now, chosen, screening):
             begin()
             candidates.append(fit(_threshold(candidates)))
     best = max((c for c in candidates if c.is_judged), key=lambda c: c.total, default=None)
-    candidates = [c if c.is_judged else replace(c, behind=best) for c in candidates]
-    least = max((c.total for c in candidates), default=0.0) - MAX_NATS_OF_RIVAL
-    return [at_its_best_place(now, c) if c.total > least else c for c in candidates]
+    added = [c if c.is_judged else replace(c, behind=best) for c in candidates[begun:]]
+    least = max((c.total for c in [*candidates[:begun], *added]), default=0.0) - MAX_NATS_OF_RIVAL
+    return [at_its_best_place(now, c) if c.total > least else c for c in added]
 
 
 def _threshold(candidates: Sequence[Candidate]) -> Threshold:

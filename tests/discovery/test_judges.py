@@ -136,6 +136,38 @@ def test_filters_of_one_refit_are_asked_once_by_all_judges(monkeypatch):
     assert sorted(asked) == [("a", 0), ("a", 0), ("broken", 0), ("now", 0)]
 
 
+class Curved:
+    """A judge whose tests see a curve, beside candidates that it may admit."""
+
+    def __init__(self, monkeypatch, gain=100.0, p_value=1e-20, evidence=40.0, correlation=0.4, behind=()):
+        curve = self._tested("curve", True, 90.0, p_value, evidence)
+        self.saturation = self._tested("saturation", False, 19.0, 1e-5)
+        correlations = torch.tensor([[1.0, correlation], [correlation, 1.0]])
+        tests = SimpleNamespace(tested=[curve, self.saturation], critical=0.01, correlations=correlations)
+        self.fits = []
+
+        def attempts(now, chosen, screening, threshold):
+            assert now == "now" and chosen == [curve]
+            given_up = threshold.stops_early and len(self.fits) in behind
+            fitted = SimpleNamespace(total=gain, is_judged=not given_up)
+            return [lambda threshold: self.fits.append(threshold.stops_early) or fitted]
+
+        monkeypatch.setattr(judges, "attempts", attempts)
+        monkeypatch.setattr(judges.ParticleJudge, "confirm", lambda self, candidate: candidate)
+        monkeypatch.setattr(judges, "bar_of", lambda fits: Threshold(1.0))
+        self.judge = judges.CurveJudge("now", SimpleNamespace(tests=tests))
+
+    @staticmethod
+    def _tested(name, is_curve, statistic, p_value, evidence=0.0):
+        given = {"is_curve": is_curve, "statistic": statistic, "p_value": p_value, "evidence": evidence}
+        return SimpleNamespace(variant=SimpleNamespace(name=name, label=name, at="forward~velocity"), **given)
+
+    def candidate(self, total=14.0, explains=True, label="saturation"):
+        variant = SimpleNamespace(name="saturation", label=label)
+        given = {"tested": self.saturation, "variant": variant, "refit": object.__new__(Refit)}
+        return SimpleNamespace(**given, total=total, is_explanation=explains)
+
+
 @pytest.mark.parametrize(
     ("change", "admitted"),
     [
@@ -143,40 +175,33 @@ def test_filters_of_one_refit_are_asked_once_by_all_judges(monkeypatch):
         ({"p_value": 0.5}, True),  # no curve is found
         ({"evidence": 15.0}, True),  # of which the tests tell little more
         ({"correlation": 0.95}, True),  # the curve is the same effect, with what it leaves
-        ({"gain": 16.9}, True),  # and brings as much
-        ({"gain": 17.1}, False),
-        ({"gain": 17.1, "is_judged": False}, True),  # given up on its way
-        ({"explains": False}, False),
-        ({"explains": False, "p_value": 0.5}, True),
+        ({"gain": 27.9}, True),  # and brings as much
+        ({"gain": 28.1}, False),
+        ({"gain": 28.1, "behind": [0, 1]}, True),  # given up on its way
     ],
 )
-def test_what_brings_less_than_a_curve_of_another_kind_is_not_admitted(monkeypatch, change, admitted):
+def test_what_brings_far_less_than_a_curve_of_another_kind_is_not_admitted(monkeypatch, change, admitted):
     """A saturation, where the rest of a friction goes with the velocity."""
-    told = {"p_value": 1e-20, "evidence": 40.0, "correlation": 0.4, "gain": 100.0, "explains": True}
-    told |= {"is_judged": True} | change
-
-    def tested(name, is_curve, statistic, p_value, evidence=0.0):
-        variant = SimpleNamespace(name=name)
-        given = {"is_curve": is_curve, "statistic": statistic, "p_value": p_value, "evidence": evidence}
-        return SimpleNamespace(variant=variant, **given)
-
-    curve = tested("curve", True, 90.0, told["p_value"], told["evidence"])
-    saturation = tested("saturation", False, 19.0, 1e-5)
-    correlations = torch.tensor([[1.0, told["correlation"]], [told["correlation"], 1.0]])
-    tests = SimpleNamespace(tested=[curve, saturation], critical=0.01, correlations=correlations)
-    fits = []
-
-    def attempts(now, chosen, screening, threshold):
-        assert chosen == [curve] and threshold.stops_early
-        fitted = SimpleNamespace(total=told["gain"], is_judged=told["is_judged"])
-        return [lambda threshold: fits.append(now) or fitted]
-
-    monkeypatch.setattr(judges, "attempts", attempts)
-    monkeypatch.setattr(judges.ParticleJudge, "confirm", lambda self, candidate: candidate)
-    monkeypatch.setattr(judges, "bar_of", lambda fits: Threshold(1.0))
-    judge = judges.CurveJudge("now", SimpleNamespace(tests=tests))
-    given = {"tested": saturation, "variant": saturation.variant, "refit": object.__new__(Refit)}
-    given |= {"total": 14.0, "is_explanation": told["explains"]}
+    curved = Curved(monkeypatch, **change)
+    candidate = curved.candidate()
     for _ in range(2):
-        assert judge.admits(SimpleNamespace(**given)) == admitted
-    assert fits == ["now"] * (not change or "gain" in change)
+        assert curved.judge.admits(candidate) == admitted
+    assert curved.fits == [True] * (not change or "gain" in change)
+    gain = change.get("gain", 100.0)
+    why = f"saturation is not added: it brings 14 nats, a curve (forward~velocity) {gain:.0f}"
+    assert curved.judge.refused == ({} if admitted else {"saturation": why})
+
+
+@pytest.mark.parametrize(("gain", "p_value", "admitted"), [(3.5, 1e-5, False), (2.5, 1e-5, True), (99.0, 0.5, True)])
+def test_what_imitates_anything_enters_where_no_curve_brings_something(monkeypatch, gain, p_value, admitted):
+    curved = Curved(monkeypatch, gain=gain, p_value=p_value, behind=[0, 1])
+    assert curved.judge.admits(curved.candidate(total=500.0, explains=False)) == admitted
+    assert curved.fits == [False] * (p_value < 0.01)
+
+
+def test_a_curve_that_was_given_up_beside_one_candidate_is_fitted_again_beside_another(monkeypatch):
+    """A broken fit of a huge log p(y) has every curve given up."""
+    curved = Curved(monkeypatch, behind=[0])
+    assert curved.judge.admits(curved.candidate(total=1e6, label="broken"))
+    assert not curved.judge.admits(curved.candidate())
+    assert len(curved.fits) == 2

@@ -75,8 +75,12 @@ class Chosen:
 )
 def test_coloured_noise_enters_where_nothing_else_is_significant(monkeypatch, totals, expected):
     candidates = [Chosen(name, *told) for name, told in totals.items()]
-    monkeypatch.setattr(search, "_refits", lambda *_: candidates)
-    screening = SimpleNamespace(tests=SimpleNamespace(p_value=0.0, critical=0.01, tested=[]))
+    screening = leading(monkeypatch, " ".join(totals))
+
+    def refits(now, chosen, *_):
+        return [one for one in candidates if one.name in [tested.variant.name for tested in chosen]]
+
+    monkeypatch.setattr(search, "_refits", refits)
     found = search.Search(None, base=None, final=None, step=None, gained=0.0)
     assert search._add_best(found, screening, 1) == (expected is not None)
     assert [one.candidate.name for one in found.found] == ([expected] if expected else [])
@@ -124,6 +128,17 @@ def test_a_knee_is_moved_beside_what_is_added_after_it(monkeypatch):
     assert found.final is moved.refit and found.found[0].candidate.tested is final
 
 
+def test_what_imitates_anything_is_not_carried(monkeypatch):
+    """It waits for the tests at the finer step."""
+    monkeypatch.setattr(search, "_fitted_again", lambda now, one: one)
+    monkeypatch.setattr(search, "attached", lambda program: [])
+    monkeypatch.setattr(Refit, "program", None)
+    base, coloured = object.__new__(Refit), Chosen("coloured", 30.0, explains=False)
+    here = search.Search(base, base, base, None, 0.0)
+    search._carry(here, [Found(coloured, [coloured], None)])
+    assert not here.found
+
+
 def test_what_is_carried_has_its_earlier_knees_moved_beside_it(monkeypatch):
     """Else what they leave at a wrong knee looks like something else: a sensor's scale, in a linear drive's log."""
     friction, drag = Chosen("friction", 30.0), Chosen("drag", 20.0)
@@ -138,16 +153,55 @@ def test_what_is_carried_has_its_earlier_knees_moved_beside_it(monkeypatch):
     assert asked == [("friction", 2)]
 
 
-@pytest.mark.parametrize(("near", "expected"), [(None, ["lag", "drag", "wind"]), ({"drag"}, ["lag", "drag"])])
-def test_at_a_finer_step_only_what_came_near_is_fitted_first_and_what_its_tests_put_first(monkeypatch, near, expected):
-    tested = [SimpleNamespace(variant=SimpleNamespace(name=name)) for name in ("lag", "drag", "wind")]
-    seen = []
+def leading(monkeypatch, names: str) -> SimpleNamespace:
+    """Tests that put these effects first, by their names."""
+    forms = {"coloured": "colour"}
+    tested = [
+        SimpleNamespace(variant=SimpleNamespace(name=name, effect=SimpleNamespace(form=forms.get(name, "push"))))
+        for name in names.split()
+    ]
     monkeypatch.setattr(search, "leaders", lambda tests, first: tested)
-    monkeypatch.setattr(search, "_refits", lambda now, chosen, *_: seen.extend(chosen) or [])
-    screening = SimpleNamespace(tests=SimpleNamespace(p_value=0.0, critical=0.01, tested=[]))
+    return SimpleNamespace(tests=SimpleNamespace(p_value=0.0, critical=0.01, tested=[]))
+
+
+@pytest.mark.parametrize(
+    ("near", "enough", "groups"),
+    [
+        (None, "", ["lag drag wind", "", "coloured"]),
+        (None, "wind", ["lag drag wind"]),
+        ({"drag"}, "", ["lag drag", "wind", "coloured"]),
+        ({"drag"}, "wind", ["lag drag", "wind"]),
+        ({"drag"}, "drag", ["lag drag"]),
+        (set(), "coloured", ["lag", "drag wind", "coloured"]),
+    ],
+)
+def test_what_came_near_is_fitted_first_and_what_imitates_anything_last(monkeypatch, near, enough, groups):
+    """At a finer step only what the coarser one or the tests point at, unless that is not enough."""
+    screening, seen = leading(monkeypatch, "coloured lag drag wind"), []
+
+    def refits(now, chosen, *_):
+        names = [tested.variant.name for tested in chosen]
+        seen.append(" ".join(names))
+        return [Chosen(name, 9.0 if name == enough else 0.0) for name in names]
+
+    monkeypatch.setattr(search, "_refits", refits)
     found = search.Search(None, base=None, final=None, step=None, gained=0.0)
-    assert not search._add_best(found, screening, 1, near)
-    assert [one.variant.name for one in seen] == expected
+    assert search._add_best(found, screening, 1, near) == bool(enough)
+    assert seen == groups and [one.candidate.name for one in found.found] == enough.split()
+
+
+@pytest.mark.parametrize(("curve", "expected"), [(100.0, None), (1.0, "coloured")])
+def test_in_the_first_round_coloured_noise_waits_for_curves(monkeypatch, curve, expected):
+    screening = leading(monkeypatch, "coloured lag")
+    coloured = Chosen("coloured", 50.0, explains=False)
+    monkeypatch.setattr(
+        search, "_refits", lambda now, chosen, *_: [coloured for t in chosen if "col" in t.variant.name]
+    )
+    monkeypatch.setattr(search, "_curves", lambda found: [SimpleNamespace(total=curve)])
+    monkeypatch.setattr(search.Search, "curve", property(lambda self: self.curves[0].total > 3 or None))
+    found = search.Search(None, base=None, final=None, step=None, gained=0.0)
+    assert search._add_best(found, screening, 0) == bool(expected)
+    assert [one.candidate.name for one in found.found] == ([expected] if expected else [])
 
 
 @pytest.mark.parametrize("failure", [RuntimeError("the tide is out"), KeyboardInterrupt()])
