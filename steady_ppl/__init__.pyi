@@ -22,6 +22,7 @@ from .errors import (
     ProgramError as ProgramError,
     RunError as RunError,
     SteadyError as SteadyError,
+    TableWarning as TableWarning,
     TrainingError as TrainingError,
     UsageError as UsageError,
 )

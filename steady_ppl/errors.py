@@ -76,6 +76,10 @@ class TrainingError(ComputationError):
     """Training failed, for example on a loss that is not finite."""
 
 
+class TableWarning(UserWarning):
+    """A table was read that is not written as it should be."""
+
+
 def require(holds: bool, setting: str, value: object, wanted: str) -> None:
     """Refuse a setting's value unless it is what is wanted, such as "at least 1".
 

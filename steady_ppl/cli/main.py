@@ -9,18 +9,19 @@ import signal
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import version as installed_version
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from steady_ppl.cli import demo, judge, learn, make
 from steady_ppl.cli.common import as_refusal
 from steady_ppl.cli.progress import progress_line
-from steady_ppl.errors import SteadyError
-from steady_ppl.utils.context import COMMAND, QUIET, bound
+from steady_ppl.errors import SteadyError, TableWarning
+from steady_ppl.utils.context import COMMAND, QUIET, UNITS_ROW, bound
 from steady_ppl.utils.cores import ONE_THREAD
 from steady_ppl.utils.progress import listening
 from steady_ppl.utils.text import one_line, say, tell
@@ -28,7 +29,8 @@ from steady_ppl.utils.text import one_line, say, tell
 INTERRUPTED_CODE = 130  # what typer returns for Ctrl-C
 # left out of the help, which then fits one screen; as --debug, which the line of an unexpected error names
 COMPLETION_OPTIONS = ("install_completion", "show_completion")
-GLOBAL_OPTIONS = {"--debug": "debug", "--quiet": "quiet", "-q": "quiet"}  # before or after the command
+# before or after the command
+GLOBAL_OPTIONS = {"--debug": "debug", "--quiet": "quiet", "-q": "quiet", "--units-row": "units row"}
 
 
 app = typer.Typer(
@@ -138,6 +140,9 @@ def say_version(asked: bool) -> None:
 def options(
     debug: Annotated[bool, typer.Option("--debug", hidden=True, help="Show the traceback of an error.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no notes, only results.")] = False,
+    units_row: Annotated[
+        bool, typer.Option("--units-row", hidden=True, help="Tables have a row of units below their header.")
+    ] = False,
     version: Annotated[
         bool, typer.Option("--version", callback=say_version, is_eager=True, hidden=True, help="Show the version.")
     ] = False,
@@ -157,6 +162,8 @@ def main(arguments: list[str] | None = None) -> int:
     typed = shlex.join(["steady", *(word for word in arguments if word not in ("--resume", "--force"))])
     with (
         bound(QUIET, "quiet" in asked),
+        bound(UNITS_ROW, "units row" in asked),
+        _warnings_said(),
         bound(COMMAND, typed),
         progress_line() as line,
         listening(line),
@@ -186,6 +193,24 @@ def main(arguments: list[str] | None = None) -> int:
                 return refusal.exit_code
             say(f"{one_line(error)} (--debug shows where)", always=True)
             return 1
+
+
+@contextmanager
+def _warnings_said() -> Iterator[None]:
+    """Say how tables were read that other programs wrote, once each."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", TableWarning)
+        show, told = warnings.showwarning, set[str]()
+
+        def said(message: Warning | str, category: type[Warning], *place: Any, **given: Any) -> None:
+            if not issubclass(category, TableWarning):
+                show(message, category, *place, **given)
+            elif str(message) not in told:
+                told.add(str(message))
+                say(str(message))
+
+        warnings.showwarning = said
+        yield
 
 
 @contextmanager

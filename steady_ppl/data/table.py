@@ -9,6 +9,7 @@ Columns: `trajectory`, `time` (s), `u.<control>`, `y.<measurement>` and, where k
 
 import csv
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -20,47 +21,58 @@ import pyarrow.parquet
 import torch
 from torch import Tensor
 
+from steady_ppl.data.dialect import read_csv
 from steady_ppl.data.trajectories import Trajectories, pad, pad_time
-from steady_ppl.errors import DataError, require
+from steady_ppl.errors import DataError, TableWarning, require
+from steady_ppl.utils.context import UNITS_ROW
 from steady_ppl.utils.files import require_file, whole_file
 from steady_ppl.utils.text import shown
 
-SEPARATORS = {";": "semicolons", "\t": "tabs"}  # of other programs' CSV
 MAX_PIECES = 1_000_000  # of all drives
 MAX_DRIVE_ROWS = 20_000  # of a drive that is looked at as a whole
 
 
-def read_table(path: str | Path) -> Trajectories:
+def read_table(path: str | Path, *, units_row: bool | None = None) -> Trajectories:
     """Read the trajectories of a `.csv` or `.parquet` file, in order of first appearance, float64.
 
-    `states` is None when no `x.` cell is filled.
+    `states` is None when no `x.` cell is filled. A `TableWarning` says how a CSV was read that other programs wrote:
+    UTF-16, semicolons or tabs, decimal commas, blanks around names, comment lines, a separator at the end of rows.
+
+    Args:
+        units_row: the row below the header of a CSV has units; None: as the command line says.
 
     Raises:
         DataError: naming the file and, where they apply, the column, the trajectory and the row.
     """
     path = Path(path)
     require_file(path, DataError)
-    read = _read_csv if _suffix(path) == ".csv" else _read_parquet
     try:
-        frame = read(path)
+        announced = UNITS_ROW.get() if units_row is None else units_row
+        frame, told = read_csv(path, announced) if _suffix(path) == ".csv" else (_read_parquet(path), [])
     except FileNotFoundError as error:
         raise DataError(f"{path.name}: there is no such file") from error
     except (OSError, ValueError, csv.Error, pyarrow.ArrowException) as error:
         reason = getattr(error, "strerror", None) or str(error).partition("\n")[0]
         raise DataError(f"{path.name}: cannot be read as {_suffix(path)[1:]}: {reason}") from error
-    return from_frame(frame, name=path.name)
+    data = from_frame(frame, name=path.name)
+    if told:
+        warnings.warn(f"{path.name}: read with {', '.join(told)}", TableWarning, stacklevel=2)
+    return data
 
 
 def write_table(data: Trajectories, path: str | Path) -> None:
     """Write a table to a `.csv` or `.parquet` file; `read_table` gives the same numbers back, bit for bit in float64.
 
     The file appears whole or not at all. DataError for another suffix, a missing folder, or a table that `read_table`
-    would refuse.
+    would refuse; a CSV has no blanks at the ends of names.
     """
     path = Path(path)
     suffix = require_table_file(path)
     frame = to_frame(data)
     from_frame(frame, name=path.name)
+    for column in frame.columns if suffix == ".csv" else ():
+        if column != column.strip():
+            fail(path.name, "a name ends with a blank: give it another, or write .parquet", column=column)
     write = frame.to_csv if suffix == ".csv" else frame.to_parquet
     with whole_file(path, DataError) as beside:
         write(beside, index=False)
@@ -207,22 +219,6 @@ def _parse_cells(cells: pd.Series) -> tuple[np.ndarray, np.ndarray]:
             bad[i] = True
         bad[i] |= "_" in text or not text.isascii()  # float() takes separators, and digits of other scripts
     return values, bad
-
-
-def _read_csv(path: Path) -> pd.DataFrame:
-    # not pandas' reader: it fills up a row that was cut short and renames a column that appears twice
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        lines = [line for line in csv.reader(file, strict=True) if line]
-    if not lines:
-        fail(path.name, "the table is empty")
-    header, *rows = lines
-    for sign, word in SEPARATORS.items():
-        if sign in header[0]:
-            fail(path.name, f"the columns are separated by {word}, expected commas, and numbers with a decimal point")
-    for i, row in enumerate(rows):
-        if len(row) != len(header):
-            fail(path.name, f"got {len(row)} cells, expected {len(header)} as in the header", row=i + 1)
-    return pd.DataFrame(rows, columns=header, dtype=object)
 
 
 def _read_parquet(path: Path) -> pd.DataFrame:

@@ -11,6 +11,8 @@ from typing import Concatenate, TypeVar
 Value = TypeVar("Value")
 QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
 """Whether nothing but errors and results is said."""
+UNITS_ROW: ContextVar[bool] = ContextVar("units_row", default=False)
+"""Whether tables that are read have a row of units below their header."""
 COMMAND: ContextVar[str | None] = ContextVar("command", default=None)
 """The command line, for the record of every run that the block makes, as a shell takes it; None in Python."""
 

@@ -1,0 +1,145 @@
+"""CSV as other programs write it. What is harmless is read, and told.
+
+Harmless are a byte order mark, UTF-16, semicolons or tabs between columns, decimal commas between these, blanks around
+column names, comment lines before the header, a separator at the end of every line, and a row of units that was
+announced.
+"""
+
+import codecs
+import csv
+import io
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from steady_ppl.errors import DataError
+from steady_ppl.utils.text import shown
+
+SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
+COMMENTS = ("#", "%")  # signs with which a comment line begins
+DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*")
+EVERY_TABLE = {"trajectory", "time"}  # columns by which a header is known
+
+
+def read_csv(path: Path, units_row: bool = False) -> tuple[pd.DataFrame, list[str]]:
+    """The cells of a file as text, under its column names, and what was harmless, in words.
+
+    Args:
+        units_row: the row below the header has units, and is left out.
+
+    Raises:
+        DataError: rows of several lengths, or a row of units where none was announced, or none where one was.
+        ValueError, csv.Error: no text, or quotes that are never closed.
+    """
+    told = list[str]()
+    lines = _without_comments(_text(path.read_bytes(), told), told)
+    separator = _separator(lines)
+    # not pandas' reader: it fills up a row that was cut short and renames a column that appears twice
+    cells = [row for row in csv.reader(io.StringIO(lines, newline=""), delimiter=separator, strict=True) if row]
+    if not cells:
+        raise DataError(f"{path.name}: the table is empty")
+    if separator != ",":
+        told.append(f"{SEPARATORS[separator]} between columns")
+    header, *rows = cells
+    header, rows = _without_last_separator(header, rows, told)
+    if (stripped := [name.strip() for name in header]) != header:
+        header = stripped
+        told.append("blanks around column names")
+    for i, row in enumerate(rows):
+        if len(row) != len(header):
+            what = f"got {len(row)} cells, expected {len(header)} as in the header"
+            raise DataError(f"{path.name}: row {i + 1}: {what}", row=i + 1)
+    rows = _without_units(path.name, header, rows, units_row, told)
+    if separator != "," and _has_decimal_commas(header, rows):
+        rows = [_with_points(header, row) for row in rows]
+        told.append("decimal commas")
+    return pd.DataFrame(rows, columns=header, dtype=object), told
+
+
+def _text(content: bytes, told: list[str]) -> str:
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        told.append("UTF-16")
+        return content.decode("utf-16")
+    return content.decode("utf-8-sig")
+
+
+def _without_comments(text: str, told: list[str]) -> str:
+    """The text from its first line that is neither blank nor a comment."""
+    count = place = 0
+    for line in io.StringIO(text, newline=""):
+        if line.strip() and not line.lstrip().startswith(COMMENTS):
+            break
+        place += len(line)
+        count += bool(line.strip())
+    if count:
+        told.append(f"{count} comment line{'s' if count > 1 else ''} before the header")
+    return text[place:]
+
+
+def _separator(text: str) -> str:
+    """What separates the columns whose names every table has; a comma where none does."""
+    first = text.partition("\n")[0]
+    names = {sign: {name.strip().strip('"') for name in first.split(sign)} for sign in SEPARATORS}
+    return next((sign for sign, there in names.items() if there >= EVERY_TABLE), ",")
+
+
+def _without_last_separator(
+    header: list[str], rows: list[list[str]], told: list[str]
+) -> tuple[list[str], list[list[str]]]:
+    """A table without the empty column that a separator at the end of every row makes."""
+    count = len(header) - (not header[-1].strip())
+    if len(header) > 1 and rows and all(len(row) == count + 1 and not row[-1].strip() for row in rows):
+        told.append("a separator at the end of every row")
+        return header[:count], [row[:count] for row in rows]
+    return header, rows
+
+
+def _without_units(
+    name: str, header: Sequence[str], rows: list[list[str]], announced: bool, told: list[str]
+) -> list[list[str]]:
+    units = [cell.strip() for cell in rows[0]] if rows else []
+    is_row_of_units = len(rows) > 1 and _is_text(header, units) and not _is_text(header, rows[1])
+    if not is_row_of_units:
+        if announced:
+            raise DataError(f"{name}: row 1 has no units: leave --units-row (units_row=True) out", row=1)
+        return rows
+    said = shown(", ".join(units), 100)
+    if not announced:
+        what = f"it looks like a row of units ({said}): read the table with --units-row (units_row=True)"
+        raise DataError(f"{name}: row 1: {what}", row=1)
+    told.append(f"a row of units ({said})")
+    return rows[1:]
+
+
+def _is_text(header: Sequence[str], cells: Sequence[str]) -> bool:
+    """Whether no cell of a row is a number, but perhaps its label, and its time is text."""
+    numbers = [cell for column, cell in zip(header, cells, strict=True) if column != "trajectory" and cell.strip()]
+    times = [cell for column, cell in zip(header, cells, strict=True) if column == "time"]
+    return any(cell.strip() for cell in times) and not any(map(_is_number, numbers))
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _with_points(header: Sequence[str], row: Sequence[str]) -> list[str]:
+    return [cell if name == "trajectory" else cell.replace(",", ".") for name, cell in zip(header, row, strict=True)]
+
+
+def _has_decimal_commas(header: Sequence[str], rows: Iterable[Sequence[str]]) -> bool:
+    """Whether some number has a decimal comma and none a point."""
+    found = False
+    for row in rows:
+        for column, cell in zip(header, row, strict=True):
+            if column == "trajectory":
+                continue
+            if "." in cell:
+                return False
+            found = found or DECIMAL_COMMA.fullmatch(cell) is not None
+    return found
