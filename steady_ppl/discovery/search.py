@@ -443,9 +443,20 @@ def _refits(now: Refit, chosen: Sequence[Tested], screening: Screening, candidat
             begin()
             candidates.append(fit(_threshold(candidates)))
     best = max((c for c in candidates if c.is_judged), key=lambda c: c.total, default=None)
-    added = [c if c.is_judged else replace(c, behind=best) for c in candidates[begun:]]
+    added = [c if c.is_judged else _unless_behind(now, replace(c, behind=best)) for c in candidates[begun:]]
     least = max((c.total for c in [*candidates[:begun], *added]), default=0.0) - MAX_NATS_OF_RIVAL
     return [at_its_best_place(now, c) if c.total > least else c for c in added]
+
+
+def _unless_behind(now: Refit, candidate: Candidate) -> Candidate:
+    """A candidate that was given up; judged after all where one fold says that it is ahead of the best that is."""
+    best, refit = candidate.behind, candidate.refit
+    if best is None or isinstance(refit, str) or candidate.total <= best.total:
+        return candidate
+    variant = candidate.variant
+    return judged(
+        now, candidate.tested, refit_with(now, variant, refit.coefficient(variant), information=refit.maxima[0])
+    )
 
 
 def _threshold(candidates: Sequence[Candidate]) -> Threshold:

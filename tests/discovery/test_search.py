@@ -113,6 +113,24 @@ def test_what_loses_or_imitates_sets_no_bar_for_what_is_fitted_after_it(monkeypa
     assert [one.variant.label for one in seen] == ["drag", "coloured"]
 
 
+@pytest.mark.parametrize(("total", "is_judged"), [(31.0, True), (30.0, False), (9.0, False)])
+def test_what_was_given_up_is_judged_after_all_where_it_seems_to_be_ahead(monkeypatch, total, is_judged):
+    """It stayed behind the best drives of one candidate and the best held-out drives of another."""
+    best, given_up, judged = Chosen("limit", 30.0), Chosen("lever", total), Chosen("lever", 35.0)
+    given_up.is_judged, given_up.tested, given_up.behind = False, "test", best
+    given_up.refit.__dict__["maxima"] = ["known"]
+    monkeypatch.setattr(Refit, "coefficient", lambda self, variant: 3.5)
+    asked = []
+    monkeypatch.setattr(
+        search, "refit_with", lambda now, *given, **known: asked.append((now, *given, known)) or "refit"
+    )
+    monkeypatch.setattr(
+        search, "judged", lambda now, tested, refit: judged if (tested, refit) == ("test", "refit") else 0
+    )
+    assert search._unless_behind("now", given_up) is (judged if is_judged else given_up)
+    assert asked == [("now", given_up.variant, 3.5, {"information": "known"})] * is_judged
+
+
 def test_a_knee_is_moved_beside_what_is_added_after_it(monkeypatch):
     knee, moved, later = (Chosen(name, 10.0, profiled={name: 1.0}) for name in ("knee", "moved", "later"))
     knee.tested = SimpleNamespace(at=lambda variant: variant)
