@@ -6,6 +6,7 @@ is held-out log p(y), each drive judged by a program that was fitted without it,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -28,7 +29,7 @@ from steady_ppl.discovery.candidates import (
     likelier_places,
     screen_program,
 )
-from steady_ppl.discovery.judges import MIN_GAIN_OF_CURVE, CurveJudge, ParticleJudge
+from steady_ppl.discovery.judges import MIN_GAIN_OF_CURVE, Choice, CurveJudge, ParticleJudge
 from steady_ppl.discovery.noise_first import Correction, needless, with_suitable_noise, without, without_outliers
 from steady_ppl.discovery.refits import (
     NO_THRESHOLD,
@@ -363,7 +364,7 @@ def _add_best(found: Search, screening: Screening, index: int, near: Collection[
             if found.curve is not None:
                 break
         candidates += _refits(found.final, group, screening, found.rounds[-1].candidates)
-        best, candidates = judge.chosen(candidates, partial(_first, is_enough))
+        best, candidates = _chosen(judge, candidates, partial(_first, is_enough))
         if best is not None:
             break
     if index == 0 and best is None and found.curve is None and not found.departed:  # neither is what the tests found
@@ -443,20 +444,30 @@ def _refits(now: Refit, chosen: Sequence[Tested], screening: Screening, candidat
             begin()
             candidates.append(fit(_threshold(candidates)))
     best = max((c for c in candidates if c.is_judged), key=lambda c: c.total, default=None)
-    added = [c if c.is_judged else _unless_behind(now, replace(c, behind=best)) for c in candidates[begun:]]
+    added = [c if c.is_judged else replace(c, behind=best) for c in candidates[begun:]]
     least = max((c.total for c in [*candidates[:begun], *added]), default=0.0) - MAX_NATS_OF_RIVAL
     return [at_its_best_place(now, c) if c.total > least else c for c in added]
 
 
-def _unless_behind(now: Refit, candidate: Candidate) -> Candidate:
-    """A candidate that was given up; judged after all where one fold says that it is ahead of the best that is."""
-    best, refit = candidate.behind, candidate.refit
-    if best is None or isinstance(refit, str) or candidate.total <= best.total:
-        return candidate
-    variant = candidate.variant
-    return judged(
-        now, candidate.tested, refit_with(now, variant, refit.coefficient(variant), information=refit.maxima[0])
-    )
+def _chosen(
+    judge: ParticleJudge, candidates: Sequence[Candidate], choose: Choice
+) -> tuple[Candidate | None, list[Candidate]]:
+    """See `ParticleJudge.chosen`. Candidates that were given up and seem to be ahead of all others are judged then:
+    a filter may have denied the one beside which they stayed behind."""
+    while True:
+        best, ranked = judge.chosen(candidates, choose)
+        most = max((c.total for c in ranked if c.is_judged), default=math.inf)
+        candidates = [c if c.is_judged or c.total <= most else _judged_after_all(judge.now, c) for c in ranked]
+        if all(one is other for one, other in zip(candidates, ranked, strict=True)):
+            return best, ranked
+
+
+def _judged_after_all(now: Refit, candidate: Candidate) -> Candidate:
+    """A candidate that was given up, fitted on every fold."""
+    assert isinstance(candidate.refit, Refit)
+    begin, known = candidate.refit.coefficient(candidate.variant), candidate.refit.maxima[0]
+    again = judged(now, candidate.tested, refit_with(now, candidate.variant, begin, information=known))
+    return at_its_best_place(now, again)
 
 
 def _threshold(candidates: Sequence[Candidate]) -> Threshold:

@@ -113,22 +113,34 @@ def test_what_loses_or_imitates_sets_no_bar_for_what_is_fitted_after_it(monkeypa
     assert [one.variant.label for one in seen] == ["drag", "coloured"]
 
 
-@pytest.mark.parametrize(("total", "is_judged"), [(31.0, True), (30.0, False), (9.0, False)])
-def test_what_was_given_up_is_judged_after_all_where_it_seems_to_be_ahead(monkeypatch, total, is_judged):
-    """It stayed behind the best drives of one candidate and the best held-out drives of another."""
-    best, given_up, judged = Chosen("limit", 30.0), Chosen("lever", total), Chosen("lever", 35.0)
-    given_up.is_judged, given_up.tested, given_up.behind = False, "test", best
-    given_up.refit.__dict__["maxima"] = ["known"]
+@pytest.mark.parametrize(("total", "expected"), [(25.0, "lever"), (20.0, "limit"), (9.0, "limit")])
+def test_what_was_given_up_is_judged_after_all_where_it_is_ahead_of_what_a_filter_leaves(monkeypatch, total, expected):
+    """It stayed behind a limit whose linearised log p(y) promises ten nats more than a filter finds."""
+    limit, lever, known = Chosen("limit", 30.0), Chosen("lever", total), "information of its first fold"
+    limit.is_confirmed = lever.is_judged = lever.is_confirmed = False
+    lever.tested, lever.refit.__dict__["maxima"] = "test", [known]
     monkeypatch.setattr(Refit, "coefficient", lambda self, variant: 3.5)
+    monkeypatch.setattr(search, "at_its_best_place", lambda now, candidate: candidate)
     asked = []
-    monkeypatch.setattr(
-        search, "refit_with", lambda now, *given, **known: asked.append((now, *given, known)) or "refit"
-    )
-    monkeypatch.setattr(
-        search, "judged", lambda now, tested, refit: judged if (tested, refit) == ("test", "refit") else 0
-    )
-    assert search._unless_behind("now", given_up) is (judged if is_judged else given_up)
-    assert asked == [("now", given_up.variant, 3.5, {"information": "known"})] * is_judged
+
+    def refit_with(now, variant, begin, *, information):
+        asked.append((now, variant.name, begin, information))
+        return "refit"
+
+    def judge(now, tested, refit):
+        assert (now, tested, refit) == ("now", "test", "refit")
+        return Chosen("lever", total)
+
+    def confirm(self, candidate):
+        return Chosen(candidate.name, candidate.total - 10.0 * (candidate is limit))
+
+    monkeypatch.setattr(search, "refit_with", refit_with)
+    monkeypatch.setattr(search, "judged", judge)
+    monkeypatch.setattr(search.ParticleJudge, "confirm", confirm)
+    ranking = search.partial(search._first, lambda c: c.total > 2)
+    best, ranked = search._chosen(search.ParticleJudge("now"), [lever, limit], ranking)
+    assert best.name == expected and best.total == max(20.0, total) and len(ranked) == 2
+    assert asked == [("now", "lever", 3.5, known)] * (expected == "lever")
 
 
 def test_a_knee_is_moved_beside_what_is_added_after_it(monkeypatch):
