@@ -1,11 +1,11 @@
-"""Whether today's source makes filed records again, to the last bit: some of the calibration and of the development
-benchmark, the two whose files are by one source.
+"""Whether today's source makes filed records again, to the last bit: eleven of the calibration, four of the development
+benchmark.
 
-    python benchmarks/repeats.py [--workers 2]
+    python benchmarks/repeats.py [--store] [--workers 2]
 
-Every figure of a record is compared but the seconds that it took. Exits with 1 where one differs, and names it: on
-another kind of processor, with other versions of torch or numba, and after a change of an algorithm that is to be
-expected; after a move or a change of names it is a fault.
+`--store` files them in `results/repeats.jsonl`, after a change of an algorithm. Every figure is compared but the
+seconds that it took. Exits with 1 where one differs, and names it: on another kind of processor, or with other versions
+of torch or numba, that is to be expected; after a move or a change of names it is a fault.
 """
 
 from __future__ import annotations
@@ -14,16 +14,17 @@ import argparse
 import json
 import sys
 from concurrent.futures import ProcessPoolExecutor
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import calibrate
 import discovery
 from discovery_sets import benchmark_sets
-from resumable import Record, stored
+from resumable import Record, digest, stored
 
-RESULTS = Path(__file__).parent / "results"
-DISCOVERED = 4  # sets of the development benchmark, the first that are filed
+FILE = Path(__file__).parent / "results" / "repeats.jsonl"
+DISCOVERED = 4  # sets of the development benchmark, the first
 CALIBRATION = (
     "states cart bootstrap 200 1200",
     "states hovercraft lookahead 100 1200",
@@ -39,9 +40,9 @@ CALIBRATION = (
 )
 
 
-def made_again(of: str, name: str) -> Record:
+def made_again(name: str) -> Record:
     """The record of a set by the present source, as a file has it."""
-    if of == "calibration":
+    if name in CALIBRATION:
         record = calibrate.work(*calibrate.jobs(calibrate.FULL)[name])
     else:
         record = discovery.judged(next(chosen for chosen in benchmark_sets() if chosen.name == name))
@@ -61,20 +62,24 @@ def difference(before: Any, after: Any, place: str = "") -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--store", action="store_true", help="file the records in place of comparing them")
     parser.add_argument("--workers", type=int, default=2)
-    workers = parser.parse_args().workers
-    filed = {name: stored(RESULTS / f"{name}.jsonl") for name in ("calibration", "discovery-continuous")}
-    chosen = [("calibration", name) for name in CALIBRATION]
-    chosen += [("discovery-continuous", name) for name in list(filed["discovery-continuous"])[:DISCOVERED]]
-    differ = 0
-    with ProcessPoolExecutor(workers) as pool:
-        for (of, name), after in zip(chosen, pool.map(made_again, *zip(*chosen, strict=True)), strict=True):
-            before = {key: value for key, value in filed[of][name].items() if key not in ("set", "version")}
-            found = difference(before, after)
-            differ += bool(found)
-            print(f"{of}: {name}: {found or 'the same'}", flush=True)
-    print(f"{len(chosen) - differ} of {len(chosen)} records are the same to the last bit")
-    return bool(differ)
+    told = parser.parse_args()
+    names = [*CALIBRATION, *(chosen.name for chosen in islice(benchmark_sets(), DISCOVERED))]
+    version, filed = digest(Path(__file__).parent.parent / "steady_ppl"), {} if told.store else stored(FILE)
+    lines, differ = [], 0
+    with ProcessPoolExecutor(told.workers) as pool:
+        for name, after in zip(names, pool.map(made_again, names), strict=True):
+            lines.append(json.dumps({"set": name, "version": version, **after}))
+            before = {key: value for key, value in filed.get(name, {}).items() if key not in ("set", "version")}
+            found = "filed" if told.store else difference(before, after)
+            differ += bool(found) and not told.store
+            print(f"{name}: {found or 'the same'}", flush=True)
+    if told.store:
+        FILE.write_text("\n".join(lines) + "\n")
+    else:
+        print(f"{len(names) - differ} of {len(names)} records are the same to the last bit")
+    return int(differ > 0)
 
 
 if __name__ == "__main__":
